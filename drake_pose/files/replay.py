@@ -29,7 +29,7 @@ from drake_pose.camera.models import HALF_PIXEL, Camera, ParallelCamera, Pinhole
 from drake_pose.errors import OutputError
 from drake_pose.files.overlay import EXCESS_RGB
 from drake_pose.fit.surfaces import reduce_meshes
-from drake_pose.registration.posed_frames import SeenFrame
+from drake_pose.registration.posed_frames import MultiViewFrame
 from drake_pose.systems.bodies import add_meshcat_skin, add_posed_plant, body_poses
 
 _BODY_PATH, _MEASURED_PATH = "visualizer", "measured"
@@ -200,7 +200,7 @@ def import_rerun() -> Any:
 
 
 def make_recording(
-    tree: PoseTree, cameras: Iterable[Camera], frames: Sequence[SeenFrame], pictures: Pictures
+    tree: PoseTree, cameras: Iterable[Camera], frames: Sequence[MultiViewFrame], pictures: Pictures
 ) -> bytes:
     """The bytes of a file .rrd.
 

@@ -1,9 +1,10 @@
-"""Which frames, cameras or joints contradict the rest, where all of them are given.
+"""Find which frames, cameras or joints contradict the others, where all of them are given.
 
-Each frame, fitted by itself (``per_frame_fit``), gives N x = h for the error x of what is given,
-with h's covariance Q by ``fit.covariance``. What all frames that agree are off alike is the fault
-of a joint's offset, a camera or the base. A frame is an outlier if it is significantly off from the
-others: r^T Q^-1 r, r = h - N x_common, follows Fisher's distribution where nothing is wrong.
+Each frame, fitted by itself (``per_frame_fit``), gives linear equations N x = h for the errors x of
+the given values, in units of their prior deviations. The covariance Q of h follows from
+``fit.covariance``. An error common to all inlier frames is attributed to a joint offset, a camera
+or the base. A frame is an outlier if its residual r = h - N x_common is significant: without errors
+r^T Q^-1 r follows an F distribution.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -30,13 +31,13 @@ from drake_pose.registration.shared_fit import SHARED
 
 
 class DiagnosisSettings(NamedTuple):
-    """From when on something counts as wrong.
+    """Thresholds of a diagnosis.
 
-    significance: a right scene, or a right frame, is named with at most this probability.
-    min_pixels, min_joint_pixels: what moves outlines by less [pixel] is not named; the latter is
-    for joint offsets in all frames that agree, whatever cameras are off by. least_focal: focal
-    lengths are known no better [share]. min_information: directions with less information, in units
-    of the priors, are left out.
+    significance: probability with which a correct scene, or a correct frame, gets a finding.
+    min_pixels: errors that move outlines by less get no finding [pixel]. min_joint_pixels: the same
+    for joint offsets common to all frames, after the cameras' errors are removed. focal_sd_floor:
+    minimum standard deviation of focal lengths [relative]. min_information: directions with less
+    information, in units of the prior, are left out of statistics.
     """
 
     significance: float = 1e-4
@@ -50,12 +51,12 @@ DIAGNOSIS = DiagnosisSettings()
 
 
 class _Information(NamedTuple):
-    """The information of frames on what was free, in units of its deviations: x^T N x - 2 h^T x.
+    """The information of frames about x: the quadratic form x^T N x - 2 h^T x.
 
-    N: (p, p); h: (p,); of_surface: (p, 12 nodes) how h follows the surfaces, which are the same in
-    all frames; outlines: (nodes, p, p) squares of how far x moves each part's outline, summed along
-    it, and lengths: (nodes,) [pixel]; scale: of the frame's errors, a variance; freedom: with which
-    that is known.
+    N: (p, p) and h: (p,). of_surface: (p, 12 nodes) derivative of h by surface errors, which are
+    the same in all frames. outlines: (nodes, p, p) quadratic forms of the squared motion of each
+    node's outline, summed along it. lengths: (nodes,) of the outlines [pixel]. scale: variance
+    factor of a frame's errors. freedom: degrees of freedom of this factor.
     """
 
     N: Array
@@ -67,7 +68,7 @@ class _Information(NamedTuple):
     freedom: float
 
     def plus(self, info: "_Information", sign: float = 1.0) -> "_Information":
-        """With another frame, by the scale of its errors; or without one of these: sign -1."""
+        """Add another frame, weighted by its variance factor, or remove it (sign -1)."""
         weight = sign / info.scale
         return self._replace(
             N=self.N + weight * info.N,
@@ -79,26 +80,27 @@ class _Information(NamedTuple):
         )
 
     def pixels(self, x: Array) -> float:
-        """How far x moves the outlines of the parts that it moves, root mean square [pixel]."""
+        """Return the root mean square motion of the outlines that x (p,) moves [pixel]."""
         squares = np.einsum("p,npq,q->n", x, self.outlines, x)
         moved = squares > 1e-6 * squares.max(initial=0.0)
         return float(np.sqrt(squares[moved].sum() / max(self.lengths[moved].sum(), 1e-9)))
 
 
 class _Cause(NamedTuple):
-    """What may be off: a "joint", a "camera", the "base", "focal" or "center", and its name.
+    """A possible cause of errors, and the result of its test.
 
-    moves: (p, d) how what was free follows it: a joint's position [rad or m], or a rotation vector
-    [rad] and a shift [m] of a camera along its axes, or of the base in the world, a share of focal
-    lengths, or principal points [pixel]; units: (d,).
-    rank: of causes that explain equally well, the one with the lowest rank is named.
-    Once it was tested: by what amount (d,) it is off, with covariance, and how far that moves what
-    was free, x (p,); with what chance; Akaike's gain.
+    kind: "joint", "camera", "base", "focal" or "center"; name: of the joint or camera, or words.
+    jacobian: (p, d) derivative of x by the cause's d parameters. units: (d,) size of the parameters
+    in x: a joint's position [rad or m]; rotation vector [rad] and translation [m] of a camera along
+    its axes, or of the base in the world; focal lengths [relative]; principal points [pixel].
+    rank: of causes that explain errors equally well, the one with the lowest rank is reported.
+    amount: (d,) the estimated parameters, with covariance (d, d). x: (p,) the errors they explain.
+    p_value: of the test. gain: improvement of Akaike's information criterion.
     """
 
     kind: str
     name: str
-    moves: Array
+    jacobian: Array
     units: Array
     rank: float
     amount: Array = np.zeros(0)
@@ -109,7 +111,7 @@ class _Cause(NamedTuple):
 
 
 class _Residual(NamedTuple):
-    """The residual r (p,) of N x = r, and its covariance Q."""
+    """The residual r (p,) of N x = r with its covariance Q, and the frames' information."""
 
     info: _Information
     N: Array
@@ -117,46 +119,46 @@ class _Residual(NamedTuple):
     Q: Array
 
     def solved(self, r: Array) -> Array:
-        """(p,) x of another r, zero where there is no information."""
+        """Return x (p,) for a right-hand side r (p,), with the prior as regularisation."""
         return np.asarray(np.linalg.solve(self.N + np.eye(len(r)), r))
 
     def pixels(self, without: float | Array = 0.0) -> float:
-        """How far outlines are off [pixel]; without x (p,)."""
+        """Return how far the residual moves outlines [pixel], after subtraction of N x."""
         x = np.broadcast_to(without, self.r.shape)
         return self.info.pixels(self.solved(self.r - self.N @ x))
 
     @property
     def p_value(self) -> float:
-        """How often a residual is as large by chance."""
+        """Probability of a residual at least as large if nothing is wrong."""
         return _p_value(*_statistic(self.r, self.Q, self.N), self.info.freedom)
 
     def test(self, cause: _Cause) -> _Cause:
-        """Whether a cause is off."""
-        M = cause.moves
+        """Estimate and test a cause."""
+        M = cause.jacobian
         N, r, Q = M.T @ self.N @ M, M.T @ self.r, M.T @ self.Q @ M
         T, rank = _statistic(r, Q, N)
         inverse = np.linalg.inv(N + 1e-3 * np.eye(len(r)))
         amount = inverse @ r
-        # More numbers explain more by chance.
+        # The rank penalises causes with several parameters.
         return cause._replace(
             amount=amount, covariance=inverse @ Q @ inverse, x=M @ amount,
             p_value=_p_value(T, rank, self.info.freedom), gain=T - 2.0 * rank,
         )  # fmt: skip
 
     def sufficient(
-        self, tests: Sequence[_Cause], least: float, share: float = 0.25
+        self, tests: Sequence[_Cause], least: float, fraction: float = 0.25
     ) -> list[_Cause]:
-        """Causes that suffice, sorted by rank and gain.
+        """Return the causes that explain the residual by themselves, sorted by rank and gain.
 
         They leave less than a fraction of the residual, or less than `least` [pixel].
         """
-        most = max(least, share * self.pixels())
+        most = max(least, fraction * self.pixels())
         enough = [one for one in tests if self.pixels(one.x) < most]
         return sorted(enough, key=lambda one: (one.rank, -one.gain))
 
     def without(self, cause: _Cause) -> "_Residual":
-        """The residual once a cause was put right."""
-        M, N = cause.moves, self.N
+        """Return the residual after elimination of a cause's parameters."""
+        M, N = cause.jacobian, self.N
         gain = np.eye(len(N)) - N @ M @ np.linalg.pinv(M.T @ N @ M) @ M.T
         return _Residual(self.info, gain @ N @ gain.T, gain @ self.r, gain @ self.Q @ gain.T)
 
@@ -164,44 +166,46 @@ class _Residual(NamedTuple):
 def diagnose_frames(
     fit: PerFrameFit,
     frames: Sequence[FrameFit],
-    asked: Collection[tuple[str, str]] = (),
+    requested: Collection[tuple[str, str]] = (),
     moved: bool = False,
 ) -> Diagnosis:
-    """Finds what contradicts the rest in frames that were fitted, in time linear in them.
+    """Diagnose fitted frames, in time linear in their number.
 
     Args:
-        asked: kinds and names of what is told of all frames that agree, however little it is off.
-        moved: whether cameras or the base may stand far from where they are said to, lenses being
+        fit: the fit that was used.
+        frames: the fitted frames.
+        requested: (kind, name) of causes that are always reported for all inlier frames.
+        moved: whether cameras or the base may be far from their given poses, and intrinsics are
             right.
     """
-    return _Diagnoser(fit, frames, asked, moved).diagnose()
+    return _Diagnoser(fit, frames, requested, moved).diagnose()
 
 
 class _Diagnoser:
-    """A diagnosis under way."""
+    """State of a diagnosis."""
 
     def __init__(
         self,
         fit: PerFrameFit,
         frames: Sequence[FrameFit],
-        asked: Collection[tuple[str, str]],
+        requested: Collection[tuple[str, str]],
         moved: bool,
     ) -> None:
-        self._fit, self._frames, self._asked, self._moved = fit, frames, asked, moved
-        # Errors of a single frame: standard deviations of angles [rad], and of places [m].
+        self._fit, self._frames, self._requested, self._moved = fit, frames, requested, moved
+        # Tolerated errors of a single frame: standard deviations [rad, m].
         tolerance = np.where(fit.is_angle, np.radians(0.1), 0.001)
         self._tolerance = np.diag((tolerance / fit.deviations) ** 2)
-        self._seen = dict[str, Distances]()
-        # Outlines are in the pictures, however far off a linear fit says they are.
-        self._most = max(float(np.hypot(one.width, one.height)) for one in fit.cameras)
+        self._known_distances = dict[str, Distances]()
+        # Reported motions are clipped at a picture's diagonal: the linear model has no limit.
+        self._max_pixels = max(float(np.hypot(one.width, one.height)) for one in fit.cameras)
         p, nodes = len(fit.names), len(fit.outlines)
-        self._nothing = _Information(
+        self._empty = _Information(
             np.zeros((p, p)), np.zeros(p), np.zeros((p, 12 * nodes)), np.zeros((nodes, p, p)),
             np.zeros(nodes), 1.0, 0.0,
         )  # fmt: skip
 
     def diagnose(self) -> Diagnosis:
-        """Does it."""
+        """Return the diagnosis of all frames."""
         usual = 4.0 if self._moved else 0.4
         explained = explained_frames([one.inlier_ratios[1] for one in self._frames])
 
@@ -210,24 +214,24 @@ class _Diagnoser:
             residuals = [self._residual(info, *common) for info in self._info]
             return np.array([one.p_value for one in residuals]), common[0]
 
-        # While it is unknown which frames agree, sizes of errors come from each by itself.
-        agreeing, together = explained, 1
+        # In the first pass inliers are unknown, so error sizes come from single frames.
+        inliers, together = explained, 1
         for _ in range(2):
-            sizes = self._pooled_sizes(np.flatnonzero(agreeing).tolist(), together)
+            sizes = self._pooled_sizes(np.flatnonzero(inliers).tolist(), together)
             self._info = [self._info_of(one, sizes) for one in self._frames]
             self._surface = sizes.surface
-            # Contradicting frames no longer make errors seem large.
-            agreeing, together = likeliest_inliers(explained, evaluate, usual), 4
-        total, frames = self._sum(agreeing), list[FrameDiagnosis]()
+            # In the second pass, outliers no longer enlarge the error sizes.
+            inliers, together = likeliest_inliers(explained, evaluate, usual), 4
+        total, frames = self._sum(inliers), list[FrameDiagnosis]()
         for fitted, info, is_inlier, is_explained in zip(
-            self._frames, self._info, agreeing, explained, strict=True
+            self._frames, self._info, inliers, explained, strict=True
         ):
             common = self._common(total.plus(info, -1.0) if is_inlier else total)
             residual = self._residual(info, *common)
             tests = [residual.test(cause) for cause in self._causes(fitted)]
-            # Each of the tests may find something by chance.
+            # Bonferroni correction for the number of tests.
             least = min(residual.p_value, *(one.p_value for one in tests)) * (1 + len(tests))
-            finding, pixels = None, min(residual.pixels(), self._most)
+            finding, pixels = None, min(residual.pixels(), self._max_pixels)
             if not is_explained:
                 finding = self._joints_finding("unexplained", residual)
             elif least <= DIAGNOSIS.significance and pixels >= DIAGNOSIS.min_pixels:
@@ -242,44 +246,44 @@ class _Diagnoser:
         common_findings = self._common_findings(kept) if kept.any() else ((), None, {})
         return Diagnosis(tuple(frames), common_findings[0], sizes, *common_findings[1:])
 
-    def _pooled_sizes(self, which: Sequence[int], together: int, most: int = 5) -> ErrorSizes:
-        """How large errors are: medians over some groups of frames that are spread over all."""
-        if not len(which):
+    def _pooled_sizes(self, indices: Sequence[int], together: int, most: int = 5) -> ErrorSizes:
+        """Return the median error sizes of up to `most` groups of `together` frames."""
+        if not len(indices):
             # Contours err by about a pixel.
             return ErrorSizes(1.0, 0.0, 1.0, 1.0, 1.0)
-        groups = max(1, min(most, len(which) // together))
-        count = min(len(which), groups * together)
-        spread = [which[k] for k in np.linspace(0, len(which) - 1, count).round().astype(int)]
+        groups = max(1, min(most, len(indices) // together))
+        count = min(len(indices), groups * together)
+        spread = [indices[k] for k in np.linspace(0, len(indices) - 1, count).round().astype(int)]
         sizes = []
         for k in range(groups):
-            pictures = [one for i in spread[k::groups] for one in self._frames[i].compared_masks]
-            seen = self._distances(pictures)
-            is_angle = np.append(self._fit.is_angle, np.zeros(len(pictures), bool))
+            masks = [one for i in spread[k::groups] for one in self._frames[i].compared_masks]
+            seen = self._distances(masks)
+            is_angle = np.append(self._fit.is_angle, np.zeros(len(masks), bool))
             sizes.append(estimate_sizes(seen, is_angle, min_camera=0.0)[:5])
         return ErrorSizes(*np.median(np.array(sizes), axis=0).tolist())
 
-    def _distances(self, pictures: Sequence[ComparedMask]) -> Distances:
-        """The distances in pictures; their values are what was free, then each picture's width."""
-        return distances_in_masks(self._fit.outlines, pictures, with_bias=True)
+    def _distances(self, masks: Sequence[ComparedMask]) -> Distances:
+        """Return the distances in masks, by the p unknowns, then each mask's boundary bias."""
+        return distances_in_masks(self._fit.outlines, masks, with_bias=True)
 
-    def _info_of(self, fitted: FrameFit, sizes: ErrorSizes, width_sd: float = 2.0) -> _Information:
-        """The information of a frame, whose masks' widths are right to a deviation [pixel]."""
+    def _info_of(self, fitted: FrameFit, sizes: ErrorSizes, bias_sd: float = 2.0) -> _Information:
+        """Return a frame's information; bias_sd: prior of its masks' boundary biases [pixel]."""
         known = float(SHARED.prior_freedom)
         if not fitted.compared_masks:
-            return self._nothing._replace(lengths=fitted.outline_lengths, freedom=known)
-        if fitted.name not in self._seen:
-            self._seen[fitted.name] = self._distances(fitted.compared_masks)
-        seen = self._seen[fitted.name]
-        own, widths = np.split(seen.X, [len(self._fit.names)], axis=1)
+            return self._empty._replace(lengths=fitted.outline_lengths, freedom=known)
+        if fitted.name not in self._known_distances:
+            self._known_distances[fitted.name] = self._distances(fitted.compared_masks)
+        seen = self._known_distances[fitted.name]
+        own, biases = np.split(seen.X, [len(self._fit.names)], axis=1)
         X = own * self._fit.deviations
-        V = distances_covariance(seen, sizes) + width_sd**2 * widths @ widths.T
+        V = distances_covariance(seen, sizes) + bias_sd**2 * biases @ biases.T
         PX, Py = np.split(np.linalg.solve(V, np.column_stack([X, seen.y])), [-1], axis=1)
         N, h = X.T @ PX, PX.T @ seen.y
         T, rank = _statistic(h, N)
         residual = max(float(seen.y @ Py[:, 0]) - T, 0.0)
         freedom = known + len(seen.y) - rank
         scale = max((known + residual) / freedom, 1.0)
-        outlines = self._nothing.outlines.copy()
+        outlines = self._empty.outlines.copy()
         for one in fitted.compared_masks:
             moves = one.moves * self._fit.deviations[:, None]
             outlines += moves @ one.A @ np.swapaxes(moves, 1, 2)
@@ -288,30 +292,31 @@ class _Diagnoser:
         )
 
     def _sum(self, kept: Mask) -> _Information:
-        """The information of some frames, each by the scale of its errors."""
-        return reduce(_Information.plus, compress(self._info, kept), self._nothing)
+        """Return the information of some frames together."""
+        return reduce(_Information.plus, compress(self._info, kept), self._empty)
 
     def _covariance(self, total: _Information) -> Array:
-        """(p, p) of a sum's h, the surfaces' errors included."""
+        """Return the covariance (p, p) of a sum's h, with errors of the surfaces."""
         surface = self._surface * total.of_surface
         return np.asarray(total.N + surface @ surface.T)
 
     def _common(self, total: _Information) -> tuple[Array, Array]:
-        """What frames have in common, x (p,), and its covariance; without any, nothing is off."""
-        # Without other frames what is given is right to within a tolerance.
+        """Return the errors x (p,) common to frames, and their covariance (p, p)."""
+        # Without frames, the given values are right to within the tolerance.
         prior = np.eye(len(total.h)) if total.freedom else np.linalg.inv(self._tolerance)
         inverse = np.linalg.inv(total.N + prior)
         return inverse @ total.h, inverse @ (self._covariance(total) + prior) @ inverse
 
     def _residual(self, info: _Information, x: Array, covariance: Array) -> _Residual:
-        """A frame's residual from what is common, x (p,) with its covariance."""
+        """Return a frame's residual from the common errors x (p,) with their covariance."""
         Q = info.scale * info.N + info.N @ (covariance + self._tolerance) @ info.N
         return _Residual(info, info.N, info.h - info.N @ x, Q)
 
     def _causes(self, fitted: FrameFit | None) -> list[_Cause]:
-        """All that may be off by itself; of the cameras those that see a frame.
+        """Return the possible causes of errors in one frame, or in all (None).
 
-        In all frames (None) focal lengths and principal points, too: of all cameras, of each.
+        A frame's cameras are those that see it. In all frames focal lengths and principal points
+        are causes, too, of all cameras together and of each.
         """
         fit, six = self._fit, len(POSE_NAMES)
         deviations, joints, names = fit.deviations, len(fit.joints), fit.camera_names
@@ -331,7 +336,7 @@ class _Diagnoser:
         groups = [("", [*range(len(names))])] if len(names) > 1 else []
         groups += [(f" of camera '{name}'", [c]) for c, name in enumerate(names)]
         for where, group in groups:
-            # A single camera was rather moved than has its principal point elsewhere.
+            # For one camera, a wrong pose is likelier than a wrong principal point.
             many, rank = ("", 6.5) if where else ("s", 2.0)
             focal, center = fit.focal_jacobian(group), fit.center_jacobian(group)
             if focal.any():
@@ -341,19 +346,19 @@ class _Diagnoser:
         return causes
 
     def _finding(self, sufficient: Sequence[_Cause], pixels: float) -> Finding:
-        """The first of the causes that suffice, and its rivals."""
+        """Return the finding of the first sufficient cause; the others are its alternatives."""
         best, *others = sufficient
         alternatives = [one.name for one in others]
-        seen_by_one = len(self._fit.camera_names) == 1
-        if seen_by_one and any(one.kind == "camera" for one in sufficient):
+        one_camera = len(self._fit.camera_names) == 1
+        if one_camera and any(one.kind == "camera" for one in sufficient):
             alternatives.append("base")
         kind, name = best.kind, best.name
         variances = np.maximum(np.diag(best.covariance), 0.0)
         if kind == "focal":
-            # A body is seen larger as if it were nearer to a thousandth of its depth at best.
+            # Errors of the body's size limit the accuracy of a focal length.
             variances = variances + DIAGNOSIS.focal_sd_floor**2
         x, sd = best.amount * best.units, np.sqrt(variances) * best.units
-        # Poses turn and shift; a joint does one of them; the rest is shifts.
+        # Poses are rotation, then translation; a joint is one of them; the rest counts as shift.
         turns = len(x) // 2 if kind in ("camera", "base") else 0
         if kind == "joint":
             turns = int(self._fit.is_angle[self._fit.joints.index(name)])
@@ -363,16 +368,16 @@ class _Diagnoser:
 
         at_body = 0.0
         if kind == "camera":
-            # A camera that turns where it stands shifts the body.
+            # Report the shift of the camera's centre, not that of the body in its frame.
             own, at_body = self._fit.camera_jacobian(name), size(x[3:])
             covariance = best.covariance * np.outer(best.units, best.units)
             x[3:], sd[3:] = own @ x, np.sqrt(np.diag(own @ covariance @ own.T))
         sizes = (size(x[:turns]), size(x[turns:]), size(sd[:turns]), size(sd[turns:]))
-        off = (*sizes, min(pixels, self._most), best.p_value, tuple(alternatives))
+        off = (*sizes, min(pixels, self._max_pixels), best.p_value, tuple(alternatives))
         return Finding(kind, name, *off, at_body=at_body)
 
     def _joints_finding(self, kind: str, residual: _Residual) -> Finding:
-        """What is off in a frame where no cause by itself explains it."""
+        """Return a finding of several joints, for a frame that no single cause explains."""
         x, names = residual.solved(residual.r), self._fit.joints
         sd = np.sqrt(residual.info.scale * np.diag(np.linalg.inv(residual.N + np.eye(len(x)))))
         joints = (x * self._fit.deviations)[: len(names)]
@@ -381,19 +386,19 @@ class _Diagnoser:
         shift = float(np.abs(joints[~turns]).max(initial=0.0))
         sure = np.flatnonzero((np.abs(x) > 3.0 * sd)[: len(names)])
         named = {names[k]: float(joints[k]) for k in sure}
-        off = (angle, shift, 0.0, 0.0, min(residual.pixels(), self._most))
+        off = (angle, shift, 0.0, 0.0, min(residual.pixels(), self._max_pixels))
         return Finding(kind, "", *off, residual.p_value, (), named)
 
     def _common_findings(
         self, kept: Mask
     ) -> tuple[tuple[Finding, ...], tuple[list[float], list[float]] | None, dict[str, float]]:
-        """What is off in all frames that agree, and what would be seen, as Diagnosis has it."""
+        """Return the common findings, center and minimum_detectable of a ``Diagnosis``."""
         info, count = self._sum(kept), np.count_nonzero(kept)
         Q = self._covariance(info) + info.N @ self._tolerance @ info.N / count
         residual = _Residual(info, info.N, info.h, Q)
         causes = self._causes(None)
         if self._moved:
-            # Cameras that moved by themselves are not told as the base and the rest.
+            # The base is a cause only if its motion explains nearly all by itself.
             tests = [residual.test(one) for one in causes if one.kind == "base"]
             alone = residual.sufficient(tests, DIAGNOSIS.min_pixels, 0.1)
             causes = [one for one in causes if one.kind != "base" or alone]
@@ -408,7 +413,7 @@ class _Diagnoser:
             sd = np.sqrt(np.diag(shifted.covariance))
             center = shifted.amount.tolist(), sd.tolist()
         whole, (residual, found) = residual, _name(residual, causes, DIAGNOSIS.min_pixels)
-        # A joint's offset moves little beside what calibrations are off by: these are free now.
+        # Small joint offsets are tested after elimination of all cameras' poses.
         named, joints, freed = [one[0].name for one in found], list[_Cause](), list[_Cause]()
         for cause in causes:
             if cause.kind == "camera":
@@ -416,49 +421,54 @@ class _Diagnoser:
                 freed.append(cause)
             elif cause.kind == "joint" and cause.name not in named:
                 joints.append(cause)
-        residual, zeros = _name(residual, joints, DIAGNOSIS.min_joint_pixels)
-        found += zeros
+        residual, offsets = _name(residual, joints, DIAGNOSIS.min_joint_pixels)
+        found += offsets
         names = {(one[0].kind, one[0].name) for one in found}
         for cause in causes:
-            if (key := (cause.kind, cause.name)) in self._asked and key not in names:
+            if (key := (cause.kind, cause.name)) in self._requested and key not in names:
                 found.append([whole.test(cause)])
         findings = list[Finding]()
         if found:
-            # By how much they are off together, and the others that are free beside.
+            # Final amounts are estimated jointly, beside the eliminated cameras.
             own = [best for best, *_ in found]
             names = {(one.kind, one.name) for one in own}
             free = [
-                one for one in freed if (zeros or self._asked) and (one.kind, one.name) not in names
+                one
+                for one in freed
+                if (offsets or self._requested) and (one.kind, one.name) not in names
             ]
-            moves = np.hstack([one.moves for one in (*own, *free)])
-            whole_test, first = whole.test(_Cause("", "", moves, np.ones(0), 0)), 0
+            jacobian = np.hstack([one.jacobian for one in (*own, *free)])
+            whole_test, first = whole.test(_Cause("", "", jacobian, np.ones(0), 0)), 0
             for best, *alternatives in found:
                 k = slice(first, first + len(best.amount))
                 first = k.stop
                 better = best._replace(
                     amount=whole_test.amount[k], covariance=whole_test.covariance[k, k]
                 )
-                pixels = whole.info.pixels(best.moves @ better.amount)
+                pixels = whole.info.pixels(best.jacobian @ better.amount)
                 least = DIAGNOSIS.min_joint_pixels if best.kind == "joint" else DIAGNOSIS.min_pixels
-                # Beside the others there may be nothing left of it.
-                if pixels >= least or (best.kind, best.name) in self._asked:
+                # A cause may vanish in the joint estimate.
+                if pixels >= least or (best.kind, best.name) in self._requested:
                     findings.append(self._finding([better, *alternatives], pixels))
         named = [one[0].name for one in found]
-        noticed = _minimum_detectable(residual, [one for one in joints if one.name not in named])
-        return tuple(findings), center, noticed
+        undetected = [one for one in joints if one.name not in named]
+        return tuple(findings), center, _minimum_detectable(residual, undetected)
 
 
 def _name(
     residual: _Residual, causes: Sequence[_Cause], least: float
 ) -> tuple[_Residual, list[list[_Cause]]]:
-    """What causes, one after the other, are off, and the residual without them.
+    """Select significant causes one after another.
 
-    With each stand those that suffice in its place. least: how far they move outlines at least
-    [pixel].
+    Args:
+        least: minimum motion of outlines by a cause [pixel].
+
+    Returns:
+        the residual without the selected causes; and each cause with its alternatives.
     """
     left, named = list(causes), list[list[_Cause]]()
     while left:
-        # What is named is off by itself, and so are its rivals.
+        # A cause must be significant by itself (Bonferroni), and so must its alternatives.
         tests = [
             one
             for one in map(residual.test, left)
@@ -476,17 +486,17 @@ def _name(
 
 
 def _minimum_detectable(residual: _Residual, causes: Sequence[_Cause]) -> dict[str, float]:
-    """How far joints must be off to be named 19 times of 20 [rad or m]; inf: never."""
+    """Return the joint offsets detected with a probability of 95 % [rad or m]; inf: never."""
     level = DIAGNOSIS.significance / max(1, len(causes))
     critical, found = fdtri(1, residual.info.freedom, 1.0 - level), {}
     for cause in causes:
-        along = cause.moves[:, 0]
+        along = cause.jacobian[:, 0]
         sd = np.sqrt(max(float(along @ residual.Q @ along), 0.0))
         information = max(float(along @ residual.N @ along), 1e-9)
         amount = (np.sqrt(critical) + 1.645) * sd / information
         pixels = max(residual.info.pixels(along), 1e-9)
-        is_told = information > DIAGNOSIS.min_information
-        least = max(amount, DIAGNOSIS.min_joint_pixels / pixels) if is_told else np.inf
+        is_observable = information > DIAGNOSIS.min_information
+        least = max(amount, DIAGNOSIS.min_joint_pixels / pixels) if is_observable else np.inf
         found[cause.name] = float(least * cause.units[0])
     return found
 
@@ -499,15 +509,18 @@ def likeliest_inliers(
     outlier_cost: float = 3.0,
     max_iterations: int = 10,
 ) -> Mask:
-    """(frames,) the frames that agree: the likeliest of the sets that some starts lead to.
+    """Return the most likely set of inlier frames (frames,), by fixed-point iterations.
+
+    Iterations start from no frames, all frames, and single frames. Each computes the common errors
+    of a set, and makes the frames without a significant residual the next set.
 
     Args:
-        explained: (frames,) those that may agree.
-        judge: of a set the p-values (frames,) of all frames' residuals, and x (p,) that the set has
-            in common.
-        usual_deviation: standard deviation of x.
+        explained: (frames,) candidates.
+        evaluate: returns, for a set, the p-values (frames,) of all frames' residuals, and its
+            common errors x (p,).
+        usual_deviation: prior standard deviation of x.
         outlier_cost: negative log-likelihood of each outlier.
-        max_iterations: of each start; also the number of single frames that are starts.
+        max_iterations: maximum number of iterations from a start, and of single frames as starts.
     """
     best, least = explained & False, np.inf
     starts = [np.zeros(len(explained), bool), explained]
@@ -532,28 +545,28 @@ def likeliest_inliers(
 
 
 def explained_frames(
-    ratios: Sequence[Mapping[str, float]], share_of_best: float = 0.75, least: float = 0.5
+    ratios: Sequence[Mapping[str, float]], of_best: float = 0.75, least: float = 0.5
 ) -> Mask:
-    """(frames,) whether something within reach explains all pictures of a frame.
+    """Return which frames (frames,) the fit explains in all their pictures.
 
     Args:
-        ratios: of each frame the fitted inlier ratios by camera.
-        share_of_best, least: of the best frames' ratio, and absolutely.
+        ratios: for each frame the fitted inlier ratios by camera.
+        of_best, least: minimum inlier ratio, as a fraction of the camera's best, and absolute.
     """
     limits = {}
     for name in {name for one in ratios for name in one}:
         own = sorted(one[name] for one in ratios if name in one)
         best = float(np.mean(own[-max(2, len(own) // 4) :]))
-        limits[name] = max(share_of_best * best, least)
+        limits[name] = max(of_best * best, least)
     return np.array([all(ratio >= limits[name] for name, ratio in one.items()) for one in ratios])
 
 
 def is_half_pixel(offset: Array, covariance: Array, near: float = 0.25) -> bool:
-    """Whether principal points are off by half a pixel along both axes, and not by chance.
+    """Return whether principal points are significantly off by half a pixel along both axes.
 
     Args:
-        offset: (2,) by how much they are off, and covariance: (2, 2) [pixel].
-        near: the largest difference from half a pixel [pixel].
+        offset: (2,) estimated correction, and covariance: (2, 2) [pixel].
+        near: largest difference from half a pixel [pixel].
     """
     half = np.copysign(0.5, offset.sum())
     T = float(offset @ np.linalg.solve(covariance, offset))
@@ -561,7 +574,7 @@ def is_half_pixel(offset: Array, covariance: Array, near: float = 0.25) -> bool:
 
 
 def _statistic(r: Array, Q: Array, N: Array | None = None) -> tuple[float, int]:
-    """r^T Q^-1 r in the directions with information, and how many these are."""
+    """Return r^T Q^-1 r in the directions with enough information, and their number."""
     known, turn = np.linalg.eigh(Q if N is None else N)
     turn = turn[:, known > DIAGNOSIS.min_information]
     if not turn.shape[1]:
@@ -571,5 +584,5 @@ def _statistic(r: Array, Q: Array, N: Array | None = None) -> tuple[float, int]:
 
 
 def _p_value(T: float, rank: int, freedom: float) -> float:
-    """How often a statistic is as large by chance."""
+    """Return the probability that the statistic T is exceeded by chance (F distribution)."""
     return float(fdtrc(rank, freedom, max(T, 0.0) / rank)) if rank else 1.0

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from drake_pose.arrays import Array, Mask
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.registration.per_frame_fit import FrameFit
-from drake_pose.registration.posed_frames import SeenFrame, common_size, reduced_sums
+from drake_pose.registration.posed_frames import MultiViewFrame, common_size, reduced_sums
 from drake_pose.registration.register import RegistrationBody, evenly_spaced
 from drake_pose.silhouette.scoring import draw_mask, score_bodies
 from drake_pose.workers import map_ordered
@@ -90,17 +90,17 @@ class Correction:
     kind: str
     name: str
     cameras: tuple[Camera, ...]
-    of: Callable[[SeenFrame], SeenFrame]
+    of: Callable[[MultiViewFrame], MultiViewFrame]
     amount: float = 0.0
     rank: float = 1.0
 
 
-def unchanged(frame: SeenFrame) -> SeenFrame:
+def unchanged(frame: MultiViewFrame) -> MultiViewFrame:
     """A frame of which nothing is changed."""
     return frame
 
 
-def apply_corrections(readings: Sequence[Correction], frame: SeenFrame) -> SeenFrame:
+def apply_corrections(readings: Sequence[Correction], frame: MultiViewFrame) -> MultiViewFrame:
     """A frame with what some readings put right, one after the other."""
     for one in readings:
         frame = one.of(frame)
@@ -118,7 +118,7 @@ class LargeErrorSearch:
     """
 
     def __init__(
-        self, body: RegistrationBody, cameras: Sequence[Camera], frames: Sequence[SeenFrame]
+        self, body: RegistrationBody, cameras: Sequence[Camera], frames: Sequence[MultiViewFrame]
     ) -> None:
         self._body, self._cameras = body, tuple(cameras)
         self._frames = evenly_spaced(frames, LARGE.frame_count)
@@ -168,7 +168,7 @@ class LargeErrorSearch:
         return np.array(rows)
 
     def _compare(
-        self, frame: SeenFrame, values: Array, cameras: Sequence[Camera] | None = None
+        self, frame: MultiViewFrame, values: Array, cameras: Sequence[Camera] | None = None
     ) -> Array:
         """(n,) as misfits, of a frame at other values (n, m)."""
         kinematics, left = self._body.kinematics, np.zeros(len(values))
@@ -256,17 +256,19 @@ class LargeErrorSearch:
         """Another sign of a joint's positions (sign -1), and what is added then [rad or m]."""
         j = self._body.kinematics.names.index(name)
 
-        def changed(frame: SeenFrame) -> SeenFrame:
+        def changed(frame: MultiViewFrame) -> MultiViewFrame:
             values = frame.values.copy()
             values[j] = sign * values[j] + by
             return replace(frame, values=values)
 
         return Correction(kind, name, self._cameras, changed, by, rank)
 
-    def _refound(self, j: int, grid: Array, beside: Array) -> Callable[[SeenFrame], SeenFrame]:
+    def _refound(
+        self, j: int, grid: Array, beside: Array
+    ) -> Callable[[MultiViewFrame], MultiViewFrame]:
         """A frame with a joint where it is seen."""
 
-        def changed(frame: SeenFrame) -> SeenFrame:
+        def changed(frame: MultiViewFrame) -> MultiViewFrame:
             values = frame.values
             for turn in range(2):
                 places = values[j] + beside if turn else grid

@@ -19,7 +19,7 @@ from drake_pose.fit.kernel import Sum
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, StepSettings
 from drake_pose.fit.parameters import POSE_NAMES, BodyParameters
 from drake_pose.fit.problem import Problem, Unknowns
-from drake_pose.registration.posed_frames import SeenFrame, common_size, middle_of
+from drake_pose.registration.posed_frames import MultiViewFrame, common_size, middle_of
 from drake_pose.registration.shared_fit import SHARED
 from drake_pose.silhouette.outline import Outline
 
@@ -69,7 +69,7 @@ class PerFrameFit:
         kinematics: TreeKinematics,
         outlines: tuple[Sequence[Outline], Sequence[Outline]],
         cameras: Sequence[Camera],
-        frames: Sequence[SeenFrame],
+        frames: Sequence[MultiViewFrame],
     ) -> None:
         self.cameras, self.outlines = tuple(cameras), outlines[1]
         self.size = common_size(cameras, frames)
@@ -97,7 +97,7 @@ class PerFrameFit:
 
     def fit(
         self,
-        frame: SeenFrame,
+        frame: MultiViewFrame,
         scales: Sequence[float] = (0.12, 0.09, 0.07, 0.05, 0.04, 0.03, 0.025),
         already: float = 1.3,
     ) -> FrameFit:
@@ -144,7 +144,7 @@ class PerFrameFit:
             compared.sums[:, :-1, [Sum.COMPARED, Sum.FITTING]].sum(axis=0),
         )
 
-    def _inlier_ratios(self, compared: Comparison, frame: SeenFrame) -> dict[str, float]:
+    def _inlier_ratios(self, compared: Comparison, frame: MultiViewFrame) -> dict[str, float]:
         sums = zip(self.camera_names, compared.sums, strict=True)
         return {name: inlier_ratio_of(one) for name, one in sums if name in frame.masks}
 

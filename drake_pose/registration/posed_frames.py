@@ -1,4 +1,4 @@
-"""Frames in which the joint positions of the body are known: of one camera, or of several."""
+"""Frames of one or several cameras in which the body's joint positions are known."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -27,18 +27,19 @@ from drake_pose.silhouette.outline import Outline
 from drake_pose.silhouette.scoring import prefix_sums
 
 LAST_SPACING = 1.0 / 300.0
-"""Of the points of silhouettes' edges in the last parts of a fit [root of the area]."""
+"""Spacing of silhouettes' edge points in the last stages of a fit [square root of the area]."""
 
 
 @dataclass(frozen=True, eq=False)
 class PosedFrame:
-    """One picture of a body at known joint positions.
+    """One camera's frame of a body at known joint positions.
 
     Args:
-        values: (m,) of the body's pose tree [rad or m].
+        name: the frame's name.
+        values: (m,) values of the body's pose tree [rad or m].
         mask: (H, W) the silhouette.
-        foreground: (H, W, 3) log-odds of each pixel to show the body (``fit.background``): a fit
-            looks at these and not at the mask, where they are given.
+        foreground: (H, W, 3) log-odds of each pixel to show the body, coded as colours
+            (``fit.background``). Where they are given, fits use them in place of the mask.
         rates: (m,) velocities of the values [rad/s or m/s], where they are known.
     """
 
@@ -50,19 +51,22 @@ class PosedFrame:
 
 
 class PosedFrames:
-    """All that a camera sees, as a search and a fit take it.
+    """All frames of one camera, prepared for searches and fits.
 
     Args:
+        kinematics: of the body's pose tree.
+        outlines: a surface for each node.
         camera: the camera; its pose is not used.
-        spacing: from one point of a silhouette's edge to the next [root of the area].
+        frames: the frames.
+        spacing: distance of the silhouettes' edge points [square root of the silhouettes' area].
 
     Attributes:
         X_WN: (frames, nodes, 4, 4) the nodes' poses.
         intrinsics: focal lengths (2,) and principal point (2,) [pixel].
-        size: the root of the silhouettes' median area [pixel].
+        size: square root of the silhouettes' median area [pixel].
 
     Raises:
-        MaskError: a mask of another size than the camera's picture, or an empty one.
+        MaskError: a mask is empty, or its size differs from the camera's.
     """
 
     def __init__(
@@ -95,7 +99,7 @@ class PosedFrames:
 
     @cached_property
     def some_points(self) -> Array:
-        """(n, 3) the points of all frames, or of about five frames spread over many."""
+        """Corners (n, 3) of the convex hulls in about five frames, in the world [m]."""
         return np.concatenate(self._corners(self.X_WN[:: max(1, len(self.X_WN) // 5)]))
 
     def _corners(self, poses: Array) -> list[Array]:
@@ -109,17 +113,17 @@ class PosedFrames:
 
     @cached_property
     def middle(self) -> Array:
-        """(3,) of the bodies' points in the world [m]."""
+        """Mean (3,) of the hulls' corners in the world [m]."""
         return np.asarray(self.some_points.mean(axis=0))
 
     @cached_property
     def extent(self) -> float:
-        """How far the bodies' points are from their middle, root mean square [m]."""
+        """Root mean square distance of the hulls' corners from their mean [m]."""
         off = self.some_points - self.middle
         return float(np.sqrt((off**2).sum(axis=1).mean()))
 
     def observations(self, camera: int, count: int) -> list[Observation]:
-        """The frames, the camera being that of an index among a number of cameras."""
+        """Return the frames as observations of camera number `camera` of `count` cameras."""
         found = []
         for frame, edge in zip(self.frames, self._edges, strict=True):
             edges = pack_evidence([edge if c == camera else NO_EDGE for c in range(count)])
@@ -129,12 +133,12 @@ class PosedFrames:
 
     @cached_property
     def body(self) -> BodyParameters:
-        """The body's parameters."""
+        """The body's parameters in a fit."""
         return BodyParameters(self.kinematics, self.outlines)
 
     @cached_property
     def _edges(self) -> list[EdgePoints]:
-        """Of the silhouettes that fits look at."""
+        """Edge points of the masks; none for frames with foreground log-odds."""
         spacing = max(1.0, round(self.spacing * self.size))
         return [
             NO_EDGE if frame.foreground is not None else find_edge_points(frame.mask, spacing)
@@ -142,18 +146,18 @@ class PosedFrames:
         ]
 
     def downscaled(self, side: float) -> PinholeCamera:
-        """The camera, its pictures so small that the root of the silhouettes' area is a side."""
-        camera, share = self.camera, min(1.0, side / self.size)
-        width, height = (max(8, round(share * one)) for one in (camera.width, camera.height))
+        """Return the camera with pictures in which the silhouettes' area is at most side^2."""
+        camera, scale = self.camera, min(1.0, side / self.size)
+        width, height = (max(8, round(scale * one)) for one in (camera.width, camera.height))
         return camera.resized(width, height)
 
     def sums(self, frame: int, camera: PinholeCamera) -> NDArray[np.int32]:
-        """(H, W + 1) prefix sums of a frame's silhouette in a smaller camera's picture."""
+        """Return prefix sums (H, W + 1) of a frame's mask in a downscaled camera's picture."""
         return reduced_sums(self.frames[frame].mask, camera)
 
 
 def reduced_sums(mask: Mask, camera: Camera) -> NDArray[np.int32]:
-    """(H, W + 1) prefix sums of a silhouette in the smaller pictures of a camera like its own."""
+    """Return prefix sums (H, W + 1) of a mask downscaled to a camera's picture size."""
     size = (camera.width, camera.height)
     small = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     return prefix_sums(small > 0.5)
@@ -165,21 +169,21 @@ def _hull_of(outline: Outline) -> Array:
 
 
 def _hull(points: Array) -> Array:
-    """Those of points (n, 3) that are corners of their convex hull; a flat body's are all."""
+    """Return the points (n, 3) that are corners of the convex hull; all points of a flat body."""
     with suppress(QhullError, ValueError):
         return np.asarray(points[ConvexHull(points).vertices])
     return points
 
 
 def placed_points(outlines: Sequence[Outline], X_WN: Array) -> Array:
-    """(n, 3) the vertices of nodes' surfaces in the world, the nodes at X_WN (nodes, 4, 4)."""
+    """Return the vertices (n, 3) of surfaces in the world, with nodes at X_WN (nodes, 4, 4)."""
     placed = zip(outlines, X_WN, strict=True)
     return np.concatenate([one.vertices @ X[:3, :3].T + X[:3, 3] for one, X in placed])
 
 
 @dataclass(frozen=True, eq=False)
-class SeenFrame:
-    """A frame of several cameras: as ``PosedFrame``, masks and log-odds by the cameras' names."""
+class MultiViewFrame:
+    """A frame of several cameras: as ``PosedFrame``, with masks and log-odds by camera name."""
 
     name: str
     values: Array
@@ -188,14 +192,14 @@ class SeenFrame:
     rates: Array | None = None
 
     def of(self, camera: str) -> PosedFrame:
-        """What a camera sees that has a mask."""
+        """Return the frame of a camera that has a mask."""
         foreground = self.foreground.get(camera)
         return PosedFrame(self.name, self.values, self.masks[camera], foreground, self.rates)
 
     def edges(self, cameras: Sequence[Camera], spacing: float) -> Evidence:
-        """The silhouettes' edges, by points at a spacing [pixel].
+        """Return the silhouettes' edge points at a spacing [pixel].
 
-        Raises MaskError: a mask of another size than its camera's picture.
+        Raises MaskError: a mask's size differs from its camera's.
         """
         edges = [NO_EDGE] * len(cameras)
         for k, camera in enumerate(cameras):
@@ -206,7 +210,7 @@ class SeenFrame:
 
 
 def require_size(camera: Camera, frame: str, mask: Mask) -> None:
-    """Refuses (MaskError) a mask of another size than its camera's picture."""
+    """Refuse (MaskError) a mask whose size differs from the camera's picture."""
     if mask.shape != (camera.height, camera.width):
         raise MaskError(
             f"camera '{camera.name}', frame '{frame}': a mask of {camera.width} x {camera.height} "
@@ -214,10 +218,10 @@ def require_size(camera: Camera, frame: str, mask: Mask) -> None:
         )
 
 
-def common_size(cameras: Sequence[Camera], frames: Sequence[SeenFrame]) -> float:
-    """The root of the silhouettes' median area [pixel].
+def common_size(cameras: Sequence[Camera], frames: Sequence[MultiViewFrame]) -> float:
+    """Return the square root of the silhouettes' median area [pixel].
 
-    Raises MaskError: a mask of another size than its camera's picture, or no mask shows the body.
+    Raises MaskError: a mask's size differs from its camera's, or no mask shows the body.
     """
     areas = []
     for frame in frames:
@@ -229,7 +233,7 @@ def common_size(cameras: Sequence[Camera], frames: Sequence[SeenFrame]) -> float
     return float(np.sqrt(np.median([area for area in areas if area])))
 
 
-def middle_of(kinematics: TreeKinematics, frames: Sequence[SeenFrame]) -> Array:
-    """(3,) of the nodes' places in the world [m]."""
+def middle_of(kinematics: TreeKinematics, frames: Sequence[MultiViewFrame]) -> Array:
+    """Return the mean position (3,) of the nodes in all frames, in the world [m]."""
     places = [kinematics.poses(frame.values)[:, :3, 3].mean(axis=0) for frame in frames]
     return np.asarray(np.mean(places, axis=0))

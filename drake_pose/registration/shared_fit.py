@@ -42,7 +42,7 @@ from drake_pose.fit.parameters import (
     link_scale_name,
 )
 from drake_pose.fit.problem import TIME_OFFSET, Problem, Unknowns, parameter_names
-from drake_pose.registration.posed_frames import PosedFrames, SeenFrame, common_size, middle_of
+from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrames, common_size, middle_of
 from drake_pose.silhouette.outline import Outline
 from drake_pose.workers import map_ordered
 
@@ -502,7 +502,7 @@ def adjust_bundle(
     outlines: Sequence[Outline],
     cameras: Sequence[PinholeCamera],
     unknown: Collection[str],
-    frames: Sequence[SeenFrame],
+    frames: Sequence[MultiViewFrame],
     is_length: Mask,
     parts: Sequence[str] = (),
     groups: Sequence[int] | None = None,

@@ -167,8 +167,6 @@ class CalibrationTarget:
         """
         simplified = simplify_surfaces(TreeSurfaces(self._bodies.tree), FEW)
         outline = simplified[self._bodies.tree.node_index(TARGET)]
-        few = simplify_surfaces(TreeSurfaces(self._bodies.tree), FEW)
-        outline = few[self._bodies.tree.node_index(TARGET)]
         corners = outline.vertices[outline.triangles]
         weights = np.linalg.norm(outline.planes[:, :3], axis=1)
         moments = np.einsum("t,tci,tcj->ij", weights, corners, corners)

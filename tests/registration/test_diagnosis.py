@@ -21,7 +21,7 @@ from drake_pose.registration.diagnosis import (
 )
 from drake_pose.registration.findings import Diagnosis, Finding
 from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit
-from drake_pose.registration.posed_frames import SeenFrame
+from drake_pose.registration.posed_frames import MultiViewFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.registration.arm_pictures import damaged
@@ -98,7 +98,7 @@ def test_half_a_pixel_along_both_axes_is_named_unless_by_chance(offset, sd, is_h
 Frames = Sequence[tuple[np.ndarray, np.ndarray, Sequence[PinholeCamera]]]
 
 
-def seen(model: ArticulatedModel, body: RegistrationBody, frames: Frames) -> list[SeenFrame]:
+def seen(model: ArticulatedModel, body: RegistrationBody, frames: Frames) -> list[MultiViewFrame]:
     """Damaged pictures of frames: the pose, the values that are given, who takes the pictures."""
     generator, found = np.random.default_rng(1), []
     for k, (pose, values, taken) in enumerate(frames):
@@ -106,7 +106,7 @@ def seen(model: ArticulatedModel, body: RegistrationBody, frames: Frames) -> lis
         masks = {
             one.name: damaged(LabelRenderer(model, one).mask(q, X_WB), generator) for one in taken
         }
-        found.append(SeenFrame(f"{k:04d}", values, masks))
+        found.append(MultiViewFrame(f"{k:04d}", values, masks))
     return found
 
 
@@ -226,13 +226,13 @@ class TestAuditFrames:
 
 def test_masks_of_another_size_and_empty_ones_are_refused(body, poses, cameras) -> None:
     mask, surfaces = np.ones((480, 640), bool), (body.medium, body.full)
-    frame = SeenFrame("0007", poses[0], {"left": mask[:100]})
+    frame = MultiViewFrame("0007", poses[0], {"left": mask[:100]})
     with pytest.raises(MaskError, match=r"'left', frame '0007'.*640 x 480"):
         PerFrameFit(body.kinematics, surfaces, cameras[:1], [frame])
-    good = SeenFrame("0000", poses[0], {"left": mask})
+    good = MultiViewFrame("0000", poses[0], {"left": mask})
     with pytest.raises(MaskError, match="frame '0007'"):
         PerFrameFit(body.kinematics, surfaces, cameras[:1], [good]).fit(frame)
-    empty = SeenFrame("0000", poses[0], {"left": ~mask})
+    empty = MultiViewFrame("0000", poses[0], {"left": ~mask})
     with pytest.raises(MaskError, match="no mask shows the body"):
         PerFrameFit(body.kinematics, surfaces, cameras[:1], [empty])
 

@@ -30,7 +30,7 @@ from drake_pose.registration.joint_offsets import (
 )
 from drake_pose.registration.online_registration import pose_difference
 from drake_pose.registration.per_frame_fit import PerFrameFit
-from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, SeenFrame
+from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrame, PosedFrames
 from drake_pose.registration.register import (
     E_total,
     RegistrationBody,
@@ -492,7 +492,7 @@ def test_a_bundle_finds_poses_and_a_camera_together(body: RegistrationBody) -> N
     for k, values in enumerate(true):
         X_WN = kinematics.poses(values)
         masks = {one.name: draw_mask(body.medium, one.X_CW @ X_WN, one) for one in cameras}
-        frames.append(SeenFrame(f"{k}", values + rng.normal(0.0, 0.02, len(values)), masks))
+        frames.append(MultiViewFrame(f"{k}", values + rng.normal(0.0, 0.02, len(values)), masks))
     X_WC = cameras[1].X_WC.copy()
     X_WC[:3, 3] += [0.02, -0.02, 0.02]
     given = [cameras[0], cameras[1].with_pose(X_WC)]
@@ -511,18 +511,20 @@ def test_a_bundle_finds_poses_and_a_camera_together(body: RegistrationBody) -> N
 
 def test_edges_are_as_fine_as_they_are_asked_for_and_a_pixel_at_most(posed: PosedFrames) -> None:
     mask, camera = posed.frames[0].mask, posed.camera
-    frame = SeenFrame("0", posed.frames[0].values, {camera.name: mask})
+    frame = MultiViewFrame("0", posed.frames[0].values, {camera.name: mask})
     counts = [len(frame.edges([camera], spacing).uv) for spacing in (0.2, 1.0, 2.0, 6.0)]
     assert counts[0] == counts[1]
     np.testing.assert_allclose(np.divide(counts[1], counts[2:]), [2.0, 6.0], rtol=0.05)
 
 
 @pytest.fixture
-def per_frame(body: RegistrationBody, posed: PosedFrames) -> tuple[PerFrameFit, list[SeenFrame]]:
+def per_frame(
+    body: RegistrationBody, posed: PosedFrames
+) -> tuple[PerFrameFit, list[MultiViewFrame]]:
     """Of a pinhole and of a parallel camera at its place, and frames of the former."""
     camera = posed.camera
     flat = ParallelCamera("flat", 640, 480, 300.0, camera.center_x, camera.center_y, camera.X_WC)
-    frames = [SeenFrame(one.name, one.values, {"eye": one.mask}) for one in posed.frames]
+    frames = [MultiViewFrame(one.name, one.values, {"eye": one.mask}) for one in posed.frames]
     surfaces = (body.medium, body.full)
     return PerFrameFit(body.kinematics, surfaces, [camera, flat], frames), frames
 

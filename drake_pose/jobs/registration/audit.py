@@ -49,7 +49,7 @@ from drake_pose.registration.picture_registration import (
     fit_pictures,
     register_pictures,
 )
-from drake_pose.registration.posed_frames import PosedFrame, SeenFrame
+from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.workers import use_workers
@@ -205,7 +205,7 @@ def _find_cameras(
     )
     warnings = say_left_out(inputs.recordings, [one.name for one in inputs.given_cameras])
     held, findings, pictures = list[Camera](), list[Finding](), dict[str, PictureRegistration]()
-    names, frames = dict[str, tuple[str, str]](), list[SeenFrame]()
+    names, frames = dict[str, tuple[str, str]](), list[MultiViewFrame]()
     for given in inputs.given_cameras:
         name, recording = given.name, inputs.recordings[given.name]
         if before is None:
@@ -223,7 +223,7 @@ def _find_cameras(
         for frame in seen:
             known = frame.name if alone else f"{name}-{frame.name}"
             names[known] = name, frame.name
-            frames.append(SeenFrame(known, frame.values, {name: frame.mask}))
+            frames.append(MultiViewFrame(known, frame.values, {name: frame.mask}))
         if lost:
             warnings.append(say_lost(name, lost, recording.names))
     far = {one.name for one in findings if one.kind == "camera"}

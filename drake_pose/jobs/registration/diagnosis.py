@@ -19,7 +19,12 @@ from drake_pose.registration.findings import Finding, FrameDiagnosis
 from drake_pose.registration.joint_offsets import JointCalibration, calibrate_joints
 from drake_pose.registration.online_registration import pose_difference, squared_distance
 from drake_pose.registration.picture_registration import PictureRegistration, Recording
-from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, SeenFrame, placed_points
+from drake_pose.registration.posed_frames import (
+    MultiViewFrame,
+    PosedFrame,
+    PosedFrames,
+    placed_points,
+)
 from drake_pose.registration.register import (
     LAST_SPACING,
     SEARCH,
@@ -131,7 +136,7 @@ def _alternatives(
 
 
 def require_seen_by(
-    body: RegistrationBody, cameras: Sequence[Camera], frames: Sequence[SeenFrame]
+    body: RegistrationBody, cameras: Sequence[Camera], frames: Sequence[MultiViewFrame]
 ) -> None:
     """Refuses a camera that cannot show the robot in any of some frames that it has masks of.
 

@@ -42,7 +42,7 @@ from drake_pose.registration.joint_offsets import (
     scalable_links,
 )
 from drake_pose.registration.picture_registration import Recording
-from drake_pose.registration.posed_frames import PosedFrame, SeenFrame
+from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrame
 from drake_pose.registration.standing_object import (
     CalibrationTarget,
     fixed_link_error,
@@ -92,7 +92,7 @@ class RegistrationInputs:
     left_out: tuple[str, ...] = ()
     recordings: Mapping[str, Recording] = field(default_factory=dict)
     audited_frames: tuple[str, ...] = ()
-    frames: tuple[SeenFrame, ...] = ()
+    frames: tuple[MultiViewFrame, ...] = ()
     visible_nodes: tuple[str, ...] | None = None
     target: CalibrationTarget | None = None
     zeros: tuple[str, ...] = ()
@@ -103,24 +103,24 @@ class RegistrationInputs:
         """What says what is known of the cameras."""
         return self.cameras or self.scene.path / CAMERA_FILE
 
-    def read(self, frame: str) -> SeenFrame:
+    def read(self, frame: str) -> MultiViewFrame:
         """A frame's positions, and the held cameras' masks but for those that show nothing."""
         if frame in self._known:
             return self._known[frame]
         names = [one.name for one in self.known_cameras if (one.name, frame) in self.scene.masks]
         masks = {name: read_mask_of(self.scene, name, frame, may_be_empty=True) for name in names}
         seen = {name: mask for name, mask in masks.items() if mask.any()}
-        return SeenFrame(frame, self.positions.of(frame, next(iter(masks), "")), seen)
+        return MultiViewFrame(frame, self.positions.of(frame, next(iter(masks), "")), seen)
 
     @cached_property
-    def _known(self) -> dict[str, SeenFrame]:
+    def _known(self) -> dict[str, MultiViewFrame]:
         return {one.name: one for one in self.frames}
 
     def of(self, camera: str) -> list[PosedFrame]:
         """What a camera sees."""
         return [one.of(camera) for one in self.frames if camera in one.masks]
 
-    def with_values(self, values: Iterable[Array]) -> tuple[SeenFrame, ...]:
+    def with_values(self, values: Iterable[Array]) -> tuple[MultiViewFrame, ...]:
         """The frames at other values (m,) of the tree."""
         frames = zip(self.frames, values, strict=True)
         return tuple(replace(one, values=own) for one, own in frames)
@@ -473,7 +473,7 @@ def _select_parameters(
 
 def _read_frames(
     inputs: RegistrationInputs, wanted: Sequence[str], most: int = 12
-) -> tuple[SeenFrame, ...]:
+) -> tuple[MultiViewFrame, ...]:
     """What cameras see; a bad mask of one that is to be found is refused.
 
     Of cameras that are held there is what can be compared with them. With positions that were
@@ -511,7 +511,7 @@ def _read_frames(
         if positions.has(frame):
             masks |= inputs.read(frame).masks
         if masks:
-            found.append(SeenFrame(frame, positions.of(frame, next(iter(masks))), masks))
+            found.append(MultiViewFrame(frame, positions.of(frame, next(iter(masks))), masks))
     for camera in names:
         if not any(camera in one.masks for one in found):
             raise MaskError(

@@ -30,7 +30,7 @@ from drake_pose.registration.large_errors import (
 )
 from drake_pose.registration.online_registration import pose_difference
 from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit
-from drake_pose.registration.posed_frames import SeenFrame, placed_points
+from drake_pose.registration.posed_frames import MultiViewFrame, placed_points
 from drake_pose.registration.register import (
     CameraSearch,
     RegisteredCamera,
@@ -65,7 +65,7 @@ class SceneFit:
     findings: tuple[Finding, ...] = ()
     warnings: tuple[str, ...] = ()
 
-    def of(self, frame: SeenFrame) -> SeenFrame:
+    def of(self, frame: MultiViewFrame) -> MultiViewFrame:
         """A frame as it is read."""
         return apply_corrections(self.readings, frame)
 
@@ -253,7 +253,7 @@ class SceneComparison:
         return moved, replace(found, frames=tuple(judged))
 
     def _placed(
-        self, frames: Sequence[SeenFrame], cameras: Sequence[Camera], least: int = 3
+        self, frames: Sequence[MultiViewFrame], cameras: Sequence[Camera], least: int = 3
     ) -> dict[str, tuple[RegisteredCamera, Finding]]:
         """Where cameras are found that explain frames, and by how much they are elsewhere.
 
@@ -387,7 +387,7 @@ class SceneComparison:
         cameras: Sequence[Camera],
         joints: Sequence[str],
         left: float = LARGE.max_remaining,
-        sample: Sequence[SeenFrame] | None = None,
+        sample: Sequence[MultiViewFrame] | None = None,
         scene: bool = True,
         likely: Collection[str] = (),
     ) -> Correction | None:

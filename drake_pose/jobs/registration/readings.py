@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.registration.large_errors import Correction, unchanged
-from drake_pose.registration.posed_frames import SeenFrame
+from drake_pose.registration.posed_frames import MultiViewFrame
 
 
 def scene_corrections(
@@ -93,8 +93,8 @@ def _groups(cameras: Sequence[Camera]) -> list[tuple[str, ...]]:
     return [names, *((name,) for name in names if len(names) > 1)]
 
 
-def _mirrored(group: Collection[str]) -> Callable[[SeenFrame], SeenFrame]:
-    def change(frame: SeenFrame) -> SeenFrame:
+def _mirrored(group: Collection[str]) -> Callable[[MultiViewFrame], MultiViewFrame]:
+    def change(frame: MultiViewFrame) -> MultiViewFrame:
         masks = {
             name: np.ascontiguousarray(mask[:, ::-1]) if name in group else mask
             for name, mask in frame.masks.items()
@@ -104,7 +104,7 @@ def _mirrored(group: Collection[str]) -> Callable[[SeenFrame], SeenFrame]:
     return change
 
 
-def _with_row(rows: Mapping[str, Array], frame: SeenFrame) -> SeenFrame:
+def _with_row(rows: Mapping[str, Array], frame: MultiViewFrame) -> MultiViewFrame:
     return replace(frame, values=rows[frame.name])
 
 

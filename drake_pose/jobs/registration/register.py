@@ -56,7 +56,7 @@ from drake_pose.registration.picture_registration import (
     posed_pictures,
     register_pictures,
 )
-from drake_pose.registration.posed_frames import PosedFrames, SeenFrame
+from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrames
 from drake_pose.registration.register import (
     CameraSearch,
     E_total,
@@ -215,7 +215,7 @@ class _Registration:
         elif inputs.target is not None:
             self._find_target(inputs.target)
         else:
-            frames = list[SeenFrame]()
+            frames = list[MultiViewFrame]()
             for camera in inputs.searched_cameras:
                 name, start = camera.name, time.perf_counter()
                 focal = self._settings.focal or name in inputs.assumed_focal
@@ -223,7 +223,7 @@ class _Registration:
                     self.body, camera, inputs.recordings[name], focal, inputs.zeros
                 )
                 frames += [
-                    SeenFrame(
+                    MultiViewFrame(
                         frame.name, frame.values, {name: frame.mask},
                         {} if frame.foreground is None else {name: frame.foreground}, frame.rates,
                     )
@@ -281,7 +281,7 @@ class _Registration:
 
     def _find_target(self, target: CalibrationTarget, most: int = 24) -> None:
         """Finds masks of an object in some pictures from a link, and each camera in these."""
-        inputs, frames, start = self.inputs, list[SeenFrame](), time.perf_counter()
+        inputs, frames, start = self.inputs, list[MultiViewFrame](), time.perf_counter()
         body = target.body(np.eye(4))
         for camera in inputs.searched_cameras:
             name = camera.name
@@ -294,7 +294,7 @@ class _Registration:
             rows, _ = choose_pictures(body, camera, recording, most)
             seen = find_target_frames(target, camera, posed_pictures(recording, rows, 0.0))
             self.seen[name] = {one.name: recording.picture(one.name) for one in seen}
-            frames += [SeenFrame(one.name, one.values, {name: one.mask}) for one in seen]
+            frames += [MultiViewFrame(one.name, one.values, {name: one.mask}) for one in seen]
             lost = [recording.names[k] for k in rows if recording.names[k] not in self.seen[name]]
             if lost:
                 self.warnings.append(say_lost(name, lost, recording.names, "target"))
@@ -318,7 +318,7 @@ class _Registration:
         for name, one in self.pictures.items():
             recording, found = one.recording, self.registered[name]
             seen, misfits, lost = evaluate_pictures(body, replace(one, zeros=self._zeros), found)
-            frames += [SeenFrame(k.name, k.values + self._zeros, {name: k.mask}) for k in seen]
+            frames += [MultiViewFrame(k.name, k.values + self._zeros, {name: k.mask}) for k in seen]
             found = self.registered[name] = replace(found, frames=misfits)
             errors = {k.frame: k.E_total for k in found.frames}
             wanted = (*found.outliers[:shown], *compared_frames(errors))

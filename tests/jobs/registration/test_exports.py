@@ -19,7 +19,7 @@ from drake_pose.errors import CameraError, SettingsError
 from drake_pose.files.replay import make_recording
 from drake_pose.jobs.registration.result import check_exports, write_exports
 from drake_pose.jobs.registration.settings import RegistrationSettings
-from drake_pose.registration.posed_frames import SeenFrame
+from drake_pose.registration.posed_frames import MultiViewFrame
 
 TEXTS = ("ros", "mujoco", "drake")
 
@@ -102,7 +102,7 @@ def test_a_recording_for_the_viewer(arm_scene, tmp_path):
     values = np.full((2, len(kinematics.names)), 0.3)
     masks = np.zeros((2, camera.height, camera.width), bool)
     masks[1, 100:120, 30:70] = True
-    frames = [SeenFrame(f"{k:04d}", values[k], {"left": masks[k]}) for k in range(2)]
+    frames = [MultiViewFrame(f"{k:04d}", values[k], {"left": masks[k]}) for k in range(2)]
     picture = np.full((camera.height, camera.width, 3), 77, np.uint8)
     path = tmp_path / "rerun.rrd"
     path.write_bytes(make_recording(tree, [camera], frames, {"left": {"0001": picture}}))

@@ -34,9 +34,9 @@ test-slow: $(VENV)/ready-test
 # Other people's robots for the tests, which are skipped without: 1.3 GB.
 robots: $(VENV)/ready-robots
 
-# The Python API as web pages: build/docs/index.html. A broken reference is an error.
+# All pages and the Python API as web pages: build/docs/index.html. A broken reference is an error.
 docs: $(VENV)/ready-docs
-	$(PYTHON) -m sphinx -n -W --keep-going -q -d build/docs-cache docs build/docs
+	$(PYTHON) -m sphinx -n -W --keep-going -q -d build/docs-cache -c docs . build/docs
 
 # DATA: a folder of recorded scenes; without it only the demonstration's is estimated.
 DATA ?= $(wildcard ../shared/data)

@@ -1,9 +1,14 @@
-"""How `make docs` makes the API pages. A reference that cannot be resolved is an error there."""
+"""How `make docs` builds the pages and the API reference; a broken reference is an error there.
+
+The source folder is the repository's root, so that the pages' relative links hold.
+"""
 
 from __future__ import annotations
 
 import re
+import shutil
 from importlib import import_module
+from pathlib import Path
 from pkgutil import walk_packages
 from typing import Any
 
@@ -18,22 +23,33 @@ from sphinx.util.docutils import SphinxDirective
 
 
 class Array:
-    """Stands for NDArray, whose shape and type would be spelt out at each argument."""
+    """Replaces NDArray, whose parameters would be written out at each argument."""
 
     def __class_getitem__(cls, item: Any) -> type:
-        """Returns the plain array."""
+        """Return the plain array."""
         return np.ndarray
 
 
-# Before drake_pose is imported.
+# Set before drake_pose is imported.
 numpy.typing.NDArray = Array  # type: ignore[misc]
 
 from drake_pose import __version__  # noqa: E402
 
+ROOT = Path(__file__).resolve().parents[1]
+
 project = "drake_pose"
 copyright = "the authors of drake_pose"
 version = release = __version__
-extensions = ["sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+]
+root_doc = "README"
+include_patterns = ["*.md", "docs/**.md", "docs/*.rst", "tutorials/*.md", "urdf/*/*.md"]
+exclude_patterns = [".*", "build", "results"]
+myst_heading_anchors = 4
 html_theme = "furo"
 html_title = f"drake_pose {__version__}"
 html_copy_source = False
@@ -46,18 +62,18 @@ autosummary_generate = False
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 napoleon_use_rtype = False
-# Two modules may have a type of the same name.
+# Two modules may define a type of the same name.
 suppress_warnings = ["ref.python"]
 napoleon_attr_annotations = False
 python_maximum_signature_line_length = 80
 
-# Other projects' pages are in the net, which a build does not need.
+# Names of other projects, whose references would need the network.
 nitpick_ignore_regex = [
     ("py:.*", r"(np|numpy|pydrake|rich|distributed|pathlib|collections|enum|jinja2|numba)\..*"),
     ("py:.*", r"(cv2|scipy|trimesh|asyncio|http|socketserver|PIL|xml|types|typing)\..*"),
     ("py:.*", r"(functools|matplotlib|socket)\..*"),
     ("py:.*", r"cyclopts\..*"),
-    # An argument that is raised; names of types, and what is imported for type checkers alone.
+    # An argument that is raised, type variables, and names imported for type checkers only.
     ("py:exc", "error_type"),
     ("py:class", r"[A-Z]\w*|threading\.Event|contextlib\.ExitStack"),
 ]
@@ -69,7 +85,7 @@ class PublicNames(SphinxDirective):
     required_arguments = 1
 
     def run(self) -> list[nodes.Node]:
-        """Returns a list."""
+        """Return a list."""
         package = import_module(self.arguments[0])
         text = []
         for name in package.__all__:
@@ -86,7 +102,7 @@ class Modules(SphinxDirective):
     required_arguments = 1
 
     def run(self) -> list[nodes.Node]:
-        """Returns a section for each module."""
+        """Return a section for each module."""
         package = import_module(self.arguments[0])
         found = walk_packages(package.__path__, f"{package.__name__}.")
         text = [f".. automodule:: {package.__name__}", "   :no-members:", ""]
@@ -102,7 +118,7 @@ class PydrakeSystem(SphinxDirective):
     has_content = True
 
     def run(self) -> list[nodes.Node]:
-        """Returns a list of ports."""
+        """Return a list of ports."""
         ports = yaml.safe_load("\n".join(self.content))
         lines = []
         for kind in ("input_ports", "output_ports"):
@@ -114,7 +130,7 @@ class PydrakeSystem(SphinxDirective):
 def resolve_known(
     app: Sphinx, env: BuildEnvironment, node: pending_xref, content: nodes.Element
 ) -> nodes.Element | None:
-    """Accepts names that exist and have no entry; a name that does not exist is an error."""
+    """Accept a name that exists but has no entry; a name that does not exist is an error."""
     target = node.get("reftarget", "")
     if node.get("refdomain") != "py" or not target.startswith("drake_pose."):
         return None
@@ -122,7 +138,7 @@ def resolve_known(
 
 
 def _exists(target: str) -> bool:
-    """Whether there is such an object."""
+    """Return whether the object can be imported."""
     module, _, name = target.rpartition(".")
     try:
         return hasattr(import_module(module), name)
@@ -133,11 +149,11 @@ def _exists(target: str) -> bool:
 def prepare_docstring(
     app: Sphinx, what: str, name: str, value: Any, options: Any, lines: list[str]
 ) -> None:
-    """Before napoleon: names that share a line are parted; what an attribute's says is no type."""
+    """Prepare a docstring for napoleon: attributes begin without a type; `a, b:` is split."""
     if what in ("attribute", "data", "property"):
         lines[:0] = ["..", ""]
     for k, line in enumerate(lines):
-        # Those of errors are parted by Sphinx itself.
+        # Sphinx itself splits names of errors.
         if (names := re.match(r"\s+\w+(, \w+)+: ", line)) and "Error" not in names.group():
             lines[k] = names.group().replace(", ", ",") + line[names.end() :]
 
@@ -145,25 +161,51 @@ def prepare_docstring(
 def shorten_signature(
     app: Sphinx, what: str, name: str, value: Any, options: Any, signature: str | None, returns: str
 ) -> tuple[str, str] | None:
-    """Writes defaults that are no Python (`<factory>`) as `...`, so that types are read."""
+    """Write defaults that are not Python (`<factory>`) as `...`: Sphinx parses signatures."""
     return None if signature is None else (re.sub(r"<\w[^<>]*>", "...", signature), returns)
 
 
 def skip_fields(
     app: Sphinx, what: str, name: str, value: Any, skip: bool, options: Any
 ) -> bool | None:
-    """Leaves out what Python itself says of a named tuple's fields, and modules' constants."""
+    """Skip the default docstrings of named tuples' fields, and modules' constants."""
     constant = what == "module" and not hasattr(value, "__qualname__")
     return True if constant or str(value.__doc__).startswith("Alias for field number") else None
 
 
+def add_contents(app: Sphinx, name: str, source: list[str]) -> None:
+    """Append the tables of contents to the first page, which has none on GitHub."""
+    if name != root_doc:
+        return
+    overview = (ROOT / "tutorials" / "README.md").read_text(encoding="utf-8")
+    pages = re.findall(r"^\| \[\w+\]\((\w+)\.md\)", overview, flags=re.MULTILINE)
+    pages = [f"tutorials/{page}" for page in ("README", *pages)]
+    bodies = sorted(f"urdf/{path.parent.name}/README" for path in ROOT.glob("urdf/*/README.md"))
+    for caption, names in (
+        ("Tutorials", pages),
+        ("Reference", ["docs/index"]),
+        ("Bundled bodies", bodies),
+        ("Project", ["CONTRIBUTING", "docs/design_notes", "CHANGELOG"]),
+    ):
+        listed = "\n".join(names)
+        source[0] += f"\n```{{toctree}}\n:hidden:\n:caption: {caption}\n\n{listed}\n```\n"
+
+
+def copy_first_page(app: Sphinx, exception: Exception | None) -> None:
+    """Write index.html, which browsers and servers open first."""
+    if exception is None:
+        shutil.copyfile(app.outdir / f"{root_doc}.html", app.outdir / "index.html")
+
+
 def setup(app: Sphinx) -> None:
-    """Called by Sphinx."""
+    """Connect the functions above."""
+    app.connect("source-read", add_contents)
+    app.connect("build-finished", copy_first_page)
     app.add_directive("public-names", PublicNames)
     app.add_directive("modules", Modules)
     app.add_directive("pydrake_system", PydrakeSystem)
     app.connect("missing-reference", resolve_known)
-    # Napoleon's own is at 500.
+    # Napoleon's handler has priority 500.
     app.connect("autodoc-process-docstring", prepare_docstring, priority=400)
     app.connect("autodoc-process-signature", shorten_signature)
     app.connect("autodoc-skip-member", skip_fields)

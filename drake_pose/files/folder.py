@@ -1,7 +1,4 @@
-"""The result folder: tables of poses and joints, files of motion, pages, overlays, a summary.
-
-Files are moved into place: none is ever half there.
-"""
+"""Result folders: names of their files, locking, atomic writing, and summary.json."""
 
 import fcntl
 import json
@@ -32,14 +29,14 @@ _Job = TypeVar("_Job", bound=Callable[..., Any])
 RESULT_FILES = (
     POSES, JOINTS, MODES, SUMMARY, REPLAY, REPORT, JOINT_CENTRES, TRC, MOT, BVH, SHAPES
 )  # fmt: skip
-"""Every file that a result may have beside its overlays."""
+"""Names of all files that a result may have, without its overlays."""
 
 
 def write_file(folder: Path, name: str, content: bytes | str) -> None:
-    """Write a file, by its path within the folder, all at once, making the folders it needs.
+    """Write the file ``name``, a path relative to ``folder``, atomically; folders are created.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: the file cannot be written.
     """
     path = folder / name
     temporary = path.with_name(path.name + ".part")
@@ -61,12 +58,16 @@ def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
 
 @contextmanager
 def claimed(path: Path, resume: bool = False) -> Iterator[None]:
-    """Keeps other runs out of a result's folder, which is made; only to resume may it hold files.
+    """Create and lock a result folder; a folder that stays empty is removed at the end.
 
-    The lock is the system's, on the folder itself: it ends with the process, whatever ends that.
+    The lock is flock's on the folder itself, so that it ends with the process.
+
+    Args:
+        path: the folder.
+        resume: whether the folder may already hold files.
 
     Raises:
-        OutputError: another run is writing there, it is not empty, or there cannot be a folder.
+        OutputError: another run is writing there, the folder is not empty, or it cannot be created.
     """
     require_no_file(path)
     made = [place for place in (path, *path.parents) if not os.path.lexists(place)]
@@ -80,29 +81,29 @@ def claimed(path: Path, resume: bool = False) -> Iterator[None]:
     except BlockingIOError:
         os.close(folder)
         raise OutputError(
-            f"{path}: another run is writing its result there; wait for it, or name another folder "
-            "with --out"
+            f"{path}: another run is writing its result there; wait for it, or choose another "
+            "folder with --out"
         ) from None
     except OSError:
-        pass  # Some disks that computers share know no locks.
+        pass  # Some network file systems have no locks.
     try:
         if not resume and any(path.iterdir()):
             raise OutputError(
-                f"{path}: the output folder exists and is not empty; name another one with --out, "
-                "or go on with an interrupted result in it with --resume"
+                f"{path}: the output folder exists and is not empty; choose another one with "
+                "--out, or continue an interrupted result in it with --resume"
             )
         yield
     finally:
         with suppress(OSError):
             for place in made:
-                place.rmdir()  # Where nothing was written nothing is left.
+                place.rmdir()
         os.close(folder)
 
 
 def writes_folder(job: _Job) -> _Job:
-    """A job whose argument ``out`` names a folder, if any, that is claimed while it runs.
+    """Decorate a job so that the folder of its argument ``out``, if any, is locked while it runs.
 
-    Where it is called from Python its errors name arguments, not options.
+    Error messages name Python arguments instead of options when the job is called from Python.
     """
 
     @wraps(job)
@@ -121,21 +122,27 @@ def writes_folder(job: _Job) -> _Job:
 
 
 def require_no_file(path: Path) -> None:
-    """Refuses a folder that cannot be, since it or what it would lie in is a file."""
+    """Raise an OutputError if a result folder, or a folder above it, is a file."""
     existing = next((place for place in (path, *path.parents) if os.path.lexists(place)), None)
     if existing is not None and not existing.is_dir():
-        what = "a file" if existing.exists() else "a link that leads nowhere"
-        raise OutputError(f"{existing}: is {what}, but the result is a folder; name another one")
+        what = "a file" if existing.exists() else "a broken link"
+        raise OutputError(f"{existing}: is {what}, but the result is a folder; choose another one")
 
 
 def read_summary(path: Path) -> dict[str, Any]:
-    """Reads the summary.json of a result folder; OutputError: there is none, or it is damaged."""
+    """Return the content of a result folder's summary.json.
+
+    Raises:
+        OutputError: the file is missing or damaged.
+    """
     require_no_file(path)
     file = path / SUMMARY
     try:
         summary = json.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
-        raise OutputError(f"{file}: cannot be read ({error.strerror}): no result folder") from error
+        raise OutputError(
+            f"{file}: cannot be read ({error.strerror}); this is not a result folder"
+        ) from error
     except ValueError as error:
         raise OutputError(f"{file}: is damaged; it is not JSON") from error
     if not isinstance(summary, dict):
@@ -144,8 +151,8 @@ def read_summary(path: Path) -> dict[str, Any]:
 
 
 def without_nan(value: Any) -> Any:
-    """Returns plain JSON values: arrays become lists, numbers that are not finite become None."""
-    # Most values are numbers and texts.
+    """Return plain JSON values: arrays become lists, numbers that are not finite become None."""
+    # The most frequent types come first.
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     if isinstance(value, str | int):
@@ -160,5 +167,5 @@ def without_nan(value: Any) -> Any:
 
 
 def cannot_write(path: Path, error: OSError) -> OutputError:
-    """The error of a file that cannot be written."""
+    """Return the exception for a file that cannot be written."""
     return OutputError(f"{path}: cannot be written: {error.strerror}")

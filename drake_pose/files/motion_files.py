@@ -1,10 +1,10 @@
-"""What people who capture motion read: joint centres as CSV and TRC, positions as MOT, BVH.
+"""Motion files: joint centres as CSV and TRC, positions as MOT, and motion as BVH.
 
-Of a BVH's skeleton, joints are the links that are seen or carry several such; a limb's far half
-whose length stays is left out. Rotations zero is the default pose with the captured lengths.
-Offsets are in centimetres, rotations in degrees, Z, X, Y; x forward, y up, z right, as in TRC. The
-root has position channels, and so has a part whose place changes: its offset is zero, so that all
-readers agree.
+The joints of a BVH skeleton are the links with geometry, and links from which several of these
+branch; the far half of a limb is left out if its length is constant. Zero rotations are the default
+pose with the captured lengths. Offsets are in centimetres, rotations in degrees in the order Z, X,
+Y; x points forward, y up, z right, as in TRC. The root, and every joint whose position in its
+parent changes, has position channels and a zero offset, which all readers interpret alike.
 """
 
 import warnings
@@ -30,7 +30,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.files.folder import BVH, JOINT_CENTRES, MOT, TRC, write_file
 from drake_pose.files.records import BASE_COLUMNS, FrameRecord, base_cells, base_pose, user_units
 
-# Turns the scene's world, z up, into that of the file, y up; nothing is mirrored.
+# Rotation from the scene's world W (z up) to the file's world Y (y up).
 R_YW = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
@@ -41,14 +41,17 @@ def write_motion(
     records: Sequence[FrameRecord],
     rate_hz: float | None,
 ) -> list[str]:
-    """Writes joint_centres.csv; of a sequence TRC, MOT and BVH files too; returns warnings.
+    """Write joint_centres.csv, and for a sequence TRC, MOT and BVH files; return warnings.
 
-    Joint centres need a landmarks.yaml beside the model; a BVH file, that or a skin: robots have no
-    readers of it. The files of a sequence hold every frame from the first to the last record's.
+    Joint centres need a landmarks.yaml beside the model; BVH needs that or a skin, since no
+    tool for robots reads it. Files of a sequence hold all frames from the first to the last record.
 
     Args:
-        frames: the scene's, in order.
-        rate_hz: frames a second; None: they do not follow each other.
+        folder: the result folder.
+        model: the model of the positions.
+        frames: names of the scene's frames, in order.
+        records: estimates, in order.
+        rate_hz: frame rate [Hz]; None if the frames are not a sequence.
 
     Raises:
         ModelError: the landmarks cannot be read.
@@ -80,17 +83,21 @@ def write_motion(
     if not filled:
         return []
     return [
-        f"{BVH}: {filled} of {len(frames)} frames have no pose and repeat the last known one; the "
-        "other files leave them out"
+        f"{BVH}: {filled} of {len(frames)} frames have no pose and repeat the last known one; use "
+        "the other files, which leave these frames out, to see where"
     ]
 
 
 def joint_centres(
     model: ArticulatedModel, landmarks: Mapping[str, Landmark], q: Array, X_WB: Array | None = None
 ) -> Array:
-    """The landmarks (frames, n, 3) in the scene's world [m] at q (frames, nq); nan where q is.
+    """Return the positions (frames, n, 3) of landmarks in the scene's world [m]; nan where q is.
 
-    X_WB: (frames, 4, 4) poses of the plant's world in the scene's; None: the same world.
+    Args:
+        model: the model of the positions.
+        landmarks: (n,) landmarks by name.
+        q: (frames, nq) positions [rad or m].
+        X_WB: (frames, 4, 4) poses of the plant's world in the scene's world; None: identity.
     """
     places = np.full((len(q), len(landmarks), 3), np.nan)
     for k in np.flatnonzero(np.isfinite(q).all(axis=1)):
@@ -100,7 +107,7 @@ def joint_centres(
 
 
 def centres_as_csv(frames: Sequence[str], names: Sequence[str], places: Array) -> str:
-    """joint_centres.csv: frame, joint, x, y, z [m] of places (frames, joints, 3); without nan."""
+    """Return joint_centres.csv of positions (frames, joints, 3) [m], without frames of nan."""
     cells = [
         [frame, name, *(f"{number:.4f}" for number in place)]
         for frame, row in zip(frames, places, strict=True)
@@ -111,11 +118,12 @@ def centres_as_csv(frames: Sequence[str], names: Sequence[str], places: Array) -
 
 
 def centres_as_trc(names: Sequence[str], places: Array, rate_hz: float) -> str:
-    """A TRC file of joint centres: millimetres, y up as its readers expect (our z), 1-based frames.
+    """Return a TRC file of joint centres: in millimetres, y up, frames counted from 1.
 
     Args:
-        places: (frames, joints, 3) in the world, z up [m]; nan is written as an empty field.
-        rate_hz: frames a second.
+        names: (joints,) names of the markers.
+        places: (frames, joints, 3) positions in the world, z up [m]; nan becomes an empty field.
+        rate_hz: frame rate [Hz].
     """
     count = len(places)
     head = ["DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units", "OrigDataRate",
@@ -130,7 +138,7 @@ def centres_as_trc(names: Sequence[str], places: Array, rate_hz: float) -> str:
         "\t".join(["", "", *axes]),
         "",
     ]
-    # x forward, y left, z up becomes x forward, y up, z right: a turn, so nothing is mirrored.
+    # A rotation: x forward, y left, z up becomes x forward, y up, z right.
     turned = 1e3 * np.stack([places[..., 0], places[..., 2], -places[..., 1]], axis=-1)
     for k, row in enumerate(turned.reshape(count, -1)):
         cells = ["" if np.isnan(number) else f"{number:.3f}" for number in row]
@@ -141,13 +149,14 @@ def centres_as_trc(names: Sequence[str], places: Array, rate_hz: float) -> str:
 def positions_as_mot(
     model: ArticulatedModel, q: Array, rate_hz: float, X_WB: Array | None = None
 ) -> str:
-    """A MOT file of a model's positions: degrees and metres; frames without a pose are left out.
+    """Return a MOT file of positions in degrees and metres, without frames that have no pose.
 
     Args:
+        model: the model of the positions.
         q: (frames, nq) positions [rad or m].
-        rate_hz: frames a second.
-        X_WB: (frames, 4, 4) poses of the plant's world in the scene's, written as the columns
-            base_x ... base_qz [m and unit quaternion]; None: the same world.
+        rate_hz: frame rate [Hz].
+        X_WB: (frames, 4, 4) poses of the plant's world in the scene's world, for BASE_COLUMNS
+            [m and unit quaternion]; None: no such columns.
     """
     known = np.flatnonzero(np.isfinite(q).all(axis=1))
     names, columns = list(model.position_names), [known / rate_hz, q[known] * user_units(model)]
@@ -169,18 +178,20 @@ def positions_as_mot(
 
 
 Skeleton = tuple[tuple[str, int], ...]
-"""Joints: link ("world": where several parts stand), and the parent's index (-1: root)."""
+"""Joints of a BVH skeleton: link ("world" if several parts stand on it), and index of the parent,
+-1 for the root."""
 
 
 def skeleton_of(model: ArticulatedModel, q: Array, stays: float = 1e-5) -> Skeleton:
-    """The joints, parents before children.
+    """Return the joints of a model's BVH skeleton, parents before children.
 
     Args:
-        q: (frames, nq) tells which lengths stay the same.
-        stays: a length that changes by less stays [m].
+        model: the model.
+        q: (frames, nq) positions [rad or m], in which constant lengths are detected.
+        stays: range of a prismatic joint below which it is constant [m].
     """
     plant, names, seen = model.plant, model.link_names, model.link_meshes
-    # By body those that hang on it, by a length that stays, or by something that moves.
+    # Children of each body: (body, whether by a constant length, whether by a moving joint).
     children: list[list[tuple[int, bool, bool]]] = [[] for _ in names]
     for index in plant.GetJointIndices():
         joint = plant.get_joint(index)
@@ -192,7 +203,7 @@ def skeleton_of(model: ArticulatedModel, q: Array, stays: float = 1e-5) -> Skele
     found: list[tuple[str, int]] = []
 
     def branches(body: int) -> int:
-        """How many bodies hang on it that are seen or carry one that is."""
+        """Return the number of children that have geometry or carry a body that has."""
         return sum(names[k] in seen or branches(k) > 0 for k, *_ in children[body])
 
     def walk(body: int, parent: int, length: bool, motion: bool) -> None:
@@ -210,30 +221,31 @@ def skeleton_of(model: ArticulatedModel, q: Array, stays: float = 1e-5) -> Skele
 def motion_as_bvh(
     model: ArticulatedModel, q: Array, X_WB: Array | None, rate_hz: float, stays: float = 1e-5
 ) -> tuple[str, int]:
-    """The text of a BVH file of a motion, and how many of its frames were filled.
+    """Return the text of a BVH file, and the number of frames in it without a pose of their own.
 
     Args:
-        q: (frames, nq) positions [rad or m]; a frame of nan is filled by the last one known before
-            it, or by the first one known.
-        X_WB: (frames, 4, 4) poses of the plant's world in the scene's; None: the same world.
-        rate_hz: frames a second.
-        stays: a part that moves by less in the part before it stays where it is [m].
+        model: the model of the positions.
+        q: (frames, nq) positions [rad or m]; a frame of nan gets the last known pose before it, or
+            the first known one.
+        X_WB: (frames, 4, 4) poses of the plant's world in the scene's world; None: identity.
+        rate_hz: frame rate [Hz].
+        stays: displacement below which a joint is fixed in its parent [m].
 
     Raises:
         SettingsError: no frame has a pose.
     """
     known = np.flatnonzero(np.isfinite(q).all(axis=1))
     if not len(known):
-        raise SettingsError("a BVH file needs a frame with a pose; none has one")
+        raise SettingsError("a BVH file needs at least one frame with a pose")
     skeleton = skeleton_of(model, q[known])
-    # The joints' links in the file's world: (frames, n, 4, 4), and (n, 4, 4) at the defaults.
+    # Poses of the joints' links L in the file's world Y: (frames, n, 4, 4); X_Y0: at the defaults.
     kinematics, X_YW = PlantKinematics(model), np.eye(4)
     X_YW[:3, :3] = R_YW
     bodies = [model.link_index(link) for link, _ in skeleton]
     X_BL = np.array([[kinematics.pose_at(body, row) for body in bodies] for row in q[known]])
     X_YL = (X_YW if X_WB is None else (X_YW @ X_WB[known])[:, None]) @ X_BL
     X_Y0 = X_YW @ np.array([kinematics.pose(body) for body in bodies])
-    # What turns a joint's own axes into its link's is what its link shows at rest.
+    # A joint frame J is parallel to Y at the default pose: R_YL = R_YJ R_Y0.
     R_YJ = X_YL[..., :3, :3] @ np.swapaxes(X_Y0[:, :3, :3], 1, 2)
     parents = [max(parent, 0) for _, parent in skeleton]
     R_PY = np.swapaxes(R_YJ[:, parents], 2, 3)
@@ -245,7 +257,7 @@ def motion_as_bvh(
     slides = np.abs(p_PJ - offsets).max(axis=(0, 2)) > stays
     slides[0] = True
     offsets[slides] = 0.0
-    # The farthest point of each joint's link, along the file's axes at rest [m].
+    # Farthest vertex of each joint's link, in the axes of Y at the default pose [m].
     tips = np.zeros((len(skeleton), 3))
     for k, (link, _) in enumerate(skeleton):
         mesh = model.link_meshes.get(link)
@@ -257,7 +269,7 @@ def motion_as_bvh(
         for k in range(len(skeleton))
     ]
     rows = np.hstack(columns)
-    # The last known frame at or before each; the first known for those before it.
+    # Index of the last known frame at or before each frame, else of the first known one.
     source = np.maximum(np.searchsorted(known, np.arange(len(q)), side="right") - 1, 0)
     text = [
         "HIERARCHY",
@@ -271,9 +283,9 @@ def motion_as_bvh(
 
 
 def _smooth_angles(R: Array) -> Array:
-    """(n, 3) rotations about Z, X, Y [deg] without jumps, of rotation matrices (n, 3, 3)."""
+    """Return the continuous Euler angles (n, 3) about Z, X, Y [deg] of rotations (n, 3, 3)."""
     with warnings.catch_warnings():
-        # At 90 degrees about X one of the others is free: any choice is right.
+        # At 90 degrees about X only the sum of the other angles is determined.
         warnings.filterwarnings("ignore", message="Gimbal lock", category=UserWarning)
         angles = Rotation.from_matrix(R).as_euler("ZXY", degrees=True)
     for k in range(1, len(angles)):
@@ -285,7 +297,14 @@ def _smooth_angles(R: Array) -> Array:
 
 
 def _hierarchy(skeleton: Skeleton, offsets: Array, slides: Mask, tips: Array) -> list[str]:
-    """The lines of the hierarchy; offsets and tips (n, 3) are in m."""
+    """Return the lines of HIERARCHY.
+
+    Args:
+        skeleton: (n,) joints.
+        offsets: (n, 3) positions in their parents [m].
+        slides: (n,) whether the position in the parent changes.
+        tips: (n, 3) end sites of the leaves [m].
+    """
     lines: list[str] = []
 
     def offset(place: Array) -> str:

@@ -1,4 +1,4 @@
-"""Pictures to judge a match by: agreement, missing and excess told apart at a glance."""
+"""Overlays of body and silhouette: agreement, silhouette only (missing), body only (excess)."""
 
 import io
 import zlib
@@ -10,7 +10,7 @@ from PIL import Image
 
 Colour = tuple[int, int, int]
 
-# Okabe and Ito's blue and vermilion differ for every kind of colour vision, and in a grey print.
+# Blue and vermilion of Okabe and Ito can be distinguished by colour-blind people and in grey.
 BACKGROUND_RGB = (24, 24, 24)
 AGREEMENT_RGB = (215, 215, 215)
 MISSING_RGB = (0, 114, 178)
@@ -18,16 +18,15 @@ EXCESS_RGB = (213, 94, 0)
 OUTLINE_RGB = (0, 0, 0)
 
 _TEXT_RGB = (255, 255, 255)
-# A silhouette's overlay is of few colours: a byte a pixel is drawn and packed in a third of the
-# time of three. The greys first, of smoothed text on black; then what is neither, only the mask,
-# only the body, and both.
+# Overlays of silhouettes have few colours: drawing and encoding palette indices takes a third of
+# the time of RGB. First 16 greys for smoothed text, then background, mask only, body only, both.
 _TEXT, _FIRST = 15, 16
 PALETTE = np.array(
     [[17 * k] * 3 for k in range(_FIRST)]
     + [BACKGROUND_RGB, MISSING_RGB, EXCESS_RGB, AGREEMENT_RGB],
     dtype=np.uint8,
 )
-"""(colours, 3) red, green, blue: what a silhouette's overlay (H, W) numbers."""
+"""(colours, 3) RGB palette of the overlays (H, W) of silhouettes."""
 _BACKGROUND, _MISSING, _EXCESS, _AGREEMENT = range(_FIRST, len(PALETTE))
 _OUTLINE = 0
 
@@ -35,9 +34,9 @@ _OUTLINE = 0
 def paint_agreement(
     mask: np.ndarray, body: np.ndarray, segments: np.ndarray | None = None
 ) -> np.ndarray:
-    """Colours (H, W, 3) every pixel by whether silhouette and body agree there.
+    """Return an RGB picture (H, W, 3) of where mask (H, W) and body (H, W) agree.
 
-    Either is alone in MISSING_RGB or EXCESS_RGB. Borders between segments (H, W) are drawn.
+    Mask only is MISSING_RGB, body only EXCESS_RGB. Borders between segments (H, W) are drawn.
     """
     return PALETTE[_number_agreement(mask, body, segments)]
 
@@ -45,7 +44,7 @@ def paint_agreement(
 def _number_agreement(
     mask: np.ndarray, body: np.ndarray, segments: np.ndarray | None
 ) -> np.ndarray:
-    """(H, W) uint8 the colours of paint_agreement in PALETTE."""
+    """Return the picture of `paint_agreement` as indices (H, W) uint8 into PALETTE."""
     picture = _FIRST + mask.view(np.uint8) + 2 * body.view(np.uint8)
     _draw_borders(picture, body, segments, _OUTLINE)
     return picture
@@ -54,19 +53,18 @@ def _number_agreement(
 def draw_overlay(
     seen: np.ndarray, body: np.ndarray, segments: np.ndarray | None, title: str
 ) -> np.ndarray:
-    """Draws the overlay of one camera and frame.
+    """Draw the overlay of one camera and frame, cropped to the body and silhouette.
 
     Args:
-        seen: (H, W) bool, a silhouette with which the body is compared; or (H, W, 3), a picture
-            over which its contour is drawn.
-        body: (H, W) bool, the estimated body; all False where no pose was found.
-        segments: (H, W) int, which segment is seen, or None.
-        title: the text above the picture.
+        seen: (H, W) bool silhouette to compare the body with, or (H, W, 3) picture over which the
+            body's contour is drawn.
+        body: (H, W) bool, the estimated body; all False if no pose was found.
+        segments: (H, W) int, index of the segment at each pixel, or None.
+        title: text above the picture.
 
     Returns:
-        (h, w, 3) uint8 over a picture, (h, w) uint8 of PALETTE over a silhouette, below which is a
-        legend: the surroundings, all of the picture where nothing is shown, enlarged by a whole
-        number where they are small.
+        (h, w, 3) uint8 RGB over a picture; (h, w) uint8 indices into PALETTE, with a legend, over a
+        silhouette. Small pictures are enlarged by an integer.
     """
     width = max(1, len(seen) // 500)
     window = _surroundings(body if seen.ndim == 3 else seen | body)
@@ -91,10 +89,16 @@ def draw_overlay(
 def draw_shapes(
     seen: np.ndarray, shapes: Sequence[np.ndarray], names: Sequence[str], title: str
 ) -> np.ndarray:
-    """Draws the contours of one or two named bodies (H, W) over a silhouette; see draw_overlay.
+    """Draw the contours of one or two bodies over a silhouette or picture.
 
     Args:
-        seen: (H, W) bool, or a picture (H, W, 3), which is shown as a whole.
+        seen: (H, W) bool silhouette, or (H, W, 3) picture, which is not cropped.
+        shapes: one or two bodies (H, W) bool.
+        names: their names in the legend.
+        title: text above the picture.
+
+    Returns:
+        (h, w, 3) uint8 RGB.
     """
     colours, legend = (MISSING_RGB, EXCESS_RGB)[: len(shapes)], []
     window, picture = (slice(None), slice(None)), seen
@@ -110,11 +114,11 @@ def draw_shapes(
 
 
 def encode_png(picture: np.ndarray) -> bytes:
-    """Returns a picture (H, W, 3) uint8, red, green, blue, or (H, W) of PALETTE as a PNG file."""
+    """Return the PNG file of an RGB picture (H, W, 3) uint8, or of indices (H, W) into PALETTE."""
     if picture.ndim == 2:
         image, stream = Image.fromarray(picture), io.BytesIO()
         image.putpalette(PALETTE.tobytes())
-        # Areas of one colour are runs; to seek more takes twice as long and finds less.
+        # Areas of one colour are runs: other strategies take twice as long for larger files.
         image.save(stream, "PNG", compress_level=1, compress_type=zlib.Z_RLE)
         return stream.getvalue()
     _, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
@@ -130,7 +134,7 @@ def _draw_contour(picture: np.ndarray, body: np.ndarray, colour: Colour, width: 
 def _draw_borders(
     picture: np.ndarray, body: np.ndarray, segments: np.ndarray | None, colour: Colour | int
 ) -> None:
-    """Draws pixels of the body whose right or lower neighbour is another segment of the body."""
+    """Colour the body's pixels whose right or lower neighbour is another segment of the body."""
     if segments is None:
         return
     borders = np.zeros(body.shape, dtype=np.bool_)
@@ -139,21 +143,21 @@ def _draw_borders(
     picture[borders & body] = colour
 
 
-def _surroundings(shown: np.ndarray, margin_share: float = 0.12) -> tuple[slice, slice]:
-    """The rows and columns around what is shown; the picture's where nothing is.
+def _surroundings(shown: np.ndarray, margin_fraction: float = 0.12) -> tuple[slice, slice]:
+    """Return rows and columns around the True pixels (H, W); the whole picture if there are none.
 
-    ``margin_share``: margin as a fraction of its size.
+    ``margin_fraction``: margin as a fraction of their extent.
     """
     left, top, width, height = cv2.boundingRect(shown.view(np.uint8))
     if not width:
         return slice(None), slice(None)
-    margin = 8 + int(margin_share * (max(width, height) - 1))
+    margin = 8 + int(margin_fraction * (max(width, height) - 1))
     rows = slice(max(0, top - margin), top + height + margin)
     return rows, slice(max(0, left - margin), left + width + margin)
 
 
 def _enlarged(picture: np.ndarray, width_to: int = 1120, height_to: int = 480) -> np.ndarray:
-    """A picture whose pixels are whole squares, as far as it fits into a size [pixel]."""
+    """Enlarge a picture by the largest integer, at most 8, that keeps it within a size [pixel]."""
     height, width = picture.shape[:2]
     scale = max(1, min(height_to // height, width_to // width, 8))
     size = width * scale, height * scale
@@ -167,7 +171,7 @@ def _framed(
     least_width: int = 560,
     band: int = 36,
 ) -> np.ndarray:
-    """A picture, at least as wide as title and legend, in bands above and below it [pixel]."""
+    """Add bands of height ``band`` [pixel] with title and legend, and pad to ``least_width``."""
     numbered = picture.ndim == 2
     ground, text_colour = (_BACKGROUND, _TEXT) if numbered else (BACKGROUND_RGB, _TEXT_RGB)
     pad = max(0, least_width - picture.shape[1])

@@ -1,6 +1,6 @@
-"""What is known of each frame, and of all: poses.csv, joints.csv, modes.csv, summary.json.
+"""Estimates of frames, and the files poses.csv, joints.csv, modes.csv and summary.json.
 
-Frames that have a row in poses.csv are finished: they survive whatever ends the job.
+A frame is finished when it has a row in poses.csv; an interrupted job keeps its finished frames.
 """
 
 import hashlib
@@ -32,42 +32,43 @@ from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.version import VERSION
 
 BASE_COLUMNS = ("base_x", "base_y", "base_z", "base_qw", "base_qx", "base_qy", "base_qz")
-"""Columns of the plant's world in the scene's world: position [m] and unit quaternion."""
+"""Columns of X_WB, the plant's world in the scene's world: position [m] and unit quaternion."""
 
 FIT_COLUMNS = ("error", "seconds")
-"""The last columns: E_total and the search's wall time [s]."""
+"""Last columns of poses.csv: E_total and the search's wall time [s]."""
 
 BADLY_EXPLAINED = 0.25
-"""From this E_total on, a pose explains its pictures badly."""
+"""E_total from which a pose is reported to fit its pictures badly."""
 
 Joints = Mapping[str, Mapping[str, Any]]
-"""By the name of a value of the pose tree: determined, low and high, as JointEstimate [deg or m];
-and value, that of a mode, None over all modes."""
+"""Estimates by the name of a value of the pose tree: ``determined``, ``low`` and ``high`` as in
+JointEstimate [deg or m], and ``value``, which is None where several modes are combined."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameRecord:
-    """A frame's estimate: its row of poses.csv, and what summary.json says of it.
+    """Estimate of one frame: its row of poses.csv and its part of summary.json.
 
     Args:
-        q: (nq,) positions [rad or m]; NaN where no pose was found.
-        base: (7,) BASE_COLUMNS; None where the model's own joints place it in the world.
-        E_total: J over the silhouettes' area; None where no pose was found.
+        q: (nq,) positions [rad or m]; NaN if no pose was found.
+        base: (7,) BASE_COLUMNS; None if the model's own joints place it in the world.
+        E_total: area where body and silhouettes differ, divided by the silhouettes' area; None if
+            no pose was found.
         seconds: the search's wall time [s].
-        first_E_total: before the re-estimation.
-        runs: how often step 3 was run.
-        stopped_by: why the search ended: "end", "exact", "run_limit" or "time_limit";
-            "tracked" where the pose was tracked, "followed" where a person was.
-        outside_limit: r in each view [pixel].
-        joint_errors: estimate minus truth by position [deg or m], where the truth is known.
-        camera_scale: pixels a metre of a parallel camera whose scale was found.
-        explained: whether the pose explains the silhouettes at least roughly.
-        joints: what is known of each value of the pose tree.
-        modes: the same in the first modes of poses that look the same.
-        mode_count: how many modes there are; None where the search does not say.
-        ious: by camera that was used, intersection over union of silhouette and body.
-        share: of the contours' lengths, what fits; by the method person alone.
-        masks: by camera, what tells the mask's file from another (``mask_digests``).
+        first_E_total: E_total before the re-estimation.
+        runs: number of runs of the search's step 3.
+        stopped_by: why the search ended: "end", "exact", "run_limit" or "time_limit"; "tracked" if
+            the pose was tracked, "followed" if a person was.
+        outside_limit: the paper's r in each view [pixel].
+        joint_errors: estimate minus ground truth by position [deg or m], as far as that is known.
+        camera_scale: estimated scale of a parallel camera [pixel/m].
+        explained: whether the pose fits the silhouettes at least roughly.
+        joints: interval of each value of the pose tree, over all modes.
+        modes: the same for each of the first modes; a mode is a set of poses that fit equally well.
+        mode_count: number of modes; None if the search does not count them.
+        ious: intersection over union of silhouette and body by camera, of the cameras used.
+        share: inlier ratio of the contours, by length; only with the method person.
+        masks: digest of the mask file by camera (``mask_digests``).
     """
 
     frame: str
@@ -91,28 +92,34 @@ class FrameRecord:
 
     @property
     def found(self) -> bool:
-        """Whether a pose was found."""
+        """Whether a pose was found in this frame."""
         return self.E_total is not None
 
     @staticmethod
     def from_json(
         frame: str, values: Mapping[str, Any], q: Array, base: Array | None = None
     ) -> "FrameRecord":
-        """Returns the record that as_json described, its positions of poses.csv."""
+        """Return the record from the values of `as_json` and the row of poses.csv (q, base)."""
         known = {name: value for name, value in values.items() if name != "found"}
         return FrameRecord(frame, q, base, **known)
 
     def as_json(self) -> dict[str, Any]:
-        """Returns plain JSON values, without those of poses.csv."""
+        """Return plain JSON values, without the columns of poses.csv."""
         told = {k: v for k, v in vars(self).items() if k not in ("frame", "q", "base")}
         return {"found": self.found, **told}
 
 
 @dataclass(frozen=True)
 class SceneEstimate:
-    """The estimate of a scene: a record of each frame, summary.json, folder and warnings.
+    """The estimate of a scene.
 
-    Position kinds are "angle" [rad], "length" [m] or "quaternion", in the plant's order.
+    Args:
+        position_names: (nq,) in the plant's order.
+        position_kinds: (nq,) "angle" [rad], "length" [m] or "quaternion".
+        records: estimates by frame.
+        summary: content of summary.json.
+        folder: the result folder; None if nothing was written.
+        warnings: messages for the user.
     """
 
     position_names: tuple[str, ...]
@@ -124,27 +131,27 @@ class SceneEstimate:
 
     @property
     def found_count(self) -> int:
-        """In how many frames a pose was found."""
+        """Number of frames in which a pose was found."""
         return sum(record.found for record in self.records.values())
 
 
 def base_cells(X_WB: Array) -> Array:
-    """BASE_COLUMNS (7,) of a pose (4, 4): position [m] and unit quaternion."""
+    """Return the BASE_COLUMNS (7,) of a pose (4, 4): position [m] and unit quaternion."""
     rotation = RotationMatrix.ProjectToRotationMatrix(X_WB[:3, :3])
     return np.concatenate([X_WB[:3, 3], rotation.ToQuaternion().wxyz()])
 
 
 def base_pose(base: Array | None) -> Array:
-    """The pose (4, 4) that BASE_COLUMNS (7,) describe; the identity where there are none."""
+    """Return the pose X_WB (4, 4) of BASE_COLUMNS (7,); the identity for None."""
     if base is None:
         return np.eye(4)
-    # The quaternion was rounded when it was written.
+    # Rounding in the file leaves the quaternion not quite normalised.
     rotation = RotationMatrix(Quaternion(base[3:] / np.linalg.norm(base[3:])))
     return np.asarray(RigidTransform(rotation, base[:3]).GetAsMatrix4())
 
 
 class PoseTable:
-    """The poses.csv of a result's folder, with or without the base's pose."""
+    """Reads and writes the poses.csv of a result folder, with or without BASE_COLUMNS."""
 
     def __init__(self, folder: Path, position_names: Sequence[str], with_base: bool) -> None:
         self._folder, self._count, self._with_base = folder, len(position_names), with_base
@@ -152,12 +159,12 @@ class PoseTable:
         self.header = ["frame", *position_names, *base, *FIT_COLUMNS]
 
     def write(self, records: Iterable[FrameRecord]) -> None:
-        """Write all rows, at once."""
+        """Write the whole table, one row for each record."""
         cells = [self._cells(record) for record in records]
         write_file(self._folder, POSES, csv_text([self.header, *cells]))
 
     def append(self, record: FrameRecord) -> None:
-        """Write one more row; it is on the disk when this returns."""
+        """Append a row to the file."""
         path = self._folder / POSES
         try:
             with path.open("a", newline="", encoding="utf-8") as file:
@@ -166,19 +173,20 @@ class PoseTable:
             raise cannot_write(path, error) from error
 
     def read(self, known: Mapping[str, Mapping[str, Any]] | None = None) -> list[FrameRecord]:
-        """The records of an interrupted job; none where there is no table.
+        """Return the records of an interrupted job; empty if there is no poses.csv.
 
-        ``known``: what its summary.json says of the frames.
+        Args:
+            known: ``frames`` of its summary.json.
 
         Raises:
-            OutputError: it cannot be read, or is another model's.
+            OutputError: the table cannot be read, or belongs to another model.
         """
         path = self._folder / POSES
         if not path.is_file():
             return []
         header, lines = read_csv(path, OutputError, whole_lines=True)
         if header != self.header:
-            raise OutputError(f"{path}: was written for another model; name another folder")
+            raise OutputError(f"{path}: was written for another model; choose another folder")
         records = []
         for line, (frame, *cells) in lines:
             try:
@@ -204,23 +212,23 @@ class PoseTable:
 
 
 def user_units(model: ArticulatedModel) -> Array:
-    """What each position (nq,) is multiplied by to be told: radians become degrees."""
+    """Return the factors (nq,) that turn positions into user units: degrees and metres."""
     return np.array([math.degrees(1.0) if k == "angle" else 1.0 for k in model.position_kinds])
 
 
 def measured_positions(model: ArticulatedModel, records: Sequence[FrameRecord]) -> Array:
-    """What was measured (frames, nq) [rad or m] where a pose was found; nan where nothing was."""
+    """Return the measured positions (frames, nq) [rad or m]; nan without measurement or pose."""
     names, q = model.position_names, np.array([record.q for record in records])
     errors = [[record.joint_errors.get(name, np.nan) for name in names] for record in records]
     measured = q - np.array(errors).reshape(q.shape) / user_units(model)
-    # Errors are of the nearest turn, which may lie beyond the limits.
+    # Errors are differences to the nearest turn, so that the result may lie beyond the limits.
     limited = model.periodic & ~model.turns_freely & np.isfinite(model.upper - model.lower)
     middle = 0.5 * np.add(model.lower, model.upper, where=limited, out=np.zeros(len(names)))
     return nearest_turn(measured, middle, limited)
 
 
 def record_pose_set(pose_set: PoseSet | None, tree: PoseTree) -> dict[str, Any]:
-    """FrameRecord's fields of what is known of each joint, over all modes and in each."""
+    """Return FrameRecord's fields ``joints``, ``modes`` and ``mode_count``; empty for None."""
     if pose_set is None:
         return {}
     kinds = dict(zip(tree.model.position_names, tree.model.position_kinds, strict=True))
@@ -251,15 +259,19 @@ def record_pose_set(pose_set: PoseSet | None, tree: PoseTree) -> dict[str, Any]:
 
 
 def record_deviations(model: ArticulatedModel, q: Array, deviations: Array) -> Joints:
-    """Each position within 95 % and its limits, determined where that is less than half its range.
+    """Return the 95 % interval of each position, clipped to its limits.
 
-    Positions q (nq,) and deviations (nq,) are in rad or m; nan: nothing is known.
+    A position is determined if its interval is less than half of its range.
+
+    Args:
+        q: (nq,) positions [rad or m].
+        deviations: (nq,) standard deviations [rad or m]; nan where unknown.
     """
     if not np.isfinite(q).all():
         return {}
     # Of a normal distribution, 95 % lie within 1.96 standard deviations.
     half = 1.96 * np.where(np.isfinite(deviations), deviations, np.inf)
-    # An interval about half a turn goes on beyond it.
+    # A position that turns freely has no limits, only a period.
     lower = np.where(model.turns_freely, q - math.pi, model.lower)
     upper = np.where(model.turns_freely, q + math.pi, model.upper)
     low, high = np.maximum(q - half, lower), np.minimum(q + half, upper)
@@ -277,9 +289,10 @@ def record_deviations(model: ArticulatedModel, q: Array, deviations: Array) -> J
 
 
 def record_modes(model: ArticulatedModel, answers: Sequence[tuple[Array, Array]]) -> dict[str, Any]:
-    """FrameRecord's fields of one pose, or of several that explain a frame as well, best first.
+    """Return FrameRecord's fields of one pose, or of several that fit a frame equally well.
 
-    ``answers``: positions (nq,) and deviations (nq,) as of `record_deviations`.
+    Args:
+        answers: positions (nq,) and deviations (nq,), as in `record_deviations`, best first.
     """
     told = [record_deviations(model, *one) for one in answers]
     if len(told) < 2:
@@ -306,7 +319,7 @@ def record_modes(model: ArticulatedModel, answers: Sequence[tuple[Array, Array]]
 
 
 def joint_table(records: Iterable[FrameRecord]) -> str:
-    """The text of joints.csv: a row for each frame and joint, over all modes [deg or m]."""
+    """Return the text of joints.csv: intervals of joints over all modes, by frame [deg or m]."""
     rows = [
         (record.frame, name, *_ends(joint), record.mode_count)
         for record in records
@@ -316,7 +329,7 @@ def joint_table(records: Iterable[FrameRecord]) -> str:
 
 
 def mode_table(records: Iterable[FrameRecord]) -> str:
-    """The text of modes.csv: a row for each frame, mode and joint; mode 1 is the answer."""
+    """Return the text of modes.csv: a row for each frame, mode and joint; mode 1 is the best."""
     rows = [
         (record.frame, number, name, f"{one['value']:.6g}", *_ends(one))
         for record in records
@@ -331,13 +344,14 @@ def _ends(joint: Mapping[str, Any]) -> tuple[str, str, str]:
 
 
 def next_summary(begin: float, period: float = 2.0, share: float = 20.0) -> float:
-    """When a summary is due again, by time.monotonic(), that now is written and was begun then [s].
+    """Return the time.monotonic() [s] at which an unfinished job writes its summary again.
 
-    Whatever ends a job writes its summary; this is for a job that is killed.
+    These summaries are for jobs that are killed; every other end of a job writes its own.
 
     Args:
-        period: least time between two summaries [s].
-        share: at least this many times as long is spent on the work itself.
+        begin: time at which writing of the present summary, now finished, began [s].
+        period: minimum time between two summaries [s].
+        share: minimum ratio of the time between two summaries to the time of writing one.
     """
     now = time.monotonic()
     return now + max(period, share * (now - begin))
@@ -346,10 +360,10 @@ def next_summary(begin: float, period: float = 2.0, share: float = 20.0) -> floa
 def describe_job(
     scene: Path, model: Path, settings: SceneSettings, cameras: Path | None = None
 ) -> dict[str, Any]:
-    """What is estimated from what and how, as plain JSON values, with the files' SHA-256.
+    """Return scene, model, settings and the files' SHA-256 digests as plain JSON values.
 
     Args:
-        cameras: a camera file in place of the scene's own.
+        cameras: camera file used instead of the scene's own.
     """
     return {
         "scene": str(scene),
@@ -363,7 +377,7 @@ def describe_job(
 
 
 def mask_digests(scene: Scene, cameras: Iterable[str], frame: str) -> dict[str, str]:
-    """What tells the mask files of a frame from others, by camera; none where it cannot be read."""
+    """Return digests of a frame's mask files by camera, without files that cannot be read."""
     found = {}
     for camera in cameras:
         path = scene.masks.get((camera, frame))
@@ -374,29 +388,29 @@ def mask_digests(scene: Scene, cameras: Iterable[str], frame: str) -> dict[str, 
 
 
 def open_job(folder: Path | None, job: Mapping[str, Any], resume: bool) -> Mapping[str, Any] | None:
-    """The summary of the job that is resumed; None where it is a new one.
+    """Return the summary of the job to be resumed; None for a new job.
 
     Raises:
-        SettingsError: nothing says which job is to be resumed.
-        OutputError: that one had other files or settings, but for the frames.
+        SettingsError: no folder is given.
+        OutputError: the earlier job had other files, or other settings than its frames.
     """
     if not resume:
         return None
     if folder is None:
-        raise SettingsError("resume needs the folder of the result that is to be resumed")
+        raise SettingsError("resume needs the folder of the result")
     recorded = read_summary(folder)
     for name in ("model", "cameras"):
         if recorded.get("sha256", {}).get(name) != job["sha256"][name]:
             raise OutputError(
                 f"{folder}: was made with another {name} file, so it cannot be resumed; "
-                "name another folder"
+                "choose another folder"
             )
     before = recorded.get("settings", {})
     for name, value in job["settings"].items():
         if name != "frames" and before.get(name) != value:
             raise OutputError(
                 f"{folder}: was made with {name} = {before.get(name)}, not {value}, so it cannot "
-                "be resumed; name another folder, or give the same options"
+                "be resumed; choose another folder, or give the same options"
             )
     return recorded
 
@@ -407,7 +421,14 @@ def summarize(
     complete: bool,
     more: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """The content of summary.json: a job of describe_job, finished frames, more of the method."""
+    """Return the content of summary.json.
+
+    Args:
+        job: from `describe_job`.
+        records: finished frames by name.
+        complete: whether all frames are finished.
+        more: entries of the method.
+    """
     ious = [iou for record in records.values() for iou in record.ious.values()]
     errors = [record.E_total for record in records.values() if record.E_total is not None]
     seconds = [record.seconds for record in records.values()]
@@ -436,7 +457,7 @@ def summarize(
 
 
 def describe_cameras(records: Mapping[str, FrameRecord]) -> dict[str, dict[str, float]]:
-    """By camera: in how many frames it was compared, and its mean intersection over union."""
+    """Return the number of compared frames and the mean intersection over union by camera."""
     found: dict[str, list[float]] = {}
     for record in records.values():
         for camera, iou in record.ious.items():
@@ -450,30 +471,32 @@ def describe_cameras(records: Mapping[str, FrameRecord]) -> dict[str, dict[str, 
 def camera_warnings(
     records: Mapping[str, FrameRecord], known: Sequence[str] = (), suspicious: float = 0.15
 ) -> tuple[str, ...]:
-    """Which of three cameras or more, `known` ones aside, agree much less than the others.
+    """Return a warning for each of three or more cameras whose IoU is much lower than the others'.
 
-    ``suspicious``: by how much the mean IoU is below the cameras' median.
+    Args:
+        known: earlier warnings; cameras that these name get no other one.
+        suspicious: minimum difference of the mean IoU to the cameras' median.
     """
     means = {name: float(one["mean_iou"]) for name, one in describe_cameras(records).items()}
     if len(means) < 3:
         return ()
     usual = float(np.median(list(means.values())))
     return tuple(
-        f"camera '{name}' agrees badly (IoU {mean:.2f}, the median is {usual:.2f}): has it moved "
-        "since it was calibrated, or are its masks poor?"
+        f"camera '{name}' fits badly (IoU {mean:.2f}, median of the cameras {usual:.2f}); check "
+        "whether it has moved since its calibration, and its masks"
         for name, mean in means.items()
         if mean < usual - suspicious and not any(f"'{name}'" in text for text in known)
     )
 
 
 def frame_warnings(records: Mapping[str, FrameRecord]) -> tuple[str, ...]:
-    """One warning of all frames without a pose, and of all whose search was stopped."""
+    """Return a warning of the frames without a pose, and one of those whose search was stopped."""
     found: dict[str, list[str]] = {}
-    limits = {"run_limit": "run limit", "time_limit": "time limit"}
+    limits = {"run_limit": "run limit", "time_limit": "time limit; raise it (time_limit)"}
     for frame, record in records.items():
-        # Why a person is not found is said where one is followed.
+        # The method person explains frames without a pose itself.
         if not record.found and record.share is None:
-            found.setdefault("no pose was found", []).append(frame)
+            found.setdefault("no pose was found; check their masks", []).append(frame)
         elif record.found and record.stopped_by in limits:
             text = f"the search was stopped by the {limits[record.stopped_by]}"
             found.setdefault(text, []).append(frame)
@@ -490,13 +513,13 @@ def poor_fit_warnings(
     held: Iterable[str],
     at_limit: float = 1e-3,
 ) -> tuple[str, ...]:
-    """One warning where poses explain their pictures badly.
+    """Return a warning if poses fit their pictures badly.
 
     Args:
-        held: positions that were not searched.
-        at_limit: a joint stands at a limit that is so near, as a fraction of its range.
+        held: names of positions that were held.
+        at_limit: distance below which a joint is at a limit, as a fraction of its range.
     """
-    # A followed person is judged by the contours (describe_fit): others in view are in the masks.
+    # The method person evaluates the contours instead: masks may show other people as well.
     errors = {
         frame: one.E_total
         for frame, one in records.items()
@@ -516,17 +539,17 @@ def poor_fit_warnings(
     if at_limits:
         advice[-1] += f" ({', '.join(at_limits)} at a limit)"
     if names := ", ".join(held):
-        advice.append(f"what is held ({names})")
+        advice.append(f"the held positions ({names})")
     return (
-        f"frame {frame_ranges(bad, list(records))} ({several}E_total {error}): the pose explains "
-        "the pictures badly, so it may be wrong; look at the overlays, the masks, "
-        f"{', '.join(advice)} and where the root is",
+        f"frame {frame_ranges(bad, list(records))} ({several}E_total {error}): the pose fits the "
+        "pictures badly and may be wrong; check the overlays, the masks, "
+        f"{', '.join(advice)} and the position of the root",
     )
 
 
 @cache
 def versions() -> dict[str, str]:
-    """The versions of drake_pose, Python and the packages that matter."""
+    """Return the versions of drake_pose, Python and the packages that affect results."""
     found = {"drake_pose": VERSION, "python": platform.python_version()}
     for package in ("drake", "numpy", "numba", "opencv-python-headless"):
         with suppress(PackageNotFoundError):
@@ -535,7 +558,7 @@ def versions() -> dict[str, str]:
 
 
 def file_digest(path: Path) -> str | None:
-    """SHA-256 of a file; None where it cannot be read."""
+    """Return the SHA-256 of a file; None if it cannot be read."""
     try:
         return hashlib.sha256(read_regular(path)).hexdigest()
     except OSError:

@@ -1,4 +1,4 @@
-"""What plays an estimate: replay.html, a page that needs no server; a recording for rerun."""
+"""Animations of estimates: replay.html, a Meshcat page without server, and rerun recordings."""
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
@@ -44,17 +44,19 @@ def make_replay(
     measured: np.ndarray | None = None,
     most_triangles: int = 8_000,
 ) -> str:
-    """The page that Meshcat records of poses of a body, and where the cameras are.
+    """Return the HTML page of a Meshcat animation of a body and the cameras.
 
     Args:
-        positions: (frames, nq) its positions [rad or m].
+        model: the body's model.
+        positions: (frames, nq) positions [rad or m].
         X_WB: (frames, 4, 4) poses of the plant's world in the scene's world.
-        period: time between two frames [s]; those a second or more apart stand still.
-        measured: (frames, nq) positions at which the body is shown as a ghost, too.
-        most_triangles: a body of more is shown with so many, a ghost with half as
-            many: a triangle takes about 100 bytes.
+        cameras: cameras to draw; the view starts near the first one.
+        period: time between two frames [s]; from 1 s on, the body stands still between frames.
+        measured: (frames, nq) positions of a ghost of the body; None: no ghost.
+        most_triangles: maximum number of triangles of the body; a ghost has at most half of it. A
+            triangle takes about 100 bytes.
     """
-    # Port 0: any free one. The server lives for a moment only, and listens on this machine alone.
+    # Port 0 is any free port. The server listens on the loopback address only.
     logger = logging.getLogger("drake")
     level = logger.level
     logger.setLevel(logging.WARNING)
@@ -80,8 +82,8 @@ def make_replay(
     p_WO, radius = _extent(model, np.concatenate(shown), np.concatenate(len(shown) * [X_WB]))
     for camera in cameras:
         _draw_camera(meshcat, camera, p_WO, radius)
-    # The body is seen from the first camera's side, past its frustum, wherever up to infinity that
-    # stands. In Meshcat's window of 75 degrees a ball is seen whole from 1.65 radii.
+    # View the body from the direction of the first camera, turned so that its frustum is not in the
+    # way. Meshcat's field of view of 75 degrees shows a whole ball from 1.65 radii.
     p_OC_W = cameras[0].X_WC[:3, 3] - p_WO
     if isinstance(cameras[0], ParallelCamera):
         p_OC_W = -cameras[0].X_WC[:3, 2]
@@ -92,7 +94,7 @@ def make_replay(
 
 
 def _lighten(scene_graph: SceneGraph, source: SourceId, most: int) -> None:
-    """Gives the shown meshes of a source fewer triangles, if they have more than so many in all."""
+    """Simplify a source's illustration meshes to at most ``most`` triangles in all."""
     inspector = scene_graph.model_inspector()
     shown = {
         one: shape
@@ -116,7 +118,7 @@ def _record(
     model: ArticulatedModel,
     measured: np.ndarray | None,
 ) -> None:
-    """Publishes every frame at its time; stills once more just before the next."""
+    """Record every frame at its time, and stills once more just before the next frame."""
     context = diagram.CreateDefaultContext()
     value = source.get_mutable_source_value(source.GetMyMutableContextFromRoot(context))
     still = period >= 1.0
@@ -144,7 +146,7 @@ def _record(
 def _extent(
     model: ArticulatedModel, positions: np.ndarray, X_WB: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """The middle (3,) and radius [m] of what the body takes up in the scene's world."""
+    """Return centre (3,) and radius [m] of the body's bounding box, over all frames."""
     boxes = {
         model.link_index(link): np.array(
             [*product(*np.c_[mesh.vertices.min(0), mesh.vertices.max(0)])]
@@ -162,9 +164,12 @@ def _extent(
 def _draw_camera(
     meshcat: Meshcat, camera: Camera, p_WO: np.ndarray, radius: float, length: float = 0.25
 ) -> None:
-    """Draws the frustum of what a camera sees; a parallel one's begins outside the object.
+    """Draw a camera's frustum; that of a parallel camera begins outside the object.
 
-    ``length``: of the frustum, in the object's radii.
+    Args:
+        p_WO: (3,) centre of the object [m].
+        radius: radius of the object [m].
+        length: length of the frustum, in radii.
     """
     parallel, f_x, f_y, c_x, c_y, *_ = camera.kernel_parameters()
     across, down = np.array([0, 1, 1, 0]), np.array([0, 0, 1, 1])
@@ -189,27 +194,32 @@ Pictures = Mapping[str, Mapping[str, NDArray[np.uint8]]]
 
 
 def import_rerun() -> Any:
-    """The library rerun of the extra `rerun`; OutputError without it."""
+    """Return the module rerun.
+
+    Raises:
+        OutputError: rerun-sdk is not installed.
+    """
     try:
         return import_module("rerun")
     except ImportError as error:
         raise OutputError(
-            f"recordings for rerun are written by rerun-sdk: pip install 'drake_pose[rerun]' "
-            f"({error})"
+            f"recordings for rerun need rerun-sdk: pip install 'drake_pose[rerun]' ({error})"
         ) from error
 
 
 def make_recording(
     tree: PoseTree, cameras: Iterable[Camera], frames: Sequence[MultiViewFrame], pictures: Pictures
 ) -> bytes:
-    """The bytes of a file .rrd.
+    """Return the bytes of a .rrd file of a body, cameras and their pictures.
 
     Args:
-        tree: the body, in the world or whatever the cameras' X_WC are given in.
-        cameras: pinholes are shown.
-        frames: in the order of the timeline `frame`.
+        tree: the body, in the frame of the cameras' X_WC.
+        cameras: cameras; only pinhole cameras are shown.
+        frames: frames in the order of the timeline `frame`.
+        pictures: pictures by camera and frame.
 
-    Raises OutputError: rerun-sdk is not installed.
+    Raises:
+        OutputError: rerun-sdk is not installed.
     """
     rr = import_rerun()
     recording = rr.RecordingStream("drake_pose")
@@ -237,14 +247,14 @@ def make_recording(
 
 
 def _log_rerun_camera(rr: Any, recording: Any, camera: Camera) -> bool:
-    """Logs a pinhole's pose and lens; False: it is none."""
+    """Log a pinhole camera's pose and intrinsics; return False for another camera."""
     if not isinstance(camera, PinholeCamera):
         return False
     place = ["world", camera.name]
     recording.log(place, _rerun_pose(rr, camera.X_WC), static=True)
     lens = rr.Pinhole(
         focal_length=[camera.focal_x, camera.focal_y],
-        # rerun counts from the picture's corner.
+        # The origin of rerun's pixel coordinates is the picture's corner.
         principal_point=[camera.center_x + HALF_PIXEL, camera.center_y + HALF_PIXEL],
         resolution=[camera.width, camera.height],
         camera_xyz=rr.ViewCoordinates.RDF,

@@ -128,7 +128,7 @@ def _describe_method(scene: Scene, estimate: SceneEstimate) -> str:
 
 
 def page_template(package: str, name: str = "report_template.html.j2") -> Template:
-    """The template of a package's page, which may use the style of all pages."""
+    """Return the template ``name`` of a package; it may extend report_base.html.j2."""
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
         loader=PackageLoader("drake_pose.files", ""),
@@ -273,7 +273,11 @@ def _picture_use(scene: Scene, estimate: SceneEstimate, camera: str) -> list[str
 def _pick_pictures(
     folder: Path, scene: Scene, estimate: SceneEstimate, most: int = 6
 ) -> list[dict[str, Any]]:
-    """Overlays of the frames that fit worst, as usual and best, as far as they were written."""
+    """Return existing overlays of the frames with the largest, median and smallest error.
+
+    Args:
+        most: approximate maximum number of overlays.
+    """
     records = estimate.records.values()
     known = [record for record in records if record.found] or list(records)
     in_order = sorted(known, key=lambda one: -(one.E_total or 0.0))
@@ -295,9 +299,16 @@ def overlay_picture(
     overlay: str = OVERLAY,
     height: int = 300,
 ) -> dict[str, Any] | None:
-    """An overlay in a result's folder: camera, frame, E_total, link of its file, uri of its data.
+    """Return an overlay for a page: camera, frame, E_total, link to the file, data URI.
 
-    ``height``: to which it is made smaller [pixel]. None where it is no picture any more.
+    Args:
+        folder: the result folder.
+        E_total: the frame's error, as a fraction.
+        overlay: the overlays' folder in the result folder.
+        height: maximum height of the embedded picture [pixel].
+
+    Returns:
+        The entries for a template; None if the file does not exist or is not a picture.
     """
     place = f"{overlay}/{camera}/{frame}.png"
     if not (folder / place).is_file():
@@ -309,12 +320,16 @@ def overlay_picture(
     small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     _, encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 82])
     uri = "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
-    told = {"camera": camera, "frame": frame, "E_total": E_total}
-    return {**told, "uri": uri, "link": quote(place)}
+    return {"camera": camera, "frame": frame, "E_total": E_total, "uri": uri, "link": quote(place)}
 
 
 def new_plot(height: float = 1.5, left: float = 0.09) -> tuple[Figure, Axes]:
-    """An empty plot of a page [inch, and fraction of the width left of the axes]."""
+    """Return an empty plot for a page.
+
+    Args:
+        height: height of the figure [inch].
+        left: space left of the axes, as a fraction of the width.
+    """
     figure = Figure(figsize=(6.4, height), dpi=120)
     axes = figure.add_axes((left, 0.3 / height, 0.985 - left, 1.0 - 0.38 / height))
     axes.tick_params(labelsize=8, length=2, colors="#57606a")
@@ -326,7 +341,7 @@ def new_plot(height: float = 1.5, left: float = 0.09) -> tuple[Figure, Axes]:
 
 
 def plot_uri(figure: Figure) -> str:
-    """A plot as the URI of a PNG picture."""
+    """Return a figure as the data URI of a PNG picture."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png")
     return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode()
@@ -342,25 +357,26 @@ def plot_curves(
     least: float | None = None,
     limits_within: float = 0.3,
 ) -> Figure:
-    """Plots curves over frames; nan leaves a gap.
+    """Plot curves over frames; nan leaves a gap.
 
     Args:
-        values: label and (frames,) values of each curve; what is labelled measured is wide.
+        frames: names of the frames.
+        values: label and (frames,) values of each curve; the curve "measured" is wide.
         joined: whether neighbouring frames are joined by a line.
-        limits: lower and upper, each in the picture where it is near.
-        intervals: low and high (frames,), and where they are what is known.
-        least: the lowest value that the axis shows, such as 0.
-        limits_within: a limit is near where it is at most this fraction of the span of curves and
-            intervals beyond them.
+        limits: lower and upper limit, each drawn only if it is near.
+        intervals: low and high (frames,), and whether the joint is determined (frames,).
+        least: lower end of the axis, such as 0; None: chosen from the curves.
+        limits_within: a limit is near if its distance to curves and intervals is at most this
+            fraction of their span.
     """
     (figure, axes), places = new_plot(), np.arange(len(frames))
     shown = np.concatenate([value for _, value in values])
     if intervals is not None:
-        low, high, known = intervals
+        low, high, determined = intervals
         shown = np.concatenate([shown, low, high])
-        # As wide as a frame, and not invisible where a frame stands alone.
+        # As wide as a frame, at most 1/40 of the axis [point].
         width = 1.1 * 420.0 / max(len(frames), 40)
-        for where, colour in ((known, "#c5dfee"), (~known, "#e4e6e8")):
+        for where, colour in ((determined, "#c5dfee"), (~determined, "#e4e6e8")):
             axes.vlines(places[where], low[where], high[where], colour, linewidth=width)
     shown = shown[np.isfinite(shown)]
     bottom, top = (float(shown.min()), float(shown.max())) if len(shown) else (0.0, 1.0)
@@ -372,7 +388,7 @@ def plot_curves(
     bottom = bottom if least is None else min(bottom, least)
     margin = 0.08 * (top - bottom if top > bottom else max(1e-3, 0.02 * abs(top)))
     axes.set_ylim(bottom - (0.0 if bottom == least else margin), top + margin)
-    # A frame between two that are not known is a dot.
+    # Markers show single frames between gaps, where there is no line.
     style: dict[str, Any] = {"linestyle": "-" if joined else "", "marker": ".", "linewidth": 1.2}
     wide = {"color": "#009e7380", "linewidth": 4, "markersize": 4 if joined else 16, "zorder": 1.5}
     for label, value in values:
@@ -389,7 +405,7 @@ def plot_curves(
 
 
 def _mark_frames(axes: Axes, frames: Sequence[str], count: int = 6) -> None:
-    """Writes the names of a few frames, evenly spread, below the axes."""
+    """Label the x axis with the names of about ``count`` frames."""
     step = max(1, -(-len(frames) // count))
     names = [name[:20] for name in frames[::step]]
     axes.set_xticks(range(0, len(frames), step), names, parse_math=False)
@@ -397,7 +413,7 @@ def _mark_frames(axes: Axes, frames: Sequence[str], count: int = 6) -> None:
 
 
 def draw_grid(frames: Sequence[str], rows: Sequence[tuple[str, Sequence[str]]]) -> Figure:
-    """Draws what state each row, a name and (frames,) states, has; equal neighbours are a bar."""
+    """Draw a row of bars for each name and (frames,) states; equal neighbours are one bar."""
     colours = {"used": "#0072b2", "found": "#0072b2", "no-picture": "#d8dee4"}
     figure, axes = new_plot(0.4 + 0.2 * len(rows), 0.2)
     for number, (_, states) in enumerate(rows):

@@ -1,7 +1,8 @@
-"""What an estimate is made with: options (cyclopts), a job file's keys, arguments in Python.
+"""Settings of estimates, captures, episodes and masks.
 
-A class's fields are all three; the text below a field is the option's help. Texts of other forms
-than an option's raise a SettingsError.
+Each field of a settings class is a command line option (cyclopts), a key of a batch's job file and
+an argument in Python. The docstring below a field is the option's help text. The parsers of option
+texts raise SettingsError for a text of another form.
 """
 
 import ast
@@ -23,18 +24,18 @@ _Settings = TypeVar("_Settings", bound=type)
 Axis = Literal["x", "y", "z"]
 RootTurns = Literal["fixed", "free"] | Mapping[Axis, tuple[float, float]]
 Corner = tuple[float, float, float]
-"""x, y, z [m]."""
+"""Position x, y, z [m]."""
 
 
 @dataclass(frozen=True)
 class FromText:
-    """A setting's converter: parses one text, or where the option may be repeated all of them."""
+    """Converter of an option: parses its text, or the list of texts of a repeated option."""
 
     parse: Callable[[Any], Any]
     repeated: bool = False
 
     def __call__(self, hint: object, tokens: Sequence[Token]) -> Any:
-        """Returns the value; a SettingsError begins with the option's name."""
+        """Return the parsed value; the message of a SettingsError begins with the option's name."""
         texts = [token.value for token in tokens]
         try:
             return self.parse(texts if self.repeated else texts[0])
@@ -45,7 +46,7 @@ class FromText:
 def from_text(
     parse: Callable[[Any], Any], metavar: str, *, name: str | None = None, repeated: bool = False
 ) -> Parameter:
-    """Returns how an option is read whose text ``parse`` understands."""
+    """Return the cyclopts parameter of an option whose text ``parse`` converts."""
     return Parameter(
         name,
         converter=FromText(parse, repeated),
@@ -57,7 +58,7 @@ def from_text(
 
 
 def within(low: float, high: float = math.inf) -> Parameter:
-    """Returns the check of an option: a finite number in this range."""
+    """Return the cyclopts validator of an option: a finite number in [low, high]."""
 
     def check(hint: object, value: float | None) -> None:
         if value is not None and not (math.isfinite(value) and low <= value <= high):
@@ -68,7 +69,7 @@ def within(low: float, high: float = math.inf) -> Parameter:
 
 
 def parse_number(text: str) -> float:
-    """Returns a finite number."""
+    """Return the finite number of a text."""
     try:
         number = float(text)
     except ValueError:
@@ -79,7 +80,7 @@ def parse_number(text: str) -> float:
 
 
 def parse_assignments(texts: Iterable[str]) -> dict[str, float]:
-    """Returns the values of ``NAME=NUMBER`` texts by name."""
+    """Return the numbers of ``NAME=NUMBER`` texts by name."""
     values: dict[str, float] = {}
     for text in texts:
         name, equals, number = text.rpartition("=")
@@ -92,7 +93,7 @@ def parse_assignments(texts: Iterable[str]) -> dict[str, float]:
 
 
 def parse_packages(texts: Iterable[str]) -> dict[str, Path]:
-    """Returns the absolute folders of ``NAME=FOLDER`` texts by package."""
+    """Return the absolute folders of ``NAME=FOLDER`` texts by package name."""
     folders: dict[str, Path] = {}
     for text in texts:
         name, equals, folder = text.partition("=")
@@ -107,15 +108,15 @@ def parse_packages(texts: Iterable[str]) -> dict[str, Path]:
 
 
 def parse_numbers(text: str, count: int) -> tuple[float, ...]:
-    """Returns the ``count`` numbers of a text ``A,B,...``."""
+    """Return the ``count`` numbers of a text ``A,B,...``."""
     parts = text.split(",")
     if len(parts) != count:
-        raise SettingsError(f"'{text}' must be {count} numbers with commas between them")
+        raise SettingsError(f"'{text}' must be {count} numbers separated by commas")
     return tuple(map(parse_number, parts))
 
 
 def parse_boxes(texts: Iterable[str]) -> tuple[tuple[Corner, Corner], ...]:
-    """Returns the least and the largest corner of each text ``X,Y,Z:X,Y,Z`` of two corners [m]."""
+    """Return the lower and upper corner [m] of each box ``X,Y,Z:X,Y,Z`` given by two corners."""
     boxes = []
     for text in texts:
         corners = text.split(":")
@@ -128,7 +129,7 @@ def parse_boxes(texts: Iterable[str]) -> tuple[tuple[Corner, Corner], ...]:
 
 
 def parse_root_position(text: str) -> Corner | tuple[Path, str] | Literal["unknown"]:
-    """Returns a position ``X,Y,Z`` [m], file and joint of ``FILE.csv:JOINT``, or ``unknown``."""
+    """Return a position ``X,Y,Z`` [m], the file and joint of ``FILE.csv:JOINT``, or ``unknown``."""
     if text == "unknown":
         return "unknown"
     if text.count(",") == 2:
@@ -137,15 +138,15 @@ def parse_root_position(text: str) -> Corner | tuple[Path, str] | Literal["unkno
     file, colon, joint = text.rpartition(":")
     if not (colon and file and joint):
         raise SettingsError(
-            f"'{text}' must be X,Y,Z in metres, FILE.csv:JOINT for one position a frame, or unknown"
+            f"'{text}' must be X,Y,Z in metres, FILE.csv:JOINT (one position a frame) or unknown"
         )
     return Path(file), joint
 
 
 def parse_root_rotation(text: str) -> RootTurns:
-    """Returns ``fixed``, ``free``, or limits about the root's axes [deg], in order of rotation.
+    """Return ``fixed``, ``free``, or the (lower, upper) limits [deg] by axis, in rotation order.
 
-    The limits' text is like ``y=-180:180,z=-10:10``.
+    Limits are written as ``y=-180:180,z=-10:10``.
     """
     if text == "fixed":
         return "fixed"
@@ -169,13 +170,13 @@ def parse_root_rotation(text: str) -> RootTurns:
     return limits
 
 
-def percent(share: float | None) -> str:
-    """Returns a share in percent, or a dash."""
-    return "-" if share is None else f"{100.0 * share:.2f} %"
+def percent(fraction: float | None) -> str:
+    """Return a fraction in percent with two decimals, or a dash for None."""
+    return "-" if fraction is None else f"{100.0 * fraction:.2f} %"
 
 
 class _Documentation:
-    """A settings class's docstring: its own words, and its fields' texts. Made when it is read."""
+    """Descriptor of a settings class's docstring: its own text and, as Args, its fields' texts."""
 
     def __init__(self, own: str) -> None:
         self._own = own
@@ -199,7 +200,7 @@ class _Documentation:
 
 
 def readable(cls: _Settings) -> _Settings:
-    """Makes ``help()`` of a dataclass of settings show plain types, and what each field means."""
+    """Decorate a settings dataclass so that ``help()`` shows plain types and the fields' texts."""
     made: Any = cls
     hints, own = get_type_hints(cls), {one.name: one for one in fields(made)}
     signature = inspect.signature(made.__init__)
@@ -215,7 +216,7 @@ def readable(cls: _Settings) -> _Settings:
 
 
 def take_single_names(settings: Any) -> None:
-    """Makes a tuple of a single name where names are expected: ``zeros="elbow"``, ``"all"``."""
+    """Replace a single name by a tuple in fields of names, as in ``zeros="elbow"``."""
     hints = get_type_hints(type(settings))
     for one in fields(settings):
         value, (kind, *_) = getattr(settings, one.name), (*get_args(hints[one.name]), None)
@@ -225,7 +226,7 @@ def take_single_names(settings: Any) -> None:
             continue
         names = (value,) if isinstance(value, str) else tuple(value) if _is_many(value) else None
         if names is None or not all(isinstance(name, str) for name in names):
-            raise SettingsError(f"{one.name} must be names, as ('a', 'b'), not {value!r}")
+            raise SettingsError(f"{one.name} must be names like ('a', 'b'), not {value!r}")
         object.__setattr__(settings, one.name, names)
 
 
@@ -249,50 +250,49 @@ Packages = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class SceneSettings:
-    """Which part of a scene is used, and where the model's packages are."""
+    """Cameras and frames of a scene to use, and the folders of the model's packages."""
 
     cameras: Annotated[Names, Parameter("--camera")] = ()
     """Use this camera; repeat for several. Default: all, used together."""
     frames: Annotated[Names, Parameter("--frame")] = ()
     """Use this frame, or frames FIRST:LAST; repeat for several. Default: all."""
     every: Annotated[int, Parameter(metavar="N")] = 1
-    """Use every Nth frame alone, from the first one on; of a sequence the time between frames is N
-    times as long."""
+    """Use only every Nth frame, starting with the first."""
     packages: Packages = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         take_single_names(self)
 
     def as_json(self) -> dict[str, Any]:
-        """Returns the settings as plain JSON values."""
+        """Return the settings as plain JSON values."""
         return {one.name: plain(getattr(self, one.name)) for one in fields(self)}
 
 
 @readable
 @dataclass(frozen=True, kw_only=True)
 class CaptureSettings(SceneSettings):
-    """Options that the capture of a person has, too."""
+    """Settings that estimates and the capture of a person share."""
 
     track: Annotated[bool, Parameter(negative="--no-track")] = True
-    """Track the body through the frames of a sequence, searching only in the first frame and after
-    a loss; or search in every frame."""
+    """--track: track the body through a sequence, and search only in the first frame and after a
+    loss. --no-track: search in every frame."""
     start: Path | None = None
-    """Joint positions in the first frame of a sequence: CSV with the columns frame and positions'
-    names [rad or m]. Rows of other frames are used after a loss."""
+    """Joint positions in the first frame of a sequence [rad or m]: CSV file with the column frame
+    and one for each joint. Rows of other frames are used after a loss."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeSettings(SceneSettings):
-    """How a robot's recorded episode is read."""
+    """Settings for reading a robot's recorded episode."""
 
     episode: Annotated[int | None, Parameter(metavar="N")] = None
-    """The number of the episode in a LeRobot data set; default: the only one that is there."""
+    """Number of the episode in a LeRobot data set. Default: the only one."""
     joint_map: Path | None = None
-    """Of an episode: which column of its joint log is which joint, in which unit (YAML)."""
+    """YAML file that assigns columns of an episode's joint log to joints, with their units."""
     units: Literal["rad", "deg"] | None = None
-    """The unit of angles in an episode's joint log; default: what the joints' limits say."""
+    """Unit of the angles in an episode's joint log. Default: inferred from the joints' limits."""
     workers: Annotated[int | None, Parameter(metavar="N")] = None
-    """Number of threads; the result is the same. Default: one for each core."""
+    """Number of threads; the result does not depend on it. Default: one for each core."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -300,7 +300,7 @@ class EpisodeSettings(SceneSettings):
             raise SettingsError(f"workers must be 1 or more, not {self.workers}")
 
     def as_json(self) -> dict[str, Any]:
-        """Returns the settings that make the result as plain JSON values."""
+        """Return the settings that affect the result as plain JSON values."""
         values = super().as_json()
         del values["workers"]
         return values
@@ -309,38 +309,37 @@ class EpisodeSettings(SceneSettings):
 @readable
 @dataclass(frozen=True, kw_only=True)
 class EstimateSettings(CaptureSettings, EpisodeSettings):
-    """How a scene is estimated.
+    """Settings of the estimate of a scene.
 
     Raises:
-        SettingsError: there is no such method, an option belongs to another one, or a number is out
-            of its range.
+        SettingsError: the method does not exist or lacks an option, or a number is out of range.
     """
 
     hold: Positions = field(default_factory=dict)
     """Hold this joint at a known position [deg or m]; repeat for several."""
     unseen: Annotated[tuple[str, ...], Parameter(metavar="LINK")] = ()
-    """This link is not in the pictures, as the forearm of a hand cut off; repeat for several. Its
-    joints are held. URDF models alone."""
+    """This link is missing in the pictures, such as the forearm of a hand cut off at the wrist;
+    repeat for several. Its joints are held. URDF models only."""
     root: Annotated[str | None, Parameter(metavar="LINK")] = None
-    """The link that is placed first; any link. Default: the model's own root."""
+    """Link at which the search starts; any link. Default: the model's root."""
     root_position: Annotated[
         tuple[float, float, float] | tuple[Path, str] | Literal["unknown"] | None,
         from_text(parse_root_position, "POINT"),
     ] = None
     """Position of the root's origin in the world: X,Y,Z [m]; or FILE.csv:JOINT, a CSV file with the
-    columns frame,joint,x,y,z and a row of that joint for each frame; or unknown, and it is searched
-    (default if the scene has no cameras.yaml)."""
+    columns frame,joint,x,y,z and a row of that joint for each frame; or unknown, to search it (the
+    default if the scene has no cameras.yaml)."""
     root_rotation: Annotated[RootTurns | None, from_text(parse_root_rotation, "ROTATION")] = None
     """Rotation of the root: fixed, free, or limits [deg] about its axes in the order of rotation,
-    like y=-180:180,z=-10:10; zero is as at the model's default positions. Default: the model's own
-    root moves as its joints allow, any other link is free."""
+    like y=-180:180,z=-10:10; zero is the rotation at the model's default positions. Default: the
+    model's own root moves as its joints allow, any other link is free."""
     time_limit: Annotated[float | None, Parameter(metavar="SECONDS")] = None
-    """Stop the search of a frame after this time [s] and return the best pose so far. Method beam
+    """Stop the search of a frame after this time [s] and take the best pose so far. Method beam
     only."""
     method: Literal["auto", "beam", "paper", "person"] = "auto"
-    """beam: beam search and continuous fit; paper: Kameda, Minoh and Ikeda's search as published,
-    with samples 10 degrees apart; person: one person, fitted to all cameras' silhouettes at once;
-    auto: person if model, cameras and options allow it, else beam."""
+    """beam: beam search and continuous fit; paper: the search of Kameda, Minoh and Ikeda as
+    published, with samples 10 degrees apart; person: fit one person to all cameras' silhouettes at
+    once; auto: person if model, cameras and options allow it, else beam."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -349,20 +348,19 @@ class EstimateSettings(CaptureSettings, EpisodeSettings):
             raise SettingsError(f"time_limit must be 0 or more, not {self.time_limit}")
         if self.method == "person" and self.search_settings:
             raise SettingsError(
-                f"the method person follows a person and searches no pose; leave "
-                f"{self.search_settings[0]} out"
+                f"the method person does not search poses; leave {self.search_settings[0]} out"
             )
         if self.method == "paper" and self.time_limit is not None:
-            raise SettingsError("the paper's search has no time limit; leave it out")
+            raise SettingsError("the method paper has no time limit; leave it out")
 
     @property
     def search_settings(self) -> tuple[str, ...]:
-        """The names of the options of searches that are not at their defaults."""
+        """Names of the search's options that are not at their defaults."""
         own = set(EstimateSettings.__annotations__) - {"method"}
         return tuple(name for name in changed(self) if name in own)
 
     def as_json(self) -> dict[str, Any]:
-        """Returns the settings that make the result as plain JSON values."""
+        """Return the settings that affect the result as plain JSON values."""
         values, turns = super().as_json(), self.root_rotation
         if isinstance(turns, Mapping):
             values["root_rotation"] = [[axis, *limits] for axis, limits in turns.items()]
@@ -372,37 +370,40 @@ class EstimateSettings(CaptureSettings, EpisodeSettings):
 @readable
 @dataclass(frozen=True, kw_only=True)
 class MaskSettings:
-    """How masks are found; where no way is given, the source holds masks of another tool.
+    """Settings for making masks; without a segmentation method the source holds masks.
 
-    Raises SettingsError: several ways at once, or options of another way.
+    Raises:
+        SettingsError: two segmentation methods at once, or an option of another method.
     """
 
     cameras: Path | None = None
-    """Camera file that the scene gets. Default: SOURCE/cameras.yaml, if it exists."""
+    """Camera file for the scene. Default: SOURCE/cameras.yaml, if it exists."""
     episode: Annotated[int | None, Parameter(metavar="N")] = None
-    """The number of the episode in a LeRobot data set; default: the only one that is there."""
+    """Number of the episode in a LeRobot data set. Default: the only one."""
     classes: Annotated[tuple[str, ...], Parameter("--class", metavar="NAME")] = ()
-    """Class of a COCO file that is the object, by name or number; repeat for several; all: every
-    class. Default: the only one."""
+    """Class of the object in a COCO file, by name or number; repeat for several; all: every class.
+    Default: the only class."""
     background: str | Path | None = None
-    """Empty room: a picture, or a folder with <camera>.png or <camera>/<frame>.png; median: of the
-    pictures themselves, in which the body moves. Default: SOURCE/background, if it exists."""
+    """Picture of the empty room, or folder with <camera>.png or <camera>/<frame>.png; median: each
+    pixel's median over the pictures, in which the body must move. Default: SOURCE/background, if it
+    exists."""
     box: Annotated[
         tuple[float, ...] | None, from_text(partial(parse_numbers, count=4), "X,Y,W,H")
     ] = None
     """Box around the object in all pictures: left, top, width, height [pixel]."""
     model: Annotated[Path | None, Parameter(alias="-m")] = None
-    """The object: URDF, SDFormat, MJCF or .dmd.yaml; pose and mask are found in turn."""
+    """Model file of the object (URDF, SDFormat, MJCF or .dmd.yaml): its pose and mask are estimated
+    alternately."""
     start: Path | None = None
-    """Rough joint positions of every frame [rad or m]: a CSV file with the column frame and one for
+    """Rough joint positions in every frame [rad or m]: CSV file with the column frame and one for
     each joint."""
     start_error: Annotated[float, Parameter(metavar="DEG")] = 5.0
-    """How far off their angles are: standard deviation [deg]."""
+    """Standard deviation of the errors of the angles in --start [deg]."""
     hold: Positions = field(default_factory=dict)
     """Hold this joint at a known position [deg or m]; repeat for several."""
     packages: Packages = field(default_factory=dict)
     largest: bool = False
-    """Keep only the largest patch of each mask."""
+    """Keep only the largest connected region of each mask."""
 
     def __post_init__(self) -> None:
         take_single_names(self)
@@ -410,25 +411,25 @@ class MaskSettings:
             raise SettingsError(f"box must be 4 numbers, not {self.box}")
         ways = [one for one in ("background", "box", "model") if getattr(self, one) is not None]
         if len(ways) > 1:
-            text = f"--{ways[0]} and --{ways[1]} are two ways to find masks: give one"
+            text = f"--{ways[0]} and --{ways[1]} are two segmentation methods: give one"
             raise SettingsError(for_caller(text))
         if self.classes and ways:
-            text = f"--class is for COCO files, not for --{ways[0]}"
+            text = f"--class needs a COCO file and excludes --{ways[0]}"
             raise SettingsError(for_caller(text))
         if (self.model is None) != (self.start is None):
-            text = "--model and --start need each other: rough joint positions"
+            text = "--model and --start (rough joint positions) need each other"
             raise SettingsError(for_caller(text))
         if not (math.isfinite(self.start_error) and self.start_error > 0.0):
             text = "--start-error must be a positive number of degrees"
             raise SettingsError(for_caller(text))
 
     def as_json(self) -> Mapping[str, Any]:
-        """The settings that are not the default's, as plain JSON values."""
+        """Return the settings that are not at their defaults as plain JSON values."""
         return {name: plain(getattr(self, name)) for name in changed(self)}
 
 
 def changed(settings: Any) -> tuple[str, ...]:
-    """Returns the names of the settings that are not at their defaults."""
+    """Return the names of the settings that are not at their defaults."""
     return tuple(
         one.name
         for one in fields(settings)
@@ -437,7 +438,7 @@ def changed(settings: Any) -> tuple[str, ...]:
 
 
 def require_choices(settings: Any) -> None:
-    """Refuses what is none of a setting's choices, by a SettingsError that names those."""
+    """Raise a SettingsError that lists the choices if a setting is none of them."""
     for name, hint in get_type_hints(type(settings)).items():
         value = getattr(settings, name)
         if get_origin(hint) is Literal and value not in get_args(hint):
@@ -446,7 +447,7 @@ def require_choices(settings: Any) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Returns a setting's value as JSON has it: paths as texts, tuples as lists."""
+    """Return a setting as a plain JSON value: paths become strings, tuples lists."""
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""A result under way: each frame is written as it comes, what is made of all of them at the end."""
+"""Writing of a result folder: each frame as it is finished, files about all frames at the end."""
 
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -44,32 +44,34 @@ from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ, Scene
 
 OnFrame = Callable[[int, int, str, "FrameRecord | None"], None]
-"""Called with the number of finished frames, that of all frames, and a finished frame's name and
-record; once with "" and None before the first frame."""
+"""Called with the number of finished frames, the number of all frames, and the finished frame's
+name and record; once before the first frame, with "" and None."""
 
 OnStage = Callable[[str, int, int | None], None]
-"""Called with what is done, and how much of it is done of how much (None: not known)."""
+"""Called with the name of a stage, the work done, and all its work (None if unknown)."""
 
 Drawn = Mapping[str, tuple[np.ndarray, np.ndarray | None]]
-"""By camera, what an overlay is made of: a mask (H, W) or picture (H, W, 3), and which part of the
-body is seen (H, W), -1 where none is; None where no pose was found."""
+"""Content of overlays by camera: a mask (H, W) or picture (H, W, 3), and the index of the body's
+node at each pixel (H, W), -1 outside the body; None if no pose was found."""
 
 
 class ResultWriter:
-    """A result under way.
+    """Writes the result of an estimate.
 
     Attributes:
-        records: of the finished frames, by name, those of an earlier job among them.
-        more: what the method adds to summary.json.
-        warnings: what the user should know.
+        records: finished frames by name, including those of an earlier job.
+        more: entries of the method for summary.json.
+        warnings: messages for the user.
 
     Args:
-        scene: what the cameras see that are used.
+        scene: the scene, with the cameras that are used.
+        model: the model of the positions.
         job: from describe_job.
-        folder: the result's; None writes nothing.
-        earlier: the summary of the job that is resumed, if one is.
-        with_base: whether the base's pose is written too.
-        frames: those that are asked for.
+        folder: the result folder; None writes nothing.
+        earlier: summary of the job to be resumed; None for a new job.
+        with_base: whether the base's pose is written, too.
+        frames: frames to be estimated.
+        warnings: warnings so far.
 
     Raises:
         OutputError: the folder cannot be written or resumed.
@@ -95,18 +97,18 @@ class ResultWriter:
         if folder is not None:
             self._table = PoseTable(folder, model.position_names, with_base)
         earlier = earlier or {}
-        # What a method says of a whole recording.
+        # Estimates for the whole recording, which frames of a resumed job do not repeat.
         kept = ("lengths_m", "radius_scales", "unseen", "proportions", "body_fit_seconds")
         self.more = {name: earlier[name] for name in kept if name in earlier}
         if not earlier or self._table is None:
             return
         self.records = {one.frame: one for one in self._table.read(earlier.get("frames"))}
-        # Frames whose masks are not known to be those they were made from are forgotten.
+        # Frames whose mask files have changed, or have no digest, are estimated again.
         gone = [f for f, record in self.records.items() if self._digests(f) != record.masks]
         if others := set(gone) - set(frames):
             raise OutputError(
                 f"frame {frame_ranges(others, scene.frames)}: the masks were replaced since "
-                "it was finished; have it estimated again, too, or name another folder"
+                "it was finished; estimate it again as well, or choose another folder"
             )
         for frame in gone:
             del self.records[frame]
@@ -120,7 +122,7 @@ class ResultWriter:
         return mask_digests(self.scene, self.scene.cameras, frame)
 
     def begin(self) -> None:
-        """Begin the folder, which is not complete until all is written."""
+        """Write poses.csv and an incomplete summary.json before the first frame."""
         if self._table is not None:
             self._table.write(self.records.values())
         self.write_summary()
@@ -131,7 +133,13 @@ class ResultWriter:
         asked: Collection[str],
         on_frame: OnFrame | None,
     ) -> None:
-        """Write frames as they come, each at once, of those that are asked for."""
+        """Write each frame, with its overlays, as soon as it is estimated.
+
+        Args:
+            frames: records and overlay contents, in order.
+            asked: names of all frames to be estimated.
+            on_frame: called after each frame.
+        """
         finished = sum(frame in self.records for frame in asked)
         if on_frame is not None:
             on_frame(finished, len(asked), "", None)
@@ -149,7 +157,7 @@ class ResultWriter:
                 on_frame(count, len(asked), record.frame, self.records[record.frame])
 
     def add(self, record: FrameRecord) -> None:
-        """Write a frame. Finished is what has its row in poses.csv; all else comes before."""
+        """Write a frame's row of poses.csv, which marks it as finished."""
         if self._table is not None:
             self._table.append(record)
         self.records[record.frame] = replace(record, masks=self._digests(record.frame))
@@ -157,12 +165,12 @@ class ResultWriter:
             self.write_summary()
 
     def write(self, name: str, content: bytes | str) -> None:
-        """Write another file of the result."""
+        """Write another file of the result, by its path in the folder."""
         if self.folder is not None:
             write_file(self.folder, name, content)
 
     def finish(self, replay: bool) -> None:
-        """Write what is made of all frames; then the result is complete."""
+        """Write the files about all frames and mark the result as complete."""
         records = self.result().records
         self.warnings += frame_warnings(records)
         self.warnings += camera_warnings(records, self.warnings)
@@ -183,7 +191,12 @@ class ResultWriter:
         self._complete = True
 
     def _replay(self, found: Sequence[FrameRecord], period: float) -> str:
-        """The replay of the frames with a pose; positions that were measured stand as a ghost."""
+        """Return the page replay.html of the frames with a pose; a ghost shows measured positions.
+
+        Args:
+            found: records with a pose.
+            period: time between two frames [s].
+        """
         q, measured = np.array([one.q for one in found]), measured_positions(self.model, found)
         ghost = None if np.isnan(measured).all() else np.where(np.isnan(measured), q, measured)
         scales = {
@@ -202,7 +215,7 @@ class ResultWriter:
         return make_replay(self.model, q, X_WB, cameras, period, ghost)
 
     def result(self) -> SceneEstimate:
-        """What came out, in the scene's order, the frames of an earlier job among it."""
+        """Return the estimate so far, in the scene's order, including frames of an earlier job."""
         records = {f: self.records[f] for f in self.scene.frames if f in self.records}
         more = {**self.more, "warnings": self.warnings}
         if self.scene.frame_rate_hz is not None:
@@ -214,7 +227,7 @@ class ResultWriter:
         )  # fmt: skip
 
     def write_summary(self) -> None:
-        """Write summary.json and the tables of joints, whatever there is by now."""
+        """Write summary.json, joints.csv and modes.csv of the frames finished so far."""
         if self.folder is None:
             return
         begin = time.monotonic()

@@ -83,7 +83,7 @@ def test_a_folder_that_holds_something_or_cannot_be_is_refused(tmp_path):
         (tmp_path, "not empty.*--resume"),
         (tmp_path / "out", "out: is a file"),
         (tmp_path / "out" / "deeper", "out: is a file"),
-        (tmp_path / "link", "link: is a link that leads nowhere"),
+        (tmp_path / "link", "link: is a broken link"),
         (tmp_path / ("a" * 300), "aaa: cannot be written: File name too long"),
     ):
         with pytest.raises(OutputError, match=message), claimed(place):

@@ -235,7 +235,7 @@ def test_frames_without_a_pose_are_filled_by_the_last_known_one():
     for name, places in gaps.places().items():
         expected = whole.places()[name][[1, 1, 2, 2, 2, 5]]
         np.testing.assert_allclose(places, expected, atol=0.01)
-    with pytest.raises(SettingsError, match="a frame with a pose"):
+    with pytest.raises(SettingsError, match="one frame with a pose"):
         motion_as_bvh(model, np.full_like(q, np.nan), None, RATE_HZ)
 
 

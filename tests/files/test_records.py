@@ -130,7 +130,7 @@ def test_a_bad_fit_says_what_stands_at_a_limit_and_what_was_held(model):
     assert "(bend at a limit)" in told(2.0, 0.25)[0]
     assert "(bend at a limit)" in told(1.0005, 0.4)[0]
     assert "at a limit" not in told(1.5, 0.4)[0]
-    assert "what is held (reach)" in told(1.5, 0.4)[0]
+    assert "the held positions (reach)" in told(1.5, 0.4)[0]
 
 
 def test_an_overlay_gives_shares_of_the_silhouette(monkeypatch):

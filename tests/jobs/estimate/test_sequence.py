@@ -148,8 +148,8 @@ def test_cameras_that_are_exchanged_or_moved(scene: TinyScene) -> None:
 def test_what_keeps_the_truth_out(scene: TinyScene, tmp_path: Path) -> None:
     (text,) = warnings_of(scene, hold={"lift": 80.0})
     assert "frame 0000-0001 (of 2, E_total " in text
-    assert "the pose explains the pictures badly" in text
-    assert "what is held (lift)" in text
+    assert "the pose fits the pictures badly" in text
+    assert "the held positions (lift)" in text
     model = tmp_path / "stiff.urdf"
     model.write_text(URDF.replace('lower="-1.6" upper="1.6"', 'lower="1.2" upper="1.6"'))
     *_, text = warnings_of(scene, model)

@@ -109,8 +109,8 @@ def test_light_that_changed_and_pictures_of_another_size_are_named(pictures, tmp
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"background": "median", "box": (1, 2, 3, 4)}, "two ways"),
-        ({"background": "median", "classes": ("1",)}, "classes is for COCO"),
+        ({"background": "median", "box": (1, 2, 3, 4)}, "two segmentation methods"),
+        ({"background": "median", "classes": ("1",)}, "classes needs a COCO file"),
         ({"box": (1, 2, 3)}, "4 numbers"),
     ],
 )

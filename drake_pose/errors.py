@@ -69,17 +69,17 @@ def listed(names: Sequence[str], most: int = 5) -> str:
     return ", ".join(names[:most]) + more
 
 
-_typed: ContextVar[bool] = ContextVar("typed", default=False)
+_options_kept: ContextVar[bool] = ContextVar("options_kept", default=False)
 
 
 @contextmanager
 def options_in_messages() -> Iterator[None]:
     """Keep the names of command-line options in messages while the command line runs."""
-    token = _typed.set(True)
+    token = _options_kept.set(True)
     try:
         yield
     finally:
-        _typed.reset(token)
+        _options_kept.reset(token)
 
 
 def for_caller(text: str) -> str:
@@ -88,7 +88,7 @@ def for_caller(text: str) -> str:
     ``--joints FILE`` becomes ``joints=FILE``, ``--camera`` becomes ``cameras``. Quoted commands
     (``drake-pose ...``) stay unchanged.
     """
-    if _typed.get():
+    if _options_kept.get():
         return text
     names = {"camera": "cameras", "frame": "frames", "class": "classes", "export": "exports"}
     names |= {"package": "packages", "no-track": "track=False"}

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array, Indices, Picture
 from drake_pose.camera.calibration_files import lens_of
-from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending
+from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending_indices
 from drake_pose.camera.models import Lens
 from drake_pose.camera.picture_files import decode_colours, import_reader
 from drake_pose.errors import CameraError, DrakePoseError, SceneError
@@ -158,7 +158,7 @@ def _ordered_times(rows: Sequence[_Row], what: str, warnings: list[str]) -> tupl
     if clock:
         warnings.append(f"{what}: headers without time stamps: the times of recording are used")
     times = 1e-9 * stamps[:, clock]
-    kept, late = ascending(times, what)
+    kept, late = ascending_indices(times, what)
     warnings += late
     return times[kept], kept
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from drake_pose.arrays import Array, Picture
-from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending
+from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending_indices
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.camera.picture_files import TimedVideo, decode_colours, import_reader
 from drake_pose.errors import SceneError, UnknownNameError, listed
@@ -49,7 +49,7 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
         table = parquet.read_table(file, columns=wanted, filters=filters)
         columns = {key: table[key].to_pylist() for key in wanted}
         times = np.array(columns["timestamp"], dtype=np.float64).ravel()
-        kept, warnings = ascending(times, f"{file}: episode {number}")
+        kept, warnings = ascending_indices(times, f"{file}: episode {number}")
         if joints is None and states:
             values = [np.array(columns[key], dtype=np.float64) for key in states]
             positions = np.column_stack([one.reshape(len(times), -1) for one in values])
@@ -225,7 +225,7 @@ def open_droid(path: Path, joints: JointLog | None) -> Episode:
                 )
             )
             times = 1e-3 * 0.5 * (start + end)
-            kept, warnings = ascending(times, f"{where}: rows")
+            kept, warnings = ascending_indices(times, f"{where}: rows")
             names = (*(f"joint{k + 1}" for k in range(arm.shape[1])), "gripper_position")
             own = JointLog(names, times[kept], np.column_stack([arm, gripper])[kept])
             for video in sorted(folder.glob("*.mp4")):
@@ -269,7 +269,7 @@ def _zed_cameras(
     """
     video, serial = TimedVideo(path), path.stem.removesuffix("-stereo")
     times = _picture_times(file, path, serial, len(video.times), warnings)
-    kept, late = ascending(times, f"{path}: pictures")
+    kept, late = ascending_indices(times, f"{path}: pictures")
     hand = file.get(f"observation/camera_type/{serial}")
     if hand is not None and not np.any(hand[()]):
         late.append(f"camera '{serial}' is the hand's (camera_type 0): it rides on the arm")

@@ -70,7 +70,7 @@ class EpisodeCamera:
         camera: calibrated camera of the undistorted images, if recorded. Its X_WC is the pose in
             ``link``; without a link the pose is unknown.
         link: link on which the camera is mounted, named as in the recording.
-        recorded: returns image k (H, W, 3) as recorded.
+        read_recorded: returns image k (H, W, 3) as recorded.
         frames: (n,) names of the images, if they have names.
         lens: lens that undistorts the images.
     """
@@ -81,7 +81,7 @@ class EpisodeCamera:
     times: Array
     camera: PinholeCamera | None
     link: str | None
-    recorded: Callable[[int], Picture]
+    read_recorded: Callable[[int], Picture]
     frames: tuple[str, ...] = ()
     lens: Lens | None = None
 
@@ -94,7 +94,7 @@ class EpisodeCamera:
         where, last = f"camera '{self.name}'", len(self.times) - 1
         if not 0 <= k <= last:
             raise SceneError(f"{where} has no picture {k}, but 0 to {last}")
-        picture = self.recorded(k)
+        picture = self.read_recorded(k)
         if picture.shape != (self.height, self.width, 3):
             raise SceneError(
                 f"{where}, picture {k}: has {picture.shape[1]} x {picture.shape[0]} pixels (width "
@@ -125,7 +125,7 @@ class Episode:
         path: Path,
         cameras: Iterable[EpisodeCamera],
         joints: JointLog | None,
-        said: Iterable[str] = (),
+        reader_warnings: Iterable[str] = (),
     ) -> "Episode":
         """Return an episode; warnings about its times and positions are appended to given ones.
 
@@ -133,12 +133,12 @@ class Episode:
             path: file or folder of the recording.
             cameras: the cameras.
             joints: the joint log.
-            said: warnings of the reader.
+            reader_warnings: warnings of the reader.
 
         Raises:
             SceneError: there is no camera or no row, or images cannot be associated with rows.
         """
-        found, warnings = {camera.name: camera for camera in cameras}, list(said)
+        found, warnings = {camera.name: camera for camera in cameras}, list(reader_warnings)
         if not found:
             raise SceneError(f"{path}: holds no camera's pictures {'; '.join(warnings)}".rstrip())
         for name, camera in found.items():
@@ -172,7 +172,9 @@ class Episode:
         return self.cameras[name]
 
 
-def ascending(times: Array, what: str, max_fraction: float = 0.1) -> tuple[Indices, list[str]]:
+def ascending_indices(
+    times: Array, what: str, max_fraction: float = 0.1
+) -> tuple[Indices, list[str]]:
     """Return the indices of time stamps later than all before them, and a warning of the others.
 
     Args:

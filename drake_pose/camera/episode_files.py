@@ -13,7 +13,7 @@ from drake_pose.arrays import Picture
 from drake_pose.camera.bags import BAGS, open_bag
 from drake_pose.camera.camera_files import CameraFile, load_camera_file
 from drake_pose.camera.data_sets import INFO, TRAJECTORY, open_droid, open_lerobot
-from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending
+from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending_indices
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.camera.picture_files import (
     VIDEOS,
@@ -64,7 +64,7 @@ def read_joint_table(path: Path) -> tuple[JointLog, list[str]]:
     positions = np.column_stack([values[name] for name in names])
     if "time" not in values:
         return JointLog(names, None, positions, frames), []
-    kept, warnings = ascending(values["time"], f"{path}: rows")
+    kept, warnings = ascending_indices(values["time"], f"{path}: rows")
     frames = tuple(frames[k] for k in kept) if frames else ()
     return JointLog(names, values["time"][kept], positions[kept], frames), warnings
 
@@ -124,7 +124,7 @@ def _image_camera(
                 f"the first is {lacking[0]}"
             )
         common = [frame for frame in known if frame in files]
-        kept, late = ascending(np.array([known[frame] for frame in common]), str(stamps))
+        kept, late = ascending_indices(np.array([known[frame] for frame in common]), str(stamps))
         frames = tuple(common[k] for k in kept)
         times, warnings = np.array([known[frame] for frame in frames]), warnings + late
     elif joints is not None and joints.times is not None and joints.frames:

@@ -35,32 +35,34 @@ class BackgroundModel:
     """Colour distributions of a body and of its background.
 
     Args:
-        shown, like_body: fraction of pixels that look like their background where the background is
-            visible, and where the body covers it.
+        visible_match, covered_match: fraction of pixels that look like their background where the
+            background is visible, and where the body covers it.
         log_peak: logarithm of the likelihood ratio of a background's own colour to any colour.
-        known_times: factor of this ratio where a pixel's background is known.
-        exact: colours within this many standard deviations are as likely as the background's own.
-        same: colours within this many standard deviations belong to the background.
-        shaken: standard deviation of the image shift caused by camera shake [pixel].
+        known_factor: factor of this ratio where a pixel's background is known.
+        core_deviations: colours within this many standard deviations are as likely as the
+            background's own.
+        match_deviations: colours within this many standard deviations belong to the background.
+        shake: standard deviation of the image shift caused by camera shake [pixel].
         min_noise: minimum standard deviation of a colour [of 255].
-        near: half width of the strip along a contour in which either side may be visible [pixel].
+        margin: half width of the strip along a contour in which either side may be visible [pixel].
         max_log_odds: log-odds are clipped to this magnitude.
-        unseen: added to relative colour frequencies, so that an unobserved colour stays possible.
-        max_frequent: maximum of a relative colour frequency (1: all colours equally frequent).
+        base_frequency: added to relative colour frequencies, so that an unobserved colour stays
+            possible.
+        max_frequency: maximum of a relative colour frequency (1: all colours equally frequent).
     """
 
-    shown: float = 0.92
-    like_body: float = 0.25
+    visible_match: float = 0.92
+    covered_match: float = 0.25
     log_peak: float = 4.0
-    known_times: float = 20.0
-    exact: float = 1.5
-    same: float = 3.0
-    shaken: float = 0.15
+    known_factor: float = 20.0
+    core_deviations: float = 1.5
+    match_deviations: float = 3.0
+    shake: float = 0.15
     min_noise: float = 1.5
-    near: int = 3
+    margin: int = 3
     max_log_odds: float = 8.0
-    unseen: float = 0.1
-    max_frequent: float = 60.0
+    base_frequency: float = 0.1
+    max_frequency: float = 60.0
 
 
 MODEL = BackgroundModel()
@@ -106,15 +108,15 @@ class PixelSums(NamedTuple):
     """Log-likelihoods of each pixel, from which ``explain`` scores poses.
 
     Attributes:
-        shown: (H, W, 3) log-likelihoods of the three backgrounds if no frame is covered.
-        more: (H, W, f, 3) change of each log-likelihood if a frame is covered.
-        none: (H, W) maximum of ``shown``.
+        visible: (H, W, 3) log-likelihoods of the three backgrounds if no frame is covered.
+        covered: (H, W, f, 3) change of each log-likelihood if a frame is covered.
+        uncovered: (H, W) maximum of ``visible``.
         edges: (2, f, H, W) strength of edges across u and v in each frame, minus its mean.
     """
 
-    shown: Floats
-    more: Floats
-    none: Floats
+    visible: Floats
+    covered: Floats
+    uncovered: Floats
     edges: Floats
 
 
@@ -135,7 +137,7 @@ class Backgrounds:
     deviations: Floats
 
     @staticmethod
-    def of(pictures: Picture) -> "Backgrounds":
+    def estimate(pictures: Picture) -> "Backgrounds":
         """Estimate the backgrounds of images (f, H, W, 3) red, green, blue."""
         floats = pictures.astype(np.float32)
         reference = np.median(floats, axis=0)
@@ -156,8 +158,10 @@ class Backgrounds:
         for f, picture in enumerate(self.pictures):
             likeness = [_likeness(picture, one, self.deviations) for one in self.colours]
             stacked = np.stack(likeness, axis=-1)
-            shown = np.log(MODEL.shown * stacked + (1.0 - MODEL.shown))
-            more[:, :, f] = np.log(MODEL.like_body * stacked + (1.0 - MODEL.like_body)) - shown
+            shown = np.log(MODEL.visible_match * stacked + (1.0 - MODEL.visible_match))
+            more[:, :, f] = (
+                np.log(MODEL.covered_match * stacked + (1.0 - MODEL.covered_match)) - shown
+            )
             total += shown
             u, v = (_largest(np.abs(one)) for one in _slopes(picture))
             # Strength saturates at four standard deviations of the noise. An edge crosses an axis
@@ -169,34 +173,34 @@ class Backgrounds:
         return PixelSums(total, more, _largest(total), edges - edges.mean())
 
     @cached_property
-    def possible(self) -> float:
+    def max_gain(self) -> float:
         """Upper bound of the log-likelihood gain over all sets of covered frames."""
         sums = self.sums
-        best = _largest(sums.shown + np.maximum(sums.more, 0.0).sum(axis=2))
-        return float(np.maximum(best - sums.none, 0.0).sum())
+        best = _largest(sums.visible + np.maximum(sums.covered, 0.0).sum(axis=2))
+        return float(np.maximum(best - sums.uncovered, 0.0).sum())
 
-    def changes(self) -> Floats:
+    def changed_frames(self) -> Floats:
         """Return (H, W) the number of frames that differ from the most frequent background."""
-        found = np.zeros(self.pictures.shape[1:3], np.float32)
+        counts = np.zeros(self.pictures.shape[1:3], np.float32)
         for picture in self.pictures:
             likeness = _likeness(picture, self.colours[0], self.deviations)
-            share = cv2.blur(1.0 - likeness / np.float32(np.exp(MODEL.log_peak)), (3, 3))
-            found += np.where(share > 0.5, share, 0.0)
-        return found
+            difference = cv2.blur(1.0 - likeness / np.float32(np.exp(MODEL.log_peak)), (3, 3))
+            counts += np.where(difference > 0.5, difference, 0.0)
+        return counts
 
-    def showing(self, covered: Mask) -> Mask:
+    def shows_background(self, covered: Mask) -> Mask:
         """Return (f, H, W) whether a frame shows the likeliest background of a pixel.
 
         Args:
             covered: (f, H, W) approximate silhouettes of the body.
         """
-        totals = self.sums.shown.copy()
+        totals = self.sums.visible.copy()
         for f, own in enumerate(covered):
-            np.add(totals, self.sums.more[:, :, f], out=totals, where=own[..., None])
+            np.add(totals, self.sums.covered[:, :, f], out=totals, where=own[..., None])
         best = totals.argmax(axis=-1)[None, ..., None]
         colours = np.take_along_axis(self.colours, best, axis=0)[0]
         deviation = _largest(np.abs(self.pictures - colours)) / self.deviations
-        return np.asarray((deviation < MODEL.same) & ~_grown(covered, MODEL.near))
+        return np.asarray((deviation < MODEL.match_deviations) & ~_grown(covered, MODEL.margin))
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,7 +222,7 @@ class KnownBackground:
     beside: Floats
 
     @staticmethod
-    def of(
+    def estimate(
         pictures: Sequence[Picture], gains: Sequence[Floats], showing: Mask, covered: Mask
     ) -> "KnownBackground":
         """Estimate the background from images of any size.
@@ -232,7 +236,7 @@ class KnownBackground:
         height, width = covered.shape[1:]
         total, count = np.zeros((height, width, 3), np.float32), np.zeros((height, width))
         on, beside = (np.zeros(COLOURS) for _ in range(2))
-        inside, near = ~_grown(~covered, MODEL.near), _grown(covered, MODEL.near)
+        inside, near = ~_grown(~covered, MODEL.margin), _grown(covered, MODEL.margin)
         small, means = [], []
         for f, (picture, gain) in enumerate(zip(pictures, gains, strict=True)):
             even = apply_gain(picture, gain)
@@ -263,27 +267,27 @@ class KnownBackground:
         """
         even = apply_gain(picture, gain)
         numbers = colour_numbers(np.clip(even, 0.0, 255.0).astype(np.uint8))
-        likeness = _likeness(even, self.colours, self.deviations) * np.float32(MODEL.known_times)
-        shown = np.log(MODEL.shown * likeness + (1.0 - MODEL.shown))
+        likeness = _likeness(even, self.colours, self.deviations) * np.float32(MODEL.known_factor)
+        shown = np.log(MODEL.visible_match * likeness + (1.0 - MODEL.visible_match))
         return np.asarray(self.on[numbers] - np.where(self.unseen, self.beside[numbers], shown))
 
 
 def foreground_picture(foreground: Floats) -> Picture:
     """Return an image (H, W, 3) that encodes log-odds (H, W), see ``foreground_of_colours``."""
-    most = MODEL.max_log_odds
-    share = (np.clip(foreground, -most, most) + most) / (2.0 * most)
-    number = np.rint(share * (COLOURS - 1)).astype(np.uint16)
+    limit = MODEL.max_log_odds
+    fraction = (np.clip(foreground, -limit, limit) + limit) / (2.0 * limit)
+    number = np.rint(fraction * (COLOURS - 1)).astype(np.uint16)
     channels = (number >> 8, (number >> 4) & 15, number & 15)
     return np.stack([(one << 4).astype(np.uint8) for one in channels], axis=-1)
 
 
 def foreground_of_colours(nodes: int) -> Floats:
     """Return (nodes, 3, COLOURS) tables with which `compare_lines` decodes a foreground_picture."""
-    known = np.zeros((nodes, len(Colour), COLOURS), np.float32)
-    known[:, Colour.FOREGROUND] = np.exp(
+    tables = np.zeros((nodes, len(Colour), COLOURS), np.float32)
+    tables[:, Colour.FOREGROUND] = np.exp(
         np.linspace(-MODEL.max_log_odds, MODEL.max_log_odds, COLOURS)
     )
-    return known
+    return tables
 
 
 def mask_of_foreground(
@@ -297,7 +301,7 @@ def mask_of_foreground(
         smooth: standard deviation of the Gaussian that smooths the log-odds [pixel].
         reach: the mask stays within this distance of ``covered`` [square root of its area].
     """
-    limit = max(MODEL.near, round(reach * float(np.sqrt(np.count_nonzero(covered)))))
+    limit = max(MODEL.margin, round(reach * float(np.sqrt(np.count_nonzero(covered)))))
     near = _grown(covered[None], limit)[0]
     found = ((cv2.GaussianBlur(foreground, (0, 0), smooth) > 0.0) & near).astype(np.uint8)
     found = cv2.morphologyEx(found, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
@@ -325,7 +329,7 @@ def _deviations(picture: Floats, noise: float) -> Floats:
     """
     gradient = _largest(np.hypot(*_slopes(picture)))
     white = max(MODEL.min_noise, noise)
-    return np.sqrt(white**2 + (MODEL.shaken * gradient) ** 2).astype(np.float32)
+    return np.sqrt(white**2 + (MODEL.shake * gradient) ** 2).astype(np.float32)
 
 
 def _grown(masks: Mask, by: int) -> Mask:
@@ -342,7 +346,7 @@ def _likeness(pictures: Floats, colours: Floats, deviations: Floats) -> Floats:
         colours, deviations: (H, W, 3) background and (H, W) its standard deviations.
     """
     deviation = _largest(np.abs(pictures - colours)) / deviations
-    beyond = np.maximum(deviation - MODEL.exact, 0.0)
+    beyond = np.maximum(deviation - MODEL.core_deviations, 0.0)
     return np.asarray(np.exp(MODEL.log_peak - 0.5 * beyond**2), np.float32)
 
 
@@ -356,7 +360,7 @@ def _log_frequencies(numbers: Array) -> Floats:
     for axis in range(3):
         counts = convolve1d(counts, [0.25, 0.5, 0.25], axis, mode="nearest")
     times = COLOURS * counts.ravel() / max(float(counts.sum()), 1.0)
-    return np.log(np.minimum(times, MODEL.max_frequent) + MODEL.unseen).astype(np.float32)
+    return np.log(np.minimum(times, MODEL.max_frequency) + MODEL.base_frequency).astype(np.float32)
 
 
 def _find_colours(pictures: Floats, deviations: Floats, rows: int = 8) -> Floats:
@@ -376,18 +380,18 @@ def _find_colours(pictures: Floats, deviations: Floats, rows: int = 8) -> Floats
         for f, picture in enumerate(own):
             deviation[f, f:] = _largest(np.abs(own[f:] - picture)) / deviations[k : k + rows]
             deviation[f:, f] = deviation[f, f:]
-        close = deviation < MODEL.same
+        close = deviation < MODEL.match_deviations
         # Among colours with equally many supporters prefer the closer ones.
         support = np.where(close, np.float32(1.0) - np.float32(0.01) * deviation, np.float32(0.0))
-        left, found = np.ones(own.shape[:3], bool), list[Floats]()
+        remaining, found = np.ones(own.shape[:3], bool), list[Floats]()
         for _ in range(3):
-            totals = np.einsum("fghw,ghw->fhw", support, left.astype(np.float32))
-            best = np.where(left, totals, -1.0).argmax(axis=0)
-            shared = np.take_along_axis(close, best[None, None], axis=0)[0] & left
+            totals = np.einsum("fghw,ghw->fhw", support, remaining.astype(np.float32))
+            best = np.where(remaining, totals, -1.0).argmax(axis=0)
+            shared = np.take_along_axis(close, best[None, None], axis=0)[0] & remaining
             number = shared.sum(axis=0)[..., None]
             mean = (own * shared[..., None]).sum(axis=0) / np.maximum(number, 1)
             found.append(np.where(number > 0, mean, found[0] if found else mean).astype(np.float32))
-            left &= ~shared
+            remaining &= ~shared
         strips.append(np.array(found))
     return np.concatenate(strips, axis=1)
 
@@ -436,7 +440,7 @@ def explain(
     Returns:
         (4,) sums by ``Explained``, and (squares, squares) the gain of each tile.
     """
-    height, width = sums.none.shape
+    height, width = sums.uncovered.shape
     frames, one = X_CN.shape[0], np.uint64(1)
     totals, tiles = np.zeros(4), np.zeros((squares, squares))
     words = np.zeros((height, width), dtype=np.uint64)
@@ -460,17 +464,17 @@ def explain(
                 continue
             covered = word & every
             if covered != 0:
-                a, b, c = sums.shown[row, column]
-                left, f = covered, 0
-                while left != 0:
-                    if left & one:
+                a, b, c = sums.visible[row, column]
+                remaining, f = covered, 0
+                while remaining != 0:
+                    if remaining & one:
                         totals[Explained.AREA] += 1.0
-                        a += sums.more[row, column, f, 0]
-                        b += sums.more[row, column, f, 1]
-                        c += sums.more[row, column, f, 2]
-                    left >>= one
+                        a += sums.covered[row, column, f, 0]
+                        b += sums.covered[row, column, f, 1]
+                        c += sums.covered[row, column, f, 2]
+                    remaining >>= one
                     f += 1
-                gain = max(a, b, c) - sums.none[row, column]
+                gain = max(a, b, c) - sums.uncovered[row, column]
                 if covered == every:
                     gain = always_covered * max(gain, 0.0)
                 totals[Explained.GAIN] += gain
@@ -481,9 +485,9 @@ def explain(
             above = words[row - 1, column] if row > 0 else word
             below = words[row + 1, column] if row < height - 1 else word
             across_u, across_v = word & ~(left_of & right_of), word & ~(above & below)
-            left, f = across_u | across_v, 0
-            while left != 0:
-                if left & one:
+            remaining, f = across_u | across_v, 0
+            while remaining != 0:
+                if remaining & one:
                     strength = -np.inf
                     if across_u >> np.uint64(f) & one:
                         strength = sums.edges[0, f % frames, row, column]
@@ -491,6 +495,6 @@ def explain(
                         strength = max(strength, sums.edges[1, f % frames, row, column])
                     totals[Explained.CONTOUR] += strength
                     totals[Explained.OUTLINE] += 1.0
-                left >>= one
+                remaining >>= one
                 f += 1
     return totals, tiles

@@ -61,36 +61,36 @@ class LineSettings(NamedTuple):
         offsets: number of edge offsets evaluated along a line.
         blocks: number of blocks of pixels on either side of the contour: four beyond the last
             offset.
-        pixels: maximum number of pixels sampled per block.
+        pixels_per_block: maximum number of pixels sampled per block.
         blocks_across: minimum number of blocks across the thinnest part, where blocks are larger
             than a pixel.
         trust: maximum excess over 1/2 of the probability that a block lies on the side its colours
             suggest.
-        speaks: a line is used if the variance of a uniform offset exceeds the edge's variance by
-            this factor.
+        min_variance_ratio: a line is used if the variance of a uniform offset exceeds the edge's
+            variance by this factor.
         spacing: distance between lines along the contour [pixel], at a step of one pixel.
         correlation: length of contour over which the errors of lines are correlated [pixel].
         steps: distance between offsets in successive rounds [pixel]; the last value applies to all
             further rounds.
-        widths: widths of the strips inside and outside the contour in which colours are counted
-            [pixel].
-        rate: weight of a new frame's colours in the histograms.
-        agreeing: a line whose edge is further from the contour than this [pixel] does not update
-            the histograms.
+        strip_widths: widths of the strips inside and outside the contour in which colours are
+            counted [pixel].
+        learning_rate: weight of a new frame's colours in the histograms.
+        max_residual: a line whose edge is further from the contour than this [pixel] does not
+            update the histograms.
     """
 
     offsets: int = 12
     blocks: int = 9
-    pixels: int = 4
+    pixels_per_block: int = 4
     blocks_across: float = 6.0
     trust: float = 0.4
-    speaks: float = 1.15
+    min_variance_ratio: float = 1.15
     spacing: float = 2.0
     correlation: float = 5.0
     steps: tuple[int, int, int] = (4, 2, 1)
-    widths: tuple[float, float] = (16.0, 30.0)
-    rate: float = 0.1
-    agreeing: float = 2.5
+    strip_widths: tuple[float, float] = (16.0, 30.0)
+    learning_rate: float = 0.1
+    max_residual: float = 2.5
 
 
 LINES = LineSettings()
@@ -107,16 +107,16 @@ class PartColours:
     """Characteristic colours of a body's parts, learnt from any cameras at a known pose.
 
     Args:
-        known: (nodes, COLOURS) whether a colour is characteristic of a part.
-        usual: (nodes,) fraction of the part's pixels with these colours at that pose; nan: the part
-            was occluded.
+        is_own: (nodes, COLOURS) whether a colour is characteristic of a part.
+        usual_fractions: (nodes,) fraction of the part's pixels with these colours at that pose;
+            nan: the part was occluded.
     """
 
-    known: Mask
-    usual: Array
+    is_own: Mask
+    usual_fractions: Array
 
     @staticmethod
-    def learned(
+    def learn(
         histograms: Iterable[Floats],
         outlines: Sequence[Outline],
         X_WN: Array,
@@ -131,30 +131,30 @@ class PartColours:
             views: cameras and their images (H, W, 3).
         """
         # A characteristic colour covers at least this fraction of the part's pixels.
-        known = np.any([one[:, Colour.ON] > 4e-4 for one in histograms], axis=0)
-        own = PartColours(known, np.ones(len(known)))
-        return PartColours(known, own._shares(outlines, X_WN, views))
+        is_own = np.any([one[:, Colour.ON] > 4e-4 for one in histograms], axis=0)
+        own = PartColours(is_own, np.ones(len(is_own)))
+        return PartColours(is_own, own._fractions(outlines, X_WN, views))
 
-    def shown(
+    def relative_fractions(
         self, outlines: Sequence[Outline], X_WN: Array, views: Iterable[tuple[Camera, Picture]]
     ) -> Array:
-        """Return (nodes,) fraction of each part's pixels with its colours, relative to ``usual``.
+        """Return (nodes,) fraction of pixels with own colours, over the usual fraction.
 
         The values are divided by their median, because illumination changes affect all parts.
-        Arguments as for ``learned``.
+        Arguments as for ``learn``.
         """
-        frequencies = self._shares(outlines, X_WN, views) / self.usual
-        return np.asarray(frequencies / max(float(np.nanmedian([*frequencies, 1.0])), 1e-9))
+        fractions = self._fractions(outlines, X_WN, views) / self.usual_fractions
+        return np.asarray(fractions / max(float(np.nanmedian([*fractions, 1.0])), 1e-9))
 
-    def _shares(
+    def _fractions(
         self, outlines: Sequence[Outline], X_WN: Array, views: Iterable[tuple[Camera, Picture]]
     ) -> Array:
         counts = np.zeros((2, len(outlines)))
         for camera, picture in views:
             labels = draw_labels(outlines, range(1, 1 + len(outlines)), camera.X_CW @ X_WN, camera)
-            seen = labels > 0
-            parts = labels[seen] - 1
-            np.add.at(counts[0], parts, self.known[parts, colour_numbers(picture[seen])])
+            covered = labels > 0
+            parts = labels[covered] - 1
+            np.add.at(counts[0], parts, self.is_own[parts, colour_numbers(picture[covered])])
             np.add.at(counts[1], parts, 1.0)
         # A hundred visible pixels are needed to evaluate a part.
         return np.where(counts[1] < 100, np.nan, counts[0] / np.maximum(counts[1], 1.0))
@@ -167,9 +167,9 @@ def search_line_step(number: int) -> int:
 
 def uninformed_histograms(cameras: int, nodes: int) -> Floats:
     """Return uninformative histograms (cameras, nodes, 3, COLOURS): all colour ratios are one."""
-    known = np.zeros((cameras, nodes, len(Colour), COLOURS), dtype=np.float32)
-    known[:, :, Colour.FOREGROUND] = 1.0
-    return known
+    histograms = np.zeros((cameras, nodes, len(Colour), COLOURS), dtype=np.float32)
+    histograms[:, :, Colour.FOREGROUND] = 1.0
+    return histograms
 
 
 def check_picture(camera: Camera, picture: Picture) -> Picture:
@@ -242,13 +242,13 @@ def weigh_parts(
         noisiest: maximum standard deviation of a part's lines [pixel], so that the lines of a
             misplaced part still pull.
     """
-    shown = [c for c, picture in enumerate(pictures) if picture is not None]
-    squares, weight = (compared.sums[shown, :-1, k] for k in (Sum.SQUARES, Sum.WEIGHT))
+    active = [c for c, picture in enumerate(pictures) if picture is not None]
+    squares, weight = (compared.sums[active, :-1, k] for k in (Sum.SQUARES, Sum.WEIGHT))
     overall = max(deviation**2, float(squares.sum() / max(float(weight.sum()), 1e-12)))
     own = np.clip(squares / np.maximum(weight, 1e-12), deviation**2, noisiest**2)
-    share = np.sqrt(overall / own)
-    compared.A[shown] *= share[..., None, None]
-    compared.b[shown] *= share[..., None]
+    factor = np.sqrt(overall / own)
+    compared.A[active] *= factor[..., None, None]
+    compared.b[active] *= factor[..., None]
 
 
 def part_distances(sums: Array, closest: float = 0.7, shortest: float = 20.0) -> Array:
@@ -264,9 +264,9 @@ def part_distances(sums: Array, closest: float = 0.7, shortest: float = 20.0) ->
     """
     squares, weight, length = (sums[:, :-1, k] for k in (Sum.SQUARES, Sum.WEIGHT, Sum.COMPARED))
     own = np.maximum(closest**2, squares / np.maximum(weight, 1e-12))
-    told = length.sum(axis=0)
-    distances = np.sqrt(told / np.maximum((length / own).sum(axis=0), 1e-12))
-    return np.where(told >= shortest, distances, 0.0)
+    total_length = length.sum(axis=0)
+    distances = np.sqrt(total_length / np.maximum((length / own).sum(axis=0), 1e-12))
+    return np.where(total_length >= shortest, distances, 0.0)
 
 
 def update_histograms(
@@ -285,17 +285,19 @@ def update_histograms(
         histograms: histograms before the frame.
         pose_is_known: the pose is known: all lines are used, and the old histograms are discarded.
     """
-    known = histograms.copy()
+    updated = histograms.copy()
     packed = pack_cameras(cameras)
-    rate, agreeing = (1.0, math.inf) if pose_is_known else (LINES.rate, LINES.agreeing)
+    rate, max_residual = (
+        (1.0, math.inf) if pose_is_known else (LINES.learning_rate, LINES.max_residual)
+    )
     for c, picture in enumerate(pictures):
         if picture is not None:
             learn_colours(
-                placed.packed, placed.X_WN, (packed[0][c], packed[1][c]), picture, known[c],
-                LINES.spacing, np.array(LINES.widths), rate, agreeing, 0,
+                placed.packed, placed.X_WN, (packed[0][c], packed[1][c]), picture, updated[c],
+                LINES.spacing, np.array(LINES.strip_widths), rate, max_residual, 0,
                 np.zeros((0, 0), np.bool_),
             )  # fmt: skip
-    return known
+    return updated
 
 
 @compiled
@@ -389,18 +391,18 @@ def _find_edge(
     anywhere = (LINES.offsets**2 - 1) / 12.0
     # On a thin part, coarse blocks would reach across it and mix in what lies beyond.
     step = max(1, min(step, int(clearance[0] / LINES.blocks_across)))
-    pixels = min(step, LINES.pixels)
+    pixels = min(step, LINES.pixels_per_block)
     pixel_spacing = step / pixels
     for k in range(-LINES.blocks, LINES.blocks + 1):
-        foreground = 1.0
+        ratio = 1.0
         for pixel in range(pixels):
             r = k * step + pixel_spacing * (pixel + 0.5) - 0.5 * step
             colour = _colour(picture, uv[0] + r * normal[0], uv[1] + r * normal[1])
             if colour >= 0:
-                foreground *= histograms[Colour.FOREGROUND, colour]
-        share = foreground / (1.0 + foreground)
+                ratio *= histograms[Colour.FOREGROUND, colour]
+        probability = ratio / (1.0 + ratio)
         # Twice the excess over 1/2 of the probability that the block is on the body.
-        blocks[k + LINES.blocks] = 4.0 * LINES.trust * (share - 0.5)
+        blocks[k + LINES.blocks] = 4.0 * LINES.trust * (probability - 0.5)
     inner, outer = clearance[0] / step, clearance[1] / step
     # Cumulative likelihoods of the blocks before each one, on the body and beside it.
     on[0] = beside[0] = 1.0
@@ -430,7 +432,7 @@ def _find_edge(
     variance = max(second / total - mean * mean, 1.0 / 12.0)
     # Subtract the information of the window itself, which says 0 +- its width.
     information = 1.0 / variance - 1.0 / anywhere
-    if variance * LINES.speaks > anywhere:
+    if variance * LINES.min_variance_ratio > anywhere:
         return 0.0, -1.0
     edge = min(max(mean / variance / information, -0.5 * LINES.offsets), 0.5 * LINES.offsets)
     return edge * step, step * step / information
@@ -444,9 +446,9 @@ def learn_colours(
     picture: Picture,
     histograms: Floats,
     spacing: float,
-    widths: Array,
+    strip_widths: Array,
     rate: float,
-    agreeing: float,
+    max_residual: float,
     step: int,
     region: Mask,
     rare: float = 1e-4,
@@ -458,10 +460,11 @@ def learn_colours(
         packed, X_WN, camera, picture: as of `compare_lines`.
         histograms: (nodes, 3, COLOURS) histograms, changed.
         spacing: distance between search lines along the contour [pixel].
-        widths: (2,) widths of the strips inside and outside the contour that are counted [pixel].
+        strip_widths: (2,) widths of the strips inside and outside the contour that are counted
+            [pixel].
         rate: weight of the new colours; 1 where a node has no colours yet.
-        agreeing: a line whose edge is further from the contour than this is ignored [pixel]; inf:
-            no line is ignored.
+        max_residual: a line whose edge is further from the contour than this is ignored [pixel];
+            inf: no line is ignored.
         step: distance between offsets [pixel] of the lines that locate the edge, on both sides of
             which colours are then counted; 0: colours are counted on both sides of the contour.
         region: (H, W) known silhouette of the body, which decides what is on the body and what is
@@ -476,17 +479,17 @@ def learn_colours(
     scratch = np.empty((3, 2 * LINES.blocks + 2))
     for i in range(len(uv)):
         node, middle = nodes[i], 0.0
-        if agreeing < np.inf and not len(region):
+        if max_residual < np.inf and not len(region):
             edge, variance = _find_edge(
                 picture, histograms[node], uv[i], normals[i], clearances[i], max(step, 1), scratch
             )
-            if variance > 0.0 and abs(edge) > agreeing:
+            if variance > 0.0 and abs(edge) > max_residual:
                 continue
             if variance > 0.0 and step > 0:
                 middle = edge
         for side in range(2):
             sign = -1.0 if side == Colour.ON else 1.0
-            pixels = int(min(widths[side], clearances[i, side] - 1.0))
+            pixels = int(min(strip_widths[side], clearances[i, side] - 1.0))
             for k in range(1, pixels):
                 r = middle + sign * k
                 u, v = uv[i, 0] + r * normals[i, 0], uv[i, 1] + r * normals[i, 1]
@@ -507,9 +510,9 @@ def learn_colours(
             frequencies, total = histograms[node, side], totals[node, side]
             if total >= fewest:
                 # The first colours of a node replace the empty histogram.
-                share = rate if frequencies.any() else 1.0
+                weight = rate if frequencies.any() else 1.0
                 for colour in range(COLOURS):
-                    frequencies[colour] += share * (
+                    frequencies[colour] += weight * (
                         counts[node, side, colour] / total - frequencies[colour]
                     )
         for colour in range(COLOURS):

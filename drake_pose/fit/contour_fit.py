@@ -43,7 +43,7 @@ class Noise:
     correlation: float | Array = 0.06
 
     @classmethod
-    def of_a_pixel(cls, pixels: float | Array) -> "Noise":
+    def per_pixel(cls, pixels: float | Array) -> "Noise":
         """Return noise that gives each pixel of contour the weight one.
 
         pixels: unit of length [pixel], scalar or (cameras,).

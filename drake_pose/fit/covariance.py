@@ -56,8 +56,8 @@ class Distances(NamedTuple):
         X: (n, m) derivatives by the values.
         effects: (5, n, n) covariances of y for each error of ``ErrorSizes`` with unit size.
         information: (m, m) information about the values if all errors were independent.
-        bends: (n, 12 nodes) derivatives by deformations of the parts' surfaces, common to all
-            images.
+        surface_derivatives: (n, 12 nodes) derivatives by deformations of the parts' surfaces,
+            common to all images.
         pictures: (n,) index of the image.
         nuisances: per group (n, k) derivatives by nuisance parameters that are common to all images
             and not among the values, such as joint offsets; each by a unit of its group.
@@ -67,7 +67,7 @@ class Distances(NamedTuple):
     X: Array
     effects: Array
     information: Array
-    bends: Array
+    surface_derivatives: Array
     pictures: Indices
     nuisances: tuple[Array, ...] = ()
 
@@ -150,7 +150,7 @@ def distances_in_masks(
             by = (by * one.size * has_surface)[:, None] * mask[:, None]
             wider.append(one._replace(moves=np.concatenate([one.moves, by], axis=1)))
         pictures = wider
-    of, along, bends = _known_directions(outlines, pictures, max_count)
+    of, along, surface_derivatives = _known_directions(outlines, pictures, max_count)
     count = pictures[0].moves.shape[1]
     y, X, camera_rows = np.zeros(len(of)), np.zeros((len(of), count)), np.zeros((len(of), 6))
     information = np.zeros((count, count))
@@ -167,9 +167,9 @@ def distances_in_masks(
         active = moves @ symmetric(one.A) @ np.swapaxes(moves, 1, 2)
         information[np.ix_(own, own)] += active.sum(axis=0)
     same_picture, same_part = (of[:, None, k] == of[None, :, k] for k in range(2))
-    alike = bends @ bends.T * same_part
+    alike = surface_derivatives @ surface_derivatives.T * same_part
     view = _views(outlines, pictures)[of[:, 0], of[:, 1]]
-    directions = bends / np.linalg.norm(bends, axis=1, keepdims=True)
+    directions = surface_derivatives / np.linalg.norm(surface_derivatives, axis=1, keepdims=True)
     repeated = directions @ directions.T * same_part * (view[:, None] == view)
     of_part = of[:, 1, None] == np.arange(len(outlines))
     camera = camera_rows @ camera_rows.T * same_picture
@@ -178,7 +178,9 @@ def distances_in_masks(
         X=X,
         effects=np.array([np.eye(len(of)), repeated, alike, alike * same_picture, camera]),
         information=information,
-        bends=(of_part[:, :, None] * bends[:, None]).reshape(len(of), 12 * len(outlines)),
+        surface_derivatives=(of_part[:, :, None] * surface_derivatives[:, None]).reshape(
+            len(of), 12 * len(outlines)
+        ),
         pictures=of[:, 0],
     )
 
@@ -207,9 +209,11 @@ def _known_directions(
         root = np.sqrt(known)[:, None]
         along = np.einsum("rij,rj->ri", D[k], turned) / root
         found.append((known, np.full(len(k), c), visible[k], along, root * turned))
-    known, picture, part, along, bends = (np.concatenate(one) for one in zip(*found, strict=True))
+    known, picture, part, along, surface_derivatives = (
+        np.concatenate(one) for one in zip(*found, strict=True)
+    )
     best = np.argsort(-known, kind="stable")[:max_count]
-    return np.column_stack([picture, part])[best], along[best], bends[best]
+    return np.column_stack([picture, part])[best], along[best], surface_derivatives[best]
 
 
 def _views(outlines: Sequence[Outline], pictures: Sequence[ComparedMask]) -> Indices:
@@ -376,14 +380,16 @@ def nuisance_covariance(
     variances = np.repeat(np.square(sizes.nuisances), [Z.shape[1] for Z in residuals.nuisances])
     inverse = np.linalg.inv(distances_covariance(residuals, sizes) + (A * variances) @ A.T)
     VX, prior_information = inverse @ residuals.X, _prior_information(is_angle)
-    left = inverse @ residuals.y - VX @ np.linalg.solve(
+    weighted_residuals = inverse @ residuals.y - VX @ np.linalg.solve(
         residuals.X.T @ VX + prior_information, VX.T @ residuals.y
     )
-    likeliest = variances * (A.T @ left)
-    follow = np.linalg.solve(residuals.information + white * prior_information, residuals.X.T @ A)
-    bias = follow @ likeliest
-    without = residuals._replace(y=residuals.y - A @ likeliest, nuisances=())
-    return (follow * variances) @ follow.T + np.outer(bias, bias), without
+    estimates = variances * (A.T @ weighted_residuals)
+    sensitivities = np.linalg.solve(
+        residuals.information + white * prior_information, residuals.X.T @ A
+    )
+    bias = sensitivities @ estimates
+    without = residuals._replace(y=residuals.y - A @ estimates, nuisances=())
+    return (sensitivities * variances) @ sensitivities.T + np.outer(bias, bias), without
 
 
 @_on_one_thread
@@ -407,14 +413,14 @@ def _prior_information(is_angle: Mask) -> Array:
     return np.diag(12.0 / np.where(is_angle, 2.0 * np.pi, 10.0) ** 2)
 
 
-def vuong_statistic(pieces: Array, others: Array) -> float:
+def vuong_statistic(tiles: Array, others: Array) -> float:
     """Return by how many standard deviations a cost exceeds another one (Vuong's test, 1989).
 
     The scatter of the differences between tiles gives the standard deviation of their sum. Evidence
     that no pose explains contributes equally to both costs and cancels.
 
     Args:
-        pieces, others: costs of both in the same image tiles, any shape.
+        tiles, others: costs of both in the same image tiles, any shape.
     """
-    more = pieces - others
+    more = tiles - others
     return float(more.sum() / max(np.sqrt(float((more**2).sum())), 1e-9))

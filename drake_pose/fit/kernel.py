@@ -67,12 +67,13 @@ def match_points(
         left, right = min(left, other_uv[j, 0]), max(right, other_uv[j, 0])
         top, bottom = min(top, other_uv[j, 1]), max(bottom, other_uv[j, 1])
     side = max(reach / 8.0, max(right - left, bottom - top) / max_cells)
-    share = 1.0 / side
-    columns, rows = int((right - left) * share) + 1, int((bottom - top) * share) + 1
+    per_pixel = 1.0 / side  # Cells per pixel.
+    columns, rows = int((right - left) * per_pixel) + 1, int((bottom - top) * per_pixel) + 1
     cells = np.empty(len(other_uv), dtype=np.int64)
     starts = np.zeros(rows * columns + 2, dtype=np.int64)
     for j in range(len(other_uv)):
-        row, column = int((other_uv[j, 1] - top) * share), int((other_uv[j, 0] - left) * share)
+        row = int((other_uv[j, 1] - top) * per_pixel)
+        column = int((other_uv[j, 0] - left) * per_pixel)
         cells[j] = row * columns + column
         starts[cells[j] + 1] += 1
     for square in range(rows * columns + 1):
@@ -86,8 +87,8 @@ def match_points(
         sorted_others[k, 2], sorted_others[k, 3] = others[j, 0], others[j, 1]
     for i in range(len(uv)):
         best, x, y, nearest = reach * reach, uv[i, 0], uv[i, 1], -1
-        row, column = math.floor((y - top) * share), math.floor((x - left) * share)
-        for ring in (1, 2, 4, math.ceil(reach * share)):
+        row, column = math.floor((y - top) * per_pixel), math.floor((x - left) * per_pixel)
+        for ring in (1, 2, 4, math.ceil(reach * per_pixel)):
             first, end = max(column - ring, 0), min(column + ring + 1, columns)
             for v in range(max(row - ring, 0), min(row + ring + 1, rows) if first < end else 0):
                 for k in range(starts[v * columns + first + 1], starts[v * columns + end + 1]):
@@ -172,8 +173,8 @@ def compare_contours(
                 own_sums[counted, Sum.COST] += cost
             else:
                 n0, n1 = normals[i, 0] + edge_normals[j, 0], normals[i, 1] + edge_normals[j, 1]
-                share = 1.0 / math.sqrt(n0 * n0 + n1 * n1)
-                n0, n1 = share * n0, share * n1
+                factor = 1.0 / math.sqrt(n0 * n0 + n1 * n1)
+                n0, n1 = factor * n0, factor * n1
                 r = (edge_uv[j, 0] - uv[i, 0]) * n0 + (edge_uv[j, 1] - uv[i, 1]) * n1
                 weight, cost = robust_weight(own_sums, counted, own_weights, length, r)
                 add_residual(point_sums, i, n0, n1, r, weight)
@@ -221,12 +222,12 @@ def robust_weight(
     """
     unit, scale, length_weight = weights[0], weights[1], weights[3]
     t = (r / scale) ** 2
-    share = 1.0 / (1.0 + t)
-    cost = length_weight * length * r * r * share
-    weight = length_weight * length * share * share
+    attenuation = 1.0 / (1.0 + t)
+    cost = length_weight * length * r * r * attenuation
+    weight = length_weight * length * attenuation * attenuation
     sums[row, Sum.COMPARED] += length * unit
     sums[row, Sum.FITTING] += length * unit * (t < 1.0)
-    sums[row, Sum.CLOSE] += length * unit * share
+    sums[row, Sum.CLOSE] += length * unit * attenuation
     sums[row, Sum.COST] += cost
     sums[row, Sum.SQUARES] += weight * r * r
     sums[row, Sum.WEIGHT] += weight
@@ -274,16 +275,16 @@ def accumulate_residuals(
                 p[k] += X_WN[node, k, c] * p_N[i, c]
         # du/dp_W and dv/dp_W.
         u = v = 0.0
-        share = 1.0
+        inverse_depth = 1.0
         if lens[0] != 1.0:
             for k in range(4):
                 u, v = u + X_CW[0, k] * p[k], v + X_CW[1, k] * p[k]
             z = X_CW[2, 0] * p[0] + X_CW[2, 1] * p[1] + X_CW[2, 2] * p[2] + X_CW[2, 3]
-            share = 1.0 / z
-            u, v = u * share, v * share
+            inverse_depth = 1.0 / z
+            u, v = u * inverse_depth, v * inverse_depth
         for k in range(3):
-            rows[0, k] = lens[1] * share * (X_CW[0, k] - X_CW[2, k] * u)
-            rows[1, k] = lens[2] * share * (X_CW[1, k] - X_CW[2, k] * v)
+            rows[0, k] = lens[1] * inverse_depth * (X_CW[0, k] - X_CW[2, k] * u)
+            rows[1, k] = lens[2] * inverse_depth * (X_CW[1, k] - X_CW[2, k] * v)
         for k in range(3):
             across = point_sums[i, 0] * rows[0, k] + point_sums[i, 1] * rows[1, k]
             along = point_sums[i, 1] * rows[0, k] + point_sums[i, 2] * rows[1, k]

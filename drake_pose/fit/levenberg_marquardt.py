@@ -53,21 +53,22 @@ class StepSettings:
     """Settings of the steps.
 
     Args:
-        longest: maximum change of an unknown per step [rad, m or a logarithm].
+        max_step: maximum change of an unknown per step [rad, m or a logarithm].
         damping: initial fraction of the diagonal that is added to it.
-        even_damping: fraction of the diagonal's mean that is added; it fixes unobservable unknowns.
-        least_damping, most_damping: limits of the damping; a step that needs more ends the stage.
-        next_damping: maximum damping at the start of a stage.
-        standstill: a step that reduces the cost by a smaller fraction ends the stage.
+        uniform_damping: fraction of the diagonal's mean that is added; it fixes unobservable
+            unknowns.
+        min_damping, max_damping: limits of the damping; a step that needs more ends the stage.
+        max_start_damping: maximum damping at the start of a stage.
+        min_decrease: a step that reduces the cost by a smaller fraction ends the stage.
     """
 
-    longest: float = 0.35
+    max_step: float = 0.35
     damping: float = 1e-3
-    even_damping: float = 1e-4
-    least_damping: float = 1e-4
-    most_damping: float = 1e2
-    next_damping: float = 0.1
-    standstill: float = 1e-3
+    uniform_damping: float = 1e-4
+    min_damping: float = 1e-4
+    max_damping: float = 1e2
+    max_start_damping: float = 0.1
+    min_decrease: float = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,14 +165,14 @@ def minimise(
             if tried.cost < cost:
                 gain = 1.0 - tried.cost / cost
                 (own, shared), equations, cost = trial, tried, tried.cost
-                damping = max(0.2 * damping, settings.least_damping)
-                if gain < settings.standstill:
+                damping = max(0.2 * damping, settings.min_damping)
+                if gain < settings.min_decrease:
                     break
             else:
                 damping *= 10.0
-                if damping > settings.most_damping:
+                if damping > settings.max_damping:
                     break
-        damping = min(damping, settings.next_damping)
+        damping = min(damping, settings.max_start_damping)
     return own, shared, float(cost), evaluations
 
 
@@ -196,7 +197,7 @@ def damped_step(
     """
     lower, upper = limits
     p = own.shape[1]
-    fractions = damping, settings.even_damping
+    fractions = damping, settings.uniform_damping
     if curvature is None:
         own_steps, shared_step = _solve_frames(
             equations.H, equations.g, own, shared, lower, upper, fractions
@@ -206,10 +207,10 @@ def damped_step(
             equations, own, shared, limits, fractions, curvature
         )
     # All steps are shortened by the same factor, so shared and own unknowns stay consistent.
-    longest = max(
+    largest = max(
         float(np.abs(own_steps).max(initial=0.0)), float(np.abs(shared_step).max(initial=0.0))
     )
-    factor = min(1.0, settings.longest / max(longest, 1e-300))
+    factor = min(1.0, settings.max_step / max(largest, 1e-300))
     return (
         np.clip(own + factor * own_steps, lower[:p], upper[:p]),
         np.clip(shared + factor * shared_step, lower[p:], upper[p:]),

@@ -166,7 +166,7 @@ class Problem:
             values = kinematics.flatten(kinematics.tree.default_values())
             pivot = kinematics.poses(values)[0, :3, 3]
         if noise is None and pixels is not None:
-            noise = Noise.of_a_pixel(pixels)
+            noise = Noise.per_pixel(pixels)
         self.body, self._cameras = body, CameraParameters(cameras, pivot)
         every = list(parameter_names(body, cameras))
         unknowns = sorted(unknowns, key=lambda one: one.shared)
@@ -191,7 +191,7 @@ class Problem:
         self._first_bias = len(every) - len(cameras)
         self._biases = np.flatnonzero(self.entries >= self._first_bias)
         self._of_foreground = foreground_of_colours(len(body.outlines))
-        self._fixed = not np.any(self.entries >= self._first_camera)
+        self._cameras_fixed = not np.any(self.entries >= self._first_camera)
         # Placing a body is faster without shift, scale or radius unknowns.
         self._values = len(kinematics.names)
         places = (self.entries >= self._values) & (self.entries < len(body.names))
@@ -311,7 +311,7 @@ class Problem:
     ) -> tuple[Array, Array, Array]:
         """Return H (u, u), g (u,) and the sums (cameras, nodes + 1, 6) of a frame."""
         compared, (_, _, motions) = self.compare(frame, theta, stage)
-        if self._fixed:
+        if self._cameras_fixed:
             moves = self._moves(compared, motions, 0, frame.rates)
             terms = [(moves, compared.A.sum(axis=0), compared.b.sum(axis=0))]
         else:
@@ -334,7 +334,9 @@ class Problem:
             c = self.entries[k] - self._first_bias
             g[k] = -compared.bias_terms[c, :, 12].sum()
             H[k] = H[:, k] = np.einsum(
-                "nux,nx->u", terms[0 if self._fixed else c][0], compared.bias_terms[c, :, :12]
+                "nux,nx->u",
+                terms[0 if self._cameras_fixed else c][0],
+                compared.bias_terms[c, :, :12],
             )
             H[k, k] = compared.sums[c][:, Sum.WEIGHT].sum()
         return H, g, compared.sums

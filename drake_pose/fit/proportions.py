@@ -176,8 +176,8 @@ class ProportionedBody(BodyParameters):
         carried = np.zeros_like(places)
         for i, node in enumerate(kinematics.tree.nodes):
             if node.parent >= 0:
-                apart = at_rest.X_WN[i, :3, 3] - at_rest.X_WN[node.parent, :3, 3]
-                carried[i] = maps[node.parent] @ apart
+                offset = at_rest.X_WN[i, :3, 3] - at_rest.X_WN[node.parent, :3, 3]
+                carried[i] = maps[node.parent] @ offset
                 places[i] = places[node.parent] + back[node.parent] + carried[i]
                 places[i] += joint_shifts[i] * (R[node.parent] @ self._rest[i])
         shift, root_scale = theta[count : count + 3], float(np.exp(theta[count + 3]))

@@ -38,7 +38,7 @@ class Border(NamedTuple):
     columns: tuple[Indices, Array]
 
     @classmethod
-    def nothing(cls, height: int, width: int) -> "Border":
+    def empty(cls, height: int, width: int) -> "Border":
         """Return the border of an empty mask."""
         return cls(
             (np.zeros(height + 1, dtype=np.int64), np.zeros(0)),
@@ -109,7 +109,7 @@ def compare_raster(
     stride, offset = lines
     segments = find_segments(packed, poses_in_camera(camera[0], X_WN), camera[1], is_moving)
     ends = segments.ends
-    apart, total, squares = 0.0, 0.0, 0.0
+    differing, total, squares = 0.0, 0.0, 0.0
     spans = np.empty((ends.shape[0] + 1, 2), dtype=np.int64)
     most = 2 * ends.shape[0] + 2 + max(len(static_border.rows[1]), len(static_border.columns[1]))
     chosen = np.empty(most, dtype=np.int64)
@@ -137,7 +137,9 @@ def compare_raster(
                 places, chosen,
             )  # fmt: skip
             if across == 0:
-                apart += _pixels_apart(places, found, border_places, first, end, int(extent + 1.0))
+                differing += _pixels_apart(
+                    places, found, border_places, first, end, int(extent + 1.0)
+                )
             if first == end or moving == 0:
                 continue
             for k in range(found):
@@ -187,7 +189,7 @@ def compare_raster(
             A, b, bias_terms, X_WN, camera, p_N, nodes[:entry_count], owners[:entry_count],
             point_sums[:entry_count],
         )  # fmt: skip
-    return stride * apart, total, squares
+    return stride * differing, total, squares
 
 
 @compiled

@@ -18,7 +18,7 @@ from drake_pose.compiled import kernel_folder
 from drake_pose.silhouette.outline import Outline, outline_of_triangles
 
 
-def stored(
+def load_or_make(
     made_of: tuple[bytes, ...],
     make: Callable[[], Outline],
     least_time: float = 0.1,

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from drake_pose.arrays import Array
 from drake_pose.body import TriangleMesh
 from drake_pose.compiled import file_digest
-from drake_pose.fit.surface_store import stored
+from drake_pose.fit.surface_store import load_or_make
 from drake_pose.silhouette.outline import Outline, TreeSurfaces, outline_from_mesh
 from drake_pose.version import VERSION
 
@@ -27,7 +27,7 @@ _SIMPLIFIER = Lock()
 
 def simplify_rigid_parts(surfaces: TreeSurfaces, count: int) -> TreeSurfaces:
     """Return surfaces with about ``count`` triangles per rigid part; skin bands stay and bend."""
-    return surfaces.with_rigid([_simplified(rigid, count) for rigid in surfaces.rigid])
+    return surfaces.with_rigid([_simplify(rigid, count) for rigid in surfaces.rigid])
 
 
 def simplify_surfaces(surfaces: TreeSurfaces, count: int = FEW) -> tuple[Outline, ...]:
@@ -35,13 +35,13 @@ def simplify_surfaces(surfaces: TreeSurfaces, count: int = FEW) -> tuple[Outline
     outlines = []
     for node, rigid in enumerate(surfaces.rigid):
         bending = surfaces.bending[node]
-        outlines.append(_simplified(rigid if bending is None else bending.rest, count))
+        outlines.append(_simplify(rigid if bending is None else bending.rest, count))
     return tuple(outlines)
 
 
 def simplify_outlines(outlines: Sequence[Outline], count: int = 160) -> tuple[Outline, ...]:
     """Return simplified surfaces simplified further, much faster than from the originals."""
-    return tuple(_simplified(outline, count) for outline in outlines)
+    return tuple(_simplify(outline, count) for outline in outlines)
 
 
 def reduce_meshes(
@@ -63,7 +63,7 @@ def reduce_meshes(
         for k, mesh in enumerate(reduced):
             count = max(100, round(total * len(mesh.triangles) / given))
             if len(mesh.triangles) > count:
-                few = _simplified(outline_from_mesh(mesh), count)
+                few = _simplify(outline_from_mesh(mesh), count)
                 reduced[k] = TriangleMesh(few.vertices, few.triangles)
     return reduced
 
@@ -77,11 +77,11 @@ def simplify_or_hull(
     """
     found = []
     for outline in outlines:
-        few = _simplified(outline, count)
+        few = _simplify(outline, count)
         if len(few.triangles) > limit * count:
             hull = trimesh.convex.convex_hull(few.vertices)
             mesh = TriangleMesh(np.array(hull.vertices), np.array(hull.faces))
-            few = _simplified(outline_from_mesh(mesh), count)
+            few = _simplify(outline_from_mesh(mesh), count)
         found.append(few)
     return tuple(found)
 
@@ -95,7 +95,7 @@ def with_radius_scales(outlines: Sequence[Outline], radius_scales: Array) -> tup
     return tuple(scaled)
 
 
-def _simplified(outline: Outline, count: int) -> Outline:
+def _simplify(outline: Outline, count: int) -> Outline:
     """Return a surface with at most about ``count`` triangles.
 
     In each pass the simplifier allows larger errors, in absolute units, until there are few enough
@@ -107,15 +107,15 @@ def _simplified(outline: Outline, count: int) -> Outline:
         return outline
     if count < FEW and len(outline.triangles) > 4000:
         # Simplifying in two steps is as accurate and takes a sixth of the time.
-        few = _simplified(outline, FEW)
+        few = _simplify(outline, FEW)
         outline = few if len(few.triangles) <= 1.1 * FEW else outline
     vertices = np.ascontiguousarray(outline.vertices, np.float64)
     triangles = np.ascontiguousarray(outline.triangles, np.int32)
-    return _simplify(vertices.tobytes(), triangles.tobytes(), count)
+    return _simplify_cached(vertices.tobytes(), triangles.tobytes(), count)
 
 
 @lru_cache(maxsize=256)
-def _simplify(vertices: bytes, triangles: bytes, count: int) -> Outline:
+def _simplify_cached(vertices: bytes, triangles: bytes, count: int) -> Outline:
     """Return the simplified surface, cached in the process and on disk.
 
     Args:
@@ -130,10 +130,10 @@ def _simplify(vertices: bytes, triangles: bytes, count: int) -> Outline:
         np.zeros((0, 5), np.int32),
     )
     method = f"{fast_simplification.__version__} {VERSION} {file_digest(__file__)} {count}".encode()
-    return stored((method, vertices, triangles), lambda: _make_simple(outline, count))
+    return load_or_make((method, vertices, triangles), lambda: _simplify_uncached(outline, count))
 
 
-def _make_simple(outline: Outline, count: int) -> Outline:
+def _simplify_uncached(outline: Outline, count: int) -> Outline:
     """Return the closer of two simplifications of a surface to about ``count`` triangles."""
     simplified = collapse_edges(outline, count)
     size = float(np.linalg.norm(np.ptp(outline.vertices, axis=0)))
@@ -191,12 +191,12 @@ def surface_distance(one: Outline, other: Outline) -> float:
 
 def _squared_distances(one: Outline, other: Outline) -> Array:
     """Return (n,) squared distances of points spread over a surface to another surface [m^2]."""
-    points, corners = _spread(one), other.vertices[other.triangles]
+    points, corners = _sample_surface(one), other.vertices[other.triangles]
     centers = corners.mean(axis=1)
     radii = np.linalg.norm(corners - centers[:, None], axis=2).max(axis=1)
     first = trimesh.triangles.closest_point(corners[cKDTree(centers).query(points)[1]], points)
-    apart = np.linalg.norm(first - points, axis=1)
-    nearest = np.fmin(cKDTree(other.vertices).query(points)[0], apart)
+    distances = np.linalg.norm(first - points, axis=1)
+    nearest = np.fmin(cKDTree(other.vertices).query(points)[0], distances)
     pairs: list[tuple[NDArray[np.intp], NDArray[np.intp]]] = []
     # Group triangles by size: large ones would otherwise widen the search for all small ones.
     sizes = float(radii.max()) * 0.25 ** np.arange(6)
@@ -205,13 +205,13 @@ def _squared_distances(one: Outline, other: Outline) -> Array:
         if not len(own):
             continue
         # Only triangles whose bounding ball comes closer than the best distance are candidates.
-        about = cKDTree(centers[own]).query_ball_point(points, nearest + most)
-        counts = [len(one) for one in about]
-        who = np.repeat(np.arange(len(points)), counts)
-        which = own[np.fromiter(chain.from_iterable(about), np.intp, sum(counts))]
-        apart = np.linalg.norm(centers[which] - points[who], axis=1)
-        near = apart <= nearest[who] + radii[which]
-        pairs.append((who[near], which[near]))
+        candidates = cKDTree(centers[own]).query_ball_point(points, nearest + most)
+        counts = [len(one) for one in candidates]
+        owners_of_pairs = np.repeat(np.arange(len(points)), counts)
+        pair_triangles = own[np.fromiter(chain.from_iterable(candidates), np.intp, sum(counts))]
+        distances = np.linalg.norm(centers[pair_triangles] - points[owners_of_pairs], axis=1)
+        near = distances <= nearest[owners_of_pairs] + radii[pair_triangles]
+        pairs.append((owners_of_pairs[near], pair_triangles[near]))
     owners, triangles = (np.concatenate(one) for one in zip(*pairs, strict=True))
     closest = trimesh.triangles.closest_point(corners[triangles], points[owners])
     squares = nearest**2
@@ -219,7 +219,7 @@ def _squared_distances(one: Outline, other: Outline) -> Array:
     return squares
 
 
-def _spread(outline: Outline, count: int = 300) -> Array:
+def _sample_surface(outline: Outline, count: int = 300) -> Array:
     """Return points (count, 3) spread evenly over a surface's area."""
     generator = np.random.default_rng(0)
     areas = np.cumsum(np.linalg.norm(outline.planes[:, :3], axis=1))

@@ -164,7 +164,7 @@ class CameraComparison:
         names = [f"{camera.name}.{one}" for one in POSE_NAMES]
         problem = Problem(
             fit.body, [camera], [Unknowns(names, True, deviation=deviations)], pivot=middle,
-            noise=fit.noise, steps=StepSettings(longest=2.0, damping=1e-6, even_damping=1e-9),
+            noise=fit.noise, steps=StepSettings(max_step=2.0, damping=1e-6, uniform_damping=1e-9),
         )  # fmt: skip
         seen = [Observation(pack_evidence([edge]), values) for edge, values in pairs]
         rounds = [AnnealingStage(scale, 0.05) for scale in scales]

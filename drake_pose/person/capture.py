@@ -381,7 +381,7 @@ def capture_by_colour(
             colours = views.updated_colours(fit, values, masked[frame])
             shown = zip(views.cameras, views.pictures, strict=True)
             X_WN = fit.kinematics.poses(values)
-            own = PartColours.learned(colours.values(), fit.outlines, X_WN, shown)
+            own = PartColours.learn(colours.values(), fit.outlines, X_WN, shown)
         else:
             if state is not None:
                 state = tracker.follow_by_colour(state, views, own)

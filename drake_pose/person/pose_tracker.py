@@ -294,13 +294,15 @@ class PersonPoseTracker:
 
             def shows(values: Array) -> Array:
                 seen = zip(colours.cameras, colours.pictures, strict=True)
-                return own.shown(self.fit.outlines, self.fit.kinematics.poses(values), seen)
+                return own.relative_fractions(
+                    self.fit.outlines, self.fit.kinematics.poses(values), seen
+                )
 
             enough, ratios = self.settings.part_lost_below, shows(fitted.values)
             for limb in self.plan.limbs.values():
                 worst = float(np.nanmin([*ratios[limb.nodes], 1.0]))
                 if worst < enough:
-                    placed = self.search.place_by_colour(fitted.values, limb, colours, own.known)
+                    placed = self.search.place_by_colour(fitted.values, limb, colours, own.is_own)
                     scored = [(one, np.nan_to_num(shows(one.values))) for one in placed]
                     shown_again = [one for one in scored if one[1][limb.nodes].min() >= enough]
                     if shown_again:

@@ -288,7 +288,7 @@ class _Diagnoser:
             moves = one.moves * self._fit.deviations[:, None]
             outlines += moves @ one.A @ np.swapaxes(moves, 1, 2)
         return _Information(
-            N, h, PX.T @ seen.bends, outlines, fitted.outline_lengths, scale, freedom
+            N, h, PX.T @ seen.surface_derivatives, outlines, fitted.outline_lengths, scale, freedom
         )
 
     def _sum(self, kept: Mask) -> _Information:

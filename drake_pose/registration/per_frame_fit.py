@@ -89,7 +89,7 @@ class PerFrameFit:
             Problem(
                 BodyParameters(kinematics, one), cameras,
                 [Unknowns(self.names, deviation=self.deviations / error)], pivot=self._middle,
-                steps=StepSettings(longest=0.2, damping=1e-3, even_damping=1e-6),
+                steps=StepSettings(max_step=0.2, damping=1e-3, uniform_damping=1e-6),
                 pixels=self.size,
             )
             for one in outlines

@@ -278,8 +278,8 @@ class PictureSearch:
             for one in (small, camera)
         ]
         pictures, gains = [one.picture for one in frames], level.backgrounds.gains
-        showing = level.backgrounds.showing(both[0])
-        return KnownBackground.of(pictures, gains, showing, both[1]), both[1]
+        showing = level.backgrounds.shows_background(both[0])
+        return KnownBackground.estimate(pictures, gains, showing, both[1]), both[1]
 
     def _segment(
         self,
@@ -376,7 +376,7 @@ class PyramidLevel:
         height = max(8, round(camera.height * width / camera.width))
         self.camera, self._X_WN = camera.resized(width, height), X_WN
         small = [cv2.resize(one, (width, height), interpolation=cv2.INTER_AREA) for one in pictures]
-        self.backgrounds = Backgrounds.of(np.array(small))
+        self.backgrounds = Backgrounds.estimate(np.array(small))
         self._packed = pack(tuple(outlines))
         self._parameters = self.camera.kernel_parameters()
         points = np.array([placed_points(outlines, X) for X in X_WN])
@@ -405,7 +405,7 @@ class PyramidLevel:
     def explained(self, X_CW: Array) -> tuple[float, float]:
         """Of a pose (4, 4) the share of all that could be explained, and edges beyond chance."""
         told = self.told(X_CW)
-        share = float(told[Explained.GAIN]) / max(self.backgrounds.possible, 1e-9)
+        share = float(told[Explained.GAIN]) / max(self.backgrounds.max_gain, 1e-9)
         return share, float(told[Explained.CONTOUR]) / max(float(told[Explained.OUTLINE]), 1.0)
 
     def score(self, X_CW: Array, frames: int | None = None) -> float:
@@ -416,7 +416,7 @@ class PyramidLevel:
         X_WN = self._X_WN[:frames]
         told = self.told(X_CW, X_WN)
         outline = told[Explained.OUTLINE] + 0.3 * len(X_WN) * self.camera.width
-        possible = self.backgrounds.possible * len(X_WN) / len(self._X_WN)
+        possible = self.backgrounds.max_gain * len(X_WN) / len(self._X_WN)
         return evidence(
             float(told[Explained.GAIN]) / max(possible, 1e-9),
             float(told[Explained.CONTOUR] / outline),
@@ -446,7 +446,7 @@ class PyramidLevel:
 
         Each rotation comes at three distances, in the middle of the changes and beside it.
         """
-        changes = self.backgrounds.changes()
+        changes = self.backgrounds.changed_frames()
         v, u = np.mgrid[: changes.shape[0], : changes.shape[1]]
         total = max(float(changes.sum()), 1e-9)
         middle = np.array([float((changes * one).sum()) / total for one in (u, v)])

@@ -82,7 +82,7 @@ class SharedFitSettings(NamedTuple):
     )
     inlier_stage: AnnealingStage = AnnealingStage(0.025, 0.01)
     final_stage: AnnealingStage = AnnealingStage(0.005, 0.005)
-    steps: StepSettings = StepSettings(longest=0.3, damping=1e-2, even_damping=1e-6)
+    steps: StepSettings = StepSettings(max_step=0.3, damping=1e-2, uniform_damping=1e-6)
     constant_deviation: float = 0.2
     max_constant: float = 0.6
     focal_deviation: float = 0.1

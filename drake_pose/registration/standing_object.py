@@ -516,7 +516,7 @@ def find_target_frames(
         X_CT = search.poses_in_camera(pose[None], one.values)
         covered = draw_mask(target.in_own_frame.full, X_CT, camera)
         # The picture's own colours, in the target and beside it, refine the mask's boundary.
-        known = KnownBackground.of([one.picture], [gains], shows[None], covered[None])
+        known = KnownBackground.estimate([one.picture], [gains], shows[None], covered[None])
         frame = segment_picture(one, known, gains, covered)
         if frame is not None and intersection_over_union(frame.mask, covered) > min_iou:
             shown.append(replace(frame, foreground=None))

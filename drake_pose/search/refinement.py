@@ -160,7 +160,7 @@ class RefinementProblem:
             (np.ascontiguousarray(view.camera.X_CW), view.camera.kernel_parameters())
             for view in views
         ]
-        self._nothing = [Border.nothing(*view.mask.shape) for view in views]
+        self._nothing = [Border.empty(*view.mask.shape) for view in views]
         self.border_length = sum(border.length for border in self._silhouettes)
 
     def mismatch(self, parameters: np.ndarray) -> list[np.ndarray]:

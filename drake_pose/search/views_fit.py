@@ -97,7 +97,7 @@ class ViewsFit:
         self.size = math.sqrt(float(np.mean([np.count_nonzero(view.mask) for view in views])))
         # Unit weight per pixel of contour, so that the cost is in pixels.
         even = Noise(deviation=1.0, correlation=0.5 / self.size**3)
-        steps = StepSettings(longest=0.3, damping=1e-2, even_damping=1e-3)
+        steps = StepSettings(max_step=0.3, damping=1e-2, uniform_damping=1e-3)
         cameras = [view.camera for view in views]
         self._levels = []
         # Distance of neighbouring points of a silhouette's edge, as a fraction of its size, at

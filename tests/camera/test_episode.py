@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drake_pose.camera.camera_files import load_camera_file
-from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending
+from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending_indices
 from drake_pose.camera.episode_files import open_episode
 from drake_pose.errors import (
     CameraError,
@@ -199,15 +199,15 @@ def test_rows_of_frames_are_found_by_name_or_number():
 def test_clocks_that_run_backwards():
     times = TIMES.copy()
     times[5], times[7] = times[4], 0.05
-    kept, said = ascending(times, "the log")
+    kept, said = ascending_indices(times, "the log")
     np.testing.assert_array_equal(kept, np.delete(np.arange(20), [5, 7]))
     assert "number 5" in said[0]
     assert "2 of 20 such are left out" in said[0]
     times[8:] -= 0.6
     with pytest.raises(SceneError, match=r"the log: number 5 .* runs backwards or stands still"):
-        ascending(times, "the log")
+        ascending_indices(times, "the log")
     with pytest.raises(SceneError, match="the log: holds nothing"):
-        ascending(np.zeros(0), "the log")
+        ascending_indices(np.zeros(0), "the log")
 
 
 def test_what_is_odd_is_named():

@@ -34,14 +34,14 @@ def drawn(episode, X_CW):
 
 
 def test_what_a_pose_explains_is_a_sum_over_pixels(episode):
-    backgrounds = Backgrounds.of(episode.pictures)
+    backgrounds = Backgrounds.estimate(episode.pictures)
     sums = backgrounds.sums
     masks, (packed, X_CN) = drawn(episode, episode.camera.X_CW)
     still = np.zeros(X_CN.shape[1], bool)
     told, pieces = explain(packed, X_CN, still, episode.camera.kernel_parameters(), sums, 20.0, 4)
     covered = np.moveaxis(masks, 0, -1)
-    each = sums.shown + np.where(covered[..., None], sums.more, 0.0).sum(axis=2)
-    gain = each.max(axis=-1) - sums.none
+    each = sums.visible + np.where(covered[..., None], sums.covered, 0.0).sum(axis=2)
+    gain = each.max(axis=-1) - sums.uncovered
     always = covered.all(axis=-1)
     gain[always] = 0.3 * np.maximum(gain[always], 0.0)
     gain[~covered.any(axis=-1)] = 0.0
@@ -52,7 +52,7 @@ def test_what_a_pose_explains_is_a_sum_over_pixels(episode):
 
 
 def test_outlines_are_where_neighbours_are_not_covered(episode):
-    sums = Backgrounds.of(episode.pictures).sums
+    sums = Backgrounds.estimate(episode.pictures).sums
     masks, (packed, X_CN) = drawn(episode, episode.camera.X_CW)
     parameters = episode.camera.kernel_parameters()
     for still in (False, True):
@@ -87,10 +87,10 @@ def test_light_is_told_whatever_else_changes():
 def test_odds_show_the_body_and_the_background_behind_it(episode):
     """The background is told where a frame shows it; and log-odds are for the body where it is."""
     covered, _ = drawn(episode, episode.camera.X_CW)
-    backgrounds = Backgrounds.of(episode.pictures)
-    showing = backgrounds.showing(covered)
+    backgrounds = Backgrounds.estimate(episode.pictures)
+    showing = backgrounds.shows_background(covered)
     assert not (showing & covered).any()
-    known = KnownBackground.of(list(episode.pictures), backgrounds.gains, showing, covered)
+    known = KnownBackground.estimate(list(episode.pictures), backgrounds.gains, showing, covered)
     assert (known.unseen == ~showing.any(axis=0)).mean() > 0.99
     seen = ~known.unseen
     assert np.median(np.abs(known.colours - episode.background).max(axis=-1)[seen]) < 6.0

@@ -126,7 +126,7 @@ def test_a_pixel_of_contour_has_the_weight_one(fit, pixels):
     (pinhole,) = circle_of_cameras(1, face_camera=False).values()
     cameras = pack_cameras([pinhole, replace(pinhole, focal_x=2.0 * pinhole.focal_x)])
     placement, step = fit.body.place(np.zeros(len(fit.lower))), AnnealingStage(0.1, 0.05)
-    weights = camera_weights(cameras, placement, step, Noise.of_a_pixel(pixels), pixels)
+    weights = camera_weights(cameras, placement, step, Noise.per_pixel(pixels), pixels)
     expected = np.column_stack(np.broadcast_arrays(1.0 / pixels, 0.1 * pixels, 0.05 * pixels, 1.0))
     np.testing.assert_allclose(weights, np.broadcast_to(expected, (2, 4)))
     # Where the metre is the unit, errors in pixels grow with the focal length; fine scales are cut.

@@ -47,7 +47,7 @@ def found_by_steps(A, b, p, bound, stages, coupling=None, **settings):
         np.zeros(q),
         (np.full(p + q, -bound), np.full(p + q, bound)),
         stages,
-        StepSettings(even_damping=0.0, **settings),
+        StepSettings(uniform_damping=0.0, **settings),
         coupling,
     )
 

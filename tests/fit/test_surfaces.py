@@ -7,7 +7,7 @@ import trimesh
 
 from drake_pose.body import TriangleMesh, bundled_model, load_model
 from drake_pose.fit import surface_store
-from drake_pose.fit.surface_store import stored
+from drake_pose.fit.surface_store import load_or_make
 from drake_pose.fit.surfaces import (
     FEW,
     VERY_FEW,
@@ -174,13 +174,13 @@ def test_a_process_loads_to_the_last_digit_what_another_simplified(folder, monke
 )
 def test_a_damaged_file_is_made_again(folder, damage):
     make = Maker()
-    stored((b"key",), make, 0.0)
+    load_or_make((b"key",), make, 0.0)
     (file,) = folder.iterdir()
     whole = file.read_bytes()
     file.write_bytes(damage(whole))
-    assert same(stored((b"key",), make, 0.0), make.outline)
+    assert same(load_or_make((b"key",), make, 0.0), make.outline)
     assert make.count == 2
-    assert same(stored((b"key",), make, 0.0), make.outline)
+    assert same(load_or_make((b"key",), make, 0.0), make.outline)
     assert make.count == 2
     assert file.read_bytes() == whole
 
@@ -189,11 +189,11 @@ def test_parts_of_a_key_are_told_apart_and_the_oldest_files_go(folder):
     makers = [Maker(1.0 + k) for k in range(4)]
     keys = [(b"ab", b"c"), (b"a", b"bc"), (b"abc",), (b"abc", b"")]
     for key, make in zip(keys, makers, strict=True):
-        assert same(stored(key, make, 0.0, 3), make.outline)
+        assert same(load_or_make(key, make, 0.0, 3), make.outline)
     assert len(list(folder.iterdir())) == 3
-    stored(keys[-1], makers[-1], 0.0)
+    load_or_make(keys[-1], makers[-1], 0.0)
     assert makers[-1].count == 1
-    stored(keys[0], makers[0], 0.0)
+    load_or_make(keys[0], makers[0], 0.0)
     assert makers[0].count == 2
 
 
@@ -202,8 +202,8 @@ def test_where_nothing_can_be_written_surfaces_are_made(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     for folder in (None, tmp_path / "file", tmp_path / "none"):
         monkeypatch.setattr(surface_store, "kernel_folder", lambda folder=folder: folder)
-        assert stored((b"key",), make, 0.0) is make.outline
+        assert load_or_make((b"key",), make, 0.0) is make.outline
     quick = Maker()
     monkeypatch.setattr(surface_store, "kernel_folder", lambda: tmp_path)
-    assert stored((b"quick",), quick, 60.0) is quick.outline
+    assert load_or_make((b"quick",), quick, 60.0) is quick.outline
     assert not (tmp_path / "surfaces").exists()

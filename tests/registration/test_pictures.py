@@ -51,7 +51,7 @@ def level(episode: PaintedEpisode) -> PyramidLevel:
 def test_starts_show_a_body_where_pictures_change_and_about_as_large(level: PyramidLevel) -> None:
     """Against the moments of what changes; then some of the starts are nearer, or aside."""
     starts = np.array(level.starts()).reshape(3, 2, -1, 4, 4)
-    moments = cv2.moments(level.backgrounds.changes())
+    moments = cv2.moments(level.backgrounds.changed_frames())
     middle = np.array([moments["m10"], moments["m01"]]) / moments["m00"]
     spread = np.sqrt((moments["mu20"] + moments["mu02"]) / moments["m00"])
     p_C = starts[..., :3, :3] @ level._middle + starts[..., :3, 3]
@@ -118,7 +118,7 @@ def test_poses_that_improve_explain_more_and_the_true_one_most(
     assert 0.5 < share < 1.0
     assert contour > level.explained(aside)[1]
     told = level.told(true)
-    assert share == pytest.approx(told[Explained.GAIN] / level.backgrounds.possible)
+    assert share == pytest.approx(told[Explained.GAIN] / level.backgrounds.max_gain)
     assert contour == pytest.approx(told[Explained.CONTOUR] / told[Explained.OUTLINE])
 
 
@@ -130,8 +130,8 @@ def test_what_a_pose_explains_is_told_apart_by_squares(level: PyramidLevel, epis
     assert pieces.shape == (16, 16)
     assert (pieces[12:] == 0.0).all()
     v, u = np.unravel_index(pieces.argmax(), pieces.shape)
-    covered = level.backgrounds.changes()[5 * v : 5 * v + 5, 5 * u : 5 * u + 5]
-    assert covered.mean() > level.backgrounds.changes().mean()
+    covered = level.backgrounds.changed_frames()[5 * v : 5 * v + 5, 5 * u : 5 * u + 5]
+    assert covered.mean() > level.backgrounds.changed_frames().mean()
 
 
 def test_poses_are_distinct_that_show_a_body_elsewhere(level: PyramidLevel, episode) -> None:

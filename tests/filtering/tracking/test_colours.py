@@ -104,7 +104,7 @@ def test_learned_colours_are_those_on_both_sides(observation, renderer):
 
 
 def test_old_colours_fade_at_the_rate(observation, renderer, monkeypatch):
-    monkeypatch.setattr(colours, "LINES", LINES._replace(rate=0.25, agreeing=100.0))
+    monkeypatch.setattr(colours, "LINES", LINES._replace(learning_rate=0.25, max_residual=100.0))
     mask, known = renderer.mask(TRUTH), observation.uninformed_histograms()
     for colour in (ORANGE, np.array([20, 20, 200])):
         picture = np.where(mask[..., None], colour, GREEN).astype(np.uint8)

@@ -100,8 +100,8 @@ def test_a_limb_without_its_own_colours_is_searched_again_or_said_to_be_lost(
     views = ColourViews(list(cameras.values()), seen, known)
     pairs = list(zip(views.cameras, seen, strict=True))
     X_WN = fit.kinematics.poses(values)
-    own = PartColours.learned(known.values(), fit.outlines, X_WN, pairs)
-    np.testing.assert_allclose(own.shown(fit.outlines, X_WN, pairs), 1.0)
+    own = PartColours.learn(known.values(), fit.outlines, X_WN, pairs)
+    np.testing.assert_allclose(own.relative_fractions(fit.outlines, X_WN, pairs), 1.0)
     wrong, limb = values.copy(), tracker.plan.limbs["left_arm"]
     wrong[limb.values] = limb.poses[7]
     assert joint_errors(person, tracker.positions(wrong), q).max() > 300.0
@@ -110,7 +110,7 @@ def test_a_limb_without_its_own_colours_is_searched_again_or_said_to_be_lost(
     state = tracker.follow_by_colour(tracker.start(wrong), views, own)
     assert not state.is_lost
     assert joint_errors(person, tracker.positions(state.values), q).max() < 60.0
-    other = own.known & ~np.isin(np.arange(len(own.known)), limb.nodes)[:, None]
+    other = own.is_own & ~np.isin(np.arange(len(own.is_own)), limb.nodes)[:, None]
     assert tracker.follow_by_colour(tracker.start(values), views, replace(own, known=other)).is_lost
 
 

@@ -50,8 +50,8 @@ def marks(model, q):
     return dict(zip(landmarks, landmark_positions(model, landmarks, q), strict=True))
 
 
-def test_script_changes_lengths_and_radius_scales(person, tmp_path):
-    written_again("person", tmp_path, "--lengths", "thigh=1.1", "--radius_scales", "thigh=0.9")
+def test_script_changes_lengths_and_girths(person, tmp_path):
+    written_again("person", tmp_path, "--lengths", "thigh=1.1", "--girths", "thigh=0.9")
     other = load_model(tmp_path / "person.urdf", check=False)
     zero = np.zeros(23)
     before, after = marks(person, zero), marks(other, zero)

@@ -1,8 +1,8 @@
 """Bands of skin between two segments: closed tubes just under the standing body's surface.
 
-A band runs along an axis through the joint, from its parent's side to its child's. Its rings of
-vertices are looked for outwards from the axis, where the way first leaves all shells of the two
-segments; so, at rest, the band is seen nowhere.
+A band runs along an axis through the joint, from the parent's side to the child's. Each of its
+vertices lies where a ray from the axis first leaves all shells of the two segments. So the band is
+hidden while the body stands upright.
 """
 
 from collections.abc import Sequence
@@ -12,23 +12,23 @@ import numpy as np
 
 from .shapes import Shell, ring_angles, tube
 
-CLEARANCE = 0.0001  # how far the band stays under the surface [m]
+CLEARANCE = 0.0001  # distance of the band under the surface [m]
 
 
 @dataclass(frozen=True)
 class Band:
-    """Where the band of one kind of joint runs, on the left side, in the child's frame.
+    """Place of the band of one kind of joint on the left side, in the child's frame.
+
+    Lengths are those of the mean woman; other bodies' bands are scaled by their stature.
 
     Attributes:
-        axis: (3,) from the parent to the child.
-        begin, end: where it begins and ends along the axis, from the joint [m].
-        reach: how far it may go from the axis [m].
-        material: its colour.
-        rings: how many rings of vertices.
-        around: how many vertices a ring has.
+        axis: (3,) direction from the parent to the child.
+        begin, end: ends along the axis, from the joint [m].
+        reach: largest distance from the axis [m].
+        material: of the band.
+        rings: number of rings of vertices.
+        around: number of vertices per ring.
         through: (3,) a point of the axis [m]; the axis must stay inside the two segments.
-
-    Lengths are those of the mean woman; other bodies' bands grow with their stature.
     """
 
     axis: tuple[float, float, float]
@@ -41,7 +41,7 @@ class Band:
     through: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def scaled(self, scale: float) -> "Band":
-        """Return the band of a body this many times as large."""
+        """Return the band of a body `scale` times as large."""
         x, y, z = self.through
         return replace(
             self,
@@ -70,8 +70,8 @@ def band_shell(band: Band, shells: Sequence[Shell]) -> Shell:
     """Return the closed band.
 
     Args:
-        band: where it runs.
-        shells: the shells of the two segments, standing, in the child's frame.
+        band: its place.
+        shells: shells of the two segments of the standing body, in the child's frame.
     """
     surface = _Surface(shells, band)
     heights = np.linspace(-band.end, -band.begin, band.rings)
@@ -87,12 +87,12 @@ def band_shell(band: Band, shells: Sequence[Shell]) -> Shell:
 
 
 def _protrusion(surface: "_Surface", grid: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Return how far facets beside each vertex (rings, around) stand out of the surface [m]."""
+    """Return how far the facets at each vertex (rings, around) protrude from the surface [m]."""
     points = surface.points(grid[..., 0], grid[..., 1], radius)
     beside = np.roll(points, -1, axis=1)
     corners = np.stack([points[:-1], points[1:], beside[:-1], beside[1:]])
     worst = np.zeros(corners.shape[1:3])
-    for up in (0.0, 0.2, 0.4, 0.6, 0.8):  # the other sides of a cell are its neighbours' first
+    for up in (0.0, 0.2, 0.4, 0.6, 0.8):  # a cell's other sides belong to its neighbours
         for side in (0.0, 0.5):
             weights = ((1 - up) * (1 - side), up * (1 - side), (1 - up) * side, up * side)
             height, angle, found = surface.coordinates(np.tensordot(weights, corners, axes=1))
@@ -105,7 +105,7 @@ def _protrusion(surface: "_Surface", grid: np.ndarray, radius: np.ndarray) -> np
 
 
 class _Surface:
-    """The union of shells as radii round an axis.
+    """The union of shells, as radii about an axis.
 
     Heights run against the band's axis, from the child to the parent, so that rings of growing
     height and angle form a tube that faces outwards.
@@ -117,7 +117,7 @@ class _Surface:
         z /= np.linalg.norm(z)
         self._frame = np.stack([np.cross(y, z), y, z])
         self._reach = band.reach
-        # Heights are measured from the joint, so the axis may be moved across itself alone.
+        # Heights are measured from the joint, so the axis may be shifted only across itself.
         through = np.array(band.through)
         self._foot = through - (through @ y) * y
         corners = np.concatenate([shell.vertices[shell.triangles] for shell in shells])
@@ -126,28 +126,28 @@ class _Surface:
         self._highest = self._corners[:, :, 1].max(axis=1)
 
     def points(self, height: np.ndarray, angle: np.ndarray, radius: np.ndarray) -> np.ndarray:
-        """Return points (..., 3) at cylinder coordinates."""
+        """Return points (..., 3) at cylindrical coordinates."""
         local = np.stack([radius * np.sin(angle), height, radius * np.cos(angle)], axis=-1)
         return np.asarray(local @ self._frame + self._foot)
 
     def coordinates(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the cylinder coordinates height, angle, radius of points (..., 3)."""
+        """Return the cylindrical coordinates height, angle and radius of points (..., 3)."""
         x, y, z = np.moveaxis((points - self._foot) @ self._frame.T, -1, 0)
         return y, np.arctan2(x, z), np.hypot(x, z)
 
     def radius(self, height: np.ndarray, angle: np.ndarray) -> np.ndarray:
-        """Return how far from the axis the shells are left for the first time, within reach."""
-        # A ray that passes exactly through an edge would meet two triangles there.
+        """Return where rays from the axis first leave the shells, at most `reach` [m]."""
+        # The small shifts avoid rays exactly through an edge, which would meet two triangles there.
         rays = zip(np.ravel(height) + 1.3e-7, np.ravel(angle) + 2.1e-7, strict=True)
         found = [self._exit(h, np.sin(a), np.cos(a)) for h, a in rays]
         return np.minimum(np.array(found), self._reach).reshape(np.shape(height))
 
     def _exit(self, height: float, sine: float, cosine: float) -> float:
-        """Return the way from the axis at a height to where it is outside all shells."""
+        """Return the distance from the axis at a height to the first point outside all shells."""
         a, b, c = np.moveaxis(
             self._corners[(self._lowest <= height) & (self._highest >= height)], 1, 0
         )
-        # Seen along the ray a triangle is met where its three edges run round the ray in one sense.
+        # A ray meets a triangle whose three edges, seen along the ray, turn about it in one sense.
         across = [corner[:, 0] * cosine - corner[:, 2] * sine for corner in (a, b, c)]
         up = [corner[:, 1] - height for corner in (a, b, c)]
         turns = [across[i] * up[i - 2] - across[i - 2] * up[i] for i in range(3)]
@@ -156,7 +156,7 @@ class _Surface:
         hit &= total != 0.0
         along = [corner[hit, 0] * sine + corner[hit, 2] * cosine for corner in (a, b, c)]
         turns = [turn[hit] for turn in turns]
-        # turns[i] belongs to the edge from corner i to the next: the weight of the third corner.
+        # turns[i] belongs to the edge from corner i to the next, and is the third corner's weight.
         way = (turns[1] * along[0] + turns[2] * along[1] + turns[0] * along[2]) / total[hit]
         ahead = way > 0.0
         order = np.argsort(way[ahead], kind="stable")

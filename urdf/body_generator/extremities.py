@@ -6,11 +6,11 @@ from numpy.typing import ArrayLike
 from .measures import Build, Measures
 from .shapes import EllipsoidBump, Loft, Section, Shell, SwellingBump
 
-# Lengths of index, middle, ring and little finger over the middle finger's, and of their
-# breadths likewise: derived, from the usual look of a hand.
+# Lengths and breadths of index, middle, ring and little finger, over the middle finger's length and
+# the mean breadth: chosen by the look of a hand.
 FINGER_LENGTHS = (0.91, 1.0, 0.93, 0.74)
 FINGER_BREADTHS = (1.0, 1.02, 0.96, 0.86)
-# How far each fingertip bends towards the palm, as a share of the finger's length: relaxed.
+# Shift of each relaxed fingertip towards the palm, as a fraction of the finger's length.
 FINGER_CURLS = (0.14, 0.18, 0.22, 0.26)
 
 
@@ -25,12 +25,12 @@ def _digit(
     """Return a finger or thumb.
 
     Args:
-        base: middle of its root (3,) [m].
-        direction: from root to tip (3,).
-        length: from base to tip [m].
-        radius: at the root [m]; the tip has three quarters of it.
-        curl: sideways shift of the tip along bend [m].
-        bend: (3,) direction in which it curls.
+        base: (3,) middle of the root [m].
+        direction: (3,) from root to tip.
+        length: from root to tip [m].
+        radius: at the root [m]; 0.78 of it at the tip.
+        curl: shift of the tip along `bend` [m].
+        bend: (3,) direction of the curl.
     """
     shares = np.array([0.0, 0.3, 0.5, 0.75, 1.0])
     sizes = np.array([1.0, 0.97, 0.98, 0.88, 0.78]) * radius
@@ -50,7 +50,7 @@ def _digit(
 
 
 def hand(m: Measures, build: Build) -> list[Shell]:
-    """Return the left hand hanging down: palm inward, thumb forward, fingers slightly bent."""
+    """Return the hanging left hand: palm inward, thumb forward, fingers slightly bent."""
     half = 0.5 * m.handbreadth
     palm = m.palmlength
     s = m.handlength / 0.1811
@@ -143,7 +143,7 @@ def foot(m: Measures, build: Build) -> list[Shell]:
         across(ball - 0.012 * s, 0.034 * s, 0.98 * half, 0.96 * half),
         across(ball + 0.012 * s, 0.024 * s, 0.96 * half, 0.88 * half, 0.001 * s),
     ]
-    # A loft runs along y: its x, y, z become the foot's x, z, y.
+    # A loft runs along y: its x, y, z become x, z, y of the foot.
     arch = SwellingBump(
         (-0.03 * s, 0.045 * s, -ankle), (0.018 * s, 0.030 * s, 0.016 * s), -0.012 * s
     )
@@ -162,7 +162,7 @@ def foot(m: Measures, build: Build) -> list[Shell]:
 
 
 def _toes(m: Measures, back: float, half: float, ball: float, s: float) -> list[Shell]:
-    """Return the five toes, from the big one (inside) outwards."""
+    """Return the five toes, from the big toe (inside) outwards."""
     shells = []
     tips = np.array([1.0, 0.985, 0.955, 0.92, 0.88]) * m.footlength + back
     centres = np.array([-0.68, -0.20, 0.16, 0.47, 0.74]) * half

@@ -17,19 +17,19 @@ from .shapes import (
 )
 
 FACE_ANGLES = (0, 6, 13, 21, 31, 46, 70, 105, 180)
-# Heights of the rings of the face and of the hair, as shares of the way from chin to crown.
+# Heights of the rings of the face and of the hair, as fractions of the way from chin to crown.
 FACE_RINGS = (0.052, 0.095, 0.145, 0.185, 0.22, 0.27, 0.31, 0.35, 0.385, 0.43, 0.475)
 SKULL_RINGS = (0.515, 0.555, 0.61, 0.70, 0.82)
 HAIR_ANGLES = (0, 15, 32, 50, 72, 100, 138, 180)
 HAIR_RINGS = (0.22, 0.32, 0.42, 0.51, 0.60, 0.69, 0.79, 0.885)
-# Hairline: degrees from straight ahead, and its height there as a share of chin to crown: over
-# the forehead, down in front of the ears, round them, to the nape.
+# Hairline: angles from straight ahead [deg], and its height there as a fraction of chin to crown:
+# over the forehead, down in front of the ears, around them, to the nape.
 HAIRLINE = (
     (0.0, 25.0, 48.0, 66.0, 84.0, 100.0, 125.0, 180.0),
     (0.800, 0.785, 0.725, 0.62, 0.49, 0.36, 0.20, 0.14),
 )
-# Eyes and brows: share of the way from chin to sellion, distance from the middle, radii and depth
-# of the centre under the skin [m for the mean woman], material.
+# Eyes and brows: fraction of the way from chin to sellion, distance from the middle, radii, and
+# depth of the centre under the skin [m for the mean woman], material.
 FACE_DETAILS = (
     (0.985, 0.0310, (0.0155, 0.0068, 0.0065), 0.0028, "eye"),
     (1.150, 0.0325, (0.0195, 0.0028, 0.0060), 0.0040, "hair"),
@@ -37,7 +37,7 @@ FACE_DETAILS = (
 
 
 def _sections(m: Measures, build: Build) -> list[Section]:
-    """Return face and skull from the chin to the crown, by height above the floor."""
+    """Return face and skull from the chin to the crown, at heights above the floor."""
     s = m.stature / 1.6285
     chin = m.stature - _face_height(m)
     height = m.stature - chin
@@ -49,7 +49,7 @@ def _sections(m: Measures, build: Build) -> list[Section]:
     def section(
         share: float, side: float, fore: float, aft: float, power: float, middle: float = 0.0
     ) -> Section:
-        """Return a section at a share of chin to crown, its axis at z = middle."""
+        """Return a section at a fraction of chin to crown, its axis at z = middle."""
         return Section(
             chin + share * height,
             side,
@@ -107,7 +107,7 @@ def _neck(m: Measures) -> Shell:
 
 
 def _face_height(m: Measures) -> float:
-    """Return the height from the chin to the crown [m]: the sellion lies at the eyes' height."""
+    """Return the height from chin to crown [m]; the sellion is at the height of the eyes."""
     return m.mentonsellionlength + 0.815 * m.tragiontopofhead
 
 
@@ -122,7 +122,7 @@ def _features(m: Measures, build: Build) -> list[Bump]:
     def swell(
         x: float, share: float, widths: tuple[float, float], amount: float, depth: float = 0.03
     ) -> None:
-        """Add a swelling at x and -x [m], share of the height from chin to sellion."""
+        """Add a swelling at x and -x [m], at a fraction of the height from chin to sellion."""
         for side in (x, -x) if x else (0.0,):
             bumps.append(
                 SwellingBump(
@@ -172,7 +172,7 @@ def _detail(size: np.ndarray, material: str, around: int = 6) -> Shell:
 
 
 def head(m: Measures, build: Build) -> list[Shell]:
-    """Return the head with its neck; the hair is a shell that leaves the face free."""
+    """Return the head with its neck; the hair is a shell that does not cover the face."""
     s = m.stature / 1.6285
     sections = _sections(m, build)
     chin = m.stature - _face_height(m)
@@ -219,12 +219,12 @@ def head(m: Measures, build: Build) -> list[Shell]:
 
 
 def _hair(m: Measures, build: Build, sections: list[Section]) -> list[Shell]:
-    """Return the hair: the skull swollen where hair grows, sunk under the skin elsewhere."""
+    """Return the hair: the skull, swollen where hair grows, and sunk under the skin elsewhere."""
     s = m.stature / 1.6285
     chin = m.stature - _face_height(m)
     height = m.stature - chin
     thick = (0.011 if build.ponytail else 0.009) * s
-    # Above the widest part the skull is stretched, so that the hair is as thick on top.
+    # The skull is stretched above its widest part, so that the hair is equally thick on top.
     widest = chin + 0.68 * height
     stretch = 1.0 + thick / (m.stature - widest)
 

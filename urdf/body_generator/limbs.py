@@ -5,8 +5,8 @@ import numpy as np
 from .measures import Build, Measures, joint_positions
 from .shapes import EllipsoidBump, Loft, Section, Shell, SwellingBump
 
-SLEEVE = 0.30  # where the shirt's sleeve ends, as a share of the upper arm
-HEM = 0.55  # where the shorts end, as a share of the thigh
+SLEEVE = 0.30  # end of the shirt's sleeve, as a fraction of the upper arm
+HEM = 0.55  # end of the shorts, as a fraction of the thigh
 
 
 def _limb_section(
@@ -19,11 +19,11 @@ def _limb_section(
     """Return a section of a limb from the origin to end (3,).
 
     Args:
-        end: where the next joint is [m].
-        share: where on the limb, 0 at the origin, 1 at the end.
+        end: position of the next joint [m].
+        share: place on the limb, 0 at the origin, 1 at the end.
         girth: circumference [m].
-        shape: proportions outward, inward, forward, backward; only their ratios count.
-        shift: of the section's axis outward and forward [m].
+        shape: radii outward, inward, forward and backward; only their ratios count.
+        shift: of the section's axis, outward and forward [m].
     """
     centre = end * share
     section = Section(centre[1], *shape, centre[0] + shift[0], centre[2] + shift[1])
@@ -31,7 +31,7 @@ def _limb_section(
 
 
 def _rings(end: np.ndarray, count: int, share: float) -> list[float]:
-    """Return count heights evenly spread over a limb, and the one at a share of it [m]."""
+    """Return `count` heights evenly spaced over a limb, and the one at the fraction `share` [m]."""
     even = np.linspace(0.0, 1.0, count)
     even = even[np.abs(even - share) > 0.02]
     return [float(end[1] * t) for t in (*even, share)]

@@ -64,19 +64,19 @@ class Measures:
 
 @dataclass(frozen=True)
 class Build:
-    """What tells one bundled body from the other, besides its measures.
+    """Looks and mass of a bundled body, besides its measures.
 
     Attributes:
         name: of the model, the URDF file and the .mtl file.
         bust: whether there are breasts.
-        jaw: breadth of the lower jaw, as a share of the bizygomatic breadth.
-        chin: breadth of the chin; 1 is the woman's.
+        jaw: breadth of the lower jaw, as a fraction of the bizygomatic breadth.
+        chin: breadth of the chin, as a multiple of the woman's.
         brow: prominence of the brow ridge [m].
-        natural_waist: breadth and depth of the narrowest waist as a share of those at the navel.
+        natural_waist: breadth and depth of the narrowest waist, as fractions of those at the navel.
         ponytail: long hair, tied behind the head; otherwise short hair.
-        muscle: size of the muscles' bulges relative to the woman's.
+        muscle: size of the muscles' bulges, as a multiple of the woman's.
         mass: of the whole body [kg].
-        mass_shares: of each kind of segment, as a share of the whole mass.
+        mass_fractions: mass of each kind of segment, as a fraction of the whole mass.
         colours: material name to red, green, blue in 0..1.
     """
 
@@ -89,16 +89,16 @@ class Build:
     ponytail: bool
     muscle: float
     mass: float
-    mass_shares: dict[str, float]
+    mass_fractions: dict[str, float]
     colours: dict[str, tuple[float, float, float]]
 
 
 def joint_positions(m: Measures) -> dict[str, np.ndarray]:
-    """Return where each segment joins its parent in the standing body [m].
+    """Return where each segment joins its parent in the standing body (3,) [m].
 
-    x to the body's left, y up from the floor, z forward; the left side only, the right side is
-    its mirror image.  The README beside each model tells which numbers are measured and which are
-    derived.
+    x is to the body's left, y up from the floor, z forward. Only the left side is returned; the
+    right side is its mirror image. The README of each model states which numbers are measured and
+    which are derived.
     """
     scale = m.stature / 1.6285
     neck = m.stature - m.tragiontopofhead - 0.015 * scale

@@ -61,7 +61,7 @@ SHAPES: dict[str, Shape] = {
 }
 AXES = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
 INERTIA_NAMES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-WORLD_REACH = 10.0  # how far the root may go along each axis of the world [m]
+WORLD_REACH = 10.0  # limit of the root's position along each axis of the world [m]
 TINY_MASS = 0.001  # of the links between two axes of one joint [kg]
 DECIMALS = 5  # of the coordinates in the .obj files: 0.01 mm
 
@@ -81,7 +81,7 @@ def link_origin(link: str, measures: Measures) -> np.ndarray:
 
 
 def obj_text(shells: Sequence[Shell], build: Build) -> str:
-    """Return a Wavefront OBJ with one normal a vertex and the faces grouped by material."""
+    """Return a Wavefront OBJ with one normal per vertex and the faces grouped by material."""
     lines = [f"mtllib {build.name}.mtl"]
     normals: list[str] = []
     faces: dict[str, list[str]] = {}
@@ -109,9 +109,9 @@ def mtl_text(build: Build) -> str:
 
 
 def mass_properties(shells: Sequence[Shell], mass: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return centre of mass (3,) [m] and inertia about it (3, 3) [kg m^2] at even density.
+    """Return centre of mass (3,) [m] and inertia about it (3, 3) [kg m^2] at uniform density.
 
-    Overlaps of the shells count twice, which for bodies this much alike does not matter.
+    Overlaps of the shells count twice, which is negligible here.
     """
     volume, first, second = 0.0, np.zeros(3), np.zeros((3, 3))
     for shell in shells:
@@ -128,7 +128,7 @@ def mass_properties(shells: Sequence[Shell], mass: float) -> tuple[np.ndarray, n
 
 
 def _numbers(values: ArrayLike) -> str:
-    """Return numbers for the URDF, with 0.01 mm or the like, and no minus zero."""
+    """Return numbers for the URDF, to 8 decimals and 6 digits, without minus zero."""
     return " ".join(f"{value + 0.0:.6g}" for value in np.round(np.asarray(values), 8))
 
 
@@ -147,7 +147,7 @@ def _joint(
 
 
 def _tiny_link(name: str) -> str:
-    """Return a link without geometry, light enough not to matter in a simulation."""
+    """Return a link without geometry, of negligible mass."""
     inertia = " ".join(f'{axis}="{1e-6 if axis[1] == axis[2] else 0}"' for axis in INERTIA_NAMES)
     return (
         f'  <link name="{name}">\n    <inertial>\n      <mass value="{TINY_MASS}"/>\n'
@@ -156,9 +156,9 @@ def _tiny_link(name: str) -> str:
 
 
 def _root_joints() -> str:
-    """Return the three sliding joints that carry the root, and the change of axes after them.
+    """Return the three prismatic joints that carry the root, and the change of axes after them.
 
-    The world is x forward, y left, z up; the links are x left, y up, z forward.
+    World axes: x forward, y left, z up. Link axes: x left, y up, z forward.
     """
     text, parent = "", "world"
     for axis in "xyz":
@@ -183,7 +183,7 @@ def _root_joints() -> str:
 
 def _link(link: str, shells: Sequence[Shell], build: Build) -> str:
     """Return a link with its mesh and inertia."""
-    mass = build.mass * build.mass_shares[SEGMENTS[link][1]]
+    mass = build.mass * build.mass_fractions[SEGMENTS[link][1]]
     centre, inertia = mass_properties(shells, mass)
     rows, columns = np.triu_indices(3)
     moments = " ".join(
@@ -219,7 +219,7 @@ def urdf_text(shells: dict[str, list[Shell]], measures: Measures, build: Build) 
 
 
 def write_body(folder: Path, measures: Measures, build: Build) -> None:
-    """Write <name>.urdf and meshes/ into folder, which is made if need be."""
+    """Write <name>.urdf and meshes/ into a folder, which is made if missing."""
     meshes = folder / "meshes"
     meshes.mkdir(parents=True, exist_ok=True)
     shells = {link: link_shells(link, measures, build) for link in SEGMENTS}

@@ -1,4 +1,4 @@
-"""The man and the woman: published measures and masses, and what we chose of their looks."""
+"""The bundled man and woman: published measures and masses, and chosen looks."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,13 +11,13 @@ class Person:
     Attributes:
         measures: body measures under their names in the survey [m].
         mass: of the whole body at these measures [kg].
-        mass_shares: of each kind of segment, as a share of the whole mass.
+        mass_fractions: mass of each kind of segment, as a fraction of the whole mass.
         build: the other fields of ``Build``.
     """
 
     measures: dict[str, float]
     mass: float
-    mass_shares: dict[str, float]
+    mass_fractions: dict[str, float]
     build: dict[str, Any]
 
 
@@ -72,12 +72,12 @@ _MEASURES = {
     "wristcircumference": (0.1759, 0.1548),
 }
 
-# Whole mass: the same survey's mean. Shares: de Leva 1996; the trunk's middle part is halved
-# between chest and waist.
+# Whole mass: the same survey's mean. Mass fractions: de Leva 1996; the middle part of the trunk is
+# divided equally between chest and waist.
 MAN = Person(
     measures={name: male for name, (male, _) in _MEASURES.items()},
     mass=85.52,
-    mass_shares={
+    mass_fractions={
         "head": 0.0694,
         "chest": 0.1596 + 0.5 * 0.1633,
         "waist": 0.5 * 0.1633 + 0.1117,
@@ -110,7 +110,7 @@ MAN = Person(
 WOMAN = Person(
     measures={name: female for name, (_, female) in _MEASURES.items()},
     mass=67.76,
-    mass_shares={
+    mass_fractions={
         "head": 0.0668,
         "chest": 0.1545 + 0.5 * 0.1465,
         "waist": 0.5 * 0.1465 + 0.1247,

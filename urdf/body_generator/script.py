@@ -1,4 +1,4 @@
-"""What the scripts beside the bundled bodies share: their command line."""
+"""Command line of the scripts that write the bundled bodies."""
 
 import argparse
 from pathlib import Path
@@ -13,9 +13,9 @@ def run(folder: Path, person: Person, *, skin: bool = False) -> None:
     """Read the command line and write a body.
 
     Args:
-        folder: the script's own folder, where the body is written unless told otherwise.
-        person: whose body.
-        skin: whether bands of skin are written, too.
+        folder: the script's folder, where the body is written by default.
+        person: the body.
+        skin: whether to write bands of skin, too.
     """
     name = person.build["name"]
     parser = argparse.ArgumentParser(description=f"Write {name}.urdf and its meshes.")
@@ -27,7 +27,7 @@ def run(folder: Path, person: Person, *, skin: bool = False) -> None:
     published = Measures(**person.measures)
     scaled = published.scaled_to(options.stature)
     mass = person.mass * (options.stature / published.stature) ** 3
-    build = Build(mass=mass, mass_shares=person.mass_shares, **person.build)
+    build = Build(mass=mass, mass_fractions=person.mass_fractions, **person.build)
     write_body(options.out, scaled, build)
     if skin:
         write_skin(options.out, name, f"make_{name}.py", body_bands(scaled, build))

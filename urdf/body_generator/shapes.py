@@ -1,9 +1,9 @@
-"""Closed triangle shells made by sweeping anatomical cross sections along an axis.
+"""Closed triangle shells, made by sweeping anatomical cross sections along an axis.
 
-Axes are the paper's: x to the body's left, y up, z forward, in metres.  A *loft* is a stack of
-cross sections perpendicular to y; each section is a superellipse with four radii of its own
-(left, right, front, back), so no limb comes out rotationally symmetric.  Bumps (ellipsoids that
-blend smoothly into the surface, or Gaussian swellings) make noses, breasts and calves.
+x points to the body's left, y up, z forward, in metres, as in the paper. A *loft* is a stack of
+cross sections perpendicular to y. Each section is a superellipse with a radius of its own to the
+left, right, front and back. Bumps (ellipsoids that blend smoothly into the surface, or Gaussian
+swellings) model noses, breasts and calves.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -20,7 +20,7 @@ class Shell:
 
     Attributes:
         vertices: (n, 3) positions [m].
-        triangles: (m, 3) vertex indices, counter-clockwise seen from outside.
+        triangles: (m, 3) vertex indices, counterclockwise seen from outside.
         materials: (m,) name of each triangle's material in the .mtl file.
     """
 
@@ -33,7 +33,7 @@ class Shell:
         return replace(self, vertices=self.vertices + np.asarray(offset, dtype=float))
 
     def transformed(self, matrix: np.ndarray) -> "Shell":
-        """Return the shell under the linear map (3, 3); reflections keep the outside outside."""
+        """Return the shell under a linear map (3, 3); triangles keep facing outwards."""
         triangles = self.triangles if np.linalg.det(matrix) > 0.0 else self.triangles[:, ::-1]
         return replace(self, vertices=self.vertices @ np.asarray(matrix).T, triangles=triangles)
 
@@ -42,14 +42,14 @@ class Shell:
         return self.transformed(np.diag([-1.0, 1.0, 1.0]))
 
     def painted_above(self, height: float, material: str) -> "Shell":
-        """Return the shell with another material where triangles lie above a height [m]."""
+        """Return the shell with another material for triangles above a height [m]."""
         above = self.vertices[self.triangles, 1].min(axis=1) > height - 1e-6
         return replace(self, materials=np.where(above, material, self.materials))
 
 
 @dataclass(frozen=True)
 class EllipsoidBump:
-    """An ellipsoid that grows out of a loft.
+    """An ellipsoid that protrudes from a loft.
 
     Attributes:
         centre: (3,) [m].
@@ -62,7 +62,7 @@ class EllipsoidBump:
     blend: float
 
     def apply(self, radius: np.ndarray, axis: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return radii (n,) from axis points (n, 3) along directions (n, 3), grown by the bump."""
+        """Return radii (n,) from axis points (n, 3) along directions (n, 3), with the bump."""
         scale = np.asarray(self.radii)
         start = (axis - np.asarray(self.centre)) / scale
         step = direction / scale
@@ -70,7 +70,7 @@ class EllipsoidBump:
         b = np.einsum("ij,ij->i", start, step)
         c = np.einsum("ij,ij->i", start, start) - 1.0
         root = b * b - a * c
-        # A ray that misses gets a value that goes on falling smoothly from the tangent's.
+        # A ray that misses the ellipsoid gets a value that decreases smoothly from the tangent's.
         hit = (-b + np.sign(root) * np.sqrt(np.abs(root))) / a
         return smooth_maximum(radius, hit, self.blend)
 
@@ -107,7 +107,7 @@ class Section:
     Attributes:
         y: height [m].
         left, right, front, back: radii towards +x, -x, +z, -z [m].
-        x, z: where the axis passes [m].
+        x, z: position of the axis [m].
         front_power, back_power: exponents of the superellipse's front and back half; 2 is an
             ellipse, larger is boxier.
     """
@@ -123,12 +123,12 @@ class Section:
     back_power: float = 2.0
 
     def values(self) -> list[float]:
-        """Return the eight numbers that are interpolated along y."""
+        """Return the eight numbers that a loft interpolates along y."""
         radii = [self.left, self.right, self.front, self.back]
         return [*radii, self.x, self.z, self.front_power, self.back_power]
 
     def scaled_to_girth(self, girth: float) -> "Section":
-        """Return the same shape with the given circumference [m]."""
+        """Return the section scaled to a circumference [m]."""
         angles = np.linspace(0.0, 2.0 * np.pi, 721)
         radius = section_radius(np.tile(self.values(), (angles.size, 1)), angles)
         ring = radius[:, None] * np.stack([np.sin(angles), np.cos(angles)], axis=1)
@@ -149,12 +149,12 @@ class Loft:
 
     Attributes:
         sections: at least two, in any order.
-        rings: heights of the rings of vertices [m], or how many, evenly spread.
+        rings: heights of the rings of vertices [m], or their number, evenly spaced.
         low_cap, high_cap: heights of the rounded ends below and above the sections [m].
-        angles: directions of the vertices round the axis [rad], 0 = front, or how many.
+        angles: directions of the vertices about the axis [rad], 0 = front, or their number.
         bumps: applied in order.
-        cap_rings: rings in each rounded end.
-        rule: last word on the radius, given points on the axis, directions and radii.
+        cap_rings: number of rings in each rounded end.
+        rule: returns the final radii, given points on the axis, directions and radii.
     """
 
     sections: Sequence[Section]
@@ -191,7 +191,7 @@ class Loft:
         return tube(vertices, heights.size, angles.size, material)
 
     def _rings(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return for every ring its height on the sections, shrinking factor and cap offset."""
+        """Return each ring's height on the sections, factor on its radius, and cap offset."""
         knots = [section.y for section in self.sections]
         low, high = min(knots), max(knots)
         if isinstance(self.rings, int):
@@ -214,7 +214,7 @@ class Loft:
 
 
 def ring_angles(angles: int | np.ndarray) -> np.ndarray:
-    """Return directions round an axis [rad]: n evenly spread ones, or those given."""
+    """Return directions about an axis [rad]: n evenly spaced ones, or those given."""
     if isinstance(angles, int):
         return np.arange(angles) * (2.0 * np.pi / angles)
     return angles
@@ -237,7 +237,7 @@ def section_radius(values: np.ndarray, angles: np.ndarray) -> np.ndarray:
 
 
 def smooth_maximum(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
-    """Return max(a, b), rounded off where the two are within width of each other."""
+    """Return max(a, b), rounded where they differ by less than `width`."""
     overlap = np.maximum(width - np.abs(a - b), 0.0) / width
     return np.maximum(a, b) + overlap**2 * width * 0.25
 
@@ -249,7 +249,7 @@ def ellipsoid(
     around: int = 8,
     rings: int = 5,
 ) -> Shell:
-    """Return an ellipsoid with its poles on the y axis."""
+    """Return an ellipsoid with poles along y."""
     tilt = np.pi * (np.arange(rings) + 1.0) / (rings + 1.0)
     turn = ring_angles(around)
     unit = np.stack(
@@ -266,7 +266,7 @@ def ellipsoid(
 
 
 def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return unit normals (n, 3): the mean of the neighbouring triangles', weighted by area."""
+    """Return unit normals (n, 3): area-weighted means of the adjacent triangles' normals."""
     corners = vertices[triangles]
     face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = np.zeros_like(vertices)
@@ -276,7 +276,7 @@ def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def tube(vertices: np.ndarray, rings: int, around: int, material: str) -> Shell:
-    """Return the shell of rings upwards, closed by two poles that come last (low, high)."""
+    """Return the shell of rings, upwards, closed by two poles: the last vertices (low, high)."""
     index = np.arange(rings * around).reshape(rings, around)
     here, beside = index, np.roll(index, -1, axis=1)
     lower = np.stack([here[:-1], beside[:-1], beside[1:]], axis=-1).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Writes bands of skin: a mesh a band and the skin file beside the model."""
+"""Bands of skin: a mesh for each band, and the skin file of the model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,10 +19,10 @@ class LinkBand:
 
     Attributes:
         parent, child: the links.
-        file: its mesh's name, without ending.
-        band: where it runs, on the left side, in the child's frame.
-        shell: its surface there.
-        mirrored: whether these links are those of the right side.
+        file: name of its mesh, without suffix.
+        band: its place on the left side, in the child's frame.
+        shell: its surface on the left side.
+        mirrored: whether the links are on the right side.
         colour: (3,) in 0..1.
     """
 
@@ -78,10 +78,10 @@ def write_skin(folder: Path, model: str, script: str, bands: Sequence[LinkBand])
     """Write <model>.skin.yaml and the bands' meshes into the folder of a model.
 
     Args:
-        folder: it.
-        model: the URDF's name, without ending.
-        script: the name of the script that does it.
-        bands: all of them.
+        folder: the model's folder.
+        model: name of the URDF, without suffix.
+        script: name of the script that writes them.
+        bands: all bands of the model.
     """
     write_meshes(
         folder,

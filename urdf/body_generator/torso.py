@@ -29,21 +29,21 @@ def _pair(bump: Bump) -> list[Bump]:
 
 
 def _section(y: float, half: float, front: float, back: float, power: float = 2.2) -> Section:
-    """Return a symmetric section of half breadth half that reaches from z = back to z = front."""
+    """Return a symmetric section of half breadth `half` from z = back to z = front [m]."""
     z = 0.5 * (front + back)
     depth = front - z
     return Section(y, half, half, depth, depth, z=z, front_power=power, back_power=power)
 
 
 def _in_link(loft_sections: Iterable[Section], origin_y: float) -> list[Section]:
-    """Return sections given by height above the floor, by height above the joint."""
+    """Return sections with heights above the joint, given heights above the floor."""
     return [replace(section, y=section.y - origin_y) for section in loft_sections]
 
 
 def _waist_sections(m: Measures, build: Build) -> list[Section]:
     """Return the torso from the navel to its narrowest place at the tenth rib, above the floor.
 
-    Chest and waist share these sections, so that they meet flush where they join.
+    Chest and waist share these sections, so that they join flush.
     """
     navel_half, navel_depth = 0.5 * m.waistbreadth, m.waistdepth
     joint = joint_positions(m)["waist"][1]
@@ -60,14 +60,14 @@ def _waist_sections(m: Measures, build: Build) -> list[Section]:
 
 
 def _chest_front(m: Measures, build: Build) -> tuple[float, float]:
-    """Return how far forward the ribs reach, without the breasts, and how far back [m]."""
+    """Return how far the ribs, without breasts, reach forward, and how far back [m]."""
     s = m.stature / 1.6285
     back = -0.118 * s
     return m.chestdepth + back - (0.052 * s if build.bust else 0.010 * s), back
 
 
 def _chest_sections(m: Measures, build: Build) -> list[Section]:
-    """Return ribs and shoulders from the hem to the collar, by height above the floor."""
+    """Return ribs and shoulders from the hem to the collar, at heights above the floor."""
     s = m.stature / 1.6285
     origin = joint_positions(m)["chest"]
     _, seam, narrow = _waist_sections(m, build)
@@ -166,7 +166,7 @@ def chest(m: Measures, build: Build) -> list[Shell]:
         bumps=_chest_bumps(m, build, origin[1]),
         cap_rings=4,
     )
-    # The shoulders' balls keep the arms attached wherever they turn.
+    # The shoulders' balls keep the arms attached in every pose.
     ball = ellipsoid((0.0, -0.004 * s, 0.0), (0.034 * s, 0.026 * s, 0.034 * s), "suit", 8, 3)
     ball = ball.moved(joint_positions(m)["upper_arm"] - origin)
     return [loft.shell("suit").moved((0.0, 0.0, -origin[2])), ball, ball.mirrored()]

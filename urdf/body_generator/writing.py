@@ -1,4 +1,4 @@
-"""Texts of links, joints and plain .obj files, for models whose colours stand in the URDF."""
+"""Texts of links, joints and .obj files, for models whose colours are in the URDF."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 from .model import DECIMALS, INERTIA_NAMES, TINY_MASS, mass_properties
 from .shapes import Shell, vertex_normals
 
-WORLD_REACH = 10.0  # how far the root may go along each axis of the world [m]
-# The world is x forward, y left, z up; the links are x left, y up, z forward.
+WORLD_REACH = 10.0  # limit of the root's position along each axis of the world [m]
+# World axes: x forward, y left, z up. Link axes: x left, y up, z forward.
 ROOT_TURN = (float(np.pi / 2.0), 0.0, float(np.pi / 2.0))
 
 
@@ -20,12 +20,12 @@ class Joint:
     """A joint of one axis, or a fixed one.
 
     Attributes:
-        name, parent, child: of the joint and its links.
+        name, parent, child: names of the joint and of its links.
         kind: "revolute", "prismatic" or "fixed".
         axis: (3,) in the child's frame.
         limits: lower and upper [deg or m].
-        xyz: (3,) where the child's frame is in the parent's [m].
-        rpy: (3,) how it is turned there [rad].
+        xyz: (3,) origin of the child's frame in the parent's [m].
+        rpy: (3,) roll, pitch and yaw of the child's frame in the parent's [rad].
     """
 
     name: str
@@ -56,7 +56,7 @@ class Joint:
 
 
 def numbers(values: ArrayLike) -> str:
-    """Return numbers for the URDF to 0.01 micrometres or the like, without minus zero."""
+    """Return numbers for the URDF, to 8 decimals and 6 digits, without minus zero."""
     return " ".join(f"{value + 0.0:.6g}" for value in np.round(np.asarray(values), 8))
 
 
@@ -66,10 +66,10 @@ def exactly(values: ArrayLike) -> str:
 
 
 def root_joints(turning: Sequence[Joint]) -> str:
-    """Return what carries the root: three sliding joints, a change of axes, then turning joints.
+    """Return the joints that carry the root: three prismatic ones, a change of axes, then others.
 
     Args:
-        turning: the root's turning joints; the first one's parent is "root_axes_link".
+        turning: the root's revolute joints; the first one's parent is "root_axes_link".
     """
     text, parent = '  <link name="world"/>\n', "world"
     for index, axis in enumerate("xyz"):
@@ -84,7 +84,7 @@ def root_joints(turning: Sequence[Joint]) -> str:
 
 
 def joint_chain(joints: Sequence[Joint]) -> str:
-    """Return joints that follow one another, with bare links between them (not after the last)."""
+    """Return successive joints with bare links between them, but none after the last joint."""
     text = ""
     for index, joint in enumerate(joints):
         text += joint.text()
@@ -94,7 +94,7 @@ def joint_chain(joints: Sequence[Joint]) -> str:
 
 
 def bare_link(name: str) -> str:
-    """Return a link without geometry, light enough not to matter in a simulation."""
+    """Return a link without geometry, of negligible mass."""
     moments = " ".join(f'{axis}="{1e-6 if axis[1] == axis[2] else 0}"' for axis in INERTIA_NAMES)
     return (
         f'  <link name="{name}">\n    <inertial>\n      <mass value="{TINY_MASS}"/>\n'
@@ -103,11 +103,11 @@ def bare_link(name: str) -> str:
 
 
 def solid_link(name: str, visuals: Mapping[str, Sequence[Shell]], mass: float) -> str:
-    """Return a link with inertia at even density.
+    """Return a link with the inertia of a uniform density.
 
     Args:
         name: of the link.
-        visuals: .obj file -> its shells, which share one material.
+        visuals: shells by .obj file; the shells of a file share one material.
         mass: of the link [kg].
     """
     shells = [shell for part in visuals.values() for shell in part]
@@ -139,7 +139,7 @@ def materials_text(colours: Mapping[str, tuple[float, float, float]]) -> str:
 
 
 def obj_text(shells: Sequence[Shell]) -> str:
-    """Return a Wavefront OBJ without materials, one normal a vertex."""
+    """Return a Wavefront OBJ without materials, with one normal per vertex."""
     positions, normals, faces, start = [], [], [], 1
     for shell in shells:
         vertices = np.round(shell.vertices, DECIMALS) + 0.0

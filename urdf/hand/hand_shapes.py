@@ -1,7 +1,7 @@
 """Measures and shapes of the left hand and forearm, each part in its link's frame [m].
 
-Axes when all angles are 0: y along the forearm towards the fingertips, z out of the palm, x from
-the thumb to the little finger. The right hand is the mirror image.
+Axes when all angles are 0: y along the forearm to the fingertips, z out of the palm, x from the
+thumb to the little finger. The right hand is the mirror image.
 """
 
 from dataclasses import dataclass
@@ -34,14 +34,14 @@ class Finger:
     """One of the four fingers.
 
     Attributes:
-        bones: lengths of the proximal, middle and distal phalanx and of the soft tissue beyond
-            the last [mm], Buryanov and Kotiuk 2010; only their proportions count.
-        knuckle: where the MCP joint's centre is: across, over the hand's breadth, from the third
-            metacarpal's axis, and along, over the hand's length, from the wrist.
-        thickness: of the three phalanges over the hand's breadth.
-        webs: how far the web reaches beyond the finger's own axis at its end, towards the thumb
-            and towards the little finger, over the hand's breadth; 0: no web on that side.
-        web_length: how far from the knuckle the web ends, over the hand's length.
+        bones: lengths of the proximal, middle and distal phalanx, and of the soft tissue beyond
+            the last [mm] (Buryanov and Kotiuk 2010); only their ratios count.
+        knuckle: centre of the MCP joint: distance from the third metacarpal's axis, over the
+            hand's breadth; distance from the wrist, over the hand's length.
+        thickness: of the three phalanges, over the hand's breadth.
+        webs: reach of the web beyond the finger's axis, towards the thumb and towards the little
+            finger, over the hand's breadth; 0: no web on this side.
+        web_length: distance of the web's end from the knuckle, over the hand's length.
     """
 
     bones: tuple[float, float, float, float]
@@ -69,16 +69,16 @@ THUMB_BONES = (31.57, 21.67, 5.67)  # proximal, distal, soft tissue [mm], as abo
 THUMB_BASE = (-0.196, 0.073, 0.040)  # CMC joint: breadth, length, breadth (towards the palm)
 THUMB_METACARPAL = 0.251  # over the hand's length
 THUMB_THICKNESS = (0.330, 0.262, 0.245)  # metacarpal, proximal, distal phalanx
-# Radii of the heads of metacarpal, proximal and middle phalanx [mm]: a joint's centre lies that
-# far inside the bone before it.
+# Radii of the heads of metacarpal, proximal and middle phalanx [mm]: the distance of a joint's
+# centre from the end of the bone before it.
 HEADS = (7.0, 4.0, 3.0)
 THUMB_HEADS = (6.0, 5.0)
 
 
 def finger_lengths(name: str, m: HandMeasures) -> tuple[float, float, float]:
-    """Return joint centre to joint centre, and last joint to fingertip [m].
+    """Return the distances between joint centres, and from the last joint to the fingertip [m].
 
-    The middle finger ends at the hand's length; the others keep the bones' proportions to it.
+    The middle finger ends at the hand's length; the others have the bones' ratios to it.
     """
     middle = FINGERS["middle"]
     reach = m.handlength * (1.0 - middle.knuckle[1])
@@ -92,7 +92,7 @@ def finger_lengths(name: str, m: HandMeasures) -> tuple[float, float, float]:
 
 
 def thumb_lengths(m: HandMeasures) -> tuple[float, float, float]:
-    """Return CMC to MCP, MCP to IP, IP to the thumb's tip [m]."""
+    """Return the distances CMC to MCP, MCP to IP, and IP to the thumb's tip [m]."""
     middle = FINGERS["middle"]
     scale = m.handlength * (1.0 - middle.knuckle[1]) / (sum(middle.bones) + HEADS[0])
     first, last, tip = THUMB_BONES
@@ -116,7 +116,7 @@ def thumb_base(m: HandMeasures) -> np.ndarray:
 
 
 def _round(y: float, radius: float, thumbwards: float = 0.0, outwards: float = 0.0) -> Section:
-    """Return a finger's section: a little broader than deep, its pulp fuller than its back.
+    """Return a finger's section: slightly broader than deep, with a fuller pulp than back.
 
     Args:
         y: along the finger [m].
@@ -136,7 +136,7 @@ def _capsule(sections: list[Section], rings: int, caps: tuple[float, float]) -> 
 
 
 def proximal(name: str, m: HandMeasures) -> Shell:
-    """Return a finger's proximal phalanx with its halves of the webs beside it."""
+    """Return a finger's proximal phalanx with half of each web beside it."""
     finger, length = FINGERS[name], finger_lengths(name, m)[0]
     half = [0.5 * share * m.handbreadth for share in finger.thickness]
     base, end = 1.04 * half[0], 0.51 * (half[0] + half[1])
@@ -170,7 +170,7 @@ def distal(name: str, m: HandMeasures) -> Shell:
 
 
 def _tip(length: float, start: float, radius: float) -> Shell:
-    """Return a last phalanx of start's radius at its joint and radius at the nail's root [m]."""
+    """Return a last phalanx of radius `start` at its joint and `radius` at the nail's root [m]."""
     cap = 0.78 * radius
     sections = [
         _round(0.0, start),
@@ -187,7 +187,7 @@ def thumb_metacarpal(m: HandMeasures) -> Shell:
     end = 1.02 * next_half
 
     def section(share: float, radius: float, web: float) -> Section:
-        """Return a section at a share of the length, reaching web [m] towards the index."""
+        """Return a section at a fraction of the length, reaching `web` [m] towards the index."""
         return Section(
             share * length, 0.95 * radius, 0.95 * radius, max(radius, web), radius, front_power=2.0
         )
@@ -274,12 +274,13 @@ def forearm(m: HandMeasures) -> Shell:
     def section(
         share: float, girth: float, shape: tuple[float, float, float, float], x: float = 0.0
     ) -> Section:
-        """Return a section at a share of the way from elbow to wrist.
+        """Return a section at a fraction of the way from elbow to wrist.
 
         Args:
             share: 0 at the elbow, 1 at the wrist.
             girth: circumference [m].
-            shape: proportions outwards (little finger), thumbwards, towards the palm, back.
+            shape: radii outwards (little finger), thumbwards, towards the palm, back; only their
+                ratios count.
             x: shift of the axis [m].
         """
         section = Section((share - 1.0) * length, *shape, x)

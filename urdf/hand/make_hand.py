@@ -30,7 +30,7 @@ TOWARDS_LITTLE = (0.0, 0.0, -1.0)
 Limits = tuple[float, float]
 DENSITY = 1100.0  # [kg/m^3]
 COLOURS = {"skin": (0.87, 0.67, 0.56)}
-# Limits [deg]; the README tells whose.
+# Joint limits [deg]; the README states their sources.
 ROOT_LIMITS = {"z": (-180, 180), "x": (-90, 90), "y": (-180, 180)}
 WRIST_LIMITS = {"flexion": (-70, 80), "deviation": (-20, 35)}
 ABDUCTION_LIMITS = {
@@ -46,8 +46,8 @@ THUMB_LIMITS = {
     "mcp_flexion": (-10, 55),
     "ip_flexion": (-50, 80),
 }
-# How the thumb's metacarpal stands in the palm when its angles are 0 [deg]: turned away from the
-# index finger in the palm's plane, raised out of it, and turned about itself.
+# Pose of the thumb's metacarpal in the palm at zero angles [deg]: turned away from the index finger
+# in the palm's plane, raised out of it, and turned about its own axis.
 THUMB_REST = (40.0, 20.0, 55.0)
 COUPLINGS = """# Loose couplings, written by make_hand.py; the README tells their sources.
 differences:
@@ -58,18 +58,18 @@ differences:
   - {first: ring_pip_flexion, second: little_pip_flexion, within: 70, unit: deg}
 rows:
 """
-# Bands of skin reach so far to both sides of a joint, over the hand's length, and from its axis,
-# over the hand's breadth.
+# Half length of the bands of skin along each joint, over the hand's length; their largest distance
+# from the joint's axis, over the hand's breadth.
 BAND_LENGTHS = {"wrist": 0.17, "finger": 0.055}
 BAND_REACHES = {"wrist": 0.42, "finger": 0.15}
 DISTAL_BAND = 30.0  # |DIP - 2/3 PIP| [deg]
-# How fingers are usually held, mean and deviation [deg]; the README tells whose.
+# Usual flexions of fingers, mean and standard deviation [deg]; the README states the source.
 USUAL_FLEXION = {"mcp": (32, 25), "pip": (45, 26)}
 USUAL_DISTAL = 10.0  # of DIP - 2/3 PIP
 USUAL_CURL = (10, 30)  # PIP - MCP
 USUAL_NEIGHBOURS = 25.0  # between the flexions of neighbouring fingers
 GAPS = (("index", "middle", 30.0), ("middle", "ring", 28.0), ("ring", "little", 50.0))
-LEAST_GAP = -8.0  # fingers may lean on one another, but not cross [deg]
+LEAST_GAP = -8.0  # fingers may lean on each other, but not cross [deg]
 
 
 def main() -> None:
@@ -142,7 +142,7 @@ def hand_shells(measures: "HandMeasures") -> "dict[str, Shell]":
 
 
 def hand_bands(measures: "HandMeasures") -> "list[LinkBand]":
-    """Return the left hand's bands of skin: at every joint but the thumb's root."""
+    """Return the left hand's bands of skin: at every joint except the thumb's root."""
     from body_generator.bands import Band, band_shell
     from body_generator.skin import LinkBand
 
@@ -151,7 +151,7 @@ def hand_bands(measures: "HandMeasures") -> "list[LinkBand]":
     for chain in hand_joints(measures):
         parent, child = chain[0].parent, chain[-1].child
         if np.any([joint.rpy for joint in chain]):
-            # The thumb's root turns in the palm's flesh.
+            # The thumb's root is inside the palm.
             continue
         half = BAND_LENGTHS["wrist" if child == "palm" else "finger"] * measures.handlength
         reach = BAND_REACHES["wrist" if child == "palm" else "finger"] * measures.handbreadth
@@ -164,7 +164,7 @@ def hand_bands(measures: "HandMeasures") -> "list[LinkBand]":
 
 
 def hand_joints(measures: "HandMeasures") -> "list[list[Joint]]":
-    """Return the left hand's joints beyond the forearm, a list for each link that is seen."""
+    """Return the left hand's joints beyond the forearm, a list for each visible link."""
     from body_generator.writing import Joint
     from hand import hand_shapes as shapes
 
@@ -178,7 +178,7 @@ def hand_joints(measures: "HandMeasures") -> "list[list[Joint]]":
 
 
 def root_turns() -> "list[Joint]":
-    """Return the joints that turn the forearm in the world."""
+    """Return the joints that rotate the forearm in the world."""
     from body_generator.writing import Joint
 
     joints, before = [], "root_axes_link"
@@ -190,7 +190,7 @@ def root_turns() -> "list[Joint]":
 
 
 def hinge(name: str, parent: str, child: str, limits: Limits, y: float = 0.0) -> "Joint":
-    """Return a joint that bends towards the palm, y [m] along its parent."""
+    """Return a joint that flexes towards the palm, y [m] along its parent."""
     from body_generator.writing import Joint
 
     return Joint(name, parent, child, "revolute", AXES["x"], limits, (0.0, y, 0.0))
@@ -254,7 +254,7 @@ def finger_joints(finger: str, measures: "HandMeasures") -> "list[list[Joint]]":
 
 
 def mirrored_joint(joint: "Joint") -> "Joint":
-    """Return the right hand's joint: the same angle means the same movement."""
+    """Return the right hand's joint, for which the same angle means the same movement."""
     flip, turn = np.array([-1.0, 1.0, 1.0]), np.array([1.0, -1.0, -1.0])
     axis = tuple(float(value) for value in turn * joint.axis + 0.0)
     return replace(joint, axis=axis, xyz=flip * joint.xyz, rpy=turn * joint.rpy)
@@ -268,7 +268,7 @@ def volume(shell: "Shell") -> float:
 
 
 def couplings_text() -> str:
-    """Return the couplings, the same for both hands."""
+    """Return the couplings, which are the same for both hands."""
     rows = [
         f"  - {{name: {finger}_distal,"
         f" terms: {{{finger}_dip_flexion: 3, {finger}_pip_flexion: -2}},"
@@ -276,7 +276,7 @@ def couplings_text() -> str:
         for finger in ABDUCTION_LIMITS
     ]
     for first, second, most in GAPS:
-        # Index and middle count away from the little finger, ring and little towards it.
+        # Index and middle abduct away from the little finger, ring and little towards it.
         terms = {
             ("index", "middle"): "index_mcp_abduction: 1, middle_mcp_abduction: -1",
             ("middle", "ring"): "middle_mcp_abduction: 1, ring_mcp_abduction: 1",
@@ -296,7 +296,7 @@ def couplings_text() -> str:
 
 
 def usual_rows() -> list[str]:
-    """Return how fingers are usually held, as rows of the couplings."""
+    """Return the usual flexions of fingers as rows of the couplings."""
     rows = []
 
     def add(name: str, terms: str, mean: float, deviation: float) -> None:

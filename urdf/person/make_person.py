@@ -22,8 +22,8 @@ COLOURS = {
     "shirt": (0.12, 0.45, 0.50),
     "trousers": (0.17, 0.19, 0.25),
 }
-# Part -> (parent, joint name, axes in order of rotation with limits [deg]), left side. 23 degrees
-# of freedom with the head's position: Date et al., figure 5. The README tells whose the limits are.
+# Part -> (parent, axes in order of rotation with limits [deg]), on the left side. 23 degrees of
+# freedom with the head's position: Date et al., figure 5. The README states the limits' sources.
 Limits = tuple[tuple[str, float, float], ...]
 HEAD: Limits = (("y", -180, 180), ("x", -60, 90))
 NECK_BASE: Limits = (("x", -50, 75), ("z", -45, 45))
@@ -37,7 +37,7 @@ LIMBS: dict[str, tuple[str, Limits]] = {
 }
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 DOWN = (0.0, -1.0, 0.0)
-# Shape joints of person_shape.urdf: how far each length may leave the average [m].
+# Shape joints of person_shape.urdf: largest deviation of each length from the average [m].
 STRETCHES = {
     "neck": 0.03,
     "trunk": 0.07,
@@ -48,8 +48,8 @@ STRETCHES = {
     "thigh": 0.06,
     "shin": 0.06,
 }
-BELLY = 0.80  # how far down the trunk the upper half's copy of the belly reaches
-SIDE_DIFFERENCE = 10  # left and right differ by no more than this [mm]
+BELLY = 0.80  # end of the upper half's copy of the belly, as a fraction of the trunk
+SIDE_DIFFERENCE = 10  # largest difference of left and right [mm]
 PAIRED = ("shoulder", "hip", "upper_arm", "forearm", "thigh", "shin")
 
 
@@ -83,7 +83,7 @@ def main() -> None:
 
 
 def factors(words: Sequence[str], known: Sequence[str]) -> dict[str, float]:
-    """Return part=factor words as a mapping.
+    """Return words of the form part=factor as a mapping.
 
     Raises:
         ValueError: a word of another form, an unknown part, or a factor outside 0.5..2.
@@ -111,7 +111,8 @@ def average_figure(
 
     mean = {name: 0.5 * (value + MAN.measures[name]) for name, value in WOMAN.measures.items()}
     shares = {
-        name: 0.5 * (share + MAN.mass_shares[name]) for name, share in WOMAN.mass_shares.items()
+        name: 0.5 * (share + MAN.mass_fractions[name])
+        for name, share in WOMAN.mass_fractions.items()
     }
     measures = Measures(**mean)
     mass = 0.5 * (WOMAN.mass + MAN.mass)
@@ -128,7 +129,7 @@ def average_figure(
         ponytail=False,
         muscle=1.2,
         mass=mass,
-        mass_shares={**shares, "trunk": shares["chest"] + shares["waist"]},
+        mass_fractions={**shares, "trunk": shares["chest"] + shares["waist"]},
         colours=COLOURS,
     )
     return Figure(measures, build, Proportions(lengths or {}, girths or {}))
@@ -149,20 +150,20 @@ def write_person(folder: Path, figure: "Figure") -> None:
 
 
 def sided(part: str) -> list[str]:
-    """Return a part's links: one of each side for limbs."""
+    """Return the names of a part's links: one on each side for limbs."""
     return [f"left_{part}", f"right_{part}"] if part in LIMBS else [part]
 
 
 def link_texts(
     figure: "Figure", stretchable: bool
 ) -> "tuple[dict[str, str], dict[str, list[Shell]]]":
-    """Return each link's element, and its .obj files' shells."""
+    """Return each link's element, and the shells of each .obj file."""
     from body_generator.writing import solid_link
     from person.person_shapes import PARTS
 
     texts, meshes = {}, {}
     for part in PARTS:
-        mass = figure.build.mass * figure.build.mass_shares[part]
+        mass = figure.build.mass * figure.build.mass_fractions[part]
         for link in sided(part):
             whole = figure.shells(part)
             pieces = {link: (link, whole)}
@@ -181,19 +182,19 @@ def link_texts(
 
 
 def on_side(shells: "list[Shell]", link: str) -> "list[Shell]":
-    """Return the shells of a left or middle link, mirrored for links of the right side."""
+    """Return the shells of a left or middle link; mirrored for links on the right side."""
     return [shell.mirrored() for shell in shells] if link.startswith("right_") else shells
 
 
 def cut_in_two(
     figure: "Figure", part: str, whole: "dict[str, list[Shell]]"
 ) -> "tuple[dict[str, list[Shell]], dict[str, list[Shell]]]":
-    """Return the shells of a part's two halves, by material; they overlap where they join."""
+    """Return the shells of a part's two halves by material; they overlap where they join."""
     from person.person_shapes import PARTS, cut, halves
 
     end = float(figure.offset(part, PARTS[part][1])[1])
     if part == "trunk":
-        # The upper half keeps a copy of the belly, so that no gap opens when the hips move down.
+        # The upper half has a copy of the belly, so that no gap opens when the hips move down.
         belly = [cut(shell, BELLY * end, np.inf) for shell in whole["trousers"]]
         return {**whole, "trousers": belly}, {"trousers": whole["trousers"]}
     start, last = {}, {}
@@ -213,7 +214,7 @@ def urdf_text(figure: "Figure", name: str, links: dict[str, str], stretchable: b
     text += root_joints(turns("head", "root_axes_link", "head", HEAD)) + links["head"]
 
     def add(chain: "list[Joint]", part: str, link: str) -> str:
-        """Return a chain of joints and the link at its end, in two halves where it stretches."""
+        """Return a chain of joints and its last link, in two halves where it stretches."""
         if not (stretchable and part in STRETCHES):
             return joint_chain(chain) + links[link]
         axis = mirrored_if_right(figure.axis(part), link)
@@ -256,7 +257,7 @@ def limb_joints(
 def turns(
     name: str, parent: str, child: str, axes: Limits, xyz: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> "list[Joint]":
-    """Return revolute joints one after another between two links."""
+    """Return successive revolute joints between two links."""
     from body_generator.writing import Joint
 
     joints = []
@@ -271,7 +272,7 @@ def turns(
 
 
 def slide(name: str, parent: str, child: str, axis: Sequence[float], length: str) -> "Joint":
-    """Return a shape joint; 0 is the average."""
+    """Return a shape joint, which is 0 at the average length."""
     from body_generator.writing import Joint
 
     reach = STRETCHES[length]
@@ -282,7 +283,7 @@ def slide(name: str, parent: str, child: str, axis: Sequence[float], length: str
 def slide_before(
     chain: "list[Joint]", name: str, axis: Sequence[float], length: str
 ) -> "list[Joint]":
-    """Return a chain of joints with a shape joint put before them."""
+    """Return a chain of joints with a shape joint before it."""
     first = chain[0]
     link = f"{name}_link"
     before = moved(slide(name, first.parent, link, axis, length), xyz=first.xyz)
@@ -300,7 +301,7 @@ def mirrored_if_right(vector: np.ndarray, link: str) -> np.ndarray:
 
 
 def couplings_text() -> str:
-    """Return the couplings of person_shape.urdf: both sides are nearly alike."""
+    """Return the couplings of person_shape.urdf: both sides are nearly equal."""
     rows = [
         f"  - {{first: left_{name}_stretch, second: right_{name}_stretch,"
         f" within: {SIDE_DIFFERENCE}, unit: mm}}"

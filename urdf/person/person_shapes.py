@@ -1,4 +1,4 @@
-"""Parts of the person: shapes of the bundled bodies' generator, coloured, joined and cut anew."""
+"""Parts of the person: shapes of the bundled bodies' generator, recoloured, joined and cut."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -8,6 +8,7 @@ from body_generator import extremities, head, limbs, torso
 from body_generator.measures import Build, Measures, joint_positions
 from body_generator.shapes import Shell
 
+# Kinds of parts: the joint of each in ``joint_positions``, and the joint at its end.
 # Each kind of part, the joint it hangs on in ``joint_positions``, and the joint at its end.
 PARTS = {
     "head": ("head", "chest"),
@@ -20,17 +21,17 @@ PARTS = {
     "foot": ("foot", None),
 }
 CLOTHES = {"upper_arm": "shirt", "forearm": "shirt", "thigh": "trousers", "shin": "trousers"}
-OVERLAP = 0.13  # how far the halves of a cut part reach beyond its middle, as a share of it
-LARGEST_BROW = 0.06  # breadth that tells a brow from the hair, which the person has none of [m]
+OVERLAP = 0.13  # reach of a cut part's halves beyond the middle, as a fraction of the part
+LARGEST_BROW = 0.06  # hair shells broader than this are no brows and are left out [m]
 
 
 @dataclass(frozen=True)
 class Proportions:
-    """Factors on the average person's parts, by kind of part; what is not named keeps its size.
+    """Factors on the average person's parts, by kind of part; others keep their size.
 
     Attributes:
         lengths: along a part, from its joint to the next.
-        girths: across it, in both directions.
+        girths: across a part, in both directions.
     """
 
     lengths: dict[str, float]
@@ -55,19 +56,19 @@ class Figure:
         return np.asarray(step / np.linalg.norm(step))
 
     def stretch(self, part: str) -> np.ndarray:
-        """Return the linear map (3, 3) of a part's proportions in its link's frame."""
+        """Return the linear map (3, 3) of a part's proportions, in its link's frame."""
         length = self.proportions.lengths.get(part, 1.0)
         girth = self.proportions.girths.get(part, 1.0)
         axis = self.axis(part)
         return np.asarray(girth * np.eye(3) + (length - girth) * np.outer(axis, axis))
 
     def offset(self, parent: str, joint: str) -> np.ndarray:
-        """Return where a joint of ``joint_positions`` is in its parent part's frame (3,) [m]."""
+        """Return a joint of ``joint_positions`` in its parent part's frame (3,) [m]."""
         joints = joint_positions(self.measures)
         return np.asarray(self.stretch(parent) @ (joints[joint] - joints[PARTS[parent][0]]))
 
     def shells(self, part: str) -> dict[str, list[Shell]]:
-        """Return a part's surfaces on the left side by material, in its link's frame."""
+        """Return a left or middle part's surfaces by material, in its link's frame."""
         shapes: dict[str, Callable[[Measures, Build], list[Shell]]] = {
             "upper_arm": limbs.upper_arm,
             "forearm": limbs.forearm,
@@ -93,7 +94,7 @@ class Figure:
         }
 
     def hips(self) -> list[Shell]:
-        """Return belly, hips and buttocks in the trunk's frame, at the average proportions."""
+        """Return belly, hips and buttocks in the trunk's frame, with average proportions."""
         joints = joint_positions(self.measures)
         step = joints["waist"] - joints["chest"]
         return [shell.moved(step) for shell in torso.waist(self.measures, self.build)]
@@ -112,15 +113,15 @@ def _head(measures: Measures, build: Build) -> dict[str, list[Shell]]:
 
 
 def _painted(shells: list[Shell], material: str) -> list[Shell]:
-    """Return shells in one material."""
+    """Return shells with all triangles in one material."""
     return [replace(s, materials=np.full(len(s.triangles), material)) for s in shells]
 
 
 def cut(shell: Shell, low: float, high: float) -> Shell:
-    """Return the piece of a left or middle lofted shell between two heights y [m], closed again.
+    """Return the piece of a lofted shell between two heights y [m], closed again.
 
-    Whole rings of vertices are kept, so the flat ends lie a little inside; a rounded end that lies
-    between the heights stays round.
+    Whole rings of vertices are kept, so the flat ends lie slightly inside. A rounded end between
+    the heights stays round.
     """
     count = len(shell.vertices) - 2
     around = int(np.count_nonzero(np.any(shell.triangles == count + 1, axis=1)))
@@ -137,7 +138,7 @@ def cut(shell: Shell, low: float, high: float) -> Shell:
 
 
 def _tube_triangles(rings: int, around: int) -> np.ndarray:
-    """Return the triangles of rings upwards, closed by two poles that come last (low, high)."""
+    """Return the triangles of rings, upwards, closed by two poles: the last vertices, low, high."""
     here = np.arange(rings * around).reshape(rings, around)
     beside = np.roll(here, -1, axis=1)
     lower = np.stack([here[:-1], beside[:-1], beside[1:]], axis=-1).reshape(-1, 3)

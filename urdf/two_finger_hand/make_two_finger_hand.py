@@ -1,8 +1,8 @@
 """Writes two_finger_hand.urdf and its couplings; see --help.
 
 The hand of Shimada, Shirai, Kuno and Miura (equations 5, 9 and 10, table 1). Every length is a
-prismatic shape joint, so that the limits of table 1 are the URDF's own. A pixel of the paper is
-a millimetre here.
+prismatic shape joint, so that table 1's limits are those of the URDF. A pixel of the paper is a
+millimetre here.
 """
 
 import argparse
@@ -12,7 +12,7 @@ from pathlib import Path
 NAME = "two_finger_hand"
 ANGLE_LIMITS = {"spread_1": (-20, 0), "spread_2": (0, 20), "flexion": (0, 90)}  # [deg]
 LENGTH_LIMITS = {1: (55, 70), 2: (30, 50), 3: (25, 50)}  # r_i1, r_i2, r_i3 [mm]
-# Table 1 does not bound the palm; these only keep it positive and hand-sized.
+# Table 1 does not bound the palm; these limits keep it positive and of a hand's size.
 PALM_LIMITS = {"palm_width": (40, 120), "palm_height": (50, 130), "palm_thickness": (10, 50)}
 FINGER_RADIUS = 0.008
 DIFFERENCES = (
@@ -34,7 +34,7 @@ INERTIAL = (
 
 
 def link(name: str, visual: str = "") -> list[str]:
-    """A link's lines; every link has a mass, so that Drake can simulate the hand."""
+    """Return a link's lines; every link has a mass, so that Drake can simulate the hand."""
     return [f'  <link name="{name}">', INERTIAL, *([visual] if visual else []), "  </link>"]
 
 
@@ -47,7 +47,7 @@ def joint(
     limits: tuple[float, float],
     xyz: str = "0 0 0",
 ) -> list[str]:
-    """A joint's lines; limits in rad or m."""
+    """Return a joint's lines; limits in rad or m."""
     return [
         f'  <joint name="{name}" type="{kind}">',
         f'    <parent link="{parent}"/><child link="{child}"/>',
@@ -58,19 +58,20 @@ def joint(
 
 
 def radians(limits: tuple[float, float]) -> tuple[float, float]:
-    """Degrees to radians."""
+    """Convert limits from degrees to radians."""
     return (math.radians(limits[0]), math.radians(limits[1]))
 
 
 def metres(limits: tuple[float, float]) -> tuple[float, float]:
-    """Millimetres to metres."""
+    """Convert limits from millimetres to metres."""
     return (limits[0] / 1000, limits[1] / 1000)
 
 
 def half_segment(j: int, sign: int) -> str:
-    """A capsule of segment j's least length from its joint along x, or back from its end.
+    """Return a capsule of segment j's least length, from its joint along x or back from its end.
 
-    The two slide over each other: no length is twice the least, so that they show every length.
+    The two capsules slide over each other. No length is twice the least one, so they cover the
+    whole segment at every length.
     """
     length = LENGTH_LIMITS[j][0] / 1000
     return (
@@ -80,11 +81,11 @@ def half_segment(j: int, sign: int) -> str:
 
 
 def finger(i: int) -> list[str]:
-    """Finger i (equations 9 and 10): spread about y at the wrist, then three flexions about z.
+    """Return finger i (equations 9 and 10): spread about y at the wrist, three flexions about z.
 
-    The base lies at p_i0 = (palm height, 0, +-palm width / 4) in the turned frame. A joint moves
-    one link only, so each finger has joints of its own that repeat the palm's height and a
-    quarter of its width; whoever sets positions sets them alike.
+    The base is at p_i0 = (palm height, 0, +-palm width / 4) in the turned frame. A joint moves one
+    link only, so each finger repeats the palm's height and a quarter of its width as joints of its
+    own; callers must set them consistently.
     """
     side = "1" if i == 1 else "-1"
     lines = link(f"spread_{i}")
@@ -112,7 +113,7 @@ def finger(i: int) -> list[str]:
 
 
 def palm() -> list[str]:
-    """The palm: a box of default size, and shape joints that carry its three sizes."""
+    """Return the palm: a box of default size, and shape joints for its three sizes."""
     lines = link(
         "palm",
         '    <visual><origin xyz="0.04 0 0"/><geometry><box size="0.08 0.02 0.07"/></geometry>'

@@ -108,4 +108,4 @@ def test_nothing_can_be_written(package: Path, tmp_path: Path) -> None:
     home.write_text("")
     values, log = run(package, HOME=str(home), XDG_CACHE_HOME=str(home / ".cache"))
     assert values == [14, 1]
-    assert log.count("name a folder that can be written in NUMBA_CACHE_DIR") == 1
+    assert log.count("set NUMBA_CACHE_DIR to a writable folder") == 1

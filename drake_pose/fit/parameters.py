@@ -28,7 +28,7 @@ ROOT_NAMES = ("root_shift_x", "root_shift_y", "root_shift_z", "log_scale")
 """Translation of the first root along the world's axes [m], and the log scale of the root and all
 nodes behind it about the root's origin."""
 
-RADIUS_SCALE_PREFIX = "log_girth_"
+RADIUS_SCALE_PREFIX = "log_radius_scale_"
 """Prefix of the names of log radius scales, which scale parts across their y axes."""
 
 POSE_NAMES = ("turn_x", "turn_y", "turn_z", "shift_x", "shift_y", "shift_z")

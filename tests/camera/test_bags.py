@@ -129,7 +129,9 @@ def test_a_camera_on_a_hand_and_two_publishers_of_joints(tmp_path, kind):
     np.testing.assert_allclose(side.times - hand.times, 0.01, rtol=0, atol=1e-6)
     order = [*range(COUNT), 3, 3, 11, 0, 1]
     assert [number_of(side.read(k)) - 100 for k in order] == order
-    np.testing.assert_array_equal([hand.recorded(k) for k in order], [numbered(k) for k in order])
+    np.testing.assert_array_equal(
+        [hand.read_recorded(k) for k in order], [numbered(k) for k in order]
+    )
     straight = cv2.undistort(numbered(5), K, np.array(PLUMB), None, hand.lens.undistorted_matrix)
     np.testing.assert_array_equal(hand.read(5), straight)
     assert hand.link == "hand"

@@ -70,7 +70,7 @@ def test_minimum_of_a_linear_problem(frames, p, q, couples, bound):
         right = np.r_[right, root * mean]
     stages = [AnnealingStage(1.0, 1.0, 40)] * 20
     own, shared, cost, _ = found_by_steps(
-        A, b, p, bound, stages, coupling, longest=10.0, damping=1e-4
+        A, b, p, bound, stages, coupling, max_step=10.0, damping=1e-4
     )
     expected = lsq_linear(matrix, right, (-bound, bound), tol=1e-14)
     np.testing.assert_allclose(cost, 2.0 * expected.cost, rtol=1e-4)
@@ -86,7 +86,7 @@ def test_step_of_all_frames_is_that_of_the_whole_system(frames, p, q):
     A, b = random_frames(np.random.default_rng(5), frames, p, q)
     share = 0.3
     stage = [AnnealingStage(1.0, 1.0)]
-    own, shared, *_ = found_by_steps(A, b, p, np.inf, stage, longest=1e3, damping=share)
+    own, shared, *_ = found_by_steps(A, b, p, np.inf, stage, max_step=1e3, damping=share)
     matrix, right = whole(A, b, p)
     H = matrix.T @ matrix
     step = np.linalg.solve(H + np.diag(share * np.diag(H) + 1e-9), matrix.T @ right)

@@ -172,7 +172,7 @@ def test_equations_are_the_slope_of_the_cost(body, rig):
         "boundary_bias",
         "left_shin_x boundary_bias",
         "root_shift_x",
-        "log_girth_odd",
+        "log_radius_scale_odd",
     ],
 )
 def test_equations_of_some_unknowns_are_part_of_those_of_all(body, rig, some):

@@ -11,7 +11,7 @@ from drake_pose.fit.surface_store import load_or_make
 from drake_pose.fit.surfaces import (
     FEW,
     VERY_FEW,
-    _simplify,
+    _simplify_cached,
     simplify_surfaces,
     surface_distance,
 )
@@ -124,7 +124,7 @@ def test_threads_that_simplify_at_once_find_what_one_does(monkeypatch):
 
     monkeypatch.setattr(surface_store, "kernel_folder", lambda: None)
     together = map_ordered(simplified, balls, 4)
-    _simplify.cache_clear()
+    _simplify_cached.cache_clear()
     for ball, one in zip(balls, together, strict=True):
         np.testing.assert_array_equal(simplified(ball).vertices, one.vertices)
 
@@ -157,12 +157,12 @@ def same(one, other):
 
 
 def test_a_process_loads_to_the_last_digit_what_another_simplified(folder, monkeypatch):
-    monkeypatch.setattr(surface_store.stored, "__defaults__", (0.0, 500))
+    monkeypatch.setattr(surface_store.load_or_make, "__defaults__", (0.0, 500))
     given = ball_and_tube(40)
-    _simplify.cache_clear()
+    _simplify_cached.cache_clear()
     made = simplify_surfaces(Rigid(given), FEW)[0]
     (file,) = folder.iterdir()
-    _simplify.cache_clear()
+    _simplify_cached.cache_clear()
     before = file.stat().st_mtime_ns
     assert same(simplify_surfaces(Rigid(given), FEW)[0], made)
     assert [file] == list(folder.iterdir())

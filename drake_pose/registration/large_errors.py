@@ -1,8 +1,8 @@
-"""Errors that are too large for fits of single frames: what is wrong in all frames, by search.
+"""Find errors common to all frames that are too large for fits of single frames.
 
-A fit near to what is given drops a link that is far from its silhouette as damage, in every frame
-alike. Here the areas of body and silhouettes are compared over each joint's whole range, and with
-the scene read otherwise: other signs, conventions, focal lengths, cameras exchanged.
+A fit near the given values treats a link far from its silhouette as damage to the mask. This search
+compares the areas of body and silhouettes instead: over each joint's whole range, and with the
+scene corrected in other ways (signs, conventions, focal lengths, exchanged cameras).
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -23,30 +23,33 @@ from drake_pose.workers import map_ordered
 
 
 class LargeErrorSettings(NamedTuple):
-    """How large errors are searched, and when one is named.
+    """Parameters of the search for large errors.
 
     Args:
-        side: root of the silhouettes' area in the pictures that are compared [pixel].
-        step: from one tried angle of a joint to the next [deg]; fine_step: about the best one.
-        places: number of tried positions of a joint that slides.
-        left: a reading of the scene is named that leaves less than this fraction of the area that
-            is in body or silhouette alone.
-        left_of_one: the same where single links do not fit, the rest does.
-        mended: what single links lack of fitting outlines must be this many times as much before.
-        improved: and that does so in at least this share of the frames.
-        as_good: a simpler reading is preferred that gains this share of the most that one gains.
-        constant: positions that differ from the log by another amount in each frame are named only
-            where no constant gains this share of what they gain.
-        again, again_focal: fits are begun anew from where they found a joint, or focal lengths,
-            that are off by more [deg, share].
-        near_angle, near_place, near_focal: what is off by less is left to fits [deg, m, share].
-        frames: number of frames that are compared, spread over all.
-        seen: a joint is looked at where less of the outlines of all links that it moves fits.
-        unseen: a link is elsewhere than the log says where less of its outline fits.
-        least_shown: of all outlines; a link that shows less is not judged.
+        side: square root of the silhouettes' area in the pictures that are compared [pixel].
+        coarse_step, fine_step: steps of a joint's angle over its range, and about the best [deg].
+        slide_steps: number of positions of a prismatic joint.
+        max_remaining: a correction is accepted if at most this fraction of the area in body or
+            silhouette alone remains.
+        max_remaining_of_joint: the same where only single links fit badly.
+        outlier_reduction: minimum factor by which a correction reduces the fraction of a joint's
+            outlines that does not fit, where only single links fit badly.
+        min_improved_frames: minimum fraction of the frames that a correction improves.
+        equivalent_gain: a simpler correction is preferred if it gains this fraction of the best.
+        constant_gain: positions that differ from the log by another amount in each frame are
+            accepted only if no constant gains this fraction of what they gain.
+        restart_angle, restart_focal: fits restart from a fitted offset or focal length beyond this
+            [deg, relative].
+        reach_angle, reach_shift, reach_focal: smaller errors are left to fits [deg, m, relative].
+        frame_count: number of frames that are compared, evenly spaced.
+        min_joint_inlier_ratio: a joint is searched if a smaller fraction of the outlines of all
+            links that it moves fits.
+        max_misplaced_inlier_ratio: a link is misplaced if a smaller fraction of its outline fits.
+        min_outline_fraction: links with a smaller fraction of all outlines are not evaluated.
 
-    Chosen on drawn arms of four and seven joints, one wrong at a time. Of outlines of links that
-    are where the log says .9 fit and more (.51 of a real flange that hardly shows), of others .47.
+    Chosen on drawn arms of four and seven joints with one wrong joint each. Of the outlines of
+    links in their logged positions, 0.9 or more fits (0.51 of a real, hardly visible flange); of
+    others 0.47.
     """
 
     side: float = 100.0
@@ -55,7 +58,7 @@ class LargeErrorSettings(NamedTuple):
     slide_steps: int = 13
     max_remaining: float = 0.8
     max_remaining_of_joint: float = 0.97
-    min_mending: float = 2.0
+    outlier_reduction: float = 2.0
     min_improved_frames: float = 0.7
     equivalent_gain: float = 0.85
     constant_gain: float = 0.8
@@ -75,46 +78,48 @@ LARGE = LargeErrorSettings()
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """What may be wrong with a whole scene, and how it reads once that is put right.
+    """A possible large error of a scene, and its correction.
 
     Args:
-        kind: "offset", "sign" or "log" of a joint (in the log's place: what is seen), "focal" of
-            cameras, or "reading", of which the name is a sentence.
-        name: of the joint, of the focal lengths' cameras, or what is wrong.
-        cameras: as they are then.
-        of: a frame as it is then.
-        amount: what must be added: to a joint's positions [rad or m], to focal lengths [share].
-        rank: of readings that explain equally well, the one with the lowest rank is named.
+        kind: "offset" or "sign" of a joint; "log": the joint's positions are searched in each frame
+            in place of the log's; "focal": focal lengths; "reading": see the name.
+        name: of the joint, or words for the cameras or for what is wrong.
+        cameras: the corrected cameras.
+        apply: returns a corrected frame.
+        amount: what is added to a joint's positions [rad or m] or focal lengths [relative].
+        rank: of corrections that explain equally well, the one with the lowest rank is chosen.
     """
 
     kind: str
     name: str
     cameras: tuple[Camera, ...]
-    of: Callable[[MultiViewFrame], MultiViewFrame]
+    apply: Callable[[MultiViewFrame], MultiViewFrame]
     amount: float = 0.0
     rank: float = 1.0
 
 
 def unchanged(frame: MultiViewFrame) -> MultiViewFrame:
-    """A frame of which nothing is changed."""
+    """Return the frame itself."""
     return frame
 
 
-def apply_corrections(readings: Sequence[Correction], frame: MultiViewFrame) -> MultiViewFrame:
-    """A frame with what some readings put right, one after the other."""
-    for one in readings:
-        frame = one.of(frame)
+def apply_corrections(corrections: Sequence[Correction], frame: MultiViewFrame) -> MultiViewFrame:
+    """Return a frame with corrections applied one after another."""
+    for one in corrections:
+        frame = one.apply(frame)
     return frame
 
 
 class LargeErrorSearch:
-    """Compares body and silhouettes in some frames, as they are given and otherwise.
+    """Compares body and silhouettes in some frames, with and without corrections.
 
     Args:
-        frames: all frames, of which some are compared.
+        body: the robot's surfaces.
+        cameras: the cameras at their given poses.
+        frames: all frames.
 
     Raises:
-        MaskError: a mask of another size than its camera's picture, or no mask shows the body.
+        MaskError: a mask's size differs from its camera's, or no mask shows the body.
     """
 
     def __init__(
@@ -122,62 +127,62 @@ class LargeErrorSearch:
     ) -> None:
         self._body, self._cameras = body, tuple(cameras)
         self._frames = evenly_spaced(frames, LARGE.frame_count)
-        self._share = min(1.0, LARGE.side / common_size(cameras, self._frames))
+        self._scale = min(1.0, LARGE.side / common_size(cameras, self._frames))
         self._sums = dict[int, tuple[Mask, NDArray[np.int32]]]()
 
     def find(
         self,
-        readings: Sequence[Correction],
+        corrections: Sequence[Correction],
         joints: Sequence[str],
-        left: float = LARGE.max_remaining,
+        max_remaining: float = LARGE.max_remaining,
         likely: Collection[str] = (),
     ) -> Correction | None:
-        """What explains the silhouettes much better than what is given; None: nothing does.
+        """Return the simplest correction that explains the silhouettes much better; None: none.
 
         Args:
-            readings: of the scene.
-            joints: whose positions may be wrong as well.
-            left: largest share of what is not explained that is left.
-            likely: joints that fits say are off: of these it may be all of it, and half of the
-                frames need not gain.
+            corrections: of the whole scene.
+            joints: joints whose positions may be wrong.
+            max_remaining: maximum fraction of the unexplained area that remains.
+            likely: joints with a fitted offset: for them any improvement is enough, in half of the
+                frames.
         """
         given = self.misfits(Correction("", "", self._cameras, unchanged))
-        told = [(one, self.misfits(one)) for one in readings]
+        tried = [(one, self.misfits(one)) for one in corrections]
         for name in joints:
-            told += self._of_joint(name)
+            tried += self._of_joint(name)
         explained = [
             (one, own.sum())
-            for one, own in told
-            if own.sum() <= (1.0 if one.name in likely else left) * given.sum()
+            for one, own in tried
+            if own.sum() <= (1.0 if one.name in likely else max_remaining) * given.sum()
             and np.mean(own < given) >= (0.5 if one.name in likely else LARGE.min_improved_frames)
             and not _is_near(self._body, one)
         ]
-        alike = [one for one in explained if one[0].kind != "log"]
+        constant = [one for one in explained if one[0].kind != "log"]
         free = min((left for one, left in explained if one.kind == "log"), default=np.inf)
-        most = min((left for _, left in alike), default=np.inf)
-        if given.sum() - most < LARGE.constant_gain * (given.sum() - free) or not alike:
-            alike, most = [one for one in explained if one[0].kind == "log"], free
+        most = min((left for _, left in constant), default=np.inf)
+        if given.sum() - most < LARGE.constant_gain * (given.sum() - free) or not constant:
+            constant, most = [one for one in explained if one[0].kind == "log"], free
         enough = given.sum() - LARGE.equivalent_gain * (given.sum() - most)
-        best = [one for one in alike if one[1] <= enough]
+        best = [one for one in constant if one[1] <= enough]
         return min(best, key=lambda one: (one[0].rank, one[1]))[0] if best else None
 
-    def misfits(self, reading: Correction) -> Array:
-        """(frames,) area that is in body or silhouette alone, of all cameras [pixel]."""
-        frames = map(reading.of, self._frames)
-        rows = [self._compare(one, one.values[None], reading.cameras)[0] for one in frames]
+    def misfits(self, correction: Correction) -> Array:
+        """Return the area (frames,) in body or silhouette alone, over all cameras [pixel]."""
+        frames = map(correction.apply, self._frames)
+        rows = [self._compare(one, one.values[None], correction.cameras)[0] for one in frames]
         return np.array(rows)
 
     def _compare(
         self, frame: MultiViewFrame, values: Array, cameras: Sequence[Camera] | None = None
     ) -> Array:
-        """(n,) as misfits, of a frame at other values (n, m)."""
+        """Return the misfits (n,) of a frame at values (n, m)."""
         kinematics, left = self._body.kinematics, np.zeros(len(values))
         X_WN = np.array([kinematics.poses(one) for one in values])
         for camera in self._cameras if cameras is None else cameras:
             if camera.name in frame.masks:
-                mask, small = frame.masks[camera.name], downscaled(camera, self._share)
+                mask, small = frame.masks[camera.name], downscaled(camera, self._scale)
                 if id(mask) not in self._sums:
-                    # The mask is kept, so that no other one has its place in memory.
+                    # Keep the mask alive, so that its id is not reused.
                     self._sums[id(mask)] = mask, reduced_sums(mask, small)
                 sums = self._sums[id(mask)][1]
                 X_CN = camera.X_CW @ X_WN
@@ -186,7 +191,7 @@ class LargeErrorSearch:
         return left
 
     def _of_joint(self, name: str) -> list[tuple[Correction, Array]]:
-        """What may be wrong with a joint's positions, and the misfits that it leaves."""
+        """Return the corrections of a joint's positions, each with its misfits (frames,)."""
         kinematics = self._body.kinematics
         j, frames = kinematics.names.index(name), self._frames
         angle, q = bool(kinematics.is_angle[j]), np.array([one.values[j] for one in frames])
@@ -209,27 +214,27 @@ class LargeErrorSearch:
         profile = np.array(map_ordered(lambda k: compare(k, grid), range(len(frames))))
 
         def at(places: Array) -> Array:
-            """(frames,) about the misfits at a place of each frame."""
+            """Interpolate the misfits (frames,) at one position in each frame."""
             period = 2.0 * np.pi if angle else None
             rows = zip(places, profile, strict=True)
             return np.array([np.interp(one, grid, own, period=period) for one, own in rows])
 
-        told, tried = list[tuple[Correction, Array]](), np.arange(-np.pi, np.pi, fine)
+        found, shifts = list[tuple[Correction, Array]](), np.arange(-np.pi, np.pi, fine)
         if not angle:
-            tried = np.linspace(low - high, high - low, 8 * LARGE.slide_steps)
+            shifts = np.linspace(low - high, high - low, 8 * LARGE.slide_steps)
         for sign, kind in ((1.0, "offset"), (-1.0, "sign")):
-            costs = [at(sign * q + by).sum() for by in tried]
-            about = tried[int(np.argmin(costs))]
+            costs = [at(sign * q + by).sum() for by in shifts]
+            about = shifts[int(np.argmin(costs))]
             every = [(k, sign * q[k] + about + beside) for k in range(len(frames))]
             exact = np.array(map_ordered(lambda one: compare(*one), every))
             best = int(np.argmin(exact.sum(axis=0)))
             by = float(about + beside[best])
             if sign < 0.0:
                 plain = np.array([compare(k, -q[[k]])[0] for k in range(len(frames))])
-                told.append((self.joint_correction("sign", name, -1.0, 0.0, 0.0), plain))
+                found.append((self.joint_correction("sign", name, -1.0, 0.0, 0.0), plain))
             rank = 1.0 if sign > 0.0 else 2.0
-            reading = self.joint_correction(kind, name, sign, by, rank)
-            told.append((reading, exact[:, best]))
+            correction = self.joint_correction(kind, name, sign, by, rank)
+            found.append((correction, exact[:, best]))
         inside = np.ones(len(grid), bool)
         if angle and high - low < 2.0 * np.pi:
             middle = 0.5 * (low + high)
@@ -239,21 +244,21 @@ class LargeErrorSearch:
         exact = np.array(map_ordered(lambda k: compare(k, seen[k] + beside), range(len(frames))))
         off = seen + beside[np.argmin(exact, axis=1)] - q
         if angle:
-            # About the middle of the smaller side, as a turn may be counted more or less.
+            # Differences are angles: wrap them about their circular mean.
             middle = np.angle(np.exp(1j * off).mean())
             off = (off - middle + np.pi) % (2.0 * np.pi) - np.pi
         if np.median(np.abs(off - np.median(off))) <= near:
-            # A constant, as well as single frames tell.
-            return told
+            # The differences from the log are constant.
+            return found
         free = Correction(
             "log", name, self._cameras, self._refound(j, grid[inside], beside), 0.0, 3.0
         )  # fmt: skip
-        return [*told, (free, exact.min(axis=1))]
+        return [*found, (free, exact.min(axis=1))]
 
     def joint_correction(
         self, kind: str, name: str, sign: float, by: float, rank: float
     ) -> Correction:
-        """Another sign of a joint's positions (sign -1), and what is added then [rad or m]."""
+        """Return the correction sign * q + by of a joint's positions; by [rad or m]."""
         j = self._body.kinematics.names.index(name)
 
         def changed(frame: MultiViewFrame) -> MultiViewFrame:
@@ -266,7 +271,7 @@ class LargeErrorSearch:
     def _refound(
         self, j: int, grid: Array, beside: Array
     ) -> Callable[[MultiViewFrame], MultiViewFrame]:
-        """A frame with a joint where it is seen."""
+        """Return a function that moves joint j of a frame to where its silhouette shows it."""
 
         def changed(frame: MultiViewFrame) -> MultiViewFrame:
             values = frame.values
@@ -280,11 +285,11 @@ class LargeErrorSearch:
         return changed
 
 
-def downscaled(camera: Camera, share: float) -> Camera:
-    """A camera of pictures that are a share as large; a parallel one as it is."""
+def downscaled(camera: Camera, scale: float) -> Camera:
+    """Return a camera with pictures scaled by a factor; a parallel camera is unchanged."""
     if not isinstance(camera, PinholeCamera):
         return camera
-    width, height = (max(8, round(share * side)) for side in (camera.width, camera.height))
+    width, height = (max(8, round(scale * side)) for side in (camera.width, camera.height))
     return camera.resized(width, height)
 
 
@@ -296,27 +301,27 @@ def mask_excess_and_lack(
     size: float,
     band: float = 2.5,
 ) -> tuple[float, float]:
-    """How much more than the body a silhouette shows, and how much of the body it lacks.
+    """Return the areas in silhouette and body alone, over the silhouette's area.
 
     Args:
-        size: the root of the silhouettes' usual area [pixel]; both are shares of that of this one,
-            of one that shows nothing of the usual one.
-        band: what is nearer to the outlines [pixel] is none of it.
+        values: (m,) of the pose tree.
+        size: square root of the silhouettes' usual area [pixel], used for an empty mask.
+        band: pixels nearer to the other's outline do not count [pixel].
     """
     small = downscaled(camera, min(1.0, LARGE.side / size))
-    share = small.width / camera.width
+    scale = small.width / camera.width
     seen = np.diff(reduced_sums(mask, small), axis=1).astype(np.uint8)
     drawn = draw_mask(body.medium, camera.X_CW @ body.kinematics.poses(values), small)
-    side = 2 * max(1, round(band * share)) + 1
+    side = 2 * max(1, round(band * scale)) + 1
     ball = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     wide, wide_seen = (cv2.dilate(one.astype(np.uint8), ball) for one in (drawn, seen))
-    area = float(seen.sum()) or (share * size) ** 2
+    area = float(seen.sum()) or (scale * size) ** 2
     more, less = (seen > wide).sum(), (drawn > wide_seen).sum()
     return float(more) / area, float(less) / area
 
 
 def _is_near(body: RegistrationBody, one: Correction) -> bool:
-    """Whether fits reach what is off."""
+    """Return whether an error is small enough for fits of single frames."""
     if one.kind == "offset":
         j = body.kinematics.names.index(one.name)
         near = np.radians(LARGE.reach_angle) if body.kinematics.is_angle[j] else LARGE.reach_shift
@@ -325,22 +330,22 @@ def _is_near(body: RegistrationBody, one: Correction) -> bool:
 
 
 def joint_inlier_ratios(fits: Sequence[FrameFit], joints: Sequence[str]) -> dict[str, float]:
-    """By joint, what share fits of the outlines of all links that it moves, in all frames."""
-    moves = [picture.moves.any(axis=2) for one in fits for picture in one.compared_masks]
+    """Return, by joint, the inlier ratio of the outlines of all links that it moves."""
+    moves = [mask.moves.any(axis=2) for one in fits for mask in one.compared_masks]
     if not moves:
         return {}
     moved = np.any(moves, axis=0)[:, : len(joints)].astype(float)
-    lengths, fit = np.sum([one.matched_lengths for one in fits], axis=0).T @ moved
-    shares = fit / np.maximum(lengths, 1e-9)
-    return {name: float(shares[k]) for k, name in enumerate(joints) if lengths[k] > 0.0}
+    lengths, fitting = np.sum([one.matched_lengths for one in fits], axis=0).T @ moved
+    ratios = fitting / np.maximum(lengths, 1e-9)
+    return {name: float(ratios[k]) for k, name in enumerate(joints) if lengths[k] > 0.0}
 
 
 def mismatched_links(fits: Sequence[FrameFit]) -> list[tuple[int, float]]:
-    """Nodes of whose outlines hardly anything fits in all frames, and what share."""
+    """Return the nodes whose outlines hardly fit in any frame, with their inlier ratios."""
     lengths, fitting = np.sum([one.matched_lengths for one in fits], axis=0).T
-    shares = fitting / np.maximum(lengths, 1e-9)
+    ratios = fitting / np.maximum(lengths, 1e-9)
     shown = lengths >= LARGE.min_outline_fraction * max(float(lengths.sum()), 1e-9)
     return [
-        (int(k), float(shares[k]))
-        for k in np.flatnonzero(shown & (shares < LARGE.max_misplaced_inlier_ratio))
+        (int(k), float(ratios[k]))
+        for k in np.flatnonzero(shown & (ratios < LARGE.max_misplaced_inlier_ratio))
     ]

@@ -1,10 +1,10 @@
-"""A camera that is registered while the body moves, and registered again after it was moved.
+"""Register a camera frame by frame while the body moves, and detect that the camera was moved.
 
-Frames come one after another. A bounded number of keyframes is kept, in which the body stands
-differently, the newest ones; the camera's pose is fitted to them. That the camera was moved shows
-in one of two ways: frames contradict the pose and agree with one another, or the pose by the newest
-keyframes alone differs significantly from that by all. How much it differs while nothing moves says
-what is significant: wrong joint zeros or lengths of links make it differ, too.
+A bounded number of keyframes is kept, the newest ones in which the body's pose differs, and the
+camera's pose is fitted to them. Two events show that the camera was moved: outlier frames that
+agree with each other, or a significant difference between the pose from the newest keyframes and
+that from all. Differences observed while the camera rests set the scale, since wrong joint offsets
+or link scales cause differences, too.
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ from drake_pose.registration.register import (
 
 
 class CameraStatus(IntEnum):
-    """What is known of a camera's pose: nothing; the pose; that the last frames contradict it."""
+    """Status of a camera: no pose yet; a pose; a pose that the last frames contradict."""
 
     NOT_REGISTERED = 0
     REGISTERED = 1
@@ -39,23 +39,23 @@ class CameraStatus(IntEnum):
 
 @dataclass(frozen=True)
 class OnlineSettings:
-    """Which frames are kept, and when the camera has been moved.
+    """Which frames are kept, and when a camera counts as moved.
 
     Args:
         least_frames: minimum number of keyframes for a search.
         most_frames: maximum number of keyframes; the newest are kept.
-        newest: number of keyframes, or of frames that contradict the pose, that show a move.
-        min_inlier_ratio: a frame contradicts the pose if its inlier ratio is below this fraction of
-            the keyframes' median.
-        bump: a bump turns the camera by no more [rad], and shifts it by no more [its distance from
-            the body]: from there a fit leads to the same view. Farther away all poses are searched.
-        trust: before anything differed, the covariance is trusted as if this many numbers had borne
-            it out; sets of the newest keyframes overlap, so that each new one adds fewer numbers
-            than a pose has.
-        novelty: a frame is a keyframe where the body's points are this far from where they are in
-            all keyframes, root mean square [the body's own extent]; or where
-        tolerance: body and mask differ by this more than in the keyframe [the mask's area].
-        min_iou: mean intersection over union, below which no camera is believed to be found.
+        newest: number of newest keyframes, or of outlier frames, that show a motion of the camera.
+        min_inlier_ratio: a frame is an outlier if its inlier ratio is below this fraction of the
+            keyframes' median.
+        bump: maximum rotation [rad] and shift [its distance from the body] of a camera that a local
+            fit finds again. After larger motions all poses are searched.
+        trust: degrees of freedom of the prior of the covariance's scale. Successive sets of newest
+            keyframes overlap, so each new one adds fewer than the pose's six.
+        novelty: a frame is a keyframe if the body's points are this far from every keyframe's, root
+            mean square [extent of the body].
+        tolerance: a frame in the pose of a keyframe replaces it if its E_total is larger by more
+            [the mask's area].
+        min_iou: minimum mean intersection over union of a found pose.
         false_alarm: p-value of a difference that counts as a moved camera.
 
     Raises:
@@ -83,16 +83,16 @@ class OnlineSettings:
 
 @dataclass(frozen=True, eq=False)
 class OnlineState:
-    """What is known of a camera; never changed, so that copies share it.
+    """Immutable state of a registration.
 
     Args:
-        keyframes, outlier_frames: the frames kept, and the last ones that contradict the pose, the
-            oldest first; the body stands differently in all of them.
-        registered: the camera as it was found; None: not yet.
-        contradictions: how many frames without a gap have contradicted the pose.
-        moves: how often the camera was found elsewhere.
-        distances: squared Mahalanobis distances of the pose by the newest keyframes alone from that
-            by all, the latest last.
+        keyframes, outlier_frames: the kept frames, and the latest consecutive outlier frames, the
+            oldest first; the body's pose differs in all of them.
+        registered: the camera's estimated pose; None: not yet known.
+        outlier_count: number of consecutive outlier frames.
+        moves: number of detected motions of the camera.
+        distances: squared Mahalanobis distances between the poses from the newest and from all
+            keyframes, the latest last.
     """
 
     keyframes: tuple[PosedFrame, ...] = ()
@@ -103,7 +103,7 @@ class OnlineState:
     distances: tuple[float, ...] = ()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "OnlineState":
-        # Drake copies abstract state, which would be megabytes of masks at every update.
+        # Drake copies abstract state at every update; the masks would be megabytes.
         return self
 
 
@@ -111,7 +111,10 @@ class OnlineRegistration:
     """Registers a camera while frames come in.
 
     Args:
-        camera: the camera's intrinsics; its pose is not used.
+        body: the robot's surfaces.
+        camera: the camera; its pose is not used.
+        settings: thresholds.
+        search: finds the camera without an initial guess.
     """
 
     def __init__(
@@ -126,7 +129,7 @@ class OnlineRegistration:
         self._search = search or CameraSearch(body)
 
     def status(self, state: OnlineState) -> CameraStatus:
-        """What is known of the camera's pose."""
+        """Return the status of the camera's pose."""
         if state.registered is None:
             return CameraStatus.NOT_REGISTERED
         if state.outlier_count >= self.settings.newest:
@@ -134,11 +137,11 @@ class OnlineRegistration:
         return CameraStatus.REGISTERED
 
     def next(self, state: OnlineState, frame: PosedFrame) -> OnlineState:
-        """What is known after another frame, which must not be changed any more.
+        """Return the state after one more frame, which must not be modified afterwards.
 
-        One without any pixel of the body says nothing; at first a state is ``OnlineState()``.
+        The initial state is ``OnlineState()``. A frame with an empty mask changes nothing.
 
-        Raises MaskError: a mask of another size than the camera's picture.
+        Raises MaskError: the mask's size differs from the camera's.
         """
         if not frame.mask.any():
             return state
@@ -157,7 +160,7 @@ class OnlineRegistration:
     def _follow(
         self, state: OnlineState, registered: RegisteredCamera, frame: PosedFrame, near: int | None
     ) -> OnlineState:
-        """After the camera was found; near: the keyframe in which the body stands alike."""
+        """Update a known pose; near: index of the keyframe with the same pose of the body."""
         if near is not None:
             posed = PosedFrames(self.body.kinematics, self.body.medium, registered.camera, [frame])
             left = E_total(overlap_areas(posed, registered.camera.X_CW[None], np.inf))[0, 0]
@@ -167,8 +170,8 @@ class OnlineRegistration:
         again = self._search.refine(registered.camera, keyframes)
         newest = again.frames[-1]
         if not (newest.is_inlier and newest.inlier_ratio >= self._least_inlier_ratio(registered)):
-            return self._contradict(state, registered, frame)
-        # The pose, or that of the newest keyframes alone where they say otherwise.
+            return self._add_outlier(state, registered, frame)
+        # Use the pose from the newest keyframes alone if it differs significantly.
         state = _registered(state, again, keyframes)
         last = state.keyframes[-self.settings.newest :]
         if len(state.keyframes) <= len(last):
@@ -181,10 +184,10 @@ class OnlineRegistration:
         distances = (*state.distances, _distance(alone, again))
         return replace(state, distances=distances[-2 * self.settings.most_frames :])
 
-    def _contradict(
+    def _add_outlier(
         self, state: OnlineState, registered: RegisteredCamera, frame: PosedFrame
     ) -> OnlineState:
-        """Another frame contradicts; the camera elsewhere, where they agree with one another."""
+        """Add an outlier frame; register the camera anew if outliers agree with each other."""
         near, settings = self._nearest(frame, state.outlier_frames), self.settings
         frames = self._kept(state.outlier_frames, frame, near)
         state = replace(state, outlier_frames=frames, outlier_count=state.outlier_count + 1)
@@ -204,24 +207,24 @@ class OnlineRegistration:
             return state
         if self._is_elsewhere(state, found, registered):
             return _registered(state, found, frames, moved=True)
-        # What is known of the pose was not worth as much as it seemed.
+        # The difference is within the uncertainty: the pose is corrected with all frames.
         frames = (*state.keyframes, *frames)[-settings.most_frames :]
         return _registered(state, self._search.refine(found.camera, frames), frames)
 
     def _is_elsewhere(
         self, state: OnlineState, found: RegisteredCamera, registered: RegisteredCamera
     ) -> bool:
-        """Whether a pose differs from that of before by more than such poses differ by chance."""
+        """Return whether two poses differ by more than the usual differences."""
         newest, trust = self.settings.newest, self.settings.trust
-        # In the last ones there may be frames of the new pose already.
+        # The last distances may contain frames from after the motion.
         usual = state.distances[: max(0, len(state.distances) - newest + 1)]
-        told = 6.0 / newest * len(usual)
-        scale = (trust + told / 6.0 * sum(usual) / max(1, len(usual))) / (trust + told)
-        limit = 6.0 * float(fdtri(6.0, trust + told, 1.0 - self.settings.false_alarm))
+        freedom = 6.0 / newest * len(usual)
+        scale = (trust + freedom / 6.0 * sum(usual) / max(1, len(usual))) / (trust + freedom)
+        limit = 6.0 * float(fdtri(6.0, trust + freedom, 1.0 - self.settings.false_alarm))
         return _distance(found, registered) > limit * max(1.0, scale)
 
     def _find(self, frames: Sequence[PosedFrame], least: float = 0.0) -> RegisteredCamera | None:
-        """The camera without a guess; None where it is not determined."""
+        """Search the camera's pose without an initial guess; None if it is not determined."""
         try:
             found = self._search.register(self.camera, frames)
         except RegistrationError:
@@ -229,29 +232,32 @@ class OnlineRegistration:
         return found if self._is_found(found, self.settings.least_frames, least) else None
 
     def _is_found(self, found: RegisteredCamera, count: int, least: float) -> bool:
-        """Whether `count` frames, and more than half, agree, with inlier ratios of `least`."""
-        agreeing = [frame for frame in found.frames if frame.is_inlier]
+        """Return whether at least `count` frames, and over half, are inliers of a unique pose.
+
+        least: minimum median inlier ratio.
+        """
+        inliers = [frame for frame in found.frames if frame.is_inlier]
         return (
             not len(found.alternatives)
-            and len(agreeing) >= max(count, len(found.frames) // 2 + 1)
-            and float(np.mean([frame.iou for frame in agreeing])) >= self.settings.min_iou
-            and float(np.median([frame.inlier_ratio for frame in agreeing])) >= least
+            and len(inliers) >= max(count, len(found.frames) // 2 + 1)
+            and float(np.mean([frame.iou for frame in inliers])) >= self.settings.min_iou
+            and float(np.median([frame.inlier_ratio for frame in inliers])) >= least
         )
 
     def _least_inlier_ratio(self, registered: RegisteredCamera) -> float:
-        """Of both contours' lengths, what fits at least in a frame that does not contradict."""
+        """Return the minimum inlier ratio of an inlier frame."""
         ratios = [frame.inlier_ratio for frame in registered.frames]
         return self.settings.min_inlier_ratio * float(np.median(ratios))
 
     def _kept(
         self, frames: Sequence[PosedFrame], frame: PosedFrame, instead_of: int | None = None
     ) -> tuple[PosedFrame, ...]:
-        """The newest of some frames and another one, which may stand for one of them."""
+        """Return the newest frames and one more, which may replace one of them."""
         others = [one for k, one in enumerate(frames) if k != instead_of]
         return (*others, frame)[-self.settings.most_frames :]
 
     def _nearest(self, frame: PosedFrame, frames: Sequence[PosedFrame]) -> int | None:
-        """The last of the frames in which the body stands as in another one; None: none does."""
+        """Return the index of the last frame with the same pose of the body; None: no frame."""
         here = self._points(frame)
         extent = float(np.sqrt(((here - here.mean(axis=0)) ** 2).sum(axis=1).mean()))
         for k in reversed(range(len(frames))):
@@ -261,26 +267,26 @@ class OnlineRegistration:
         return None
 
     def _points(self, frame: PosedFrame) -> Array:
-        """(n, 3) of the body in the world."""
+        """Return points (n, 3) of the body's surface in the world."""
         return placed_points(self.body.coarse, self.body.kinematics.poses(frame.values))
 
 
 def pose_difference(X_WC: Array, from_X_WC: Array) -> Array:
-    """(6,) rotation vector and shift along the world's axes from one pose (4, 4) to another."""
+    """Return rotation vector and shift (6,) along the world's axes between poses (4, 4)."""
     R = X_WC[:3, :3] @ from_X_WC[:3, :3].T
     turn = Rotation.from_matrix(R).as_rotvec()
     return np.concatenate([turn, X_WC[:3, 3] - from_X_WC[:3, 3]])
 
 
 def squared_distance(off: Array, covariance: Array) -> float:
-    """Squared Mahalanobis distance of a difference (6,) from 0, by its covariance (6, 6)."""
+    """Return the squared Mahalanobis distance of a difference (6,) with covariance (6, 6)."""
     return float(off @ np.linalg.solve(covariance, off))
 
 
 def _registered(
     state: OnlineState, found: RegisteredCamera, frames: Sequence[PosedFrame], moved: bool = False
 ) -> OnlineState:
-    """The state in which the frames that agree are kept; moved: the camera is elsewhere."""
+    """Return the state with the inlier frames as keyframes; moved: counts as a motion."""
     pairs = [
         (one, frame) for one, frame in zip(frames, found.frames, strict=True) if frame.is_inlier
     ]
@@ -290,6 +296,6 @@ def _registered(
 
 
 def _distance(found: RegisteredCamera, registered: RegisteredCamera) -> float:
-    """Squared Mahalanobis distance of a pose from another, by its own covariance."""
+    """Return the squared Mahalanobis distance of two poses, by the covariance of the first."""
     off = pose_difference(found.camera.X_WC, registered.camera.X_WC)
     return squared_distance(off, found.covariance)

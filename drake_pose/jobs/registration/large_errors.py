@@ -46,7 +46,7 @@ class SceneFit:
 
     Args:
         cameras: as they are read.
-        readings: what was put right, in order.
+        corrections: what was put right, in order.
         fits: of the frames in which a mask shows something, and found: by these.
         shares: by camera and frame, how much more than the robot a mask shows, and how much of it
             that lacks.
@@ -56,7 +56,7 @@ class SceneFit:
     """
 
     cameras: tuple[Camera, ...]
-    readings: tuple[Correction, ...]
+    corrections: tuple[Correction, ...]
     fit: PerFrameFit
     fits: tuple[FrameFit, ...]
     shares: Mapping[tuple[str, str], tuple[float, float]]
@@ -67,7 +67,7 @@ class SceneFit:
 
     def of(self, frame: MultiViewFrame) -> MultiViewFrame:
         """A frame as it is read."""
-        return apply_corrections(self.readings, frame)
+        return apply_corrections(self.corrections, frame)
 
     def joint_off(self, name: str) -> Finding | None:
         """What fits say of a joint that is so far off that they should begin anew from there."""
@@ -151,26 +151,26 @@ class SceneComparison:
     def _correct(self, now: SceneFit, most: int) -> SceneFit:
         """With as many large errors put right as are found."""
         for _ in range(most):
-            reading = self._find_correction(now)
-            if reading is None:
+            correction = self._find_correction(now)
+            if correction is None:
                 break
-            again = self._compare(reading.cameras, (*now.readings, reading))
-            told = now.joint_off(reading.name) if reading.kind == "offset" else None
-            if reading.kind == "focal":
+            again = self._compare(correction.cameras, (*now.corrections, correction))
+            told = now.joint_off(correction.name) if correction.kind == "offset" else None
+            if correction.kind == "focal":
                 told = now.focal_off
-            if told is not None and (told.angle + told.shift) * reading.amount > 0.0:
-                now = self._record(now, again, reading, told)
+            if told is not None and (told.angle + told.shift) * correction.amount > 0.0:
+                now = self._record(now, again, correction, told)
                 continue
             if again.inlier_ratio <= now.inlier_ratio:
                 break
             if not now.is_doubtful:
                 before, after = (
-                    now.joint_inlier_ratios[reading.name],
-                    again.joint_inlier_ratios[reading.name],
+                    now.joint_inlier_ratios[correction.name],
+                    again.joint_inlier_ratios[correction.name],
                 )
-                if LARGE.min_mending * (1.0 - after) > 1.0 - before:
+                if LARGE.outlier_reduction * (1.0 - after) > 1.0 - before:
                     break
-            now = self._record(now, again, reading)
+            now = self._record(now, again, correction)
         return now
 
     def _finish(self, now: SceneFit) -> SceneFit:
@@ -312,7 +312,7 @@ class SceneComparison:
                     texts.append(f"camera '{camera}': {said}")
         return texts
 
-    def _compare(self, cameras: Sequence[Camera], readings: tuple[Correction, ...]) -> SceneFit:
+    def _compare(self, cameras: Sequence[Camera], corrections: tuple[Correction, ...]) -> SceneFit:
         """Fits all frames as they are read."""
         inputs, fitted, unseen = self._inputs, list[FrameFit](), list[str]()
 
@@ -320,13 +320,13 @@ class SceneComparison:
             raise MaskError(
                 f"{inputs.scene.path}: no mask shows the body; it must be white in them"
             )
-        body, sample = self.body, [apply_corrections(readings, one) for one in self._sample]
+        body, sample = self.body, [apply_corrections(corrections, one) for one in self._sample]
         shares = dict[tuple[str, str], tuple[float, float]]()
         fit = PerFrameFit(body.kinematics, (body.medium, body.full), cameras, sample)
         for done, name in enumerate(inputs.audited_frames, 1):
             seen = inputs.read(name)
             if seen.masks:
-                seen = apply_corrections(readings, seen)
+                seen = apply_corrections(corrections, seen)
                 fitted.append(fit.fit(seen))
                 for camera in cameras:
                     mask = seen.masks.get(camera.name)
@@ -337,17 +337,19 @@ class SceneComparison:
                         shares[camera.name, name] = own
             else:
                 unseen.append(name)
-            if self._on_frame is not None and not readings:
+            if self._on_frame is not None and not corrections:
                 self._on_frame(done)
-        asked = [(_KINDS[one.kind], one.name) for one in readings if one.kind in _KINDS]
+        asked = [(_KINDS[one.kind], one.name) for one in corrections if one.kind in _KINDS]
         found = diagnose_frames(fit, fitted, asked)
-        return SceneFit(tuple(cameras), readings, fit, tuple(fitted), shares, tuple(unseen), found)
+        return SceneFit(
+            tuple(cameras), corrections, fit, tuple(fitted), shares, tuple(unseen), found
+        )
 
     def _find_correction(self, now: SceneFit) -> Correction | None:
         """What is wrong by much; nothing is looked for where nothing is doubtful."""
         sample = [now.of(one) for one in self._sample]
         if now.is_doubtful:
-            of_scene = not now.readings
+            of_scene = not now.corrections
             return self._search(now.cameras, now.fit.joints, LARGE.max_remaining, sample, of_scene)
         off = [name for name in now.fit.joints if now.joint_off(name) is not None]
         shares = now.joint_inlier_ratios.items()
@@ -355,18 +357,18 @@ class SceneComparison:
             name for name, share in shares if share < LARGE.min_joint_inlier_ratio or name in off
         ]
         if doubted:
-            reading = self._search(
+            correction = self._search(
                 now.cameras, doubted, LARGE.max_remaining_of_joint, sample, False, off
             )
-            if reading is not None:
-                return reading
+            if correction is not None:
+                return correction
         # Fits are linear about where they begin.
         if off:
             by = next(one.angle for one in now.found.common if one.name == off[0])
             search = LargeErrorSearch(self.body, now.cameras, sample)
             return search.joint_correction("offset", off[0], 1.0, by, 0.0)
         lens = now.focal_off
-        if lens is None or any(one.kind == "focal" for one in now.readings):
+        if lens is None or any(one.kind == "focal" for one in now.corrections):
             return None
         group = [one.name for one in now.cameras if f"'{one.name}'" in lens.name]
         return focal_correction(now.cameras, group, lens.name, 1.0 + lens.shift)
@@ -379,7 +381,7 @@ class SceneComparison:
         if not placed:
             return None
         cameras = [placed[one.name][0].camera if one.name in placed else one for one in now.cameras]
-        again = self._compare(cameras, now.readings)
+        again = self._compare(cameras, now.corrections)
         return replace(again, findings=(*now.findings, *(one for _, one in placed.values())))
 
     def _search(
@@ -392,21 +394,25 @@ class SceneComparison:
         likely: Collection[str] = (),
     ) -> Correction | None:
         inputs = self._inputs
-        readings = list[Correction]()
+        corrections = list[Correction]()
         if scene and not inputs.recordings:
             values = [inputs.read(name).values for name in inputs.audited_frames]
-            readings = list(scene_corrections(cameras, values, inputs.audited_frames))
+            corrections = list(scene_corrections(cameras, values, inputs.audited_frames))
         search = LargeErrorSearch(self.body, cameras, sample or self._sample)
-        return search.find(readings, joints, left, likely)
+        return search.find(corrections, joints, left, likely)
 
     def _record(
-        self, before: SceneFit, now: SceneFit, reading: Correction, told: Finding | None = None
+        self, before: SceneFit, now: SceneFit, correction: Correction, told: Finding | None = None
     ) -> SceneFit:
         """With what was put right as a finding; told: of a joint, what fits have said of it."""
-        kind, name, warnings = _KINDS.get(reading.kind, reading.kind), reading.name, before.warnings
+        kind, name, warnings = (
+            _KINDS.get(correction.kind, correction.kind),
+            correction.name,
+            before.warnings,
+        )
         off = Finding(kind, name, 0.0, 0.0, 0.0, 0.0, self._pixels(before, now), 0.0)
-        if reading.kind in _KINDS:
-            size, of_focal = reading.amount, reading.kind == "focal"
+        if correction.kind in _KINDS:
+            size, of_focal = correction.amount, correction.kind == "focal"
             if not of_focal and self._turns(name):
                 off = replace(off, angle=size, angle_sd=float(np.radians(LARGE.fine_step)))
                 if told is not None and abs(size - told.angle) < 1e-9:
@@ -417,7 +423,7 @@ class SceneComparison:
                 if told is not None and abs(size - told.shift) < 1e-9:
                     off = told
         elif kind in ("sign", "log"):
-            off = self._differing(off, before, reading)
+            off = self._differing(off, before, correction)
         else:
             now_fits, given = percent(now.inlier_ratio), percent(before.inlier_ratio)
             warnings = (*warnings, f"{name}; so {now_fits} of the contours fit, as given {given}")
@@ -436,24 +442,24 @@ class SceneComparison:
         kinematics = self.body.kinematics
         return bool(kinematics.is_angle[kinematics.names.index(joint)])
 
-    def _differing(self, off: Finding, before: SceneFit, reading: Correction) -> Finding:
+    def _differing(self, off: Finding, before: SceneFit, correction: Correction) -> Finding:
         """How far a joint is from its log, in words and as the largest difference."""
-        j = self.body.kinematics.names.index(reading.name)
+        j = self.body.kinematics.names.index(correction.name)
         frames = [before.of(one) for one in self._sample]
         logged = np.array([one.values[j] for one in frames])
-        by = np.array([reading.of(one).values[j] for one in frames]) - logged
-        turns = self._turns(reading.name)
+        by = np.array([correction.apply(one).values[j] for one in frames]) - logged
+        turns = self._turns(correction.name)
         unit, factor = ("degrees", 180.0 / np.pi) if turns else ("mm", 1e3)
         sizes = np.abs((by + np.pi) % (2.0 * np.pi) - np.pi if turns else by)
         text = f"it is {factor * sizes.min():.0f} to {factor * sizes.max():.0f} {unit} off"
-        if reading.kind == "log":
+        if correction.kind == "log":
             text += ", no constant and no sign explains it"
             if np.ptp(logged) < 1e-6:
                 text += f"; the log has {logged[0]:.4g} in all frames"
-        elif abs(reading.amount) > 1e-9:
-            text += f"; then {factor * reading.amount:.0f} {unit} are to be added"
+        elif abs(correction.amount) > 1e-9:
+            text += f"; then {factor * correction.amount:.0f} {unit} are to be added"
         angle, shift = (float(sizes.max()), 0.0) if turns else (0.0, float(sizes.max()))
-        return replace(off, link=self._link(reading.name), text=text, angle=angle, shift=shift)
+        return replace(off, link=self._link(correction.name), text=text, angle=angle, shift=shift)
 
     def _link(self, joint: str) -> str:
         """The first link that a joint moves."""

@@ -1,8 +1,8 @@
-"""Many scenes, long ones in chunks, on any number of workers; the result does not depend on it.
+"""Estimates and audits of many scenes, long ones in chunks, on any number of workers.
 
-A result is made beside its place on the shared disk and moved there in one step when it is whole: a
-task done twice does no harm, and one that was done is not done again. The state of a batch is in
-batch.json, with which an interrupted one goes on.
+The result does not depend on the number of workers. Each task writes to a temporary folder on the
+shared disk and renames it when it is complete, so that tasks may run twice, and finished ones are
+skipped. The state of a batch is in batch.json, from which an interrupted batch is resumed.
 """
 
 from __future__ import annotations
@@ -61,17 +61,19 @@ if TYPE_CHECKING:
     from distributed import Client
 
 OnProgress = Callable[[int, int, str], None]
-"""Called with the number of frames done, that of all frames, and what went wrong just now or ""."""
+"""Called with the number of finished frames, that of all frames, and an error message or ""."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """A piece of work.
+    """A chunk of a scene, or a whole scene.
 
     Args:
-        index: of the chunk; None: the whole scene, put together from its chunks if it has any.
-        frames: the chunk's frames; all of the scene's where index is None.
-        chunks: folders of the chunks of which a scene is put together.
+        job: the scene's job.
+        out: folder of the batch.
+        index: index of the chunk; None: the whole scene, joined from its chunks if it has any.
+        frames: frames of the chunk or of the whole scene.
+        chunks: result folders of the chunks to be joined.
     """
 
     job: SceneJob
@@ -82,29 +84,31 @@ class Task:
 
     @property
     def extent(self) -> str:
-        """Which frames, for messages; "" where it is the whole scene."""
+        """The range of frames, for messages; "" for the whole scene."""
         return "" if self.index is None else f"frames {self.frames[0]} to {self.frames[-1]}"
 
     @property
     def work(self) -> Path:
-        """Folder of the scene's finished chunks, until all are there."""
+        """Folder of the scene's finished chunks, removed when the scene is finished."""
         return self.out / ".chunks" / self.job.name
 
     @property
     def place(self) -> Path:
-        """Where the result will lie."""
+        """The task's result folder."""
         if self.index is None:
             return self.out / self.job.name
-        # A scene to which frames were added has other chunks.
+        # The digest distinguishes the chunks of a scene to which frames were added.
         frames = hashlib.sha256("\n".join(self.frames).encode()).hexdigest()
         return self.work / f"{self.index:06d}-{frames[:8]}"
 
 
 class Outcome(NamedTuple):
-    """What became of a task.
+    """Result of a task.
 
-    error: why it failed; None where it did not; seconds: how long it took [s], 0 where its result
-    was there already; totals: of a whole scene, numbers of its summary.
+    Args:
+        error: message of the error; None if the task succeeded.
+        seconds: wall time [s]; 0 if the result existed already.
+        totals: entries of the summary of a whole scene.
     """
 
     error: str | None
@@ -114,15 +118,16 @@ class Outcome(NamedTuple):
 
 @dataclass
 class SceneState:
-    """How far a scene is.
+    """Progress of a scene.
 
     Args:
+        job: the scene's job.
         described: the job and its files as they were at the start.
-        tasks: its chunks, or the one task of a scene that is not cut.
-        done: the indices of the finished tasks.
-        errors: what went wrong, and in which frames ("": the whole scene).
-        totals: as of Outcome; of a finished scene.
-        seconds: of the work on it in this run, over all workers [s].
+        tasks: its chunks, or the single task of a scene that is not cut.
+        done: indices of the finished tasks.
+        errors: by message, the ranges of frames that failed ("": the whole scene).
+        totals: as in Outcome; empty until the scene is finished.
+        seconds: time spent on the scene in this run, summed over all workers [s].
     """
 
     job: SceneJob
@@ -135,7 +140,7 @@ class SceneState:
 
     @property
     def state(self) -> str:
-        """Of the scene: waiting, finished or failed."""
+        """The state of the scene: waiting, finished or failed."""
         return "failed" if self.errors else "finished" if self.totals else "waiting"
 
     @property
@@ -145,12 +150,12 @@ class SceneState:
 
     @property
     def frames_done(self) -> int:
-        """Number of the frames of finished tasks."""
+        """Number of frames of the finished tasks."""
         return sum(len(task.frames) for task in self.tasks if task.index in self.done)
 
     @property
     def whole(self) -> Task:
-        """The task that puts the scene together from its chunks; the only one if it is not cut."""
+        """The task that joins the chunks; the only task of a scene that is not cut."""
         if self.tasks[0].index is None:
             return self.tasks[0]
         frames = tuple(frame for task in self.tasks for frame in task.frames)
@@ -158,7 +163,7 @@ class SceneState:
         return Task(self.job, self.tasks[0].out, None, frames, chunks)
 
     def as_json(self) -> dict[str, Any]:
-        """Plain JSON values."""
+        """Return the scene's entry of batch.json."""
         totals = ("found_count", "mean_E_total")
         if self.job.audit is not None:
             totals = ("agreeing_count", "contradictions")
@@ -175,7 +180,7 @@ class SceneState:
 
 
 def plan_scene(job: SceneJob, out: Path) -> tuple[Task, ...]:
-    """Cuts a scene into tasks: chunks in order, or one if a person is followed or it is audited.
+    """Return the tasks of a scene: its chunks in order; one task for a person or an audit.
 
     Raises:
         DrakePoseError: the scene cannot be read.
@@ -189,7 +194,7 @@ def plan_scene(job: SceneJob, out: Path) -> tuple[Task, ...]:
     scene, asked = scene.every(settings.every, settings.frames)
     frames = scene.frames_with_files(asked)
     is_whole = job.audit is not None
-    # A model is read, in seconds, only if it may be a person's.
+    # Reading a model takes seconds: only models that may be a person are read.
     if isinstance(settings, EstimateSettings) and (
         landmarks_file(job.model).is_file() or settings.method == "person"
     ):
@@ -202,7 +207,7 @@ def plan_scene(job: SceneJob, out: Path) -> tuple[Task, ...]:
 
 
 def perform(task: Task) -> Outcome:
-    """Does a task; a failure is part of the outcome."""
+    """Run a task; errors become part of the outcome."""
     begin = time.perf_counter()
     seconds = 0.0
     try:
@@ -213,7 +218,7 @@ def perform(task: Task) -> Outcome:
             seconds = time.perf_counter() - begin
         return Outcome(None, seconds, _totals(task))
     except (Exception, SystemExit) as error:  # noqa: BLE001
-        # Drake's failed demands raise SystemExit, which would end a worker.
+        # A failed DRAKE_DEMAND raises SystemExit, which would end the worker.
         return Outcome(_describe_failure(error), time.perf_counter() - begin)
 
 
@@ -221,12 +226,12 @@ def _describe_failure(error: BaseException) -> str:
     if isinstance(error, DrakePoseError):
         return str(error)
     if isinstance(error, SystemExit):
-        return f"Drake stopped with a failed demand: {error}"
+        return f"a DRAKE_DEMAND failed in Drake: {error}"
     return f"{type(error).__name__}: {error}"
 
 
 def _load(job: SceneJob) -> Scene:
-    """A job's scene."""
+    """Return the scene of a job."""
     cameras = None if job.camera_file is None else load_cameras(job.camera_file)
     settings = job.settings
     is_person = isinstance(settings, EstimateSettings) and settings.method == "person"
@@ -234,12 +239,12 @@ def _load(job: SceneJob) -> Scene:
 
 
 def _joints(job: SceneJob) -> Path | None:
-    """The table of joint positions of an audit; None: the episode's own."""
+    """Return an audit's table of joint positions; None for the episode's own log."""
     return job.audit if isinstance(job.audit, Path) else None
 
 
 def _require_same_masks(task: Task) -> None:
-    """Refuses a finished scene whose masks were replaced; of chunks, those that join them do."""
+    """Raise an OutputError if masks of a finished scene have changed; joining checks chunks."""
     settings = task.job.settings
     is_episode = isinstance(settings, AuditSettings) and uses_pictures(task.job.scene, settings)
     if task.index is not None or is_episode:
@@ -253,12 +258,12 @@ def _require_same_masks(task: Task) -> None:
     if gone:
         raise OutputError(
             f"{task.place}: the masks of frame {frame_ranges(gone, scene.frames)} were replaced "
-            "since; remove that folder to have it done again"
+            "since; remove that folder to run the scene again"
         )
 
 
 def _make(task: Task) -> None:
-    """Makes a task's result beside its place and moves it there."""
+    """Write a task's result to a temporary folder, then rename it."""
     job, settings = task.job, task.job.settings
     task.work.mkdir(parents=True, exist_ok=True)
     part = task.work / f"{task.place.name}.part-{uuid.uuid4().hex[:12]}"
@@ -281,7 +286,7 @@ def _make(task: Task) -> None:
         try:
             os.replace(part, task.place)
         except OSError as error:
-            # Another worker, taken for dead, may have finished the same task.
+            # A worker that was presumed dead may have finished the same task.
             if not task.place.is_dir():
                 raise OutputError(f"{task.place}: cannot be written: {error.strerror}") from error
     finally:
@@ -289,12 +294,12 @@ def _make(task: Task) -> None:
 
 
 def _join_chunks(task: Task, settings: EstimateSettings, part: Path) -> None:
-    """Puts a scene together as a result that lacks no frame; resuming it makes the other files."""
+    """Join chunks to an unfinished result with all frames; resuming it writes the other files."""
 
     def link(source: str, target: str) -> None:
         try:
             os.link(source, target)
-        except OSError:  # The disk has no links.
+        except OSError:  # The file system has no hard links.
             shutil.copyfile(source, target)
 
     header, rows, records = "", [], {}
@@ -311,7 +316,7 @@ def _join_chunks(task: Task, settings: EstimateSettings, part: Path) -> None:
 
 
 def _totals(task: Task) -> Mapping[str, Any] | None:
-    """What a whole scene's summary says."""
+    """Return the totals of a whole scene from its summary; None for a chunk."""
     if task.index is not None:
         return None
     summary = read_summary(task.place)
@@ -343,19 +348,23 @@ def run_batch(
     work: Callable[[Task], Outcome] = perform,
     tries: int = 3,
 ) -> Batch:
-    """Estimates many scenes; each gets a result folder in ``out``, which is empty or not there.
+    """Estimate or audit many scenes, each with a result folder in ``out``.
 
-    A scene that fails does not stop the others. Interrupted, finished chunks are in ``out``.
+    A scene that fails does not stop the others. If interrupted, finished chunks are kept in
+    ``out``.
 
     Args:
-        client: of the workers; this process works where None.
-        resume: go on with what is in ``out``, and try failed scenes again.
-        work: does a task.
-        tries: a task that has killed its process this often is given up.
+        jobs: the scenes.
+        out: folder of the batch; it must be new or empty.
+        client: Dask client of the workers; None: this process does the work.
+        resume: continue the batch in ``out``, and try failed scenes again.
+        on_progress: called when a task is finished or has failed.
+        work: runs a task.
+        tries: number of attempts for a task that kills its process.
 
     Raises:
-        OutputError: the folder cannot be used, or holds another job.
-        ClusterError: the workers are gone.
+        OutputError: the folder cannot be used, or holds another batch.
+        ClusterError: the connection to the workers is lost.
     """
     out = out.absolute()
     if resume:
@@ -375,13 +384,13 @@ def run_batch(
 
 
 class Batch:
-    """A batch under way, and what became of it.
+    """State and result of a batch.
 
     Attributes:
-        scenes: by name.
-        seconds: of this run [s].
-        out: the folder.
-        waiting: tasks to do.
+        scenes: progress by scene.
+        seconds: wall time of this run [s].
+        out: folder of the batch.
+        waiting: tasks still to be run.
     """
 
     def __init__(self, jobs: Sequence[SceneJob], out: Path, on_progress: OnProgress) -> None:
@@ -393,11 +402,11 @@ class Batch:
 
     @property
     def failed(self) -> tuple[str, ...]:
-        """The scenes that have no result."""
+        """Names of the scenes that failed."""
         return tuple(name for name, one in self.scenes.items() if one.errors)
 
     def as_json(self) -> dict[str, Any]:
-        """The content of batch.json."""
+        """Return the content of batch.json."""
         return {
             "complete": all(one.state == "finished" for one in self.scenes.values()),
             "seconds": self.seconds,
@@ -406,7 +415,11 @@ class Batch:
         }
 
     def write(self) -> None:
-        """Writes batch.json at once, and the tables of audits; or raises OutputError."""
+        """Write batch.json and the tables of audits.
+
+        Raises:
+            OutputError: a file cannot be written.
+        """
         self.seconds = time.monotonic() - self._begin
         text = json.dumps(without_nan(self.as_json()), indent=2, ensure_ascii=False)
         write_file(self.out, "batch.json", text + "\n")
@@ -428,7 +441,7 @@ class Batch:
                     path.unlink()
 
     def plan(self) -> None:
-        """Lists the tasks that have no result yet."""
+        """Plan all scenes and queue the tasks that have no result yet."""
         for folder in (self.out / ".chunks").glob("*/*.part-*"):
             shutil.rmtree(folder, ignore_errors=True)
         for state in self.scenes.values():
@@ -445,15 +458,18 @@ class Batch:
         self._report()
 
     def run_on(self, client: Client, work: Callable[[Task], Outcome], tries: int) -> None:
-        """Does the tasks on workers, one for each thread: none waits at a worker that may die."""
+        """Run the tasks on workers, one at a time on each thread.
+
+        No task waits at a worker, where it would be blamed for the worker's death.
+        """
         from distributed import KilledWorker, as_completed
 
         completed, tasks = as_completed(loop=client.loop), dict[object, Task]()
         while self.waiting or tasks:
-            # A worker that died is being started again.
+            # The number of threads may be 0 while a dead worker is restarted.
             while self.waiting and len(tasks) < max(1, sum(client.nthreads().values())):
                 task = self.waiting.popleft()
-                # Pickled, so that the worker, whose child works, need not import Drake.
+                # Pickled, so that only the worker's child process imports Drake.
                 payload = pickle.dumps((work, task))
                 future = client.submit(call_in_child, payload, retries=tries - 1, pure=False)
                 tasks[future.key] = task
@@ -466,18 +482,18 @@ class Batch:
                 error = future.exception()
                 text = _describe_failure(error)
                 if isinstance(error, KilledWorker):
-                    text = "given up: it has killed its worker again and again"
+                    text = "given up: it killed its worker several times"
                 elif isinstance(error, ClusterError):
                     text = f"given up after {tries} tries: {error}"
                 self.note(task, Outcome(text))
             else:
                 raise ClusterError(
-                    f"the scheduler at {address_of(client)} has gone; finished chunks are in "
-                    f"{self.out}; go on with --resume"
+                    f"the connection to the scheduler at {address_of(client)} is lost; finished "
+                    f"chunks are in {self.out}; continue with --resume"
                 )
 
     def note(self, task: Task, outcome: Outcome) -> None:
-        """Notes what became of a task, and lists the one that follows from it."""
+        """Record the outcome of a task; queue the joining of a scene after its last chunk."""
         state = self.scenes[task.job.name]
         state.seconds += outcome.seconds
         if outcome.error is not None:
@@ -493,14 +509,14 @@ class Batch:
                 state.done.update(one.index for one in state.tasks)
                 shutil.rmtree(task.work, ignore_errors=True)
                 with suppress(OSError):
-                    # The last scene leaves it empty.
+                    # Empty after the last scene.
                     task.work.parent.rmdir()
             else:
                 self._fail(
                     state,
                     "",
-                    f"{task.place}: has {count} frames, but the scene has {state.frame_count} by "
-                    "now; remove that folder to have it estimated again",
+                    f"{task.place}: has {count} frames, but the scene has {state.frame_count} now; "
+                    "remove that folder to run the scene again",
                 )
         self._report()
         if (begin := time.monotonic()) > self._next_summary:
@@ -508,7 +524,7 @@ class Batch:
             self._next_summary = next_summary(begin)
 
     def _fail(self, state: SceneState, extent: str, error: str, most: int = 3) -> None:
-        """Notes what went wrong; a scene of which this many chunks have failed is given up."""
+        """Record an error; after ``most`` failed chunks the scene's other tasks are dropped."""
         state.errors.setdefault(error, []).append(extent)
         if not extent or sum(map(len, state.errors.values())) >= most:
             self.waiting = deque(one for one in self.waiting if one.job is not state.job)
@@ -522,14 +538,14 @@ class Batch:
 
 
 def _require_same_batch(jobs: Sequence[SceneJob], out: Path) -> None:
-    """Refuses to resume a batch whose scenes were described otherwise; more are allowed."""
+    """Raise an OutputError if a scene of the batch has changed; new scenes are allowed."""
     path = out / "batch.json"
     try:
         recorded = json.loads(path.read_text(encoding="utf-8"))["scenes"]
         before = {name: scene["job"] for name, scene in recorded.items()}
     except OSError as error:
         raise OutputError(
-            f"{path}: cannot be read ({error.strerror}): no batch to resume"
+            f"{path}: cannot be read ({error.strerror}); there is no batch to resume"
         ) from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise OutputError(f"{path}: is damaged, so it cannot be resumed") from error
@@ -539,6 +555,6 @@ def _require_same_batch(jobs: Sequence[SceneJob], out: Path) -> None:
         for key, value in described.items():
             if known.get(key) != value:
                 raise OutputError(
-                    f"{out}: scene '{job.name}' was begun with {key} = {known.get(key)}, not "
-                    f"{value}, so it cannot be resumed; name another folder"
+                    f"{out}: scene '{job.name}' was started with {key} = {known.get(key)}, not "
+                    f"{value}, so it cannot be resumed; choose another folder"
                 )

@@ -1,4 +1,4 @@
-"""The job file of `drake-pose batch`: which scenes are estimated or audited, and how."""
+"""The job file of `drake-pose batch`: scenes to be estimated or audited, with their settings."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -18,16 +18,19 @@ from drake_pose.yaml_files import read_yaml
 
 @dataclass(frozen=True)
 class SceneJob:
-    """One scene of a job.
+    """One scene of a batch.
 
     Args:
-        name: of the result's folder.
-        truth: measured joint positions to compare with.
-        chunk: number of frames in a chunk; a person's recording, and a scene that is audited, is
-            not cut.
-        audit: joint positions that the scene is audited against; True: those that an episode holds;
-            None: the scene is estimated.
-        camera_file: of an audit, in place of the scene's cameras.yaml.
+        name: name of the scene and its result folder.
+        scene: the scene's folder.
+        model: the model file.
+        settings: settings of the estimate or audit.
+        truth: measured joint positions to compare an estimate with.
+        overlay, replay: whether overlays and replay.html are written.
+        chunk: number of frames in a chunk; recordings of a person and audits are not cut.
+        audit: table of joint positions to be audited; True: the episode's own joint log; None: the
+            scene is estimated.
+        camera_file: camera file of an audit, used instead of the scene's cameras.yaml.
     """
 
     name: str
@@ -42,7 +45,7 @@ class SceneJob:
     camera_file: Path | None = None
 
     def describe(self) -> dict[str, Any]:
-        """Returns plain JSON values that tell whether a resumed job is still the same."""
+        """Return plain JSON values, equal only if a resumed job is unchanged."""
         truth = None if self.truth is None else str(self.truth)
         described = describe_job(self.scene, self.model, self.settings)
         described |= {"chunk": self.chunk, "truth": truth}
@@ -55,25 +58,25 @@ class SceneJob:
 
 
 def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
-    """Reads a job file's scenes, in its order. Paths in it are relative to its folder.
+    """Return the scenes of a job file, in order. Its paths are relative to its folder.
 
     Args:
-        path: the YAML file: ``scenes`` (name: settings), perhaps ``defaults`` for all, and
-            ``chunk``.
-        chunk: number of frames in a chunk, in place of the file's.
+        path: YAML file with ``scenes`` (settings by name) and optionally ``defaults`` (settings of
+            all scenes) and ``chunk``.
+        chunk: number of frames in a chunk, instead of the file's.
 
     Raises:
-        SettingsError: names the file, the scene and the setting at fault.
+        SettingsError: the message names the file, scene and setting at fault.
     """
     content = _known(read_yaml(path, SettingsError), str(path), ("chunk", "defaults", "scenes"))
     scenes = content.get("scenes")
     if not isinstance(scenes, dict) or not scenes:
-        raise SettingsError(f"{path}: names no scenes; expected 'scenes:' with NAME: settings")
+        raise SettingsError(f"{path}: has no scenes; expected 'scenes:' with NAME: settings")
     length = content.get("chunk", SceneJob.chunk) if chunk is None else chunk
     if not isinstance(length, int) or isinstance(length, bool) or length < 1:
         raise SettingsError(f"{path}: chunk: must be a whole number, 1 or more, not {length!r:.60}")
     own = ("scene", "model", "truth", "overlay", "replay", "audit", "camera_file")
-    # A batch estimates scenes; episodes it audits.
+    # A batch can audit episodes, but not estimate them.
     of_estimates = [
         one.name
         for one in fields(EstimateSettings)
@@ -106,7 +109,11 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
 
 
 def _known(value: Any, where: str, known: tuple[str, ...]) -> dict[str, Any]:
-    """A mapping; SettingsError: it is none, or has other keys."""
+    """Return a mapping whose keys are in ``known``.
+
+    Raises:
+        SettingsError: it is not a mapping, or has other keys.
+    """
     if not isinstance(value, dict):
         raise SettingsError(f"{where}: expected NAME: VALUE lines")
     unknown = [str(key)[:40] for key in value if key not in known]
@@ -120,7 +127,15 @@ def _known(value: Any, where: str, known: tuple[str, ...]) -> dict[str, Any]:
 def _scene_job(
     name: str, values: Mapping[str, Any], own: tuple[str, ...], chunk: int, where: str, base: Path
 ) -> SceneJob:
-    """The job of a scene's entry, whose keys are known."""
+    """Return the job of a scene from its entry, the defaults included.
+
+    Args:
+        values: the entry; None means that the key is not given.
+        own: keys that are fields of SceneJob.
+        chunk: number of frames in a chunk.
+        where: file and scene, for messages.
+        base: folder of relative paths.
+    """
     values = {key: value for key, value in values.items() if value is not None}
     is_audit = "audit" in values
     kind = AuditSettings if is_audit else EstimateSettings
@@ -153,7 +168,7 @@ def _scene_job(
 
 
 def _convert(value: Any, hint: Any, where: str, base: Path) -> Any:
-    """A YAML value as a field of a type has it; paths are relative to base."""
+    """Convert a YAML value to the type of a settings field; paths are relative to ``base``."""
     reader = None
     while get_origin(hint) is Annotated:
         hint, *more = get_args(hint)
@@ -161,7 +176,7 @@ def _convert(value: Any, hint: Any, where: str, base: Path) -> Any:
         reader = next((one for one in found if isinstance(one, FromText)), reader)
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType) and reader is not None:
-        # What an option's text, or a list of its numbers, means.
+        # Parse the text as the option does; a list of numbers is joined to such a text.
         text = ",".join(map(str, value)) if isinstance(value, list) else value
         if not isinstance(text, str):
             raise SettingsError(f"{where}: must be a text, not {value!r:.60}")

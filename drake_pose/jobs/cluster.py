@@ -1,4 +1,4 @@
-"""Workers on this machine or on others, by Dask (the extra `cluster`)."""
+"""Dask workers on this machine or on others (needs the extra `cluster`)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _local = threading.local()
 
 
 def has_dask() -> bool:
-    """Whether the extra ``cluster`` is installed."""
+    """Return whether Dask distributed (extra ``cluster``) is installed."""
     return find_spec("distributed") is not None
 
 
@@ -39,27 +39,26 @@ def open_cluster(
     tries: int = 3,
     timeout: float = 5.0,
 ) -> Iterator[Client]:
-    """Workers, for as long as the context lasts.
+    """Open a Dask client and, without ``scheduler``, workers on this machine.
 
     Args:
-        workers: number of processes of one thread on this machine, which use its loopback address
-            alone; None: one for each core.
+        workers: number of worker processes with one thread each, which listen on the loopback
+            address only; None: one for each core.
         scheduler: address of a Dask scheduler whose workers are used instead.
-        tries: a task that has killed its worker this often fails.
-        timeout: of the connection to a scheduler [s].
+        tries: number of workers that a task may kill before it fails.
+        timeout: timeout of the connection to a scheduler [s].
 
     Raises:
         ClusterError: distributed is not installed, or the scheduler cannot be reached.
     """
     if not has_dask():
         raise ClusterError(
-            'workers need Dask distributed: pip install "drake_pose[cluster]"; or do without them: '
-            "--workers 0"
+            'workers need Dask distributed: pip install "drake_pose[cluster]"; or use --workers 0'
         )
-    # Importing it sets the level.
+    # Importing distributed sets log levels; they are changed below.
     import distributed
 
-    # Dask logs dead workers for its developers; batch says the same in its own words.
+    # A batch reports dead workers itself.
     loggers = [logging.getLogger(name) for name in ("distributed", "asyncio")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
@@ -77,7 +76,7 @@ def open_cluster(
         settings = {
             "distributed.worker.multiprocessing-method": "spawn",
             "distributed.scheduler.allowed-failures": tries - 1,
-            # A task that waits at a worker that is killed would be suspected of having killed it.
+            # Tasks that wait at a killed worker would count as having killed it.
             "distributed.scheduler.worker-saturation": 1.0,
             "distributed.logging.distributed": "critical",
             "distributed.admin.low-level-log-length": 0,
@@ -106,7 +105,7 @@ def open_cluster(
 
 
 def _connect(address: str, timeout: float) -> Client:
-    """A client of a scheduler that runs elsewhere."""
+    """Return a client of a running scheduler."""
     from distributed import Client
     from distributed.comm import connect, get_address_host_port
 
@@ -114,20 +113,20 @@ def _connect(address: str, timeout: float) -> Client:
         get_address_host_port(address, strict=True)
     except ValueError as error:
         raise ClusterError(
-            f"'{address}' is no scheduler's address; give one like tcp://10.0.0.7:8786"
+            f"'{address}' is not a scheduler's address like tcp://10.0.0.7:8786"
         ) from error
 
     async def shake_hands() -> None:
-        # connect's own timeout does not hold where a server accepts and says nothing.
+        # The timeout of connect does not cover a server that accepts and does not answer.
         await (await asyncio.wait_for(connect(address, timeout=timeout), timeout + 0.5)).close()
 
     try:
-        # Before a Client is made: one without a scheduler complains when it is destroyed.
+        # Before the Client is made: a Client without scheduler logs errors when it is destroyed.
         asyncio.run(shake_hands())
         return Client(address, timeout=timeout, set_as_default=False)
     except (TimeoutError, OSError, ValueError, TypeError, EOFError, MemoryError) as error:
-        # A server that is no scheduler may answer anything: bytes of a web page are taken for the
-        # size of a message, exabytes.
+        # Another kind of server may answer anything; bytes of a web page, read as the size of a
+        # message, cause a MemoryError.
         raise ClusterError(
             f"no scheduler answers at {address} within {timeout:g} s; start one with "
             "'dask scheduler --host 127.0.0.1' and workers with 'dask worker ADDRESS --nthreads 1'"
@@ -135,12 +134,12 @@ def _connect(address: str, timeout: float) -> Client:
 
 
 def address_of(client: Client) -> str:
-    """A client's scheduler, for messages."""
+    """Return the address of a client's scheduler, for messages."""
     return "its address" if client.scheduler is None else str(client.scheduler.address)
 
 
 def worker_facts(file: Path | None = None) -> tuple[str, str, bool]:
-    """This process's version, the SHA-256 of its source code, and whether it sees a file."""
+    """Return this process's version, the SHA-256 of its source code, and whether a file exists."""
     digest = hashlib.sha256()
     package = Path(version.__file__).parent
     for path in sorted(package.rglob("*.py")):
@@ -150,10 +149,10 @@ def worker_facts(file: Path | None = None) -> tuple[str, str, bool]:
 
 
 def require_fit_workers(client: Client, out: Path, timeout: float = 5.0) -> None:
-    """Checks that all workers have this drake_pose and see the folder of the result.
+    """Check that all workers have this version of drake_pose and see the result folder.
 
     Raises:
-        ClusterError: there is no worker within the timeout [s], or one is not fit.
+        ClusterError: there is no worker within the timeout [s], or a worker fails a check.
     """
     with suppress(asyncio.TimeoutError):
         client.wait_for_workers(1, timeout=timeout)
@@ -184,8 +183,8 @@ def require_fit_workers(client: Client, out: Path, timeout: float = 5.0) -> None
             )
         elif not facts[2]:
             how = (
-                f"does not see the folder {out}; scenes, models and results must lie where all "
-                "machines find them under the same path"
+                f"does not see the folder {out}; all machines must find scenes, models and "
+                "results at the same paths"
             )
         else:
             continue
@@ -193,10 +192,13 @@ def require_fit_workers(client: Client, out: Path, timeout: float = 5.0) -> None
 
 
 def call_in_child(payload: bytes) -> bytes:
-    """Calls a pickled pair of a function and its argument in a child of this worker's thread.
+    """Call a function in a child process of this thread, which is kept for the next call.
 
-    Drake's renderer and Meshcat must be destroyed in the thread that made them: work is done in a
-    child's main thread. A crash ends the child, not the worker. A child is kept for the next call.
+    Drake's renderer and Meshcat must be destroyed in the thread that made them, so that the work is
+    done in the main thread of a child. A crash ends the child, not the worker.
+
+    Args:
+        payload: pickled pair of a function and its argument.
 
     Returns:
         The pickled result.
@@ -209,9 +211,9 @@ def call_in_child(payload: bytes) -> bytes:
         from distributed import get_worker
 
         limit = None
-        with suppress(ValueError):  # Not called by a worker.
+        with suppress(ValueError):  # Raised outside of a worker.
             limit = get_worker().memory_manager.memory_limit
-        # Dask's nannies make workers daemons, which multiprocessing allows no children.
+        # Dask starts workers as daemons, which multiprocessing allows no children.
         multiprocessing.current_process().daemon = False
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
@@ -234,11 +236,11 @@ def call_in_child(payload: bytes) -> bytes:
 
 
 def _answer(requests: Connection, memory_limit: int | None) -> None:
-    """Calls what the parent asks for until the parent ends."""
-    # Ctrl-C is the parent's business.
+    """Serve the parent's calls until the parent ends."""
+    # The parent handles Ctrl-C.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if memory_limit:
-        # The task fails, rather than the machine.
+        # Too large a task fails by itself instead of exhausting the machine's memory.
         with suppress(ImportError, ValueError, OSError):
             import resource  # Absent on Windows.
 

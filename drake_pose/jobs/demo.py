@@ -1,4 +1,4 @@
-"""The demonstration: a real person's joint angles from one real silhouette."""
+"""The demonstration: joint angles of a real person from one silhouette."""
 
 import json
 from pathlib import Path
@@ -13,29 +13,29 @@ from drake_pose.jobs.estimate.scene import estimate_scene
 
 
 def stored_scene(name: str) -> Path:
-    """Returns a stored scene's folder, in a checkout or inside the installed package.
+    """Return the folder of a bundled scene, in a checkout or in the installed package.
 
     Raises:
-        SceneError: if it is in neither place.
+        SceneError: the scene is in neither.
     """
     package = Path(__file__).resolve().parents[1]
     for root in (package.parent, package):
         folder = root / "tutorials" / "data" / name
         if (folder / "cameras.yaml").is_file():
             return folder
-    raise SceneError(f"the stored pictures '{name}' are missing; install drake_pose again")
+    raise SceneError(f"the bundled scene '{name}' is missing; install drake_pose again")
 
 
 def demo_scene() -> Path:
-    """Returns the demonstration's scene."""
+    """Return the folder of the demonstration's scene."""
     return stored_scene("human")
 
 
 def demo_settings(scene: Path) -> EstimateSettings:
-    """Returns the recipe of Kameda, Minoh and Ikeda (experiment B) for a person who stands.
+    """Return the settings of Kameda, Minoh and Ikeda's experiment B for a standing person.
 
-    One camera; the root is a foot whose position is known. The foot may point anywhere, and be
-    tilted by 20 degrees. The search is the multi-start search, at continuous angles.
+    The root is a foot with a known position, any heading, and a tilt of up to 20 degrees. The
+    search is the multi-start search at continuous angles.
     """
     return EstimateSettings(
         root="right_foot",
@@ -45,14 +45,14 @@ def demo_settings(scene: Path) -> EstimateSettings:
 
 
 def run_demo(out: Path, on_frame: OnFrame | None = None) -> SceneEstimate:
-    """Estimates the stored scene.
+    """Estimate the demonstration's scene.
 
     Args:
-        out: folder for the result; what an earlier demonstration left there is replaced.
-        on_frame: hears of the finished frame.
+        out: folder for the result; the result of an earlier demonstration is replaced.
+        on_frame: called with the finished frame.
 
     Raises:
-        OutputError: if the folder holds something else.
+        OutputError: the folder holds other files.
     """
     scene = demo_scene()
     with claimed(out, resume=True):

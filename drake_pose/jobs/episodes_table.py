@@ -1,4 +1,4 @@
-"""Of all audited episodes: where cameras were found, their clocks, who moved, and camera files."""
+"""Table of the cameras of all audited episodes, and camera files of cameras that did not move."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -19,20 +19,21 @@ COLUMNS = (
     "scene", "camera", "frames", "agreeing", "x", "y", "z", "sd_mm", "sd_deg", "off_mm", "off_deg",
     "time_offset_s", "time_offset_sd_s", "joints", "moved_mm", "moved_deg", "moved", "camera_file",
 )  # fmt: skip
-"""Of the table. x, y, z: the camera in the world [m]; off: from where it is given, where that is
-named; joints: those that are named; moved: from where the episodes before have a camera of this
-name; camera_file: holds the cameras as all episodes have them that saw them stand there."""
+"""Columns of episodes.csv. x, y, z: position of the camera in the world [m]; off: distance from its
+given pose, if that is an error; joints: joints with errors; moved: distance from the pose in
+earlier episodes, and whether that is significant; camera_file: file with the cameras' poses,
+combined from all episodes in which they did not move."""
 
 
 def episodes_table(episodes: Mapping[str, Mapping[str, Any]]) -> tuple[str, dict[str, str]]:
-    """The table (CSV) of all audited episodes' cameras, and camera files (YAML) by name.
+    """Return the text of episodes.csv, and the texts of camera files (YAML) by name.
 
-    A camera has moved if its pose differs significantly from the pose that the episodes since its
-    last move have together. A new camera file begins with each episode in which one has moved.
+    A camera has moved if its pose differs significantly from the combined pose of the episodes
+    since its last move. A new camera file begins at each episode in which a camera has moved. There
+    are no camera files without audited episodes.
 
     Args:
-        episodes: totals of scenes by name, in the order of the job; those without cameras are no
-            audited episodes. No camera file: there is none.
+        episodes: totals by scene, in the order of the job; scenes without cameras are skipped.
     """
     rows = list[list[Any]]()
     files: list[dict[str, _Standing]] = [{}]
@@ -43,7 +44,7 @@ def episodes_table(episodes: Mapping[str, Mapping[str, Any]]) -> tuple[str, dict
         for name, one in totals.get("cameras", {}).items():
             moves[name] = stand[name].moved(one) if name in stand else (None,) * 3
         if any(moved == "yes" for *_, moved in moves.values()):
-            # Who stands still has one pose in all files.
+            # Cameras that have not moved keep their combined pose.
             files.append({k: v for k, v in stand.items() if moves.get(k, "-")[-1] != "yes"})
         for name, move in moves.items():
             one = totals["cameras"][name]
@@ -66,11 +67,12 @@ def episodes_table(episodes: Mapping[str, Mapping[str, Any]]) -> tuple[str, dict
 
 
 class _Standing:
-    """The pose of a camera that several episodes saw in one place: their weighted mean.
+    """Combined pose of a static camera from several episodes: the information-weighted mean.
 
-    Errors of episodes are correlated, as a joint offset's are, by an unknown amount. Covariance
-    intersection (Julier and Uhlmann, 1997, equal weights) gives a covariance that holds all the
-    same: that of one episode if all are equal. Sums are kept: a batch has thousands of episodes.
+    Errors of episodes are correlated by an unknown amount, for instance by joint offsets.
+    Covariance intersection with equal weights (Julier and Uhlmann, 1997) gives a covariance that is
+    consistent for any correlation: with n equal episodes it is that of one. Only sums are stored,
+    since a batch may have thousands of episodes.
     """
 
     def __init__(self, one: Found) -> None:
@@ -79,7 +81,7 @@ class _Standing:
         self._information, self._weighted = np.zeros((6, 6)), np.zeros(6)
 
     def add(self, one: Found) -> None:
-        """Counts what another episode says."""
+        """Add the camera's pose in another episode."""
         information = np.linalg.inv(np.array(one["covariance"]))
         self._information += information
         self._weighted += information @ pose_difference(np.array(one["X_WC"]), self._first)
@@ -88,7 +90,7 @@ class _Standing:
         self._surest = min(self._surest, one, key=lambda k: float(k["translation_sd_mm"]))
 
     def pose(self) -> tuple[Array, Array]:
-        """X_WC (4, 4) and its covariance (6, 6)."""
+        """Return the combined X_WC (4, 4) and its covariance (6, 6), rotation first [rad, m]."""
         inverse, X_WC = np.linalg.inv(self._information), self._first.copy()
         mean = inverse @ self._weighted
         X_WC[:3, :3] = Rotation.from_rotvec(mean[:3]).as_matrix() @ X_WC[:3, :3]
@@ -96,7 +98,7 @@ class _Standing:
         return X_WC, np.asarray(self._count * inverse)
 
     def moved(self, one: Found) -> tuple[float, float, str]:
-        """How far a pose is from here [mm, degrees], and whether the camera has moved."""
+        """Return the distance [mm], angle [deg] and "yes" or "no": whether the camera has moved."""
         X_WC, covariance = self.pose()
         off = pose_difference(np.array(one["X_WC"]), X_WC)
         distance = squared_distance(off, covariance + np.array(one["covariance"]))
@@ -105,9 +107,10 @@ class _Standing:
         return float(shift), float(turn), "yes" if is_moved else "no"
 
     def entry(self) -> dict[str, Any]:
-        """The camera in a file; where its focal length was found, as the surest episode has it.
+        """Return the camera's entry of a camera file.
 
-        For its distance goes with that.
+        If focal lengths were estimated, it is the entry of the episode with the smallest standard
+        deviation, since estimated focal length and distance are correlated.
         """
         own: dict[str, Any] = self._surest["camera"]
         return own if self._is_focal else own | {"X_WC": self.pose()[0].tolist()}

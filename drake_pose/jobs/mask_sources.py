@@ -1,4 +1,4 @@
-"""Where masks come from: folders of pictures, videos, and COCO files, by camera."""
+"""Sources of masks by camera: folders of pictures, videos, COCO files and recorded episodes."""
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,15 +30,18 @@ from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, common_rate
 
 @dataclass(frozen=True)
 class Source:
-    """Where the pictures of all cameras are, or what other tools say of them.
+    """Pictures or annotations of all cameras.
 
-    The only camera is named "" where nothing names it.
+    A single camera without a name is "".
 
     Args:
-        cameras: what the camera file says; None where there is none.
-        pictures: by camera and frame, the files; none where there are videos.
-        annotated: COCO files, each with the camera whose folder it lies in.
-        episode: a data set's, or a bag, whose cameras' pictures are read.
+        path: folder or file of the source.
+        camera_file: the camera file; None if there is none.
+        cameras: content of the camera file; None if there is none.
+        pictures: picture files by camera and frame; empty if there are videos.
+        videos: video files by camera.
+        annotated: COCO files, each with the name of the folder that it lies in.
+        episode: recorded episode whose pictures are read; None if there is none.
     """
 
     path: Path
@@ -52,20 +55,21 @@ class Source:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The cameras' names."""
+        """Names of the cameras."""
         return (*self.pictures, *self.videos, *(self.episode.cameras if self.episode else ()))
 
     def rate(self) -> tuple[float | None, tuple[str, ...]]:
-        """Pictures a second of videos or an episode; what is wrong with their times."""
+        """Return the frame rate [Hz] of videos or an episode, and warnings about their times."""
         if self.episode is None:
             return common_rate(self.videos)
         steps = np.diff(next(iter(self.episode.cameras.values())).times)
         return (1.0 / float(np.median(steps)) if len(steps) else None), self.episode.warnings
 
     def read(self, camera: str) -> Iterator[tuple[str, str, Picture]]:
-        """The frames of a camera: name, where it is from, and the picture (H, W, 3).
+        """Yield each frame of a camera: name, origin for messages, and picture (H, W, 3).
 
-        Raises SceneError: a picture that cannot be read, or has another size than its camera.
+        Raises:
+            SceneError: a picture cannot be read, or differs in size from its camera.
         """
         for frame, path in self.pictures.get(camera, {}).items():
             picture = read_picture(path, SceneError)
@@ -90,9 +94,15 @@ class Source:
                 yield f"{number:06d}", f"{self.videos[camera]}: frame {number:06d}", picture
 
     def check_size(self, camera: str, shape: tuple[int, ...], where: str) -> None:
-        """SceneError where a camera is calibrated for, or gave before, another (height, width).
+        """Raise a SceneError if a picture differs in size from its camera's calibration.
 
-        Pictures that nothing says to be of one camera may have any sizes.
+        Without calibration its size must be that of the camera's first picture. Pictures of a
+        camera without a name may have any size.
+
+        Args:
+            camera: the camera's name.
+            shape: (height, width, ...) of the picture.
+            where: the picture's origin, for messages.
         """
         own = None if self.cameras is None else self.cameras.cameras[camera]
         size, whose = shape[:2], f"camera '{camera}' had before"
@@ -107,12 +117,13 @@ class Source:
             )
 
     def annotated_pictures(self) -> Iterator[tuple[str, str, Annotations, AnnotatedPicture]]:
-        """Of each picture of the COCO files: camera, frame, the file and the picture.
+        """Yield each picture of the COCO files: camera, frame, COCO file and annotated picture.
 
-        The camera is the last folder of the picture's path in the file that is a camera's name, or
-        that in which the COCO file lies.
+        The camera is the last folder in the picture's path that is a camera's name, else the folder
+        in which the COCO file lies.
 
-        Raises SceneError: nothing tells the camera, or a frame is there twice.
+        Raises:
+            SceneError: the camera is unknown, or a frame occurs twice.
         """
         known = [] if self.cameras is None else list(self.cameras.cameras)
         listed = [(folder, coco, one) for folder, coco in self.annotated for one in coco.pictures]
@@ -138,18 +149,20 @@ class Source:
 
 
 def open_source(path: Path, camera_file: Path | None = None, episode: int | None = None) -> Source:
-    """Finds out what there is.
+    """Open a source of masks.
 
-    It may be an episode of a data set, of DROID or a bag; ``episode`` is its number in a LeRobot
-    data set. A folder has ``images/<camera>/<frame>.png`` or ``.jpg``; where a camera has no such
-    folder ``videos/<camera>.mp4``; or the same without ``images`` and ``videos``, or in ``masks``
-    where there is neither; with a single camera the pictures may lie in it. A file is a picture, a
-    video, or of COCO. Its cameras are those of ``camera_file``, or of the folder's cameras.yaml.
+    Args:
+        path: one of: a folder with ``images/<camera>/<frame>.png`` or ``.jpg`` (cameras without
+            such a folder: ``videos/<camera>.mp4``), the same without ``images`` and ``videos``, or,
+            without both, in ``masks``; the pictures of a single camera need no folder of their own;
+            a picture, video or COCO file; an episode of a LeRobot data set, of DROID, or a bag.
+        camera_file: camera file; None: the folder's cameras.yaml, if it exists.
+        episode: number of the episode in a LeRobot data set.
 
     Raises:
-        SceneError: names what is missing, or in doubt.
-        CameraError: the camera file is wrong.
-        MaskError: a COCO file is wrong.
+        SceneError: the message names what is missing or ambiguous.
+        CameraError: the camera file cannot be used.
+        MaskError: a COCO file cannot be used.
     """
     if not path.exists():
         raise SceneError(f"{path}: there is no such folder or file")
@@ -165,8 +178,8 @@ def open_source(path: Path, camera_file: Path | None = None, episode: int | None
         raise SceneError(f"{error.filename or path}: cannot be read: {error.strerror}") from error
     if not (found.names or found.annotated):
         raise SceneError(
-            f"{path}: holds no pictures images/<camera>/<frame>.png or .jpg, no videos "
-            "videos/<camera>.mp4, no COCO file (.json), and is no data set or bag"
+            f"{path}: has no pictures images/<camera>/<frame>.png or .jpg, no videos "
+            "videos/<camera>.mp4, no COCO file (.json), and is not a data set or bag"
         )
     pictures, videos = found.pictures, found.videos
     if cameras is not None:
@@ -175,12 +188,12 @@ def open_source(path: Path, camera_file: Path | None = None, episode: int | None
             if name not in (*known, ""):
                 raise SceneError(
                     f"{path}: the pictures of '{name}' belong to no camera of {camera_file}, which "
-                    f"has {', '.join(known)}; take them out, or calibrate that camera"
+                    f"has {', '.join(known)}; remove them, or calibrate that camera"
                 )
         if "" in found.names and len(known) > 1:
             raise SceneError(
-                f"{path}: its pictures lie in no camera's folder, but {camera_file} has "
-                f"{len(known)} cameras: {', '.join(known)}"
+                f"{path}: its pictures are not in a camera's folder, but {camera_file} has "
+                f"{len(known)} cameras: {', '.join(known)}; name the folder after one of them"
             )
         pictures = {name or known[0]: files for name, files in pictures.items()}
         videos = {name or known[0]: file for name, file in videos.items()}
@@ -197,13 +210,13 @@ def _open_file(path: Path) -> Source:
         return Source(path, videos={"": path})
     if kind in SUFFIXES:
         return Source(path, pictures={"": {path.stem: path}})
-    raise SceneError(f"{path}: is no picture, video or COCO file")
+    raise SceneError(f"{path}: is not a picture, video or COCO file")
 
 
 def _open_folder(path: Path) -> Source:
-    """Pictures, videos or COCO files by camera, which nothing may name."""
+    """Return the pictures, videos or COCO files of a folder by camera; "" without a name."""
     places = [path / name for name in ("images", "videos") if (path / name).is_dir()]
-    # Where there is nothing to find objects in, masks that another tool put there are meant.
+    # Without pictures to segment, masks of another tool are read.
     roots = places or [path / "masks" if (path / "masks").is_dir() else path]
     no_cameras = ("background", "overlay", "masks", "images", "videos")
     folders = [("", root) for root in roots] + [
@@ -224,17 +237,17 @@ def _open_folder(path: Path) -> Source:
                 annotated.append((name, read_coco(file)))
             elif kind in VIDEOS and folder in roots:
                 if file.stem in videos:
-                    raise SceneError(f"{file}: there is a second video of camera '{file.stem}'")
+                    raise SceneError(f"{file}: is a second video of '{file.stem}'; remove one")
                 videos[file.stem] = file
-    # COCO files lie beside the pictures that they are of.
+    # The pictures beside COCO files are those that were annotated.
     if annotated:
         return Source(path, annotated=annotated)
-    # As wherever a recording is read, a video counts where its camera has no folder of pictures.
+    # As in scenes, a folder of pictures takes precedence over a video of the same camera.
     videos = {name: file for name, file in videos.items() if name not in pictures}
     if "" in pictures and len(pictures) > 1:
         raise SceneError(
-            f"{roots[0]}: has pictures beside folders of pictures; put them in a camera's folder"
+            f"{roots[0]}: has pictures beside folders of pictures; move them into a camera's folder"
         )
     if "" in pictures and videos:
-        raise SceneError(f"{roots[0]}: has pictures and videos; give one of them")
+        raise SceneError(f"{roots[0]}: has pictures and videos; remove one of them")
     return Source(path, pictures=pictures, videos=videos)

@@ -1,4 +1,4 @@
-"""Masks for a scene: those of other tools, or found by the empty room, a box or the model."""
+"""Masks for a scene: read from other tools, or segmented by background, box or model."""
 
 import math
 import shutil
@@ -51,23 +51,27 @@ from drake_pose.silhouette.segmentation import (
 )
 
 MIN_AGREEMENT = 0.85
-"""Least IoU of a mask and what its picture tells otherwise, by which it is believed."""
+"""Minimum IoU of a mask and an independent segmentation of its picture, below which it is
+doubtful."""
 _PARTIAL = "masks.part"
 
 Find = Callable[[str, Picture], tuple[Mask, float, tuple[str, ...]]]
-"""The mask of a camera's picture, how well that tells it, and what its user should look at."""
+"""Called with a camera and its picture; returns mask, agreement (see FoundMask) and warnings."""
 
 
 class FoundMask(NamedTuple):
-    """A mask of one picture, or why there is none.
+    """The mask of one picture, or why it was rejected.
 
     Args:
-        where: names the picture in messages.
+        camera: the camera's name.
+        frame: the frame's name.
+        where: origin of the picture, for messages.
         mask: (H, W).
-        picture: (H, W, 3) red, green, blue; None where only the mask is known.
-        refusal: why the mask is not good; "" where it is.
-        warnings: what its user should look at.
-        agreement: IoU with what is found in the picture otherwise; nan where that is unknown.
+        picture: (H, W, 3) RGB; None if only the mask is given.
+        refusal: why the mask is rejected; "" if it is accepted.
+        warnings: messages for the user.
+        agreement: lowest IoU with masks of slightly different settings, or with the colours; nan if
+            not known.
     """
 
     camera: str
@@ -82,9 +86,12 @@ class FoundMask(NamedTuple):
 
 @dataclass(frozen=True)
 class SceneMasks:
-    """What was written: the scene's folder, and what its ``summary.json`` holds.
+    """A written scene of masks.
 
-    By camera and frame that is each mask's area [pixel], or why there is none, and its warnings.
+    Args:
+        folder: the scene's folder.
+        summary: content of its summary.json: for each camera and frame the mask's area [pixel] or
+            why it was rejected, and warnings.
     """
 
     folder: Path
@@ -92,12 +99,12 @@ class SceneMasks:
 
     @property
     def count(self) -> int:
-        """How many masks the scene has."""
+        """Number of masks in the scene."""
         return int(self.summary["mask_count"])
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """All warnings, each with the picture's name."""
+        """All warnings; each names its picture or camera."""
         return tuple(self.summary["warnings"])
 
 
@@ -110,20 +117,25 @@ def make_masks(
     overlay: bool = True,
     on_mask: Callable[[int], None] = lambda _: None,
 ) -> SceneMasks:
-    """Writes a scene whose masks are those of another tool, or are found in pictures.
+    """Write a scene of masks, read from another tool or segmented in pictures.
 
-    The scene has ``masks/<camera>/<frame>.png``, or ``masks/<frame>.png`` of a single camera that
-    nothing names; the source's ``cameras.yaml`` and ``scene.yaml``, where it has them; and
-    ``overlay/<camera>/<frame>.jpg``, the pictures with the masks' outlines. A picture whose mask is
-    empty or full gets none, and a warning. Until all are there, masks lie in ``masks.part``.
+    The scene has ``masks/<camera>/<frame>.png`` (``masks/<frame>.png`` for a camera without a
+    name), the source's ``cameras.yaml`` and ``scene.yaml`` if they exist, and
+    ``overlay/<camera>/<frame>.jpg``, the pictures with the masks' contours. An empty or full mask
+    is not written and causes a warning. Until all masks are written they are in ``masks.part``.
 
     Args:
-        source: see ``open_source``.
-        out: the scene's folder; new or empty.
-        on_mask: called after each picture with the number of those done.
+        source: as in `open_source`.
+        out: folder for the scene; it must be new or empty.
+        settings: the segmentation; None: defaults.
+        overlay: whether overlays are written.
+        on_mask: called after each picture with the number of finished ones.
+
+    Returns:
+        The scene's folder and summary.
 
     Raises:
-        DrakePoseError: names the file, camera or frame at fault; no picture has a good mask.
+        DrakePoseError: the message names the file, camera or frame at fault; or no mask is usable.
     """
     settings, folder = settings or MaskSettings(), Path(out)
     opened = open_source(Path(source), settings.cameras, settings.episode)
@@ -159,8 +171,8 @@ def make_masks(
             warnings += [text for name, own in cameras.items() for text in _doubt_camera(name, own)]
         if opened.cameras is None and set(cameras) != {""}:
             warnings.append(
-                f"{folder}: its cameras {', '.join(cameras)} have no {CAMERA_FILE}, which estimate "
-                "needs (--cameras)"
+                f"{folder}: there is no {CAMERA_FILE} for the cameras {', '.join(cameras)}, which "
+                "estimate needs; add it, or give --cameras"
             )
         summary = {
             "source": str(opened.path),
@@ -178,20 +190,20 @@ def make_masks(
 
 
 def _doubt_camera(name: str, frames: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
-    """A warning of the masks that a camera's pictures do not tell."""
+    """Yield a warning if masks of a camera depend on the settings of the segmentation."""
     known = {frame: one["agreement"] for frame, one in frames.items() if "agreement" in one}
     bad = [frame for frame, agreement in known.items() if agreement < MIN_AGREEMENT]
     if bad:
         usual = float(np.median([known[frame] for frame in bad]))
         yield (
             f"camera '{name or 'camera'}', frame {frame_ranges(bad, list(frames))} ({len(bad)} of "
-            f"{len(frames)}): masks and pictures hardly agree: by a box or threshold that is a "
-            f"little other, the masks are others (IoU {usual:.0%}); look at the overlays"
+            f"{len(frames)}): the masks are doubtful: a slightly different box or threshold gives "
+            f"other masks (IoU {usual:.0%}); check the overlays"
         )
 
 
 def _write_scene(source: Source, folder: Path, summary: Mapping[str, Any]) -> None:
-    """Writes what else belongs to the scene; its masks come last."""
+    """Write the scene's other files, then rename the folder of masks."""
     own = source.path / SCENE_FILE
     try:
         if source.path.is_dir() and own.is_file():
@@ -211,7 +223,7 @@ def _write_scene(source: Source, folder: Path, summary: Mapping[str, Any]) -> No
 
 
 def _draw_outline(picture: Picture, mask: Mask, refused: bool) -> bytes:
-    """A JPEG file of a picture (H, W, 3) with the mask's outline; one that is refused is dark."""
+    """Return the JPEG file of a picture (H, W, 3) with a mask's contour, dark if it is rejected."""
     drawn = np.array(picture[:, :, ::-1] // (3 if refused else 1))
     contours, _ = cv2.findContours(mask.view(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     vermilion_bgr = (0, 94, 213)
@@ -220,29 +232,30 @@ def _draw_outline(picture: Picture, mask: Mask, refused: bool) -> bytes:
 
 
 def refuse_mask(mask: Mask, max_fraction: float = 0.98) -> str:
-    """Why a mask (H, W) cannot be used: it is empty or full; "" where it can.
+    """Return why a mask (H, W) is rejected: it is empty or full; "" if it is accepted.
 
-    ``max_fraction``: largest fraction of the picture.
+    ``max_fraction``: maximum fraction of the picture that a mask covers.
     """
     if not mask.any():
         return "the object is not found: the mask is empty"
     if mask.mean() >= max_fraction:
-        return "the mask fills the picture: nothing tells the object from the rest"
+        return "the mask fills the picture: object and background are not separated"
     return ""
 
 
 def doubt_mask(mask: Mask, max_border: float = 0.6, second_patch: float = 0.25) -> list[str]:
-    """Why a mask (H, W) that is not empty may show something else.
+    """Return warnings that a mask (H, W), not empty, may show something else than the object.
 
     Args:
-        max_border: largest fraction of the picture's border that an object covers.
-        second_patch: least area of a second object, as a fraction of the largest patch's.
+        mask: the mask.
+        max_border: maximum fraction of the picture's border that an object covers.
+        second_patch: minimum area of a second object, as a fraction of the largest region's area.
     """
     warnings = []
     border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()
     if border > max_border:
         warnings.append(
-            f"the mask covers {border:.0%} of the picture's border: is it the background?"
+            f"the mask covers {border:.0%} of the picture's border; check that it shows the object"
         )
     _, _, statistics, middles = cv2.connectedComponentsWithStats(mask.view(np.uint8))
     areas = statistics[1:, cv2.CC_STAT_AREA]
@@ -250,14 +263,15 @@ def doubt_mask(mask: Mask, max_border: float = 0.6, second_patch: float = 0.25) 
     if len(areas) > 1 and areas[second] > second_patch * areas[first]:
         (x0, y0), (x1, y1) = np.rint(middles[[1 + first, 1 + second]]).astype(int)
         warnings.append(
-            f"there are two patches, of {areas[first]} pixels about ({x0}, {y0}) and of "
-            f"{areas[second]} about ({x1}, {y1}): two objects? --largest keeps the larger one"
+            f"the mask has two regions, of {areas[first]} pixels around ({x0}, {y0}) and of "
+            f"{areas[second]} around ({x1}, {y1}); if they are two objects, --largest keeps the "
+            "larger one"
         )
     return warnings
 
 
 def largest_patch(mask: Mask) -> Mask:
-    """The largest connected patch of a mask (H, W); what is empty stays so."""
+    """Return the largest connected region of a mask (H, W)."""
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8))
     if count <= 2:
         return mask
@@ -265,23 +279,22 @@ def largest_patch(mask: Mask) -> Mask:
 
 
 def find_masks(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
-    """The masks of a source, one by one, in the way that the settings choose.
+    """Yield the masks of a source, read or segmented as the settings say.
 
-    Raises DrakePoseError: names the file, camera or frame at fault.
+    Raises:
+        DrakePoseError: the message names the file, camera or frame at fault.
     """
     background = settings.background
     way = replace(settings, largest=False, cameras=None, episode=None)
     if way == MaskSettings():
-        # Beside its pictures a scene may have those of the empty room, which say what is meant.
+        # Without a segmentation method, a folder of background pictures implies one.
         room = source.path / "background"
         background = room if room.is_dir() else None
     if background is None and settings.box is None and settings.model is None:
         yield from _read_given(source, settings)
         return
     if source.annotated:
-        raise SceneError(
-            f"{source.path}: has annotations, but the object is to be found in pictures"
-        )
+        raise SceneError(f"{source.path}: has annotations; segmentation needs pictures")
     if background is None and settings.box is None:
         yield from _find_by_model(source, settings)
         return
@@ -300,11 +313,11 @@ def find_masks(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
 
 
 def _read_given(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
-    """Masks of other tools in COCO files, pictures or videos."""
+    """Yield the masks that other tools wrote to COCO files, pictures or videos."""
     known = sorted({name for _, coco in source.annotated for name in coco.classes})
     if not settings.classes and len(known) > 1:
         raise MaskError(
-            f"{source.path}: has the classes {', '.join(known)}; say which are the object: "
+            f"{source.path}: has the classes {', '.join(known)}; choose those of the object: "
             f"--class '{known[0]}', or --class all"
         )
     numbers = {number: name for _, coco in source.annotated for number, name in coco.names.items()}
@@ -339,27 +352,36 @@ def _by_box(
     usual: tuple[float, float] = (0.03, 0.95),
     margins: Sequence[float] = (-0.05, 0.05),
 ) -> tuple[Mask, float, tuple[str, ...]]:
-    """GrabCut within x, y, width and height [pixel].
+    """Segment a picture by GrabCut in a box.
 
     Args:
-        usual: least and largest fraction of its box that an object fills.
-        margins: by these fractions of its sides the box is enlarged for comparison.
+        box: x, y, width and height [pixel].
+        picture: (H, W, 3).
+        usual: minimum and maximum fraction of its box that an object fills.
+        margins: enlargements of the box for comparison, as fractions of its sides.
+
+    Returns:
+        Mask, agreement and warnings, as in FoundMask.
     """
     mask, (x, y, w, h) = grab_cut_box(picture, box), box
     part = mask.sum() / (w * h)
     again = []
     for share in margins:
-        # Around a larger one there may be nothing left.
+        # A larger box may leave no background around it.
         with suppress(SettingsError):
             other = (x - share * w, y - share * h, w + 2.0 * share * w, h + 2.0 * share * h)
             again.append(grab_cut_box(picture, other))
     is_good = part == 0.0 or usual[0] <= part <= usual[1]
-    warnings = () if is_good else (f"the mask is {part:.1%} of its box: find it another way",)
+    warnings = (
+        ()
+        if is_good
+        else (f"the mask fills {part:.1%} of its box; change the box or use another method",)
+    )
     return mask, _least_overlap(mask, again), warnings
 
 
 def _least_overlap(mask: Mask, others: Iterable[Mask]) -> float:
-    """The least IoU of a mask and others; nan where there is none."""
+    """Return the lowest IoU of a mask with others; nan if there are none."""
     return min((intersection_over_union(mask, one) for one in others), default=math.nan)
 
 
@@ -369,11 +391,13 @@ def _by_empty_room(
     thresholds: Sequence[float] = (0.7, 1.4),
     changed: float = 0.6,
 ) -> Find:
-    """What differs from the background, as of ``MaskSettings.background``.
+    """Return a function that segments the region of a picture that differs from the background.
 
     Args:
-        thresholds: factors of the background's noise, by which masks are found for comparison.
-        changed: fraction of a picture that differs where light or camera have changed.
+        source: the source.
+        background: as in ``MaskSettings.background``.
+        thresholds: factors of the background's noise for masks to compare with.
+        changed: fraction of a picture from which a changed light or camera is suspected.
     """
     doubts: dict[str, tuple[str, ...]] = {}
     rooms: dict[str, list[Background]] = {}
@@ -386,15 +410,15 @@ def _by_empty_room(
         if picture.shape != room.mean.shape:
             height, width = room.mean.shape[:2]
             raise SceneError(
-                f"is not of the background's size, {width} x {height} (width x height)"
+                f"differs in size from the background, {width} x {height} (width x height)"
             )
         mask, *again = (person_region(picture, one) for one in rooms[camera])
-        # A bad background is reported once.
+        # Warnings of a background are given once.
         warnings = doubts.pop(camera, ())
         if mask.mean() > changed:
             warnings += (
-                f"{mask.mean():.0%} of it differ from the background: did the light change, or "
-                "the camera move?",
+                f"{mask.mean():.0%} of it differ from the background; check whether the light has "
+                "changed or the camera has moved",
             )
         return mask, _least_overlap(mask, again), warnings
 
@@ -404,16 +428,20 @@ def _by_empty_room(
 def _background(
     source: Source, camera: str, given: Path | str, max_count: int = 60
 ) -> tuple[Background, tuple[str, ...]]:
-    """A camera's background, and why it is not good.
+    """Return a camera's background model, and warnings.
 
-    ``max_count``: a median is of more than half as many and fewer than twice as many pictures.
+    Args:
+        source: the source.
+        camera: the camera's name.
+        given: as in ``MaskSettings.background``.
+        max_count: a median uses between this number and twice as many pictures of a long recording.
     """
     if given == "median":
-        # Spread evenly over a recording whose length is not known.
+        # Pictures evenly spread over a recording of unknown length.
         kept, step = list[Picture](), 1
         for k, (_, where, picture) in enumerate(source.read(camera)):
             if kept and picture.shape != kept[0].shape:
-                raise SceneError(f"{where}: has another size than the pictures before")
+                raise SceneError(f"{where}: differs in size from the pictures before")
             if k % step == 0:
                 kept.append(picture)
                 if len(kept) == 2 * max_count:
@@ -431,8 +459,8 @@ def _background(
         files = [file for file in single if file.is_file()][:1]
     if not files:
         raise SceneError(
-            f"{folder}: has no picture of the empty room before camera '{camera}': {camera}.png, "
-            f"or a folder {camera}; or give --background median"
+            f"{folder}: has no background picture of camera '{camera}'; add {camera}.png or a "
+            f"folder {camera}, or give --background median"
         )
     pictures = []
     for file in files:
@@ -449,24 +477,26 @@ def _doubt_median(
     radius: float = 0.3,
     stays: float = 0.6,
 ) -> tuple[str, ...]:
-    """Why a recording's median is no good background.
+    """Return warnings if a recording's median is not a good background.
 
     Args:
-        support: a pixel that shows the median in a smaller fraction of pictures may be the body's.
-        doubtful: a median is bad if a larger fraction of the masks' area may be the body's.
-        radius, stays: a body stays that is within this radius, as a fraction of its size, of one
-            place in this fraction of the pictures (0.8 and more of simulated arms, 0.3 of who walks
-            by).
+        room: the background from the median.
+        recording: the pictures.
+        support: a pixel may belong to the body if a smaller fraction of pictures shows the median.
+        doubtful: fraction of the masks' area of such pixels from which the median is doubtful.
+        radius: radius around a point within which the body stays, as a fraction of its size.
+        stays: fraction of the pictures from which the body stays near one point (simulated arms:
+            0.8 and more; a person walking by: 0.3).
     """
     shown = background_support(recording, room)
     masks = [person_region(picture, room) for picture in recording]
     unsure = [float((shown[mask] < support).mean()) for mask in masks if mask.any()] or [0.0]
     part = float(np.median(unsure))
     text = (
-        f"the median of {len(recording)} pictures is no good background, here and in this camera's "
-        f"other pictures: in {part:.0%} of the masks' area it is seen in fewer than three of four "
-        "pictures, so the body may stand in it; give pictures of the empty room, or a longer "
-        "recording in which the body leaves every place"
+        f"the median of {len(recording)} pictures is not a good background for this camera: in "
+        f"{part:.0%} of the masks' area fewer than three of four pictures show it, so it may "
+        "contain the body; give pictures of the empty room, or a longer recording in which the "
+        "body does not stay in one place"
     )
     texts: tuple[str, ...] = (text,) if part > doubtful else ()
     seen = [mask.astype(np.uint8) for mask in masks if mask.any()]
@@ -476,30 +506,29 @@ def _doubt_median(
     if about.max() > stays * len(masks):
         y, x = np.unravel_index(int(np.argmax(about)), about.shape)
         texts += (
-            f"this camera's pictures show what moves about one place, ({x}, {y}): what of it "
-            "stands still there, as an arm's base does, is taken for the empty room and is not in "
-            "the masks; give pictures of the empty room",
+            f"the body stays around one place of this camera's pictures, ({x}, {y}): its parts "
+            "that do not move, such as an arm's base, count as background and are missing in the "
+            "masks; give pictures of the empty room",
         )
     return texts
 
 
 def _find_by_model(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
-    """The masks of a body whose pose is about known in each frame (``settings.start``)."""
+    """Yield the masks of a body whose approximate pose is given (``settings.start``)."""
     file = source.cameras
     if file is None:
         raise CameraError(
-            f"{source.path}: a model's silhouette needs to know the cameras: {CAMERA_FILE} or "
+            f"{source.path}: segmentation by a model needs cameras; add {CAMERA_FILE}, or give "
             "--cameras"
         )
     for name in source.names:
         where = f"{source.camera_file}: camera '{name}'"
         if name in file.links:
             raise CameraError(
-                f"{where} rides on a link, but the background beside a body is told from cameras "
-                "that stand still"
+                f"{where} is mounted on a link, but segmentation by a model needs static cameras"
             )
         if name in file.unplaced:
-            raise CameraError(f"{where} needs X_WC: where it stands before the body")
+            raise CameraError(f"{where} needs its pose X_WC")
     assert settings.model is not None
     assert settings.start is not None
     cameras = [file.cameras[name] for name in source.names]
@@ -521,45 +550,43 @@ def _find_by_model(source: Source, settings: MaskSettings) -> Iterator[FoundMask
             mask, agreement = pose.masks[c], pose.agreements[c]
             if mask is None:
                 continue
-            refusal, warnings = _judge_pose(agreement, kinematics.names, pose.deviations)
+            refusal, warnings = _check_pose(agreement, kinematics.names, pose.deviations)
             where, picture = own[frame]
             told = (*warned, *warnings)
             yield FoundMask(name, frame, where, mask, picture, refusal, told, agreement)
             warned = ()
 
 
-def _judge_pose(
+def _check_pose(
     agreement: float,
     names: Sequence[str],
     deviations: np.ndarray,
     doubtful: float = 0.9,
     max_deviations: float = 3.0,
 ) -> tuple[str, tuple[str, ...]]:
-    """Why a model's mask is not good, and what is suspicious of it.
+    """Return why a model's mask is rejected ("" if it is accepted), and warnings.
 
     Args:
-        agreement: IoU of the model's silhouette and what colours tell.
-        deviations: (m,) of the values from their starts [standard deviations].
-        doubtful: a mask that agrees less is suspicious.
-        max_deviations: so is a value that is farther from its start.
+        agreement: IoU of the model's silhouette and the segmentation by colour.
+        names: (m,) names of the values.
+        deviations: (m,) deviations of the values from their starts [standard deviations].
+        doubtful: agreement below which there is a warning.
+        max_deviations: deviation above which there is a warning [standard deviations].
     """
     if agreement < MIN_AGREEMENT:
         return (
-            "pose and colours do not agree: the model's silhouette and what colours tell from the "
-            f"background overlap by {agreement:.0%} (IoU); is the start too far off, the object "
-            "hidden, or the model another?",
+            "pose and colours do not agree: the IoU of the model's silhouette and the segmentation "
+            f"by colour is {agreement:.0%}; check the start, the model, and whether the object is "
+            "occluded",
             (),
         )
     warnings, off = [], np.abs(deviations)
     if agreement < doubtful:
-        warnings.append(
-            f"pose and colours hardly agree: they overlap by {agreement:.0%} (IoU); look at the "
-            "overlay"
-        )
+        warnings.append(f"pose and colours hardly agree (IoU {agreement:.0%}); check the overlay")
     worst = int(np.argmax(off))
     if off[worst] > max_deviations:
         warnings.append(
-            f"joint {names[worst]} is {off[worst]:.1f} standard deviations from its start "
-            "(--start-error); look at the overlay"
+            f"joint {names[worst]} is {off[worst]:.1f} standard deviations (--start-error) from "
+            "its start; check the overlay"
         )
     return "", tuple(warnings)

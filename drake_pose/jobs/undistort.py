@@ -1,4 +1,4 @@
-"""`drake-pose undistort`: pictures free of their lenses' distortion, and the cameras of these."""
+"""Removal of lens distortion from pictures: the job of `drake-pose undistort`."""
 
 from pathlib import Path
 
@@ -14,16 +14,15 @@ from drake_pose.files.overlay import encode_png
 def undistort_pictures(
     folder: str | Path, cameras: str | Path, out: str | Path
 ) -> dict[tuple[str, str], Path]:
-    """Writes a folder's pictures free of distortion, and the cameras that see them so.
+    """Write undistorted pictures and their cameras.
 
     Args:
-        folder: holds `images/<camera>/<frame>.png` (or .jpg).
-        cameras: a camera file of any kind that is read, with the cameras' distortion.
-        out: a folder; the pictures go to `images/<camera>/<frame>.png` in it, the cameras to
-            `cameras.yaml`, without X_WC where the given file has none.
+        folder: folder with `images/<camera>/<frame>.png` (or .jpg).
+        cameras: camera file of any supported format, with distortion.
+        out: folder for `images/<camera>/<frame>.png` and `cameras.yaml`.
 
     Returns:
-        The files by (camera, frame).
+        The written pictures by (camera, frame).
 
     Raises:
         CameraError: a camera is not in the file, or a picture cannot be read or has another size.
@@ -37,7 +36,7 @@ def undistort_pictures(
     for name in names:
         if not isinstance(known.cameras.get(name), PinholeCamera):
             raise CameraError(
-                f"{cameras}: has no pinhole camera '{name}'; there are: {', '.join(known.cameras)}"
+                f"{cameras}: has no pinhole camera '{name}'; it has: {', '.join(known.cameras)}"
             )
     used = {name: known.cameras[name] for name in names}
     text = dump_cameras(used, known.links, known.unplaced)

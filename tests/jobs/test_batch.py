@@ -221,7 +221,7 @@ def test_who_listens_but_is_no_scheduler_is_named_in_time(words, caplog, capfd):
 
 @pytest.mark.parametrize("address", ["foo", "10.0.0.7:8786", "tcp://foo", "htp://x:1"])
 def test_what_is_no_address_of_a_scheduler_is_named(address):
-    message = f"'{address}' is no scheduler's address"
+    message = f"'{address}' is not a scheduler's address"
     with pytest.raises(ClusterError, match=message), open_cluster(scheduler=address):
         pass
 
@@ -265,7 +265,7 @@ def test_job_file_gives_the_settings(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("scenes: {}", "names no scenes"),
+        ("scenes: {}", "has no scenes"),
         ("scenes: {a: {}}", "scene 'a': 'scene' is missing"),
         ("scenes: {../a: {scene: a}}", "slashes"),
         ("scenes: {1: {scene: a}}", "quotes"),
@@ -375,10 +375,10 @@ def test_failed_chunks_do_not_stop_the_others_until_three_have_failed(scenes, ou
 
 def test_another_job_is_not_resumed(scenes, out):
     (job,) = read_job(write_job(scenes, {"stills": {"scene": "stills"}}, "one.yaml"))
-    with pytest.raises(OutputError, match="no batch to resume"):
+    with pytest.raises(OutputError, match="there is no batch to resume"):
         run_batch([job], out, resume=True)
     run_batch([job], out, work=finish)
-    with pytest.raises(OutputError, match=r"'stills' was begun with chunk = 2, not 3"):
+    with pytest.raises(OutputError, match=r"'stills' was started with chunk = 2, not 3"):
         run_batch([dataclasses.replace(job, chunk=3)], out, resume=True)
     (out / "batch.json").write_text("{")
     with pytest.raises(OutputError, match="damaged"):

@@ -76,7 +76,7 @@ def test_median_of_a_recording_finds_what_moves_alone(filmed, pictures, tmp_path
     still = write_pictures(tmp_path / "scene", angles)
     result = make_masks(still.folder / "images", tmp_path / "still", settings)
     assert sum("no good background" in text for text in result.warnings) == 1
-    assert sum("hardly agree" in text for text in result.warnings) == 1
+    assert sum("masks are doubtful" in text for text in result.warnings) == 1
 
 
 def test_pictures_of_two_sizes_are_refused(pictures, out):
@@ -224,7 +224,7 @@ def test_coco_polygons_without_cameras(tmp_path, out, two_views):
     scene = load_scene(two_views.folder)
     file = write_coco(tmp_path / "a.json", scene, lambda _: [(3, [POLYGON])])
     result = make_masks(file, out)
-    assert "have no cameras.yaml" in result.warnings[0]
+    assert "there is no cameras.yaml" in result.warnings[0]
     mask = cv2.imread(str(out / "masks" / "side" / "0001.png"), cv2.IMREAD_GRAYSCALE)
     expected = np.zeros((160, 200))
     expected[40:100, 60:120] = 255

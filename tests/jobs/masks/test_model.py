@@ -79,10 +79,10 @@ def test_what_is_missing_is_named(filmed, tmp_path):
     with pytest.raises(SettingsError, match="model and start"):
         MaskSettings(model=filmed.model)
     settings = MaskSettings(model=filmed.model, start=start)
-    with pytest.raises(CameraError, match="needs to know the cameras"):
+    with pytest.raises(CameraError, match="needs cameras"):
         make_masks(filmed.folder / "images", tmp_path / "a", settings)
     riding = {"X_WC": None, "link": "boom", "X_LC": np.eye(4).tolist()}
-    for fields, said in ((riding, "rides on a link"), ({"X_WC": None}, "needs X_WC")):
+    for fields, said in ((riding, "is mounted on a link"), ({"X_WC": None}, "needs its pose X_WC")):
         other = edit_camera(
             filmed.folder / "cameras.yaml", "side", tmp_path / "cameras.yaml", **fields
         )

@@ -91,7 +91,6 @@ def evaluate_joint(
     """Write the upper rows of a joint's transform in traversal order, or of a derivative.
 
     Args:
-        steps: the packed joints.
         step: index of the joint.
         values: the joint's values [rad or m], and any further ones.
         fraction: factor by which the values are multiplied.
@@ -140,7 +139,6 @@ def place_bands(
     """Place the vertices of bands in their nodes' frames; skip bands whose values have not changed.
 
     Args:
-        bands: the packed bands.
         ranges: (b, 2) range of each band's values [first, end) in the columns of ``values``.
         values: (n, m) all values [rad or m].
         last_values: (n, m) values of the previous call, or NaN; overwritten.

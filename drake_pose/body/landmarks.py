@@ -86,8 +86,6 @@ def landmark_positions(
     """Return the landmarks (n, 3) in the world [m], in the mapping's order.
 
     Args:
-        model: the model.
-        landmarks: the landmarks by name.
         q: (nq,) the plant's positions.
         X_WB: (4, 4) pose of the plant's world frame in the world; None: the identity.
 

@@ -158,7 +158,6 @@ def _add_body(model: Any, body: int, name: str, parent: ElementTree.Element) -> 
         model: MuJoCo's compiled model.
         body: index of the body.
         name: name of the innermost body.
-        parent: the element to write into.
     """
     first = model.body_jntadr[body]
     joints = range(first, first + model.body_jntnum[body])

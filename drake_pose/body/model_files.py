@@ -170,7 +170,6 @@ def open_loops(
 
     Args:
         model: the element that contains the joints.
-        joints: the joint elements.
         ends: the parent and the child link of each joint.
         warn: receives a message for each removed joint.
     """
@@ -208,7 +207,6 @@ def take_mimic(
 
     Args:
         parent: the element that contains <mimic>, with its values as attributes or elements.
-        name: the joint's name.
         leaders: names of the joints that can be followed.
         warn: receives a message for a <mimic> that is not enforced.
     """
@@ -295,8 +293,6 @@ class FileFinder:
         """Return the absolute path of a file or folder that a model file names.
 
         Args:
-            name: the name in the model file.
-            file: the model file.
             what: what the name stands for, for messages.
 
         Raises ModelError: the package is unknown, or the file does not exist or is not local.

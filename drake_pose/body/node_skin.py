@@ -109,8 +109,6 @@ def find_skin(
     """Return the skin band between a node and its parent, or None.
 
     Args:
-        model: the model with the bands.
-        graph: the model's link graph.
         parent: index of the parent's link group.
         group: index of the node's link group.
         steps: the joints from the parent to the node.

@@ -185,7 +185,6 @@ def describe_positions(
     """Return names, kinds, limits and couplings of a finalized plant's positions, and warnings.
 
     Args:
-        plant: a finalized plant.
         given: limits (lower, upper) [rad or m] by position name that replace the plant's limits.
         where: the model file, for messages.
 
@@ -378,8 +377,6 @@ class ParsedModel:
         turns_freely: whether the position is an angle without limits, or with limits so wide that
             they are ignored.
         couplings: positions that follow others; no leader follows another position.
-        path: the model file.
-        name: the model's name.
         plant: a finalized MultibodyPlant, from which contexts are made; do not change it.
         scene_graph: the SceneGraph with the plant's geometry.
         link_meshes: the visual geometry of each link that has some, in the link's frame.

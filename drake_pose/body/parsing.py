@@ -40,8 +40,6 @@ class ModelSource:
     """A model file and the sanitised text that Drake parses in its place.
 
     Attributes:
-        path: the model file.
-        text: the sanitised text.
         kind: the file type that Drake's parser expects: "urdf", "sdf", "xml" or "dmd.yaml".
         warnings: parts of the file that are not read or not enforced, each once.
         limits: limits (lower, upper) [rad] by position name that Drake's parser does not read.
@@ -323,7 +321,6 @@ def why_unusable(read: Reader, path: str, packages: str, limits: str) -> str:
 
     Args:
         read: the function that reads the model.
-        path: the model file.
         packages: package folders by name, as JSON.
         limits: limits [rad or m] by position name, as JSON.
     """

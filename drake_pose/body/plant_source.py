@@ -110,7 +110,6 @@ class PlantSource:
         limits: empty; the limits are the plant's own.
 
     Args:
-        plant: a finalized plant.
         scene_graph: the SceneGraph that the plant is registered with.
         drawn: the bodies whose geometry belongs to the model.
     """

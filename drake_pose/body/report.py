@@ -22,8 +22,6 @@ class ModelReport:
     """What a model file holds, what may be unexpected, and what forbids its use.
 
     Attributes:
-        path: the model file.
-        name: the model's name.
         nodes: one dictionary for each node of the pose tree: name, parent, number of triangles,
             whether it is watertight, and joints. A joint has name, kind, lower and upper limit [deg
             or m], and the joint that it follows with multiplier and offset [rad or m] ("": none).
@@ -203,7 +201,6 @@ def _is_symmetric(
     the axis.
 
     Args:
-        mesh: the surface.
         X_turn: (4, 4) a quarter turn about the axis.
         levels: number of levels along the axis.
         sectors: number of sectors about the axis; with seven sectors no square passes for round.

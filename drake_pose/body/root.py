@@ -319,8 +319,6 @@ def base_of_chain(
     """Return how the joints from the world outwards to a node take up that node's pose.
 
     Args:
-        model: the model.
-        graph: the model's link graph.
         chain: the joints from the world outwards.
         node: index of the node in the tree.
         held: indices in q of positions that keep their values if the others suffice.

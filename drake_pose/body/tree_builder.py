@@ -354,12 +354,9 @@ def _rerooted(
     """Return the tree that starts at a link with its own pose in the world.
 
     Args:
-        model: the model.
-        graph: the model's link graph.
         start: index of the root's group.
         is_own: whether the root is the plant's own root.
         position: (3,) the root's origin in the world [m]; None: its default position.
-        rotation: the root's rotation.
         held: values of held positions [rad or m], by index in q.
 
     Raises SettingsError: a position is missing, or a held position follows from the root's pose.

@@ -66,8 +66,6 @@ class TreeKinematics:
     """Compiled kinematics of a pose tree; arrays (m,) are in the order of the nodes' values.
 
     Attributes:
-        tree: the pose tree.
-        names: the names of the values.
         value_nodes: (m,) index of each value's node.
         lower, upper: (m,) limits [rad or m]; equal where a value is held, infinite where an angle
             can take every direction.

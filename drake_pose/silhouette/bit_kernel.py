@@ -120,7 +120,6 @@ def draw_bits(
 
     Args:
         celled: the surface; its skin band, if any, is deformed to the pair's sample.
-        view: the silhouette.
         X_WP: (g, 4, 4) poses of the parent in the world.
         X_PN: (n, 4, 4) poses of the node in its parent at its samples.
         pairs: (m, 2) int32 indices of a parent pose and a sample.
@@ -187,7 +186,6 @@ def _walk_cell(
     """Walk the contour edges of the viewing direction's cell, with the span kernel's arithmetic.
 
     Args:
-        celled: the surface.
         X: (3, 4) pose of the surface in the camera.
         camera: (8,) kernel parameters.
         crossings: (height, capacity) output.
@@ -287,7 +285,6 @@ def _gather_spans(
     """Collect the spans of all rows inside the window, and empty the rows.
 
     Args:
-        view: the silhouette.
         crossings, rows: output of the span kernel.
         limit: largest area outside the silhouette [pixel].
         spans: (k, 3) output: row of the window, and columns [a, b); grown as needed.
@@ -385,7 +382,6 @@ def prune_by_balls(
     No pair within the limit is pruned.
 
     Args:
-        view: the silhouette.
         X_WP: (g, 4, 4) poses of the parent in the world.
         p_PB: (n, k, 3) centres of k balls in the parent's frame at each sample of the node [m].
         radii: (k,) radii of the balls [m].
@@ -457,7 +453,6 @@ def draw_discs(
     """Draw discs that contain the image of a ball, as bits of the silhouette's pixels.
 
     Args:
-        view: the silhouette.
         X_WP: (g, 4, 4) poses of the frame P that the ball is fixed in.
         p_PB: (3,) the ball's centre in frame P [m].
         radius: the ball's radius [m].

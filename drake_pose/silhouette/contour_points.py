@@ -58,7 +58,6 @@ def find_segments(
     Triangles nearer than the near plane are left out.
 
     Args:
-        packed: the surfaces.
         X_CN: (nodes, 4, 4) poses of the surfaces in the camera.
         camera: (8,) kernel parameters.
         selected: (nodes,) bool, which surfaces.
@@ -123,7 +122,6 @@ def find_crossings(
     An edge crosses lines from its upper end, included, to its lower end, excluded.
 
     Args:
-        segments: the contour edges.
         across: 0: the lines are rows, along u; 1: the lines are columns, along v.
         first: coordinate of the first line on the other axis [pixel].
         spacing: distance between lines [pixel].
@@ -254,7 +252,6 @@ def sample_contour(
     """Return points on the visible contour of the union of surfaces.
 
     Args:
-        packed: the surfaces.
         X_CN: (nodes, 4, 4) poses of the surfaces in the camera; rotations may be scaled uniformly
             for a parallel camera.
         camera: (8,) kernel parameters. Triangles nearer than the near plane are left out.
@@ -357,7 +354,6 @@ def divide_outline(
     """Return a surface with its cells of directions.
 
     Args:
-        outline: the surface.
         spread: largest angle between the viewing directions of the surface's points and of its
             ball's centre [rad]; 0 for parallel rays.
         band: the surface's skin band at rest, which gets no cells; None: no band.
@@ -400,7 +396,6 @@ def _find_cell_edges(
     """Return ``cell_starts`` and ``cell_edges`` of ``CelledOutline``.
 
     Args:
-        packed: the surface.
         side: number of cells along each side of a face.
         spread: as for ``divide_outline`` [rad].
         margin: tolerance for rounding errors of directions [rad].

@@ -24,7 +24,6 @@ class AnnotatedPicture:
     """A picture of a COCO file with its annotations.
 
     Attributes:
-        file: the picture's file name.
         width, height: size [pixel].
         annotations: class name and COCO entry of each annotation.
     """
@@ -57,7 +56,6 @@ class Annotations:
     """The content of a COCO file.
 
     Attributes:
-        path: the file.
         pictures: the pictures, in the file's order.
         names: class names by class number.
         warnings: what was left out.

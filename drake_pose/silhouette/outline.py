@@ -254,7 +254,6 @@ def project(
     """Write the image coordinates u, v [pixel] of one surface's points, at any depth.
 
     Args:
-        packed: the surfaces.
         node: index of the surface.
         X_CN: (nodes, 3 or 4, 4) poses in the camera.
         camera: (8,) kernel parameters.
@@ -311,7 +310,6 @@ def clip_triangle(
     """Write u, v [pixel] and 1 / depth [1/m] of a triangle's part beyond a pinhole's near plane.
 
     Args:
-        packed: the surfaces.
         node: index of the surface.
         t: index of the triangle within its surface.
         X_CN: (nodes, 3 or 4, 4) poses in the camera.
@@ -392,7 +390,6 @@ class BendingOutline:
     """A rigid surface and a skin band in its frame N, whose vertices move.
 
     Attributes:
-        rigid: the rigid part.
         rest: both parts with the band at rest; the rigid part's vertices and triangles come first.
     """
 
@@ -447,7 +444,6 @@ class TreeSurfaces:
     Attributes:
         value_counts: number of values of each node.
         skins: the skin band of each node; None: it has none.
-        rigid: the rigid part of each node.
         bending: the rigid part and band of each node; None: it has no band.
     """
 

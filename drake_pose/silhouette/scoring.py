@@ -42,9 +42,7 @@ def score_bodies(
     The union of the body's surfaces is exact.
 
     Args:
-        surfaces: the surfaces of the body's nodes.
         X_CN: (n, nodes, 4, 4) poses of the surfaces in the camera.
-        camera: the camera.
         prefixes: (k, H, W + 1) int32 prefix sums of the sets; k may be 0.
         bands: for each bending surface, (n, v, 3) vertices of its band in its frame N at each pose
             [m].
@@ -102,10 +100,8 @@ def draw_labels(
     """Return the label (H, W) int16 of the nearest surface in each pixel.
 
     Args:
-        outlines: the surfaces.
         labels: (nodes,) non-negative labels of the surfaces.
         X_CN: (nodes, 4, 4) poses of the surfaces in the camera.
-        camera: the camera.
         empty: label of pixels without a surface.
     """
     packed, poses = _check_body(outlines, np.asarray(X_CN)[None])
@@ -128,9 +124,7 @@ def subtract_body(
     Args:
         mask: (H, W) bool, changed in place.
         prefix: (H, W + 1) int32 prefix sums of the mask, changed in place.
-        outlines: the surfaces of the body.
         X_CN: (nodes, 4, 4) poses of the surfaces in the camera.
-        camera: the camera.
     """
     packed, poses = _check_body(outlines, np.asarray(X_CN)[None])
     first, end = paint(packed, poses[0], camera.kernel_parameters(), mask.view(np.uint8), 0)
@@ -157,7 +151,6 @@ class VisualHull:
         """Draw the images of a surface.
 
         Args:
-            outline: the surface.
             side: width and height of each image [pixel].
             directions: number of viewing directions.
         """
@@ -258,9 +251,7 @@ def require_visible(
     far larger than the image, or if the body is outside the image.
 
     Args:
-        outlines: the surfaces of the body.
         X_CN: (nodes, 4, 4) poses of the surfaces in the camera.
-        camera: the camera.
         max_pictures: largest size of the body, as a multiple of the image's diagonal.
     """
     solid = [

@@ -186,7 +186,6 @@ def foreground_log_ratios(
     break_even^2) / 2, within bounds.
 
     Args:
-        pictures: the pictures of the camera.
         probabilities: (H, W) foreground probability at each pixel of each picture.
         indices: indices of the pictures whose ratios are returned.
         max_background: a pixel shows the background where its foreground probability is lower.

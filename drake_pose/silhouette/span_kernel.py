@@ -361,7 +361,6 @@ def paint_labels(
     for which triangles are rasterised.
 
     Args:
-        packed: the surfaces.
         labels: (nodes,) int16 non-negative labels, all different from ``empty``.
         closed: (nodes,) bool, whether a surface is closed with outward normals; only its front
             faces are then drawn.

@@ -43,7 +43,6 @@ class DeformableSkin:
     """A model's skin bands as a source of a SceneGraph, whose configuration port must be connected.
 
     Args:
-        skin: the bands.
         scene_graph: the SceneGraph to register with.
         labels: render label of each band's child link, by name; bands of other links get 0.
         name: name of the source.

@@ -24,7 +24,6 @@ def read_mask(
     """Return the mask (H, W) of a PNG picture with black (0) and one other colour, the object's.
 
     Args:
-        path: the picture.
         width, height: required size [pixel]; None: any.
         may_be_empty: whether a picture without an object is accepted.
 

@@ -27,7 +27,6 @@ def read_scene(
     """Return a checked scene of the wanted cameras, and its wanted frames.
 
     Args:
-        path: the scene's folder.
         wanted: names of cameras; empty: all.
         frames: names or ranges of frames, as for ``select_frames``; empty: all.
         cameras: cameras that replace those of the folder.
@@ -127,7 +126,6 @@ def describe_unreadable(
 
     Args:
         refused: reasons by (camera, frame).
-        known: the scene's frames.
     """
     found = []
     for camera in dict.fromkeys(name for name, _ in refused):

@@ -36,7 +36,6 @@ class Scene:
     """A folder of masks and the cameras that took them.
 
     Args:
-        path: the folder.
         cameras: cameras by name, in the camera file's order.
         frames: frame names in natural order (2 before 10); a frame may lack some cameras.
         masks: mask file by (camera, frame).
@@ -221,7 +220,6 @@ def load_scene(
     belong to one uncalibrated camera for each size of picture.
 
     Args:
-        path: the folder.
         cameras: cameras that replace those of the folder.
         wanted: names of cameras; if all of them have a pose X_WC, other cameras of the file may
             lack it.
@@ -365,7 +363,6 @@ def find_masks(
     Hidden files are ignored. Frames of equal number are the same, with or without leading zeros.
 
     Args:
-        folder: the scene's folder.
         cameras: names of the cameras.
 
     Returns:
@@ -431,7 +428,6 @@ def find_images(
     A video's frames are named 000000, 000001 and so on, or like the known frame of that number.
 
     Args:
-        folder: the scene's folder.
         cameras: names of the cameras.
         frames: names of known frames.
 

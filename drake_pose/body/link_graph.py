@@ -68,7 +68,7 @@ class JointMap:
         probe = np.array([0.7, -1.1, 2.3])[:position_count]
         error = np.abs(joint_map.transforms(probe[None])[0] - pose(probe)).max()
         if error > 1e-9:
-            raise ModelError(f"joint '{name}' moves in a way that drake_pose does not know")
+            raise ModelError(f"joint '{name}' moves in a way that is not supported")
         return joint_map
 
     def transforms(self, values: NDArray[Any]) -> NDArray[Any]:

@@ -224,8 +224,8 @@ def take_mimic(
             found = {"joint": leader, "multiplier": repr(multiplier), "offset": repr(offset)}
         else:
             warn(
-                f"joint '{name}' is written to follow joint '{leader}' (<mimic>): not enforced, it "
-                "is searched by itself"
+                f"joint '{name}' is written to follow joint '{leader}' (<mimic>): not enforced, "
+                "the joint is searched independently"
             )
     return found
 

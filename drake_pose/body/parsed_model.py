@@ -256,8 +256,8 @@ def _resolve_chains(found: Sequence[Coupling], names: Sequence[str]) -> tuple[Co
         shift = (one.multiplier * other.offset + one.offset - own.offset) / own.multiplier
         if own.leader == other.leader:
             raise ModelError(
-                f"joints '{names[one.follower]}' and '{names[one.leader]}' follow each other in "
-                "two ways (<mimic>): leave one of them out"
+                f"joints '{names[one.follower]}' and '{names[one.leader]}' are coupled in two ways "
+                "(<mimic>): remove one of them"
             )
         for k, known in of.items():
             if known.leader == own.leader:

@@ -101,15 +101,15 @@ def model_warnings(
     if constraints:
         warnings.append(
             f"{constraints} constraints between joints or links are written in the file; they are "
-            "not enforced: every joint is searched by itself"
+            "not enforced: each joint is searched independently"
         )
     searched = {position for node in tree.nodes for position in node.positions} - {*tree.held}
     for follower, leader, *_ in model.couplings:
         if {follower, leader} <= searched:
             one, other = (model.position_names[k] for k in (follower, leader))
             warnings.append(
-                f"joint '{one}' is written to follow joint '{other}' (<mimic>): not enforced, it "
-                "is searched by itself, because other joints move their links, too"
+                f"joint '{one}' is written to follow joint '{other}' (<mimic>): not enforced, the "
+                "joint is searched independently, because other joints move their links, too"
             )
     if tree.unobserved_positions and tree.root == "world":
         warnings.append(

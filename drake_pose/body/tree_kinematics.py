@@ -115,7 +115,7 @@ class TreeKinematics:
         parts = [np.asarray(values, dtype=np.float64).reshape(-1) for values in node_values]
         wanted = [len(node.value_names) for node in self.tree.nodes]
         if [len(part) for part in parts] != wanted:
-            raise SettingsError(f"values of {wanted} numbers a node expected")
+            raise SettingsError(f"{wanted} values of the nodes expected")
         return np.concatenate(parts) if parts else np.zeros(0)
 
     def split(self, values: np.ndarray) -> tuple[np.ndarray, ...]:

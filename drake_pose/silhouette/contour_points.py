@@ -211,7 +211,7 @@ def find_line_spans(
         s = owners[k]
         if winding == 0:
             start = k
-        # The weight holds for an edge that descends the lines; else it has the opposite sign.
+        # The weight holds for an edge towards later lines; otherwise its sign is opposite.
         rising = ends[s, 1 - across] < ends[s, 3 - across]
         winding += segments.weights[s] if rising else -segments.weights[s]
         if winding == 0 and places[k] - places[start] > tolerance:

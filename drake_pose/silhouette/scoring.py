@@ -277,7 +277,7 @@ def require_visible(
     picture = math.hypot(camera.width, camera.height)
     if size > max_pictures * picture:
         raise CameraError(
-            f"{where}: the body is larger than the picture, at least {size:.3g} pixels across, "
+            f"{where}: the body is larger than the picture: at least {size:.3g} pixels across, "
             f"the picture {picture:.0f}; check the focal length [pixel], X_WC and the model's "
             "scale [m]"
         )

@@ -60,7 +60,7 @@ FLOATING_URDF = urdf(
     joint("toe_joint", "revolute", "leg", "toe"),
 )
 
-# The same kind of body on three prismatic and three revolute joints instead.
+# A similar body on three prismatic and three revolute joints.
 JOINTED_BASE_URDF = urdf(
     *(link(name, "") for name in ("bx", "by", "bz", "ry", "rz")),
     link("head"),
@@ -98,7 +98,7 @@ def _limits(lower: float, upper: float) -> str:
     return f"<limit><lower>{lower}</lower><upper>{upper}</upper><effort>0</effort></limit>"
 
 
-# Every other joint type: universal, ball, screw, and a revolute one whose parent is outermost.
+# The other joint types: universal, ball, screw, and a revolute one whose parent is the outer link.
 JOINTS_SDF = f"""<sdf version="1.9"><model name="m">
 {"".join(_sdf_link(name) for name in "abcdef")}
 <joint name="w" type="fixed"><parent>world</parent><child>a</child></joint>
@@ -130,14 +130,14 @@ def cube_obj(*, normals: bool) -> str:
     return str(trimesh.exchange.obj.export_obj(cube, include_normals=normals))
 
 
-# A limb of two prisms with flat ends and a band of skin about the joint between them.
+# A limb of prisms with flat ends, and skin bands about the joints between them.
 HALF = 0.03
 LENGTH = 0.2
 REACH = 0.06
 
 
 def tube_obj(rings: int = 7, half: float = 0.999 * HALF, reach: float = REACH) -> str:
-    """A closed square tube along z about the origin, its rings evenly spread, as an OBJ."""
+    """A closed square tube along z about the origin, with evenly spaced rings, as an OBJ file."""
     heights = np.linspace(-reach, reach, rings)
     corners = half * np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
     points = [(x, y, z) for z in heights for x, y in corners]
@@ -171,7 +171,7 @@ def hinge(name: str, parent: str, child: str, axis: str, z: float, limit: float 
     )
 
 
-# Downwards: upper, by an elbow of one axis to lower, by a wrist of three to hand.
+# Downwards: upper, an elbow of one axis, lower, a wrist of three axes, hand.
 LIMB_URDF = "".join(
     [
         '<robot name="limb"><link name="world"/>',
@@ -205,7 +205,7 @@ def band_entry(parent: str, child: str, **changes: object) -> str:
 
 
 def write_limb(folder: Path, skin: str | None = None, text: str = LIMB_URDF) -> Path:
-    """Write the limb with a skin file; "" for none. Returns the URDF."""
+    """Write the limb with a skin file ("": none) and return the URDF's path."""
     (folder / "tube.obj").write_text(tube_obj())
     path = folder / "limb.urdf"
     path.write_text(text)

@@ -1,4 +1,4 @@
-"""Models whose parts are left out or longer than in their file."""
+"""Models with links hidden, scaled or shifted, and with joint offsets."""
 
 from dataclasses import replace
 
@@ -13,23 +13,23 @@ from tests.search.bodies import front_camera
 
 
 def area(model, q, scale=1.0):
-    """How much Drake draws of it [pixel]."""
+    """The area of a model in Drake's rendering [pixel]."""
     camera = replace(front_camera(300, shift=0.2), pixels_per_metre=scale * 100.0)
     return int(np.count_nonzero(LabelRenderer(model, camera).mask(q)))
 
 
-def test_a_link_without_looks_is_drawn_by_nobody(body):
+def test_hidden_link_is_not_rendered(body):
     q = np.array([0.1, 1.5, -1.5])
     without = body.without(["left"])
     assert "left" not in without.link_meshes
     assert without.position_names == body.position_names
-    # The left arm is a box of 4 x 15 pixels, of which the trunk hides little.
+    # The left arm is a box of 4 x 15 pixels, slightly occluded by the trunk.
     assert 40 < area(body, q) - area(without, q) <= 60
     with pytest.raises(UnknownNameError, match="tail"):
         body.without(["tail"])
 
 
-def test_a_body_stretched_alike_everywhere_is_seen_larger(body):
+def test_uniform_link_scales_equal_a_larger_image_scale(body):
     q = np.array([0.1, 1.2, -0.8])
     double = body.reshaped(link_scales={name: (2.0, 2.0, 2.0) for name in body.link_names})
     assert area(double, q) == pytest.approx(area(body, q, scale=2.0), rel=0.02)
@@ -39,7 +39,7 @@ def test_a_body_stretched_alike_everywhere_is_seen_larger(body):
     np.testing.assert_allclose(after[:, :3, 3], 2.0 * before[:, :3, 3], atol=1e-12)
 
 
-def test_joints_stand_further_by_their_zeros_and_keep_their_limits(tmp_path):
+def test_joint_offsets_move_links_and_keep_physical_limits(tmp_path):
     zeros = {"x": 0.3, "head_y": 0.2, "neck": -0.4}
     model = load_model(write(tmp_path, JOINTED_BASE_URDF), check=False)
     text = reshaped(JOINTED_BASE_URDF, joint_offsets=zeros)
@@ -52,7 +52,7 @@ def test_joints_stand_further_by_their_zeros_and_keep_their_limits(tmp_path):
         np.testing.assert_allclose(X, expected[name], atol=1e-12)
 
 
-def test_joints_and_looks_lie_elsewhere_on_their_links(tmp_path):
+def test_shifts_move_joints_and_meshes_in_their_link_frames(tmp_path):
     model = load_model(write(tmp_path, JOINTED_BASE_URDF), check=False)
     shift, move = np.array([0.1, -0.2, 0.3]), np.array([-0.3, 0.1, 0.2])
     other = model.reshaped(joint_shifts={"neck": shift}, link_shifts={"chest": move})

@@ -1,4 +1,4 @@
-"""Joints that follow others, against Drake's plant and parser."""
+"""Coupled joints, against Drake's plant and parser."""
 
 import numpy as np
 import pytest
@@ -22,8 +22,8 @@ from tests.body.models import joint, link, link_poses, urdf, write
 from tests.fit.motions import assert_motions_are_derivatives
 
 LIMITS = 'lower="0" upper="0.8"'
-# A finger that is driven, one that follows it, its tip, which follows by half, and what the tip
-# carries; a joint whose leader is moved by others between.
+# A driven finger, a finger that follows it, its tip, which follows by half, and a nail on the tip;
+# last a follower that cannot be enforced, because other joints move it, too.
 HAND = urdf(
     link("world", ""),
     *map(link, ("palm", "one", "two", "tip", "nail", "far")),
@@ -49,7 +49,7 @@ def drawn(tree, generator):
 
 
 @pytest.mark.parametrize("root", [None, "tip", "one"])
-def test_nodes_are_where_the_plant_has_them_and_one_value_moves_all(tmp_path, root):
+def test_node_poses_of_coupled_joints_match_the_plant(tmp_path, root):
     tree = tree_of(tmp_path, root=root, root_position=None if root is None else [0.1, 0.2, 0.3])
     model = tree.model
     kinematics = TreeKinematics(tree)
@@ -72,7 +72,7 @@ def test_nodes_are_where_the_plant_has_them_and_one_value_moves_all(tmp_path, ro
         np.testing.assert_allclose(kinematics.poses(back), kinematics.poses(values), atol=1e-9)
 
 
-def test_what_is_not_enforced_is_told_and_what_is_stands_in_the_report(tmp_path):
+def test_report_lists_enforced_couplings_and_warns_of_others(tmp_path):
     tree = tree_of(tmp_path)
     (told,) = model_warnings(tree.model, tree)
     assert "'far' is written to follow joint 'lead'" in told
@@ -91,7 +91,7 @@ def test_motions_against_finite_differences(tmp_path, lengths):
     assert_motions_are_derivatives(body, np.append(values, logs))
 
 
-def test_limits_are_shared_and_what_is_held_holds_the_others(tmp_path):
+def test_couplings_intersect_limits_and_propagate_held_values(tmp_path):
     model = load_model(write(tmp_path, HAND), check=False)
     lead, mirror = model.position_index("lead"), model.position_index("mirror")
     np.testing.assert_allclose([model.lower[lead], model.upper[lead]], [0.0, 0.7])
@@ -124,7 +124,7 @@ MJCF = """<mujoco model="m"><worldbody><body name="a"><geom type="box" size=".1 
 
 
 @pytest.mark.parametrize(("text", "name"), [(SDF, "m.sdf"), (MJCF, "m.xml")], ids=["sdf", "mjcf"])
-def test_every_format_couples_alike(tmp_path, text, name):
+def test_every_format_gives_the_same_coupling(tmp_path, text, name):
     model = load_model(write(tmp_path, text, name), check=False)
     (one,) = model.couplings
     plant = MultibodyPlant(0.001)
@@ -134,7 +134,7 @@ def test_every_format_couples_alike(tmp_path, text, name):
     np.testing.assert_allclose(one[2:], (-2.0, 0.5), atol=1e-12)
 
 
-def test_a_plant_says_what_follows_as_its_file_does(tmp_path):
+def test_plant_and_file_give_the_same_couplings(tmp_path):
     path = write(tmp_path, HAND)
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.001)

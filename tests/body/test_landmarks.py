@@ -1,4 +1,4 @@
-"""Landmarks: the bundled models' against Drake, in pose trees, and files that are wrong."""
+"""Landmarks of the bundled models against Drake, and invalid landmark files."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ BODIES = [
     bundled_model("person"),
     bundled_model("person").with_name("person_shape.urdf"),
 ]
-# ANSUR II means of women and men, and half-way between [mm]: lengths that landmarks span.
+# Distances between landmarks [mm]: ANSUR II means of women and men, and their averages.
 LENGTHS = {
     "woman": {"forearm": 241.3, "stature": 1628.5, "ankle": 62.7, "knee": 465.9},
     "man": {"forearm": 267.9, "stature": 1756.2, "ankle": 72.9, "knee": 491.7},
@@ -39,8 +39,8 @@ LENGTHS = {
 
 @pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)
 @pytest.mark.parametrize("root", [None, "left_shin"])
-def test_bundled_landmarks_are_where_drake_puts_them(path, root):
-    """By the model's positions, and by a pose tree that may be turned over."""
+def test_bundled_landmarks_match_drakes_link_poses(path, root):
+    """From the model's positions, and from a pose tree that may be re-rooted."""
     model = load_model(path, check=False)
     landmarks, rng = load_landmarks(path), np.random.default_rng(1)
     assert set(landmarks) == JOINT_CENTRES
@@ -59,7 +59,7 @@ def test_bundled_landmarks_are_where_drake_puts_them(path, root):
 
 
 @pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)
-def test_bundled_landmarks_span_the_measured_lengths(path):
+def test_bundled_landmarks_match_anthropometric_means(path):
     model = load_model(path, check=False)
     landmarks = load_landmarks(path)
     zero = np.zeros(len(model.position_names))
@@ -74,7 +74,7 @@ def test_bundled_landmarks_span_the_measured_lengths(path):
     assert at["left_wrist"][1] > 100 > -100 > at["right_wrist"][1]
 
 
-def test_links_unknown_or_unseen_and_bad_positions_are_named(tmp_path):
+def test_errors_name_invalid_links_and_positions(tmp_path):
     model = load_model(write(tmp_path, FLOATING_URDF), check=False)
     wrong = {"elbow": Landmark("elbow_link", np.zeros(3))}
     q = np.array(model.default_positions)
@@ -111,7 +111,7 @@ def test_links_unknown_or_unseen_and_bad_positions_are_named(tmp_path):
         ("landmarks: [", "not a YAML file"),
     ],
 )
-def test_bad_files_are_named(text, complaint, tmp_path):
+def test_errors_name_the_file_and_the_entry(text, complaint, tmp_path):
     file = tmp_path / "landmarks.yaml"
     file.write_text(text, encoding="utf-8")
     with pytest.raises(ModelError, match=complaint) as caught:

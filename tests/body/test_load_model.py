@@ -50,7 +50,7 @@ def test_positions_limits_and_defaults(tmp_path):
 def test_every_mesh_format_shows_the_same_cube(tmp_path, extension):
     cube = trimesh.creation.box((1.0, 2.0, 3.0))
     if extension in ("gltf", "glb"):
-        # A glTF file's y is up, Drake's z: write what Drake shall see turned back.
+        # Up is y in glTF and z in Drake, so write the cube rotated.
         cube.vertices = cube.vertices @ np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
     cube.export(tmp_path / f"cube.{extension}")
     text = mesh_urdf(f"cube.{extension}", scale="2 1 1")
@@ -60,7 +60,7 @@ def test_every_mesh_format_shows_the_same_cube(tmp_path, extension):
     np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [2, 2, 3], atol=1e-6)
 
 
-def test_merging_drops_what_has_no_area_and_is_not_used():
+def test_merging_drops_degenerate_triangles_and_unused_vertices():
     vertices = np.array([[0.0, 0, 0], [9, 9, 9], [1, 0, 0], [0, 1, 0], [0, 0, 0]])
     mesh = TriangleMesh(vertices, np.array([[0, 2, 3], [4, 0, 2], [4, 2, 3]], dtype=np.int32))
     merged = merge_duplicate_vertices(mesh)
@@ -68,7 +68,7 @@ def test_merging_drops_what_has_no_area_and_is_not_used():
     np.testing.assert_array_equal(merged.triangles, [[0, 1, 2], [0, 1, 2]])
 
 
-def test_meshes_drake_would_not_draw_are_replaced(tmp_path):
+def test_undrawable_mesh_files_are_replaced(tmp_path):
     trimesh.creation.box((1.0, 2.0, 3.0)).export(tmp_path / "cube.stl")
     (tmp_path / "bare.obj").write_text(cube_obj(normals=False))
     (tmp_path / "good.obj").write_text(cube_obj(normals=True))
@@ -84,7 +84,7 @@ def test_meshes_drake_would_not_draw_are_replaced(tmp_path):
     assert sum(str(path) == str(tmp_path / "good.obj") for path in paths) == 1
 
 
-def test_bundled_models_are_found_through_drakes_package_map():
+def test_bundled_models_are_in_the_package_map():
     assert bundled_model("woman").is_file()
     assert package_map().Contains("drake_pose")
     with pytest.raises(UnknownNameError, match=r"'goblin'.*woman"):
@@ -107,13 +107,13 @@ def test_bundled_models_are_found_through_drakes_package_map():
         ("a.ply", b"ply\n"),
     ],
 )
-def test_broken_meshes_name_the_file_and_the_link(tmp_path, name, content):
+def test_errors_of_broken_meshes_name_the_files(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ModelError, match=rf"thing\.urdf.*{name}"):
         load_model(write(tmp_path, mesh_urdf(name)), check=False)
 
 
-def test_what_drake_warns_of_is_collected_once_and_not_printed(caplog):
+def test_drakes_warnings_are_collected_once_and_not_printed(caplog):
     with captured_warnings() as texts:
         for level in (logging.INFO, logging.WARNING, logging.ERROR, logging.WARNING):
             record = logging.makeLogRecord({"levelno": level, "msg": f" {level}\n"})
@@ -141,7 +141,7 @@ def alias_bomb():
     ],
     ids=["SDFormat", "directives", "aliases", "accessor out of bounds"],
 )  # fmt: skip
-def test_files_that_crash_drake_do_not_crash_us(tmp_path, name, text):
+def test_files_that_crash_drake_raise_model_error(tmp_path, name, text):
     trimesh.creation.box().export(tmp_path / "cube.gltf")
     document = json.loads((tmp_path / "cube.gltf").read_text())
     for accessor in document["accessors"]:
@@ -151,7 +151,7 @@ def test_files_that_crash_drake_do_not_crash_us(tmp_path, name, text):
         load_model(write(tmp_path, text, name), package_paths={"mine": tmp_path})
 
 
-def test_report_says_what_may_surprise(tmp_path):
+def test_report_warns_of_symmetry_and_unobserved_joints(tmp_path):
     round_ = '<visual><geometry><cylinder radius="0.1" length="0.3"/></geometry></visual>'
     text = urdf(
         link("a"),

@@ -23,7 +23,7 @@ def assert_tetrahedron(mesh, scale=1.0):
     assert len(mesh.vertices) == 4
     places = {tuple(np.round(corner, 6)) for corner in mesh.vertices[mesh.triangles].reshape(-1, 3)}
     assert places == {tuple(corner) for corner in np.round(CORNERS * scale, 6)}
-    # The divergence theorem: right only where every triangle looks outward.
+    # By the divergence theorem the volume is right only if all normals point outward.
     a, b, c = mesh.vertices[mesh.triangles].transpose(1, 0, 2)
     assert np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0 == pytest.approx(scale**3)
 
@@ -48,7 +48,7 @@ def text_stl():
     ],
     ids=["binary", "binary solid", "text", "named", "latin1", "upper"],
 )
-def test_stl_files_of_every_kind_are_read(tmp_path, data):
+def test_every_variant_of_stl_is_read(tmp_path, data):
     (tmp_path / "t.stl").write_bytes(data)
     assert_tetrahedron(read_mesh_file(tmp_path / "t.stl"))
 
@@ -67,7 +67,7 @@ def test_stl_files_of_every_kind_are_read(tmp_path, data):
     ],
     ids=["truncated", "fewer", "more", "solid", "half text", "spoiled text", "no number", "empty"],
 )
-def test_stl_files_that_lie_or_end_early_are_refused_with_link_and_mesh(tmp_path, data):
+def test_damaged_stl_files_are_refused_by_link_and_file(tmp_path, data):
     (tmp_path / "t.stl").write_bytes(data)
     text = (
         '<robot name="r"><link name="hand"><visual><geometry><mesh filename="t.stl"/></geometry>'
@@ -78,7 +78,7 @@ def test_stl_files_that_lie_or_end_early_are_refused_with_link_and_mesh(tmp_path
     assert "charset" not in str(caught.value)
 
 
-def test_a_dae_file_needs_no_texture_and_is_in_metres(tmp_path):
+def test_dae_is_read_in_metres_without_textures(tmp_path):
     mesh = tetrahedron()
     pixels = trimesh.visual.texture.SimpleMaterial()
     mesh.visual = trimesh.visual.TextureVisuals(uv=np.zeros((4, 2)), material=pixels)
@@ -101,7 +101,7 @@ def test_a_dae_file_needs_no_texture_and_is_in_metres(tmp_path):
     assert_tetrahedron(read_mesh_file(broken))
 
 
-def test_written_meshes_are_what_drake_reads(tmp_path):
+def test_drake_reads_back_written_meshes(tmp_path):
     random = np.random.default_rng(2)
     points = random.normal(size=(70000, 3))
     triangles = random.integers(0, len(points), size=(70000, 3), dtype=np.int32)
@@ -111,7 +111,7 @@ def test_written_meshes_are_what_drake_reads(tmp_path):
     faces = surface.triangles()
     for index in random.integers(0, len(faces), size=1000):
         assert [faces[index].vertex(corner) for corner in range(3)] == list(triangles[index])
-    # Another surface of the same name is another file, and the same one is not.
+    # Different surfaces of one name get different files; equal surfaces share one.
     assert write_obj(TriangleMesh(points + 1.0, triangles), "name with / and \xe9") != path
     (tmp_path / "t.stl").write_bytes(binary_stl())
     assert drawable_file(tmp_path / "t.stl") == drawable_file(tmp_path / "t.stl")

@@ -1,4 +1,4 @@
-"""MJCF as Drake is given it: poses of links and what is drawn, against MuJoCo and by hand."""
+"""Sanitised MJCF: link poses and meshes against MuJoCo and against values by hand."""
 
 import sys
 
@@ -12,7 +12,7 @@ from drake_pose.body import load_model
 from drake_pose.errors import ModelError
 from tests.body.models import link_poses, write
 
-# Two joints a body: what Drake gets wrong, where the file reaches it as it is.
+# Two joints on one body, which Drake's own parser places wrongly.
 TWO_JOINTS = """<body name="a" pos="0 0 0.1"><joint name="x" axis="1 0 0" range="-90 90"/>
 <joint name="y" axis="0 1 0" pos="0 0 0.1" range="-90 90"/><geom size="0.05"/>
 <body name="b" pos="0 0 0.2"><joint name="z" range="-9 9"/><geom size="0.04"/></body></body>"""
@@ -45,12 +45,12 @@ def file_of(folder, body=TWO_JOINTS, more="", attributes='model="m"'):
 
 
 def posed(model, q):
-    """The pose (4, 4) of every body, by name, at positions given by name."""
+    """The pose (4, 4) of every body by name, given positions by name."""
     return link_poses(model, np.array([q.get(name, 0.0) for name in model.position_names]))
 
 
 def assert_as_mujoco(path, model):
-    """Link poses at random positions, and limits, within 1e-9 of MuJoCo's."""
+    """Compare link poses at random positions, and limits, with MuJoCo's."""
     theirs = mujoco.MjModel.from_xml_path(str(path))
     data = mujoco.MjData(theirs)
     random = np.random.default_rng(11)
@@ -87,7 +87,7 @@ def assert_as_mujoco(path, model):
     ],
     ids=["classes", "frames", "references", "replicate"],
 )
-def test_bodies_stand_and_move_as_in_mujoco(tmp_path, more, body):
+def test_body_poses_match_mujoco(tmp_path, more, body):
     path = file_of(tmp_path, body, more)
     model = load_model(path, check=False)
     assert_as_mujoco(path, model)
@@ -99,21 +99,21 @@ def test_bodies_stand_and_move_as_in_mujoco(tmp_path, more, body):
             np.testing.assert_allclose(X[:3, 3], places[node.name][:3, 3], atol=1e-12)
 
 
-def test_looks_of_classes_and_frames(tmp_path):
+def test_meshes_of_classes_and_frames(tmp_path):
     model = load_model(file_of(tmp_path, SLIDES, CLASSES), check=False)
     assert set(model.link_meshes) == {"base", "arm", "hand"}  # A plane is no part of the object.
     sizes = {name: np.ptp(mesh.vertices[:, 2]) for name, mesh in model.link_meshes.items()}
     np.testing.assert_allclose(list(sizes.values()), 0.3, atol=1e-9)
-    # The box runs down from (0, 0, 1) in a, since the frame in a stands on its head.
+    # The frame in a is upside down, so the box extends downwards from (0, 0, 1).
     model = load_model(file_of(tmp_path, FRAMES), check=False)
     assert np.max(model.link_meshes["a"].vertices[:, 2]) == pytest.approx(1.0)
-    # A joint without limits is searched about its reference.
+    # A joint without limits is searched about its reference position.
     model = load_model(file_of(tmp_path, REFERENCES), check=False)
     np.testing.assert_allclose(model.lower, (-np.pi / 3, -1.0, np.radians(-200)), atol=1e-12)
 
 
-# What a strict reader refuses in a file, or reads otherwise.
-SPOILT = {
+# Deviations from strict XML that must be read.
+DEVIATIONS = {
     "newline": lambda text: ("\n \n<?xml version='1.0'?>" + text).encode(),
     "comment": lambda text: text.replace("<worldbody>", "<worldbody><!-- a -- b --->").encode(),
     "latin1": lambda text: text.replace('"m"', '"m\xe9"').encode("latin-1"),
@@ -125,22 +125,22 @@ SPOILT = {
 }
 
 
-@pytest.mark.parametrize("spoil", SPOILT.values(), ids=SPOILT)
-def test_what_a_strict_reader_refuses_is_read_all_the_same(tmp_path, spoil):
+@pytest.mark.parametrize("deviate", DEVIATIONS.values(), ids=DEVIATIONS)
+def test_xml_is_read_leniently(tmp_path, deviate):
     path = file_of(tmp_path)
-    path.write_bytes(spoil(path.read_text()))
+    path.write_bytes(deviate(path.read_text()))
     model = load_model(path, check=False)
     assert model.position_names == ("x", "y", "z")
     assert model.name.startswith("m")
-    # x lays the body down along -y about its origin at (0, 0, 0.1); b is 0.2 above that origin.
+    # x rotates a about its origin (0, 0, 0.1) towards -y; b is 0.2 from that origin.
     X_b = posed(model, {"x": np.pi / 2})["b"]
     np.testing.assert_allclose(X_b[:3, 3], (0.0, -0.2, 0.1), atol=1e-12)
-    # y turns about a point 0.1 above a's origin: b stands 0.1 beside that point.
+    # y rotates about a point 0.1 above a's origin; b is 0.1 from that point.
     X_b = posed(model, {"y": np.pi / 2})["b"]
     np.testing.assert_allclose(X_b[:3, 3], (0.1, 0.0, 0.2), atol=1e-12)
 
 
-def test_what_is_not_drawn_or_collides_or_weighs_does_not_matter(tmp_path):
+def test_collision_geometry_inertia_and_textures_are_ignored(tmp_path):
     plate = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]
     plate = trimesh.Trimesh(plate, [[0, 1, 2], [1, 3, 2]], process=False)
     plate.export(tmp_path / "plate.stl")
@@ -161,13 +161,13 @@ def test_what_is_not_drawn_or_collides_or_weighs_does_not_matter(tmp_path):
     model = load_model(file_of(tmp_path, body, more), check=True)
     assert set(model.link_meshes) == {"a"}
     assert any("1 <equality> constraint" in warning for warning in model.warnings)
-    # A box whose class says the sizes that it does not, and the plate.
+    # A box, whose class completes its sizes, and the plate.
     mesh = model.link_meshes["a"]
     assert len(mesh.triangles) == 12 + 2
     np.testing.assert_allclose(np.max(mesh.vertices, axis=0), (1.0, 1.0, 0.1), atol=1e-6)
     np.testing.assert_allclose(np.min(mesh.vertices, axis=0), (-0.2, -0.1, -0.1), atol=1e-6)
     assert model.scene_graph.model_inspector().NumGeometriesWithRole(Role.kProximity) == 0
-    # A body without <inertial> keeps the mass of the geom that is not drawn.
+    # A body without <inertial> keeps the mass of its undrawn geom.
     assert model.plant.GetBodyByName("b").default_mass() == pytest.approx(8.0)
 
 
@@ -175,7 +175,7 @@ def test_what_is_not_drawn_or_collides_or_weighs_does_not_matter(tmp_path):
     ("asset", "corner"),
     [
         ('file="t.stl" scale="2 1 1"', (2.0, 2.0, 3.0)),
-        # First to the reference pose, then to scale: (0, 2, 0) - (1, 0, 0), a quarter back, twice.
+        # Reference pose first, then scale: (0, 2, 0) - (1, 0, 0), rotated back by 90 deg, doubled.
         (
             f'file="t.stl" refpos="1 0 0" refquat="{HALF_ROOT} 0 0 {HALF_ROOT}" scale="2 1 1"',
             (4.0, 1.0, 3.0),
@@ -210,14 +210,14 @@ GEOM = '<geom size="1"/></body>'
         ('<attach model="s" prefix="left_"/>', "model 's'"),
     ],
 )
-def test_what_mujoco_refuses_is_refused_with_its_reason(tmp_path, text, message):
+def test_errors_quote_mujocos_reason(tmp_path, text, message):
     whole = text.startswith(("<robot", "<sdf"))
     path = write(tmp_path, text, "m.xml") if whole else file_of(tmp_path, text)
     with pytest.raises(ModelError, match=rf"(?s)m\.xml.*{message}"):
         load_model(path, check=False)
 
 
-def test_mujoco_is_asked_for_by_name(tmp_path, monkeypatch):
+def test_missing_mujoco_names_the_extra_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(ModelError, match=r'm\.xml: .*pip install "drake_pose\[mjcf\]"'):
         load_model(file_of(tmp_path), check=False)

@@ -1,4 +1,4 @@
-"""Which values joints may have, and which of them are searched and answered with."""
+"""Joint limits, and the ranges that are searched and reported."""
 
 import math
 
@@ -15,7 +15,7 @@ FULL = 2.0 * math.pi
 
 
 def one_joint(tmp_path, limits, kind="revolute", given=None, mount="fixed"):
-    """Two links, and between them a joint with limits as they are written in a URDF."""
+    """Two links with a joint between them; limits are URDF attributes."""
     text = urdf(
         link("a"),
         link("b"),
@@ -35,7 +35,7 @@ def one_joint(tmp_path, limits, kind="revolute", given=None, mount="fixed"):
         ('lower="-12.6" upper="12.6"', "revolute"),
     ],
 )
-def test_limits_beyond_a_few_turns_are_none(tmp_path, limits, kind):
+def test_limits_wider_than_four_turns_are_ignored(tmp_path, limits, kind):
     model = one_joint(tmp_path, limits, kind)
     np.testing.assert_allclose([model.lower[0], model.upper[0]], [-math.pi, math.pi])
     assert model.turns_freely[0]
@@ -53,7 +53,7 @@ def test_limits_beyond_a_few_turns_are_none(tmp_path, limits, kind):
 
 
 @pytest.mark.parametrize("high", [3.1, math.pi, FULL, 2.0 * FULL])
-def test_of_limits_of_some_turns_one_turn_is_searched(tmp_path, high):
+def test_one_turn_is_searched_of_limits_of_several_turns(tmp_path, high):
     model = one_joint(tmp_path, f'lower="{-high}" upper="{high}"')
     assert not model.turns_freely[0]
     assert not model.warnings
@@ -72,12 +72,12 @@ def test_of_limits_of_some_turns_one_turn_is_searched(tmp_path, high):
     np.testing.assert_allclose(kinematics.nearest_turns(np.array([9.0])), [turned])
 
 
-def test_the_turn_that_is_searched_lies_about_the_default_inside_the_limits(tmp_path):
+def test_searched_turn_is_inside_limits_about_the_default(tmp_path):
     text = """<sdf version="1.9"><model name="m"><link name="a"><visual name="v"><geometry><box>
     <size>1 1 1</size></box></geometry></visual></link><joint name="j" type="revolute"><parent>world
     </parent><child>a</child><axis><xyz>0 0 1</xyz>
     <limit><lower>{}</lower><upper>{}</upper></limit></axis></joint></model></sdf>"""
-    # Without a default of its own a joint's is 0, moved inside the limits.
+    # A joint without a default position has 0, moved inside its limits.
     for limits, turn in (
         ((-math.pi, 3 * math.pi), (-math.pi, math.pi)),
         ((-1.0, 9.0), (-1.0, FULL - 1.0)),
@@ -93,7 +93,7 @@ def test_the_turn_that_is_searched_lies_about_the_default_inside_the_limits(tmp_
         assert len(np.unique(np.round(np.degrees(grid) % 360.0, 6) % 360.0)) == len(grid) == 18
 
 
-def test_limits_given_by_hand_are_taken_likewise(tmp_path):
+def test_given_limits_replace_those_of_the_file(tmp_path):
     model = one_joint(tmp_path, None, "continuous", {"j": (-500.0, 500.0)})
     assert model.turns_freely[0]
     assert "joint 'j'" in model.warnings[0]
@@ -101,9 +101,9 @@ def test_limits_given_by_hand_are_taken_likewise(tmp_path):
     assert not model.warnings
     np.testing.assert_allclose([model.lower[0], model.upper[0]], [-0.5, 0.25])
     model = one_joint(tmp_path, 'lower="-1e16" upper="1e16"', "prismatic")
-    assert np.isinf([model.lower[0], model.upper[0]]).all(), "a slide of absurd length"
+    assert np.isinf([model.lower[0], model.upper[0]]).all(), "a slide with absurd limits"
     assert "joint 'j' has limits of -1e+16 and 1e+16 m" in model.warnings[0]
-    # Of one that has none, or one only, nothing is to be said before it is searched.
+    # A slide with no limit, or with one, gives no warning before it is searched.
     for none in (None, 'upper="1"'):
         assert not one_joint(tmp_path, none, "prismatic").warnings
     for wrong, message in (((2.0, 1.0), "lower limit 2 is above upper"), ((np.nan, 1.0), "NaN")):
@@ -120,14 +120,14 @@ def test_limits_given_by_hand_are_taken_likewise(tmp_path):
         ('lower="-1"', "revolute", r"joint 'j' has no limits: .*upper inf \[rad\]"),
     ],
 )
-def test_what_cannot_be_searched_is_refused_by_name(tmp_path, limits, kind, message):
+def test_joints_that_cannot_be_searched_are_refused_by_name(tmp_path, limits, kind, message):
     with pytest.raises(ModelError, match=message):
         one_joint(tmp_path, limits, kind, mount="revolute").pose_tree()
     model = one_joint(tmp_path, limits, kind, {"j": (-0.5, 0.5)}, mount="revolute")
     assert model.pose_tree().model.upper[model.position_index("j")] == 0.5
 
 
-def test_a_screw_looks_different_after_a_turn(tmp_path):
+def test_screw_is_not_periodic(tmp_path):
     three_turns = JOINTS_SDF.replace(
         "<lower>-3</lower><upper>3</upper>", "<lower>-9</lower><upper>9</upper>"
     )
@@ -150,8 +150,7 @@ def test_a_screw_looks_different_after_a_turn(tmp_path):
     assert any("'screw' is a screw without limits" in warning for warning in model.warnings)
 
 
-def test_turned_values_are_the_same_pose_for_drake(tmp_path):
-    """Plain forward kinematics at values before and after they are brought into another turn."""
+def test_full_turns_do_not_change_drakes_poses(tmp_path):
     model = one_joint(tmp_path, 'lower="-6.2831853" upper="6.2831853"')
     tree = model.pose_tree()
     kinematics = TreeKinematics(tree)
@@ -176,8 +175,8 @@ def test_turned_values_are_the_same_pose_for_drake(tmp_path):
     assert kinematics.within_limits(np.array([400.0]))[0] == pytest.approx(400.0 - 63 * FULL)
 
 
-def test_a_root_that_is_turned_about_axes_is_answered_within_its_limits():
-    """Euler angles come from -180 to 180 degrees, whatever the limits are."""
+def test_root_rotation_angles_are_within_limits():
+    """Euler angles between -180 and 180 degrees must be moved into the limits."""
     rotation = RootRotation.limited([("y", 90.0, 270.0)])
     for angle in (100.0, 190.0, 265.0):
         R = RotationMatrix.MakeYRotation(math.radians(angle)).matrix()

@@ -1,4 +1,4 @@
-"""Models of plants that somebody else made."""
+"""Models of existing plants."""
 
 import numpy as np
 import pytest
@@ -52,7 +52,7 @@ def body_poses(plant, q):
 
 
 @pytest.mark.parametrize("kind", JOINTS)
-def test_a_copy_moves_as_the_plant_does(kind):
+def test_copy_of_a_plant_has_the_same_poses(kind):
     plant, scene_graph = new_plant()
     instance = plant.AddModelInstance("thing")
     ends = [plant.world_body()]
@@ -80,7 +80,7 @@ def test_a_copy_moves_as_the_plant_does(kind):
     assert np.allclose(body_poses(copy, q), body_poses(plant, q), atol=1e-14)
 
 
-def test_a_plant_gives_what_its_file_gives(tmp_path):
+def test_model_from_plant_equals_model_from_file(tmp_path):
     for file in (write(tmp_path, FLOATING_URDF), bundled_model("woman")):
         read = load_model(file, check=False)
         plant, scene_graph = new_plant()
@@ -95,7 +95,7 @@ def test_a_plant_gives_what_its_file_gives(tmp_path):
             assert np.allclose(mesh.vertices, read.link_meshes[name].vertices, atol=1e-12)
 
 
-def test_only_the_bodies_that_are_asked_for_are_the_model(tmp_path):
+def test_model_has_the_chosen_instances_bodies_only(tmp_path):
     plant, scene_graph = new_plant()
     model = load_model(write(tmp_path, FLOATING_URDF), check=False)
     _, second = (model.add_to(plant, scene_graph, prefix=name) for name in ("a_", "b_"))
@@ -104,7 +104,7 @@ def test_only_the_bodies_that_are_asked_for_are_the_model(tmp_path):
     plant.Finalize()
     made = ArticulatedModel.from_plant(plant, scene_graph, second)
     own = {int(index) for index in plant.GetBodyIndices(second[0])}
-    # Two links have no looks.
+    # Two links have no visual geometry.
     assert made.labels < own
     assert len(made.labels) == len(made.link_meshes) == len(own) - 2
     assert {plant.get_body(BodyIndex(k)).name() for k in own} >= {
@@ -119,7 +119,7 @@ def test_only_the_bodies_that_are_asked_for_are_the_model(tmp_path):
         made.without(["b_::thing::leg"])
 
 
-def test_plants_that_cannot_be_read_are_refused():
+def test_unusable_plants_are_refused_by_name():
     plant, scene_graph = new_plant()
     plant.set_name("bench")
     with pytest.raises(ModelError, match="bench is not finalized"):

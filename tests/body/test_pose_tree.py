@@ -21,7 +21,7 @@ from tests.body.models import (
 
 
 def largest_difference_from_drake(model, tree, *, samples=20):
-    """Compare node_poses, positions_from and values_from_positions with the plant."""
+    """Largest difference of node_poses, positions_from and values_from_positions from Drake."""
     random = np.random.default_rng(1)
     bounds = [tree.value_bounds(i) for i in range(len(tree.nodes))]
     drawn = [random.uniform(low, high, (samples, len(low))) for low, high in bounds]
@@ -51,7 +51,7 @@ def loaded(folder, *parts):
     return load_model(write(folder, urdf(*parts)), check=False)
 
 
-def test_links_without_geometry_make_one_node_and_welded_links_merge(models):
+def test_links_without_geometry_and_welded_links_merge(models):
     floating = models["floating"]
     tree = floating.pose_tree()
     assert [node.name for node in tree.nodes] == ["trunk", "arm", "leg", "hand"]
@@ -76,7 +76,7 @@ def test_links_without_geometry_make_one_node_and_welded_links_merge(models):
     ],
 )
 @pytest.mark.parametrize("kind", ["own", "free", "fixed", "limited"])
-def test_every_tree_agrees_with_drake(models, name, root, kind):
+def test_every_tree_matches_drake(models, name, root, kind):
     rotation = {
         "own": None,
         "free": RootRotation.free(20.0),
@@ -96,7 +96,7 @@ def test_every_tree_agrees_with_drake(models, name, root, kind):
 
 
 def planar_robot(*more):
-    """A body that slides and turns in a plane, and an arm."""
+    """A body that slides and rotates in a plane, and an arm."""
     free = {"limits": None, "origin": ""}
     return urdf(
         *(link(name, "") for name in ("bx", "bz")),
@@ -109,7 +109,7 @@ def planar_robot(*more):
     )
 
 
-def test_slides_without_limits_say_where_the_only_object_stands(tmp_path):
+def test_unlimited_slides_place_the_only_object(tmp_path):
     model = load_model(write(tmp_path, planar_robot()), check=False)
     slides = [model.position_index("x"), model.position_index("z")]
     moved = model.pose_tree(root_position=(1.0, -2.0, 3.0))
@@ -122,7 +122,7 @@ def test_slides_without_limits_say_where_the_only_object_stands(tmp_path):
     np.testing.assert_allclose(X_WN[0, :3, 3], (1.0, -2.0, 3.0), atol=1e-12)
 
 
-def test_slides_without_limits_are_refused_where_they_must_be_searched(tmp_path):
+def test_unlimited_slides_are_refused_if_searched(tmp_path):
     ball = link("ball") + joint("y", "prismatic", "world", "ball", limits=None)
     model = load_model(write(tmp_path, planar_robot(ball)), check=False)
     with pytest.raises(ModelError, match=r"'x', 'z', 'y' have no limits.*of 2 objects"):
@@ -137,7 +137,7 @@ def test_slides_without_limits_are_refused_where_they_must_be_searched(tmp_path)
         model.pose_tree()
 
 
-def test_planar_joint_agrees_with_drake_and_needs_limits(tmp_path):
+def test_planar_joint_matches_drake_and_needs_limits(tmp_path):
     planar = """<sdf version="1.9" xmlns:drake="http://drake.mit.edu"><model name="m">
     <link name="a"><visual name="v"><geometry><sphere><radius>0.1</radius></sphere></geometry>
     </visual></link><link name="b"><pose>1 2 3 0.1 0.2 0.3</pose><visual name="v"><geometry><sphere>
@@ -176,18 +176,18 @@ HANGING = [
 @pytest.mark.parametrize(
     ("parts", "root", "nodes"),
     [
-        # Links on a link that is not seen make a node with an empty mesh ...
+        # A branching link without geometry is a node with an empty mesh ...
         (HAND, None, [("palm", -1), ("thumb", 0), ("finger", 0)]),
-        # ... that merely continues a chain where the tree starts at one of them.
+        # ... but is skipped where re-rooting makes it part of a chain.
         (HAND, "finger", [("finger", -1), ("thumb", 0)]),
-        # What is seen in the world stands beside a floating body.
+        # Geometry welded to the world is a further root beside a floating body.
         (BESIDE, "handle", [("handle", -1), ("cup", 0), ("table", -1)]),
-        # What hangs on a world that is not seen, too.
+        # So are links attached to a world without geometry.
         (HANGING, None, [("ball", -1), ("upper", -1), ("lower", 1)]),
     ],
-    ids=["unseen", "unseen inside", "seen world", "unseen world"],
+    ids=["branching", "chain", "world", "empty world"],
 )
-def test_what_is_not_seen_and_what_stands_in_the_world(tmp_path, parts, root, nodes):
+def test_nodes_of_links_without_geometry_and_of_the_world(tmp_path, parts, root, nodes):
     model = loaded(tmp_path, *parts)
     tree = model.pose_tree(root, root_position=None if root is None else [0, 0, 1])
     assert [(node.name, node.parent) for node in tree.nodes] == nodes
@@ -207,12 +207,12 @@ def test_what_is_not_seen_and_what_stands_in_the_world(tmp_path, parts, root, no
         (None, {"held": {"slide": 0.4}}, SettingsError, r"'slide' .* 0\.4, outside its limits, -0"),
     ],
 )
-def test_bad_arguments_name_what_exists(models, root, arguments, error, words):
+def test_errors_of_arguments_name_the_culprit(models, root, arguments, error, words):
     with pytest.raises(error, match=words):
         models["floating"].pose_tree(root, **arguments)
 
 
-def test_bad_grids_and_values_are_refused(models):
+def test_invalid_grids_and_values_are_refused(models):
     with pytest.raises(SettingsError, match="cannot be held"):
         models["jointed"].pose_tree("arm", root_position=[0, 0, 0], held={"head_y": 0.0})
     tree = models["floating"].pose_tree()
@@ -244,26 +244,26 @@ TWENTY = np.radians(20.0)
         (50, 110, [60, 80, 100]),
     ],
 )
-def test_multiples_by_size_negative_first(lower, upper, expected):
+def test_samples_are_sorted_by_magnitude_negative_first(lower, upper, expected):
     samples = axis_samples(np.radians(lower), np.radians(upper), TWENTY, is_angle=True)
     np.testing.assert_allclose(np.degrees(samples), expected, atol=1e-9)
     assert min(samples) >= np.radians(lower)
     assert max(samples) <= np.radians(upper)
 
 
-def test_full_turn_gives_each_direction_once():
+def test_full_turn_has_each_direction_once():
     samples = np.degrees(axis_samples(-np.pi, np.pi, TWENTY, is_angle=True))
     assert len(samples) == 18
     assert len(np.unique(np.round(samples % 360.0, 6))) == 18
     assert len(axis_samples(-np.pi, np.pi, TWENTY, is_angle=False)) == 19
 
 
-def test_too_many_samples_name_the_node():
+def test_error_of_too_many_samples_names_the_node():
     with pytest.raises(SettingsError, match="node 'head'"):
         product_grid([range(1000)] * 3, "head")
 
 
-def test_even_rotations_leave_no_gap():
+def test_even_rotations_cover_so3_without_gaps():
     interval = np.radians(30.0)
     grid = Rotation.from_rotvec(even_rotations(interval))
     np.testing.assert_allclose(grid[0].magnitude(), 0.0, atol=1e-12)
@@ -274,7 +274,7 @@ def test_even_rotations_leave_no_gap():
     assert min(distances) > 0.3 * interval
 
 
-def test_limited_rotation_is_applied_in_order():
+def test_limited_rotation_applies_axes_in_order():
     rotation = RootRotation.limited([("y", -180, 180), ("z", -10, 10)])
     values = np.array([[0.5, 0.1]])
     expected = Rotation.from_euler("y", 0.5) * Rotation.from_euler("z", 0.1)
@@ -295,11 +295,11 @@ def test_limited_rotation_is_applied_in_order():
         (lambda: RootRotation.limited([]), "one to three"),
     ],
 )
-def test_bad_rotations_are_refused(make, message):
+def test_invalid_rotations_are_refused(make, message):
     with pytest.raises(SettingsError, match=message):
         make()
 
 
-def test_a_tiny_interval_is_refused_before_memory_is_taken():
+def test_tiny_interval_is_refused_before_allocation():
     with pytest.raises(SettingsError, match=r"1e-12.*larger interval"):
         axis_samples(-1.0, 1.0, 1e-12, is_angle=True)

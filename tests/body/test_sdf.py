@@ -1,4 +1,4 @@
-"""SDFormat files and model directives as they are found."""
+"""Sanitising of SDFormat files and model directives."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def collision(mesh):
     return f'<collision name="c">{shape}</collision>'
 
 
-def test_collision_and_what_simulators_add_are_left_out(tmp_path):
+def test_collision_and_simulator_elements_are_left_out(tmp_path):
     plugin = '<plugin name="p" filename="x"><bogus>${x}</bogus></plugin>'
     sensor = '<sensor name="s" type="camera"/><light name="l" type="point"/>'
     text = sdf(
@@ -54,7 +54,7 @@ def test_collision_and_what_simulators_add_are_left_out(tmp_path):
     assert "no visual geometry" in refusal(tmp_path, bare, "bare.sdf")
 
 
-def test_joints_that_couple_others_are_named(tmp_path):
+def test_warnings_name_couplings_gearboxes_and_loops(tmp_path):
     text = sdf(
         *(link(name) for name in "abcd"),
         joint("shut", "d", "c"),
@@ -111,7 +111,7 @@ def test_refusals_name_link_or_joint(tmp_path, text, named):
     assert named in refusal(tmp_path, text, "thing.sdf")
 
 
-def test_included_models_are_read_in_the_same_way(tmp_path):
+def test_included_models_are_sanitised(tmp_path):
     trimesh.creation.box().export(tmp_path / "c.stl")
     arm = urdf_file(urdf_link("upper", BOX + STL.format("c.stl")))
     write(tmp_path, arm, "arm.urdf")
@@ -136,7 +136,7 @@ def directives(*lines):
     return "directives:\n" + "\n".join(lines) + "\n"
 
 
-def test_models_named_by_directives_are_cured_as_if_they_were_read_alone(tmp_path):
+def test_models_of_directives_are_sanitised(tmp_path):
     trimesh.creation.box().export(tmp_path / "c.stl")
     write(tmp_path, WELDED_URDF.replace("</link>", STL.format("c.stl") + "</link>"), "arm.urdf")
     write(tmp_path, "\n" + MJCF, "joints.xml")

@@ -1,4 +1,4 @@
-"""Bands of skin: where they are, how they move, with which tree, and what is refused."""
+"""Skin bands: vertices at rest and in motion, re-rooted trees, and invalid skin files."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def in_frame(X, points):
     return points @ X[:3, :3].T + X[:3, 3]
 
 
-def test_at_rest_the_band_is_as_drawn(tmp_path):
+def test_band_at_rest_equals_its_mesh(tmp_path):
     model = load_limb(tmp_path)
     ends = [(band.parent, band.child) for band in model.skin]
     assert ends == [("upper", "lower"), ("lower", "hand")]
@@ -31,33 +31,33 @@ def test_at_rest_the_band_is_as_drawn(tmp_path):
     assert first.skin is None
     lines = [line.split() for line in tube_obj().splitlines()]
     drawn = np.array([line[1:] for line in lines if line[0] == "v"], dtype=float)
-    share = np.interp(-drawn[:, 2], [-REACH, 0.0, REACH], [0.0, 0.5, 1.0])
-    known = np.isin(share, [0.0, 0.5, 1.0])
+    fraction = np.interp(-drawn[:, 2], [-REACH, 0.0, REACH], [0.0, 0.5, 1.0])
+    known = np.isin(fraction, [0.0, 0.5, 1.0])
     for node in others:
         found = node.skin.vertices(np.zeros((1, len(node.value_names))))[0]
         np.testing.assert_allclose(found, drawn)
         np.testing.assert_allclose(node.skin.mesh.vertices, drawn)
-        np.testing.assert_allclose(node.skin.weights[known], share[known], atol=1e-12)
+        np.testing.assert_allclose(node.skin.weights[known], fraction[known], atol=1e-12)
 
 
-def test_one_joint_turns_a_vertex_by_its_share(tmp_path):
+def test_vertex_rotates_by_its_weight_times_the_angle(tmp_path):
     model = load_limb(tmp_path)
     tree = model.pose_tree()
     node = tree.nodes[1]
     angles = np.array([-2.1, -0.4, 0.0, 1.0, 2.4])
     found = node.skin.vertices(angles[:, None])
     for angle, p_N in zip(angles, found, strict=True):
-        # Seen from the parent the joint is at the same place; the elbow turns about x.
+        # The elbow rotates about x; its origin is fixed in the parent.
         whole = Rotation.from_rotvec([angle, 0, 0]).inv()
-        share = Rotation.from_rotvec(node.skin.weights[:, None] * np.array([angle, 0.0, 0.0]))
+        part = Rotation.from_rotvec(node.skin.weights[:, None] * np.array([angle, 0.0, 0.0]))
         np.testing.assert_allclose(
-            p_N, (whole * share).apply(np.array(node.skin.mesh.vertices)), atol=1e-14
+            p_N, (whole * part).apply(np.array(node.skin.mesh.vertices)), atol=1e-14
         )
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_ends_go_with_their_links(tmp_path, seed):
-    """Drake's own poses of the two links carry the band's ends; nothing else moves it."""
+def test_ends_of_a_band_move_rigidly_with_their_links(tmp_path, seed):
+    """Drake's poses of both links move the band's ends; other joints do not move the band."""
     model = load_limb(tmp_path)
     skin = ModelSkin(model)
     q, mixed = np.random.default_rng(seed).uniform(model.lower, model.upper, (2, 5))
@@ -78,7 +78,7 @@ def test_the_ends_go_with_their_links(tmp_path, seed):
 
 
 @pytest.mark.parametrize("root", ["lower", "hand"])
-def test_a_turned_over_tree_has_the_same_band(tmp_path, root):
+def test_rerooted_tree_has_the_same_band(tmp_path, root):
     model = load_limb(tmp_path)
     skin = ModelSkin(model)
     q = np.random.default_rng(2).uniform(model.lower, model.upper)
@@ -94,12 +94,12 @@ def test_a_turned_over_tree_has_the_same_band(tmp_path, root):
     assert len(found) == 2
     for expected in skin.vertices(q):
         assert min(np.abs(p_W - expected).max() for p_W in found) < 1e-12
-    turned = [node.skin.inverted for node in tree.nodes if node.skin is not None]
-    assert any(turned)
+    inverted = [node.skin.inverted for node in tree.nodes if node.skin is not None]
+    assert any(inverted)
 
 
-def test_links_welded_to_each_other_share_a_band(tmp_path):
-    """The band is given in the frame of a link that is welded to the one that names the node."""
+def test_band_of_a_welded_link_belongs_to_its_group(tmp_path):
+    """The band is given in the frame of a link that is welded to the node's link."""
     extra = (
         '<link name="cuff"/><joint name="fix" type="fixed"><parent link="lower"/>'
         '<child link="cuff"/><origin xyz="0.01 0 0.02" rpy="0.2 0.3 0.4"/></joint></robot>'
@@ -139,7 +139,7 @@ def test_links_welded_to_each_other_share_a_band(tmp_path):
         ({"mesh": "open.obj"}, "not closed"),
     ],
 )
-def test_a_wrong_band_is_refused(tmp_path, changes, message):
+def test_invalid_band_is_refused(tmp_path, changes, message):
     text = tube_obj()
     (tmp_path / "open.obj").write_text(text[: text.rindex("f ")])
     with pytest.raises(ModelError, match=message) as caught:
@@ -153,12 +153,12 @@ def test_a_wrong_band_is_refused(tmp_path, changes, message):
     "text",
     ["- 1", "3", "bands: 3", "bands: [1", "bands: []", "bands: {a: 1}", "other: 1", "\0", "bands:"],
 )
-def test_a_broken_file_is_refused(tmp_path, text):
+def test_invalid_skin_file_is_refused(tmp_path, text):
     with pytest.raises(ModelError, match=r"limb\.skin\.yaml"):
         load_limb(tmp_path, text)
 
 
-def test_names_are_checked(tmp_path):
+def test_unknown_links_and_duplicate_bands_are_refused(tmp_path):
     path = write_limb(tmp_path, "bands:\n" + band_entry("upper", "paw"))
     for check in (False, True):
         with pytest.raises((UnknownNameError, ModelError), match=r"skin\.yaml has no link 'paw'"):
@@ -173,11 +173,11 @@ def test_names_are_checked(tmp_path):
     [
         ("upper", "hand", ArticulatedModel.pose_tree, "not neighbours"),
         ("world", "lower", ArticulatedModel.pose_tree, "not neighbours"),
-        # Where Drake draws.
+        # On conversion for Drake.
         ("lower", "upper", ModelSkin, "exchanged"),
     ],
 )
-def test_a_band_joins_neighbours(tmp_path, parent, child, use, message):
+def test_band_must_join_neighbours(tmp_path, parent, child, use, message):
     model = load_limb(tmp_path, "bands:\n" + band_entry(parent, child))
     with pytest.raises(DrakePoseError, match=message):
         use(model)

@@ -9,8 +9,8 @@ from tests.body.models import FLOATING_URDF, JOINTED_BASE_URDF, JOINTS_SDF, WELD
 
 _TREES = {
     "floating": (FLOATING_URDF, "f.urdf", {"root_position": (0.3, -0.2, 0.9)}),
-    "turned over": (FLOATING_URDF, "f.urdf", {"root": "hand", "root_position": (0.3, 0.2, 0.1)}),
-    "turned over, limited": (
+    "re-rooted": (FLOATING_URDF, "f.urdf", {"root": "hand", "root_position": (0.3, 0.2, 0.1)}),
+    "re-rooted, limited": (
         FLOATING_URDF,
         "f.urdf",
         {
@@ -27,7 +27,7 @@ _TREES = {
     "welded": (WELDED_URDF, "w.urdf", {}),
     "held": (WELDED_URDF, "w.urdf", {"held": {"a1": 0.3}}),
     "all joints": (JOINTS_SDF, "j.sdf", {}),
-    "all joints turned over": (JOINTS_SDF, "j.sdf", {"root": "f", "root_position": (0, 0, 0)}),
+    "all joints re-rooted": (JOINTS_SDF, "j.sdf", {"root": "f", "root_position": (0, 0, 0)}),
 }
 
 
@@ -44,13 +44,13 @@ def draw(kinematics, seed):
 
 
 def move(motions, j, points):
-    """Velocities (nodes, n, 3) of points (nodes, n, 3) of the world with parameter j."""
+    """Velocities (nodes, n, 3) of points (nodes, n, 3) in the world by motion j."""
     omega, v, sigma = motions.twists[j, :3], motions.twists[j, 3:6], motions.twists[j, 6]
     velocities = np.cross(np.broadcast_to(omega, points.shape), points) + v + sigma * points
     return velocities * motions.moves[:, j, None, None]
 
 
-def test_poses_are_the_trees(kinematics):
+def test_poses_match_the_pose_tree(kinematics):
     for seed in range(5):
         values = draw(kinematics, seed)
         expected = kinematics.tree.node_poses(kinematics.split(values))
@@ -58,7 +58,7 @@ def test_poses_are_the_trees(kinematics):
         assert np.array_equal(kinematics.flatten(kinematics.split(values)), values)
 
 
-def test_motions_are_the_derivatives_of_the_poses(kinematics):
+def test_motions_match_finite_differences_of_poses(kinematics):
     p_N = np.random.default_rng(3).normal(size=(len(kinematics.tree.nodes), 4, 3))
     step = 1e-6
     for seed in range(3):
@@ -75,7 +75,7 @@ def test_motions_are_the_derivatives_of_the_poses(kinematics):
             assert np.abs(move(motions, j, place(values)) - difference).max() < 1e-7
 
 
-def test_the_derivative_of_a_free_root_holds_near_no_turn(tmp_path):
+def test_derivative_of_a_free_root_is_right_near_the_identity(tmp_path):
     model = load_model(write(tmp_path, FLOATING_URDF), check=False)
     kinematics = TreeKinematics(model.pose_tree(root_rotation=RootRotation.free()))
     for size in (0.0, 1e-6, 1e-4, 1e-3):
@@ -90,7 +90,7 @@ def test_the_derivative_of_a_free_root_holds_near_no_turn(tmp_path):
             assert np.abs(found - motions.twists[j, :3]).max() < 1e-8
 
 
-def test_shift_and_growth_move_the_root_and_all_behind_it(kinematics):
+def test_translation_and_scale_move_the_first_roots_tree(kinematics):
     values = draw(kinematics, 2)
     motions = kinematics.motions(values, translation=True, scale=True)
     m = len(values)
@@ -98,8 +98,8 @@ def test_shift_and_growth_move_the_root_and_all_behind_it(kinematics):
     points = np.random.default_rng(1).normal(size=(len(motions.X_WN), 3, 3))
     for k in range(3):
         assert np.allclose(move(motions, m + k, points)[0], np.eye(3)[k])
-    growth = move(motions, m + 3, points)[0]
-    assert np.allclose(growth, points[0] - motions.X_WN[0, :3, 3])
+    scaling = move(motions, m + 3, points)[0]
+    assert np.allclose(scaling, points[0] - motions.X_WN[0, :3, 3])
     assert motions.moves[:, m:].any(axis=1).tolist() == [
         _root_of(kinematics.tree, i) == 0 for i in range(len(motions.X_WN))
     ]
@@ -111,14 +111,14 @@ def _root_of(tree, node):
     return node
 
 
-def test_values_of_the_wrong_number_are_refused(kinematics):
+def test_wrong_numbers_of_values_are_refused(kinematics):
     with pytest.raises(SettingsError, match="values expected"):
         kinematics.motions(np.zeros(len(kinematics.names) + 1))
-    with pytest.raises(SettingsError, match="numbers a node expected"):
+    with pytest.raises(SettingsError, match="values of the nodes expected"):
         kinematics.flatten([np.zeros(9) for _ in kinematics.tree.nodes])
 
 
-def test_a_joint_that_moves_in_another_way_is_refused():
+def test_unsupported_joint_motion_is_refused():
     def pose(values):
         X = np.eye(4)
         X[0, 3] = 1e-3 * values[0] ** 2

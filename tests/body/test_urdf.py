@@ -1,4 +1,4 @@
-"""URDF files as they are found: what is read rightly, what is named, what is refused."""
+"""Sanitising of URDF files: geometry, packages, warnings and errors."""
 
 import os
 
@@ -37,7 +37,7 @@ def visual(shape, material=""):
 
 
 @pytest.mark.parametrize("extension", ["stl", "dae"])
-def test_collision_is_never_drawn_nor_read(tmp_path, extension):
+def test_collision_meshes_are_neither_drawn_nor_read(tmp_path, extension):
     trimesh.creation.box().export(tmp_path / f"c.{extension}")
     for mesh in (f"c.{extension}", "gone.stl", "package://unknown/c.stl"):
         model = read(tmp_path, WELDED_URDF.replace(BOX, BOX + STL.format(mesh)))
@@ -47,7 +47,7 @@ def test_collision_is_never_drawn_nor_read(tmp_path, extension):
     assert "no visual geometry" in refusal(tmp_path, bare, "bare.urdf")
 
 
-def test_materials_of_the_same_name_keep_their_own_colours(tmp_path):
+def test_materials_of_one_name_keep_their_colours(tmp_path):
     def material(rgba):
         return f'<material name="m"><color rgba="{rgba}"/></material>'
 
@@ -83,7 +83,7 @@ def test_materials_of_the_same_name_keep_their_own_colours(tmp_path):
     ],
 )
 @pytest.mark.parametrize("declared", [True, False])
-def test_macros_that_are_left_are_refused(tmp_path, left, named, declared):
+def test_unexpanded_macros_are_refused(tmp_path, left, named, declared):
     text = arm(more=left)
     if declared:
         text = text.replace("<robot ", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" ')
@@ -92,7 +92,7 @@ def test_macros_that_are_left_are_refused(tmp_path, left, named, declared):
     assert "xacro robot.urdf.xacro > robot.urdf" in message
 
 
-def test_a_declared_prefix_without_macros_does_no_harm(tmp_path):
+def test_declared_xacro_prefix_without_macros_is_accepted(tmp_path):
     text = arm(more='<gazebo><plugin><p>$(arg x)</p></plugin></gazebo><transmission name="t"/>')
     text = text.replace("<robot ", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" ')
     model = read(tmp_path, text)
@@ -101,7 +101,7 @@ def test_a_declared_prefix_without_macros_does_no_harm(tmp_path):
     assert "expand it first" in refusal(tmp_path, text, "thing.urdf.xacro")
 
 
-def test_what_moves_nothing_is_left_out_and_what_is_unknown_is_named(tmp_path):
+def test_irrelevant_elements_are_left_out_and_unknown_ones_named(tmp_path):
     text = arm(
         '<safety_controller k_velocity="1"/><dynamics damping="-1"/><mimic joint="gone"/>',
         '<transmission name="t"><joint name="gone"/></transmission><bogus/>',
@@ -110,13 +110,13 @@ def test_what_moves_nothing_is_left_out_and_what_is_unknown_is_named(tmp_path):
     model = read(tmp_path, text.replace(' name="thing"', ""))
     assert model.name == "thing"
     assert sorted(model.warnings) == [
-        "joint 'elbow' is written to follow joint 'gone' (<mimic>): not enforced, it is searched "
-        "by itself",
+        "joint 'elbow' is written to follow joint 'gone' (<mimic>): not enforced, the joint "
+        "is searched independently",
         "robot 'thing': the element <bogus> is unknown and left out",
     ]
 
 
-def test_continuous_joints_have_no_limits_whatever_the_file_says(tmp_path):
+def test_continuous_joints_ignore_limits(tmp_path):
     for limits in ('lower="0" upper="0"', 'lower="1" upper="-1"', None):
         model = read(tmp_path, arm(kind="continuous", limits=limits))
         assert (model.lower[-1], model.upper[-1]) == (-np.pi, np.pi)
@@ -184,19 +184,19 @@ HEAD = '<?xml version="1.0" encoding="{}"?>\n'
         ("", "iso-8859-1"),
     ],
 )
-def test_encodings_and_what_stands_before_the_declaration(tmp_path, head, encoding):
+def test_encodings_and_text_before_the_xml_declaration(tmp_path, head, encoding):
     path = tmp_path / "thing.urdf"
     path.write_bytes((head + arm(more_of_joint="").replace('"b"', '"Fuß"')).encode(encoding))
     assert "Fuß" in load_model(path, check=False).link_names
 
 
-def test_nothing_outside_the_file_is_read(tmp_path):
+def test_external_entities_are_refused(tmp_path):
     write(tmp_path, "secret", "secret.txt")
     entity = '<!DOCTYPE robot [<!ENTITY e SYSTEM "secret.txt">]>'
     assert "external entity" in refusal(tmp_path, entity + arm(more="<bogus>&e;</bogus>"))
 
 
-def test_paths_with_spaces_letters_links_and_read_only_folders(tmp_path):
+def test_unusual_paths_and_read_only_folders(tmp_path):
     folder = tmp_path / "mein Roboter é %20"
     (folder / "meshes").mkdir(parents=True)
     trimesh.creation.box().export(folder / "meshes" / "a b.stl")
@@ -218,7 +218,7 @@ def package_urdf(name="package://my_arm/meshes/a.stl"):
 
 
 def make_package(folder, name=None):
-    """A folder with a mesh; a name of its own is written in its package.xml."""
+    """A folder with a mesh, and with a package.xml if a name is given."""
     (folder / "meshes").mkdir(parents=True)
     trimesh.creation.box().export(folder / "meshes" / "a.stl")
     if name:
@@ -235,7 +235,7 @@ def make_package(folder, name=None):
         ("my_arm", None, "my_robot/urdf", "///"),
     ],
 )
-def test_packages_are_found_on_the_way_up(tmp_path, package, name, model, slashes):
+def test_packages_are_found_in_folders_above(tmp_path, package, name, model, slashes):
     make_package(tmp_path / package, name)
     (tmp_path / model).mkdir(parents=True)
     text = package_urdf(f"package:{slashes}my_arm/meshes/a.stl")
@@ -260,7 +260,7 @@ def test_packages_are_found_in_search_paths(tmp_path, monkeypatch, variable):
         assert read(tmp_path / "models", package_urdf()).link_meshes["a"]
 
 
-def test_given_packages_come_first_and_unknown_ones_name_the_option(tmp_path):
+def test_given_packages_take_precedence(tmp_path):
     make_package(tmp_path / "my_arm")
     given = make_package(tmp_path / "elsewhere")
     (given / "meshes" / "a.stl").unlink()
@@ -286,7 +286,7 @@ def test_given_packages_come_first_and_unknown_ones_name_the_option(tmp_path):
         (1.0, 0.0, ["they never move: turn"]),
     ],
 )
-def test_sizes_and_limits_that_nothing_has_are_said(tmp_path, scale, upper, said) -> None:
+def test_implausible_sizes_and_limits_give_warnings(tmp_path, scale, upper, said) -> None:
     sides = f"{0.3 * scale} {scale} {0.1 * scale}"
     box = f'<visual><geometry><box size="{sides}"/></geometry></visual>'
     at = {"axis": "0 0 1", "limits": f'lower="0" upper="{upper}"', "origin": 'xyz="0 0 0"'}

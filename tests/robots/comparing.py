@@ -1,4 +1,4 @@
-"""Models of robots from PyPI's packages, what drake_pose makes of each, and how that is checked."""
+"""Comparison of robot models from PyPI packages with other libraries' reading of them."""
 
 import csv
 import re
@@ -23,32 +23,32 @@ from tests.robots.references import (
 )
 
 POSE_TOLERANCE = 1e-9
-# A ball is many flat triangles here: half a percent of its size, or less.
+# Triangulated balls are smaller by at most half a percent.
 BOX_TOLERANCE, BOX_PART = 1e-3, 0.005
-# The references read meshes once more, which takes time: bounding boxes of smaller models only.
+# Bounding boxes are compared for smaller models only, because reading meshes again is slow.
 MOST_TRIANGLES_FOR_BOXES = 40_000
 DRAWS = 3
 
-# Where each package keeps its models, relative to its installation.
+# Folder of each package's models, relative to its installation.
 _FOLDERS = {
     "example-robot-data": "cmeel.prefix/share/example-robot-data/robots",
     "dm-control": "dm_control",
 }
 _MODEL_FILES = ("*.urdf", "*.sdf", "*.xml", "*.mjcf")
-# What C++ says of itself when it gives up.
+# Raw C++ or Python errors, which no message may contain.
 _RAW = re.compile(r"condition '|failed\.$|Failure at|assert|Traceback|\.cc:", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
 class Row:
-    """One line of models.csv.
+    """A row of models.csv.
 
     Attributes:
         package: PyPI's name of the package.
         file: the model file in the package's folder of models.
-        geometry: "yes"; "no": nothing is seen of it, or it is no model; "missing": it names files
-            that the package lacks, or that its own library refuses too.
-        verdict: "fit", or words of the refusal.
+        geometry: "yes"; "no": the file has no visual geometry, or is no model; "missing": it names
+            files that the package lacks, or that the reference library refuses, too.
+        verdict: "fit", or part of the error message.
     """
 
     package: str
@@ -58,26 +58,26 @@ class Row:
 
     @property
     def path(self) -> Path:
-        """The installed file; the test is skipped where the package is not installed."""
+        """The installed file; skips the test if the package is not installed."""
         path = package_folder(self.package) / self.file
         assert path.is_file(), f"{path} is in the table, but not in the package"
         return path
 
 
 def rows(*packages: str) -> list[Row]:
-    """The table's lines of some packages."""
+    """The rows of some packages."""
     with (Path(__file__).parent / "models.csv").open(encoding="utf-8", newline="") as file:
         table = [Row(**line) for line in csv.DictReader(file)]
     return [row for row in table if row.package in packages]
 
 
 def cases(table: Sequence[Row]) -> list[object]:
-    """One test a line."""
+    """One test case per row."""
     return [pytest.param(row, id=row.file) for row in table]
 
 
 def package_folder(package: str) -> Path:
-    """The folder of a package's models; the test is skipped where it is not installed."""
+    """The folder of a package's models; skips the test if it is not installed."""
     for needed in (package, "pin", "mujoco"):
         try:
             found = metadata.distribution(needed)
@@ -96,7 +96,7 @@ def model_files(package: str) -> list[str]:
 
 
 def check_verdict(row: Row) -> None:
-    """Read a model, and check what was read against another library, or how it is refused."""
+    """Read a model, and compare it with the reference library, or check the error message."""
     path = row.path
     if row.verdict != "fit":
         with pytest.raises(ModelError) as refusal:
@@ -121,7 +121,7 @@ def check_verdict(row: Row) -> None:
 
 
 def reference_of(model: ArticulatedModel) -> Reference:
-    """The other library's reading of the same file."""
+    """The same file as read by the reference library."""
     if model.path.suffix != ".urdf":
         return MujocoReference(model.path)
     plant = model.plant
@@ -131,7 +131,7 @@ def reference_of(model: ArticulatedModel) -> Reference:
 
 
 def random_positions(model: ArticulatedModel, random: np.random.Generator) -> NDArray[np.float64]:
-    """Positions (nq,) inside limits that are some; else within a metre or radian, rotations any."""
+    """Positions (nq,) inside finite limits, else within 1 m or 1 rad; quaternions are arbitrary."""
     limited = model.upper - model.lower < 1e3
     q = random.uniform(np.where(limited, model.lower, -1.0), np.where(limited, model.upper, 1.0))
     quaternions = np.flatnonzero([kind == "quaternion" for kind in model.position_kinds])
@@ -144,7 +144,7 @@ def random_positions(model: ArticulatedModel, random: np.random.Generator) -> ND
 
 
 def check_poses(model: ArticulatedModel, tree: PoseTree, reference: Reference) -> None:
-    """The poses of all links, and those of the pose tree's nodes relative to its first."""
+    """Compare the poses of all links and of the pose tree's nodes."""
     random = np.random.default_rng(11)
     for _ in range(DRAWS):
         q = random_positions(model, random)
@@ -163,7 +163,7 @@ def check_poses(model: ArticulatedModel, tree: PoseTree, reference: Reference) -
 
 
 def check_tree(tree: PoseTree, q: NDArray[np.float64], expected: Poses) -> None:
-    """The poses of the tree's nodes, each relative to the root that it hangs on."""
+    """Compare the poses of the tree's nodes, each relative to its root."""
     X_WN = tree.node_poses(tree.values_from_positions(q))
     roots: list[int] = []
     for index, (node, X) in enumerate(zip(tree.nodes, X_WN, strict=True)):
@@ -179,10 +179,10 @@ def check_tree(tree: PoseTree, q: NDArray[np.float64], expected: Poses) -> None:
 
 
 def check_limits(model: ArticulatedModel, reference: Reference) -> None:
-    """The limits of joints that have some; wider than a few turns, or none, means none."""
+    """Compare limits; limits wider than four turns count as none."""
     for name, (lower, upper) in reference.limits().items():
         if name not in model.position_names:
-            # A joint that closes a loop of links, for one.
+            # For example a joint that closes a loop of links.
             assert any(f"'{name}'" in warning for warning in model.warnings), name
             continue
         index = model.position_index(name)
@@ -198,7 +198,7 @@ def check_limits(model: ArticulatedModel, reference: Reference) -> None:
 
 
 def check_boxes(model: ArticulatedModel, reference: Reference) -> None:
-    """The bounding boxes of what is seen of each link."""
+    """Compare the bounding boxes of each link's visual geometry."""
     expected = reference.boxes()
     assert set(model.link_meshes) == set(expected)
     for link, mesh in model.link_meshes.items():

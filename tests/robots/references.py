@@ -1,21 +1,19 @@
-"""Where links are and how large they look, by pinocchio for URDF and by MuJoCo for MJCF.
+"""Reference link poses, limits and bounding boxes: pinocchio for URDF, MuJoCo for MJCF.
 
-Conventions. Both libraries are asked joint by joint, by the joint's name, and answer link by link,
-by the link's name; the positions are those of Drake's plant.
+Inputs are Drake's positions by joint name; outputs are by link name. Conventions:
 
-- pinocchio fixes a URDF's outermost link to its universe, Drake lets it float unless it is called
-  "world": a floating base becomes pinocchio's free flyer (x y z, then the quaternion x y z w).
+- pinocchio fixes a URDF's outermost link to its universe; Drake lets it float unless it is named
+  "world". A floating base becomes pinocchio's free flyer (x y z, then the quaternion x y z w).
 - pinocchio joins welded links into one body; every link is still a frame of type BODY.
-- pinocchio describes a joint that turns without limits by cosine and sine. ``mimic`` is off: every
-  joint has its own value, which the positions that are asked for give it.
+- pinocchio describes a joint without limits by cosine and sine. ``mimic`` is off: every joint has
+  its own value.
 - MuJoCo's free joint is x y z, then the quaternion w x y z; Drake has the quaternion first. A hinge
   or slide has the same value in both. Drake's ball joint has roll, pitch and yaw, MuJoCo's a
-  quaternion w x y z. An unnamed free joint is known by its body.
-- A body with several joints is nested bodies here; the innermost has MuJoCo's name, and the others
-  are unknown to MuJoCo and not compared. Bodies without a name are body1, body2 ... in the order of
-  the file.
-- What is seen is pinocchio's visual geometry, and MuJoCo's geoms of groups 0 to 2 that are not
-  wholly transparent; planes and height fields are ground, not object.
+  quaternion w x y z. An unnamed free joint is found by its body.
+- A body with several joints becomes nested bodies in Drake. The innermost has MuJoCo's name; the
+  others are not compared. Bodies without a name are body1, body2 ... in the order of the file.
+- Visual geometry is pinocchio's visual geometry, and MuJoCo's geoms of groups 0 to 2 that are not
+  fully transparent; planes and height fields are ground and left out.
 """
 
 import itertools
@@ -32,13 +30,13 @@ from scipy.spatial.transform import Rotation
 Poses = dict[str, NDArray[np.float64]]
 Boxes = dict[str, NDArray[np.float64]]
 
-# A geom of this colour has the colour of its material (XMLreference, geom rgba).
+# The default colour, which means that the material's colour counts (XMLreference, geom rgba).
 _NO_COLOUR = (0.5, 0.5, 0.5, 1.0)
 
 
 @dataclass(frozen=True)
 class JointValue:
-    """The values of one joint of Drake's plant; name, Drake's type, and the link it moves."""
+    """Values of one joint of Drake's plant; ``kind``: Drake's type, ``link``: its child link."""
 
     name: str
     kind: str
@@ -47,7 +45,7 @@ class JointValue:
 
 
 def joint_values(plant: MultibodyPlant, q: NDArray[np.float64]) -> list[JointValue]:
-    """q (nq,) joint by joint."""
+    """Split q (nq,) by joints."""
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     return [
         JointValue(
@@ -62,7 +60,7 @@ def joint_values(plant: MultibodyPlant, q: NDArray[np.float64]) -> list[JointVal
 
 
 class PinocchioReference:
-    """A URDF file, by pinocchio."""
+    """A URDF file as read by pinocchio."""
 
     def __init__(self, path: Path, *, floating: bool, packages: Path) -> None:
         import pinocchio
@@ -131,7 +129,7 @@ def _coal_box(shape: Any, X_LG: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class MujocoReference:
-    """An MJCF file, by MuJoCo."""
+    """An MJCF file as read by MuJoCo."""
 
     def __init__(self, path: Path) -> None:
         import mujoco
@@ -210,7 +208,7 @@ def _points_box(points: NDArray[np.float64], X: NDArray[np.float64]) -> NDArray[
 
 
 def _shape_box(kind: str, size: NDArray[np.float64], X: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The bounding box (2, 3) of a shape, given half its lengths or radius and half length."""
+    """The bounding box (2, 3) of a shape; ``size``: half lengths, or radius and half length."""
     R, axis = X[:3, :3], np.abs(X[:3, 2])
     if kind == "box":
         reach = np.abs(R) @ size[:3]

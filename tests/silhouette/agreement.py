@@ -1,4 +1,4 @@
-"""How well the span kernel agrees with Drake's own label images."""
+"""Agreement between the span kernel and Drake's label images."""
 
 from collections.abc import Mapping
 
@@ -10,10 +10,10 @@ from drake_pose.silhouette.outline import BendingOutline, outline_from_mesh
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.scoring import draw_mask
 
-LARGEST_SHARE = 0.002
-"""The largest part of a mask that may differ."""
+MAX_DIFFERENCE = 0.002
+"""Largest fraction of a mask's pixels that may differ."""
 
-# How many pixels may differ however small the mask is.
+# Number of pixels that may differ, however small the mask is.
 _SLACK = 2
 
 
@@ -24,14 +24,13 @@ def measure_agreement(
     seed: int = 0,
     held: Mapping[str, float] | None = None,
 ) -> tuple[float, float, np.ndarray]:
-    """Draws a model in random poses inside its limits, by the kernel and by Drake.
+    """Draw a model at random positions within limits, by the kernel and by Drake.
 
-    Positions without limits (the pose of a floating body) keep their default, those in held their
-    value.
+    Positions without limits keep their defaults; positions in ``held`` keep the given values.
 
     Returns:
-        The worst pose's differing pixels over its mask's (0 for no more than two), and all poses'
-        differing pixels over all masks', without any slack; and the areas (n,) of Drake's masks.
+        The largest fraction of a mask's pixels that differ (0 for at most two pixels); the fraction
+        over all poses, without that tolerance; and the areas (n,) of Drake's masks [pixel].
     """
     renderer, skin = LabelRenderer(model, camera), ModelSkin(model)
     outlines = {name: outline_from_mesh(mesh) for name, mesh in model.link_meshes.items()}
@@ -52,5 +51,5 @@ def measure_agreement(
         X_WL += [np.eye(4)] * len(bent)
         mask = draw_mask([*outlines.values(), *bent], camera.X_CW @ np.array(X_WL), camera)
         differing[n], areas[n] = np.count_nonzero(mask != reference), reference.sum()
-    shares = np.where(differing <= _SLACK, 0.0, differing / np.maximum(areas, 1))
-    return float(shares.max()), float(differing.sum() / max(areas.sum(), 1)), areas
+    fractions = np.where(differing <= _SLACK, 0.0, differing / np.maximum(areas, 1))
+    return float(fractions.max()), float(differing.sum() / max(areas.sum(), 1)), areas

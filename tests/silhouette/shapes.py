@@ -1,4 +1,4 @@
-"""Small surfaces and an independent, slow way to draw them."""
+"""Small surfaces, and an independent brute-force renderer."""
 
 import numpy as np
 import trimesh
@@ -9,7 +9,7 @@ from drake_pose.camera.models import Camera
 
 
 def random_pose(rng: np.random.Generator, position: tuple[float, float, float]) -> np.ndarray:
-    """A random rotation (4, 4) about a position."""
+    """A pose (4, 4) with a random rotation at a position."""
     X = np.eye(4)
     X[:3, :3] = Rotation.random(random_state=rng).as_matrix()
     X[:3, 3] = position
@@ -17,26 +17,26 @@ def random_pose(rng: np.random.Generator, position: tuple[float, float, float]) 
 
 
 def soup(rng: np.random.Generator, vertices: int, triangles: int, size: float) -> TriangleMesh:
-    """Random triangles between random points: nothing closed, nothing oriented."""
+    """Random triangles between random points, neither closed nor oriented."""
     points = rng.normal(size=(vertices, 3)) * size
     return TriangleMesh(points, rng.integers(0, vertices, (triangles, 3)).astype(np.int32))
 
 
 def box(size: float) -> TriangleMesh:
-    """A closed cube about the origin, triangles counter-clockwise seen from outside."""
+    """A closed cube about the origin with outward normals."""
     cube = trimesh.creation.box((size, size, size))
     return TriangleMesh(np.array(cube.vertices), np.array(cube.faces, dtype=np.int32))
 
 
 def brute_force_mask(mesh: TriangleMesh, X_CN: np.ndarray, camera: Camera) -> np.ndarray:
-    """Which pixel centres see a mesh."""
+    """The mask (H, W) of a mesh by ray casting."""
     return np.isfinite(brute_force_depth(mesh, X_CN, camera))
 
 
 def brute_force_depth(mesh: TriangleMesh, X_CN: np.ndarray, camera: Camera) -> np.ndarray:
-    """Casts the ray of every pixel centre at every triangle (Moeller and Trumbore 1997).
+    """Intersect the ray of every pixel centre with every triangle (Moeller and Trumbore 1997).
 
-    Returns (H, W) the depth of the nearest one along the camera's z; infinite where there is none.
+    Returns (H, W) the depth of the nearest intersection along the camera's z; inf where none is.
     """
     kind, fx, fy, cx, cy, near = camera.kernel_parameters()[:6]
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))

@@ -1,4 +1,4 @@
-"""The kernel against Drake's own renderer."""
+"""The span kernel against Drake's renderer."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -13,7 +13,7 @@ from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.scoring import draw_mask
 from tests.body.models import joint, link, urdf, write
-from tests.silhouette.agreement import LARGEST_SHARE, measure_agreement
+from tests.silhouette.agreement import MAX_DIFFERENCE, measure_agreement
 
 SHAPES = {
     "box": '<box size="0.3 0.2 0.5"/>',
@@ -25,9 +25,8 @@ SHAPES = {
 }
 
 
-# A cube without its top, one more wall inside it, and a fin: neither closed nor a manifold.
 def write_open_mesh(path):
-    """A cube without its top, one more wall inside it, and a fin: neither closed nor a manifold."""
+    """A cube without a top, with an inner wall and a fin: neither closed nor a manifold."""
     z, y, x = np.indices((2, 2, 2)).reshape(3, 8) * 2 - 1
     points = np.vstack([np.column_stack([x, y, z]), [0, 0, 2]])
     quads = [(0, 1, 3, 2), (0, 4, 5, 1), (1, 5, 7, 3), (3, 7, 6, 2)]
@@ -36,7 +35,7 @@ def write_open_mesh(path):
 
 
 def model_of(folder, shapes):
-    """A chain with one link for each shape, on the world."""
+    """A chain on the world with one link for each shape."""
     write_open_mesh(folder / "open.obj")
     parts, parent = [], "world"
     for i, shape in enumerate(shapes):
@@ -54,7 +53,7 @@ def model_of(folder, shapes):
 
 
 def looking_at_origin(rng, distance):
-    """A pose X_WC from which the origin is seen near the picture's middle."""
+    """A pose X_WC with the origin near the image's middle."""
     X_WC = np.eye(4)
     X_WC[:3, :3] = Rotation.random(random_state=rng).as_matrix()
     X_WC[:3, 3] = -distance * X_WC[:3, 2] + rng.uniform(-0.1, 0.1, 3)
@@ -62,7 +61,7 @@ def looking_at_origin(rng, distance):
 
 
 def cameras(rng):
-    """One parallel camera, one pinhole, and one so near that parts are behind the near plane."""
+    """A parallel camera, a pinhole camera, and one whose near plane cuts the model."""
     return [
         ParallelCamera("parallel", 500, 400, 180.0, 230.3, 210.7, looking_at_origin(rng, 3.0)),
         PinholeCamera("far", 480, 360, 400.0, 410.0, 250.2, 170.6, looking_at_origin(rng, 3.0)),
@@ -73,17 +72,17 @@ def cameras(rng):
 
 
 @pytest.mark.parametrize("shape", list(SHAPES))
-def test_every_shape_looks_as_drake_draws_it(tmp_path, shape):
+def test_masks_of_every_shape_match_drake(tmp_path, shape):
     model = model_of(tmp_path, [shape, shape])
     for seed in range(2):
         for camera in cameras(np.random.default_rng(seed)):
-            share, whole, _ = measure_agreement(model, camera, 8, seed)
-            assert share <= LARGEST_SHARE, (shape, camera.name, share)
-            # Primitives of 45 or 60 sides instead of VTK's 50 differ in 0.0016 and more.
-            assert shape == "open mesh" or whole <= 3e-4, (shape, camera.name, whole)
+            worst, overall, _ = measure_agreement(model, camera, 8, seed)
+            assert worst <= MAX_DIFFERENCE, (shape, camera.name, worst)
+            # Primitives with 45 or 60 sides instead of VTK's 50 would differ by 0.0016 or more.
+            assert shape == "open mesh" or overall <= 3e-4, (shape, camera.name, overall)
 
 
-def test_labels_are_links(tmp_path):
+def test_labels_are_those_of_links(tmp_path):
     model = model_of(tmp_path, ["box", "sphere"])
     camera = cameras(np.random.default_rng(2))[0]
     renderer = LabelRenderer(model, camera)
@@ -101,7 +100,7 @@ def test_labels_are_links(tmp_path):
             assert outside <= max(2, 0.002 * alone.sum())
 
 
-def test_wrong_use_of_a_renderer_is_refused(tmp_path):
+def test_wrong_positions_and_threads_are_refused(tmp_path):
     renderer = LabelRenderer(
         model_of(tmp_path, ["box"]), ParallelCamera("c", 40, 30, 9.0, 20.0, 15.0, np.eye(4))
     )

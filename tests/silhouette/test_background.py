@@ -1,4 +1,4 @@
-"""An object by its background, learnt or beside it, or by a box, against scenes drawn by hand."""
+"""Segmentation by background models, boxes and outlines, on synthetic pictures."""
 
 import cv2
 import numpy as np
@@ -19,7 +19,7 @@ from drake_pose.silhouette.segmentation import (
 from tests.jobs.masks.rooms import texture
 
 
-def test_a_background_is_the_mean_and_deviation_of_pictures():
+def test_background_is_the_mean_and_deviation_of_pictures():
     pictures = np.random.default_rng(0).integers(0, 256, (8, 9, 12, 3)).astype(np.uint8)
     found = learn_background([*pictures[:7], pictures[7]])
     np.testing.assert_array_equal(found.mean, np.rint(pictures.mean(axis=0)))
@@ -30,8 +30,8 @@ def test_a_background_is_the_mean_and_deviation_of_pictures():
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_region_is_what_its_definition_says(seed):
-    # Small pictures: patches meet the border, each other, and are missing altogether.
+def test_person_region_matches_its_definition(seed):
+    # In small pictures patches meet the border and each other, or are missing.
     generator = np.random.default_rng(seed)
     shape = tuple(generator.integers(3, 45, 2))
     mean = generator.integers(0, 256, (*shape, 3)).astype(np.uint8)
@@ -56,7 +56,7 @@ def test_region_is_what_its_definition_says(seed):
     assert region.any() == bool(expected.any())
 
 
-def test_sizes_must_agree():
+def test_pictures_of_different_sizes_are_refused():
     with pytest.raises(SettingsError):
         learn_background([])
     background = learn_background([np.zeros((4, 5, 3), np.uint8)])
@@ -65,7 +65,7 @@ def test_sizes_must_agree():
 
 
 def passing(room, shown=255.0, count=9):
-    """Pictures of a room in which a square passes, and where it is."""
+    """Pictures of a room with a moving square, and the square's masks."""
     rng, pictures, masks = np.random.default_rng(2), [], []
     for k in range(count):
         mask = np.zeros(room.shape[:2], bool)
@@ -76,14 +76,14 @@ def passing(room, shown=255.0, count=9):
     return pictures, np.array(masks)
 
 
-def test_what_passes_is_not_in_the_median_and_hides_what_it_covers():
+def test_moving_object_is_not_in_the_median_background():
     room = texture(np.random.default_rng(3))
     pictures, masks = passing(room)
     background = background_of_recording(pictures)
     np.testing.assert_allclose(background.mean, room, atol=6.0)
     np.testing.assert_allclose(background.deviation, 3.0, atol=0.1)
     support = background_support(pictures, background)
-    # Where the wall is white, too, nothing is seen to pass.
+    # The white square is invisible before white parts of the wall.
     differs = room.max(axis=2) < 220.0
     hidden = 1.0 - masks.mean(axis=0)
     np.testing.assert_allclose(support[differs], hidden[differs], atol=1e-6)
@@ -91,8 +91,8 @@ def test_what_passes_is_not_in_the_median_and_hides_what_it_covers():
         background_of_recording(pictures[:2])
 
 
-def test_background_is_told_from_pictures_of_another_exposure():
-    """A square that moves before a room, half the pictures redder and darker."""
+def test_log_ratios_hold_across_exposures():
+    """A square moves in a room; half of the pictures are redder and darker."""
     room = texture(np.random.default_rng(2))
     pictures, masks = passing(room, 255.0 - room, 8)
     for k in (1, 3, 5, 7):
@@ -105,7 +105,7 @@ def test_background_is_told_from_pictures_of_another_exposure():
     for ratio, mask in zip(every, masks, strict=True):
         assert (ratio[~mask] < 0.0).mean() > 0.97
         assert (ratio[mask & differs] > 0.0).mean() > 0.97
-    # Of fewer that are wanted the same is told wherever their body is likely.
+    # A subset of pictures gives the same ratios where their body is likely.
     some = foreground_log_ratios(pictures, probabilities, [5, 2])
     for ratio, k in zip(some, (5, 2), strict=True):
         near = probabilities[k] > 0.02
@@ -114,7 +114,7 @@ def test_background_is_told_from_pictures_of_another_exposure():
     assert not alone[0].any()
 
 
-def test_a_box_around_an_object_cuts_it_out():
+def test_box_around_an_object_segments_it():
     rng, true = np.random.default_rng(3), np.zeros((120, 160), bool)
     true[30:90, 40:110] = True
     true[50:60, 60:80] = False
@@ -128,12 +128,14 @@ def test_a_box_around_an_object_cuts_it_out():
         grab_cut_box(picture, (0, 0, 160, 120))
 
 
-def drawn(cut, width):
-    """A picture of a ring's half, a square with a pattern and clutter, and the square's mask."""
+def drawn(at_border, width):
+    """A picture with half a ring and a patterned square, and the square's mask."""
     rng, height = np.random.default_rng(0), 3 * width // 4
     picture = np.full((height, width, 3), (120, 90, 60), np.uint8)
     cv2.ellipse(picture, (width // 4, height // 2), (90, 60), 20.0, 0.0, 220.0, (60, 90, 160), 20)
-    turned = cv2.boxPoints(((0.7 * width, (0.05 if cut else 0.5) * height), (150.0, 110.0), 25.0))
+    turned = cv2.boxPoints(
+        ((0.7 * width, (0.05 if at_border else 0.5) * height), (150.0, 110.0), 25.0)
+    )
     mask = cv2.fillPoly(np.zeros((height, width), np.uint8), [turned.astype(np.int32)], 1) > 0
     picture[mask] = 225
     u, v = np.meshgrid(np.arange(width), np.arange(height))
@@ -143,9 +145,9 @@ def drawn(cut, width):
     return np.clip(noisy, 0, 255).astype(np.uint8), mask
 
 
-@pytest.mark.parametrize(("cut", "width"), [(False, 640), (True, 640), (False, 400)])
-def test_a_patterned_object_is_one_region(cut, width):
-    picture, mask = drawn(cut, width)
+@pytest.mark.parametrize(("at_border", "width"), [(False, 640), (True, 640), (False, 400)])
+def test_patterned_object_is_one_region(at_border, width):
+    picture, mask = drawn(at_border, width)
     grey = np.repeat(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=2)
     for shown in (picture, grey):
         regions = find_regions(shown, 12)
@@ -153,5 +155,5 @@ def test_a_patterned_object_is_one_region(cut, width):
         assert all(one.shape == mask.shape for one in regions)
 
 
-def test_there_may_be_none():
+def test_uniform_picture_has_no_regions():
     assert find_regions(np.full((60, 80, 3), 100, np.uint8), 12) == []

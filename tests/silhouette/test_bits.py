@@ -1,4 +1,4 @@
-"""Bit masks against the span kernel's masks, contour cells and balls against what they promise."""
+"""Bit masks against the span kernel's masks; pruning by balls and discs is conservative."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ _POSES = 120
 
 
 def crooked_surface(seed, triangles=60):
-    """Random triangles in a ball: open, crossing, with edges of one and of several triangles."""
+    """Random triangles: open, intersecting, with edges of one and of several triangles."""
     generator = np.random.default_rng(seed)
     vertices = generator.uniform(-0.12, 0.12, (triangles // 2, 3))
     return outline_from_mesh(
@@ -53,7 +53,7 @@ def random_mask(seed):
 
 
 def read_bits(view, numbers, run, words):
-    """The mask (H, W) that a run of words stands for."""
+    """The mask (H, W) that a run of words encodes."""
     first, count, place = run
     row = np.zeros(int(numbers[-1, -1]) // 64 + 1, dtype=np.uint64)
     row[first : first + count] = words[place : place + count]
@@ -73,10 +73,10 @@ def pairs():
 
 @pytest.mark.parametrize("camera", picture_cameras(), ids=lambda camera: camera.name)
 @pytest.mark.parametrize("spread", [0.0, 0.25])
-def test_bits_are_the_pixels_of_the_span_kernel(camera, spread):
+def test_bits_equal_the_span_kernels_pixels(camera, spread):
     outline, mask = crooked_surface(1), random_mask(2)
     view = make_bit_view(mask, camera.kernel_parameters(), camera.X_CW, 5)
-    # Some poses come so near that no table suits, and some are cut by the near plane.
+    # At some poses the cells are invalid, and the near plane cuts some.
     X_WN = np.concatenate([random_poses(3)[: _POSES // 2], random_poses(4, 0.2)[_POSES // 2 :]])
     celled = divide_outline(outline, spread)
     kept, areas, runs, words = draw_bits(celled, view, np.eye(4)[None], X_WN, pairs(), np.inf)
@@ -95,7 +95,7 @@ def test_bits_are_the_pixels_of_the_span_kernel(camera, spread):
     assert distance[band].max() <= 5 * np.sqrt(2.0)
 
 
-def test_poses_with_too_much_outside_are_left_out():
+def test_poses_beyond_the_limit_are_skipped():
     camera, outline, mask = picture_cameras()[0], crooked_surface(5), random_mask(6)
     view = make_bit_view(mask, camera.kernel_parameters(), camera.X_CW, 0)
     X_WN = random_poses(7)
@@ -112,9 +112,9 @@ def thick_surface():
     return outline_from_mesh(TriangleMesh(ball.vertices * [0.05, 0.08, 0.2], ball.faces))
 
 
-def test_balls_lie_inside_and_reach_to_the_ends():
+def test_balls_are_inside_and_reach_the_ends():
     balls = VisualHull(thick_surface()).spread_balls(8)
-    # A ball inside an ellipsoid: its points in all directions are inside.
+    # Points on each ball in all directions are inside the ellipsoid.
     directions = Rotation.random(300, random_state=1).as_matrix()[:, 0]
     points = balls[:, None, :3] + balls[:, None, 3:] * directions
     assert np.linalg.norm(points / [0.05, 0.08, 0.2], axis=2).max() <= 1.0
@@ -122,7 +122,7 @@ def test_balls_lie_inside_and_reach_to_the_ends():
     assert np.ptp(balls[:, 2]) > 0.2
 
 
-def test_nothing_has_no_balls():
+def test_empty_surface_has_no_balls():
     empty = outline_from_mesh(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32)))
     assert VisualHull(empty).spread_balls(5).shape == (0, 4)
     assert VisualHull(empty).radii(np.zeros((2, 3))).tolist() == [0.0, 0.0]
@@ -130,7 +130,7 @@ def test_nothing_has_no_balls():
 
 @pytest.mark.parametrize("camera", picture_cameras(), ids=lambda camera: camera.name)
 @pytest.mark.parametrize("limit", [0.0, 40.0])
-def test_pruning_loses_no_pose_inside_the_limit(camera, limit):
+def test_pruning_keeps_every_pose_within_the_limit(camera, limit):
     outline = thick_surface()
     mask = np.zeros((70, 90), dtype=bool)
     mask[10:60, 15:80] = True
@@ -147,7 +147,7 @@ def test_pruning_loses_no_pose_inside_the_limit(camera, limit):
 
 
 @pytest.mark.parametrize("camera", picture_cameras(), ids=lambda camera: camera.name)
-def test_discs_hold_all_that_can_be_reached(camera):
+def test_discs_contain_the_surface(camera):
     outline, mask = thick_surface(), random_mask(9)
     view = make_bit_view(mask, camera.kernel_parameters(), camera.X_CW, 0)
     X_WN = random_poses(10)
@@ -158,7 +158,7 @@ def test_discs_hold_all_that_can_be_reached(camera):
         assert not (drawn & mask & ~disc).any()
 
 
-def test_the_pixel_outside_is_nearly_the_nearest():
+def test_nearest_outside_pixel_is_within_two_percent():
     mask = np.zeros((70, 90), dtype=bool)
     mask[:50, 20:71] = True
     mask[20:23, 30:35] = False

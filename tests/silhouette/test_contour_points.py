@@ -19,7 +19,7 @@ def find_contour_points(outlines, X_CN, camera, spacing=1.0):
 
 
 def covered(meshes, X_CN, camera, uv):
-    """Whether points (n, 2) of the picture lie in any projected triangle."""
+    """(n,) whether image points (n, 2) lie in any projected triangle."""
     inside = np.zeros(len(uv), dtype=bool)
     for mesh, X in zip(meshes, X_CN, strict=True):
         p_C = mesh.vertices @ X[:3, :3].T + X[:3, 3]
@@ -35,7 +35,7 @@ def covered(meshes, X_CN, camera, uv):
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.name)
 @pytest.mark.parametrize("kind", ["boxes", "soup"])
-def test_points_lie_on_the_border_of_the_union(camera, kind):
+def test_points_are_on_the_border_of_the_union(camera, kind):
     rng = np.random.default_rng(5)
     for _ in range(4):
         meshes = [box(s) if kind == "boxes" else soup(rng, 5, 4, 0.5 * s) for s in (0.9, 0.6, 0.5)]
@@ -45,7 +45,7 @@ def test_points_lie_on_the_border_of_the_union(camera, kind):
         assert len(points.uv) > 50
         out = covered(meshes, X, camera, points.uv + 1e-4 * points.normals)
         into = covered(meshes, X, camera, points.uv - 1e-4 * points.normals)
-        # Corners nearer than the step may fool the step.
+        # The step may cross a corner.
         assert out.mean() < 0.01
         assert into.mean() > 0.99
         p_C = np.einsum("nij,nj->ni", X[points.nodes][:, :3, :3], points.p_N)
@@ -69,10 +69,10 @@ def test_lengths_sum_to_the_perimeter():
     assert np.all(((points.uv - center) * points.normals).sum(axis=1) > 27.9)
 
 
-def test_clearances_are_how_far_it_is_across_parallel_edges():
+def test_clearances_are_distances_between_parallel_edges():
     camera = CAMERAS[0]
     X = np.tile(np.eye(4), (2, 1, 1))
-    # Two boxes side by side, 20 pixels wide, turned in the picture; the gap is 7 pixels.
+    # Two boxes side by side, 20 pixels wide, rotated in the image; the gap is 7 pixels.
     turn = np.radians(20.0)
     X[:, :2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
     half = 0.5 * (20.0 + 7.0) / 40.0
@@ -80,7 +80,7 @@ def test_clearances_are_how_far_it_is_across_parallel_edges():
     X[1, :3, 3] = np.array([*(half * X[0, :2, 0]), 2.0])
     found = find_contour_points((outline_from_mesh(box(0.5)),) * 2, X, camera)
     across = (found.uv - [camera.center_x, camera.center_y]) @ X[0, :2, :2]
-    # Away from the corners.
+    # Exclude points near corners.
     middle = np.abs(across[:, 1]) < 2.0
     within = middle & (np.abs(np.abs(across[:, 0]) - 3.5) < 0.1)
     without = middle & (np.abs(np.abs(across[:, 0]) - 23.5) < 0.1)
@@ -91,20 +91,20 @@ def test_clearances_are_how_far_it_is_across_parallel_edges():
     assert np.all(np.isinf(found.clearances[without][:, 1]))
 
 
-def test_what_lies_behind_or_within_has_no_points():
+def test_occluded_surfaces_have_no_points():
     camera = CAMERAS[0]
     X = np.tile(np.eye(4), (2, 1, 1))
     X[1, :3, 3] = [0.05, 0.02, 4.0]
     X[:, :3, :3] = random_pose(np.random.default_rng(1), (0, 0, 0))[:3, :3]
     outlines = (outline_from_mesh(box(1.0)), outline_from_mesh(box(0.3)))
     assert set(find_contour_points(outlines, X, camera).nodes) == {0}
-    # The same surface twice: one contour.
+    # Two equal surfaces have one contour.
     twice = find_contour_points((outlines[0], outlines[0]), X[[0, 0]], camera)
     once = find_contour_points(outlines[:1], X[:1], camera)
     assert np.allclose(np.sort(twice.uv, axis=0), np.sort(once.uv, axis=0))
 
 
-def test_a_scaled_body_in_a_parallel_camera():
+def test_scaled_pose_equals_scaled_body_in_a_parallel_camera():
     camera = CAMERAS[0]
     X = random_pose(np.random.default_rng(2), (0.0, 0.0, 0.0))
     scaled = X.copy()
@@ -115,7 +115,7 @@ def test_a_scaled_body_in_a_parallel_camera():
     assert np.allclose(1.3 * small.p_N, large.p_N)
 
 
-def test_nothing_in_the_picture():
+def test_body_outside_the_image_has_no_points():
     X = np.eye(4)
     X[0, 3] = 50.0
     outline = outline_from_mesh(box(0.5))

@@ -1,4 +1,4 @@
-"""Masks of videos and of COCO (compared with its own library and matplotlib)."""
+"""Masks from lossy pictures and COCO files, against pycocotools and matplotlib."""
 
 import json
 import sys
@@ -22,13 +22,13 @@ HEIGHT, WIDTH = 40, 60
 
 @pytest.fixture
 def classes():
-    """Three classes: 0, 1 a box, 7 another."""
+    """A class image (H, W): background 0, a box of class 1 and a box of class 7."""
     layer = np.zeros((HEIGHT, WIDTH), np.uint8)
     layer[5:20, 10:30], layer[25:35, 40:55] = 1, 7
     return layer
 
 
-def test_values_of_few_bits_in_files_of_sixteen_are_refused(tmp_path):
+def test_twelve_bit_values_in_sixteen_bit_files_are_refused(tmp_path):
     """OpenCV keeps the upper eight of 16 bits, so that 12-bit values would read as black."""
     ramp = np.linspace(0, 4095, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH).astype(np.uint16)
     for name, values in (("twelve", ramp), ("sixteen", ramp * 16), ("black", ramp * 0)):
@@ -39,7 +39,7 @@ def test_values_of_few_bits_in_files_of_sixteen_are_refused(tmp_path):
     assert read_picture(tmp_path / "black.png", SceneError).max() == 0
 
 
-def test_a_photograph_is_no_mask_that_compression_blurred(classes, tmp_path):
+def test_blurred_masks_are_read_but_photographs_are_refused(classes, tmp_path):
     blurred = cv2.GaussianBlur(np.where(classes > 0, 255, 0).astype(np.uint8), (3, 3), 0)
     grey = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
     for k, picture in enumerate((blurred, grey)):
@@ -56,7 +56,7 @@ def test_a_photograph_is_no_mask_that_compression_blurred(classes, tmp_path):
 
 
 def star(rng, count=9):
-    """A polygon without crossings that reaches beyond the picture."""
+    """A polygon without self-intersections that exceeds the picture."""
     angles = np.sort(rng.uniform(0.0, 2.0 * np.pi, count))
     lengths = rng.uniform(5.0, 60.0, count)
     return np.array([40.0, 30.0]) + lengths[:, None] * np.column_stack(
@@ -65,14 +65,14 @@ def star(rng, count=9):
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_polygons_hold_the_pixels_whose_centres_lie_in_them(seed):
+def test_polygons_contain_pixels_by_their_centres(seed):
     corners = star(np.random.default_rng(seed))
     centres = np.indices((60, 80))[::-1].reshape(2, -1).T + 0.5
     inside = MplPath(np.vstack([corners, corners[:1]]), closed=True).contains_points(centres)
     assert (fill_polygon(corners, 60, 80).ravel() == inside).all()
 
 
-def test_a_rectangle_has_its_exact_pixels_and_crossings_are_even_odd():
+def test_rectangle_is_exact_and_overlaps_are_even_odd():
     box = np.array([(2.0, 3.0), (6.0, 3.0), (6.0, 5.0), (2.0, 5.0)])
     mask = fill_polygon(box, 8, 9)
     assert mask[3:5, 2:6].all()
@@ -84,7 +84,7 @@ def test_a_rectangle_has_its_exact_pixels_and_crossings_are_even_odd():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_run_lengths_are_coco_s(seed):
+def test_run_lengths_match_pycocotools(seed):
     rng = np.random.default_rng(seed)
     mask = fill_polygon(star(rng), 60, 80) ^ (rng.random((60, 80)) < 0.05 * seed)
     packed = coco.encode(np.asfortranarray(mask, dtype=np.uint8))
@@ -105,14 +105,14 @@ def test_damaged_run_lengths_are_refused(counts):
         decode_run_lengths(counts, 5, 5)
 
 
-def test_run_lengths_without_the_library_say_what_to_install(monkeypatch):
+def test_missing_pycocotools_names_the_extra_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pycocotools", None)
     with pytest.raises(MaskError, match=r"drake_pose\[coco\]"):
         decode_run_lengths([25], 5, 5)
 
 
 def annotations(path, **changes):
-    """A COCO file of two pictures, of which the first has two areas; changed at its first ones."""
+    """A COCO file of two pictures; ``changes`` apply to the first image and area."""
     image = {"id": 5, "file_name": "left/0001.jpg", "width": WIDTH, "height": HEIGHT}
     box = [[10.0, 5.0, 30.0, 5.0, 30.0, 20.0, 10.0, 20.0]]
     area = {"id": 0, "image_id": 5, "category_id": 3, "segmentation": box}
@@ -163,7 +163,7 @@ def test_damaged_annotations_are_refused(tmp_path, change, words):
 
 
 @pytest.mark.parametrize("text", ["{", "[]", "{}"])
-def test_what_is_no_coco_file_is_refused(tmp_path, text):
+def test_other_json_files_are_refused(tmp_path, text):
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(MaskError, match=r"a\.json"):
         read_coco(tmp_path / "a.json")

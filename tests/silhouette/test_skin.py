@@ -1,4 +1,4 @@
-"""Surfaces with bands of skin: kernel, brute force and Drake's renderer agree; gaps are closed."""
+"""Surfaces with skin bands: the kernel against brute force and Drake's renderer."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -19,14 +19,14 @@ from drake_pose.silhouette.outline import (
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.scoring import draw_mask, prefix_sums, score_bodies, subtract_body
 from tests.body.models import load_limb
-from tests.silhouette.agreement import LARGEST_SHARE, measure_agreement
+from tests.silhouette.agreement import MAX_DIFFERENCE, measure_agreement
 from tests.silhouette.shapes import brute_force_mask
 
 SIDE = 160
 
 
 def looking_along(direction, distance):
-    """A camera's pose (4, 4) in the limb's world, its middle in view."""
+    """A camera's pose (4, 4) that looks at the limb's middle."""
     z = np.asarray(direction, dtype=float) / np.linalg.norm(direction)
     middle, up = np.array([0.0, 0.0, 0.1]), (0, 0, 1) if abs(z[2]) < 0.9 else (0, 1, 0)
     return look_at(middle - distance * z, middle, up)
@@ -47,13 +47,13 @@ def pose(model, q, camera):
     return values, camera.X_CW @ tree.node_poses(values)
 
 
-def test_kernel_and_brute_force_agree(tmp_path):
+def test_masks_match_brute_force(tmp_path):
     model = load_limb(tmp_path)
     tree = model.pose_tree()
     surfaces = TreeSurfaces(tree)
     rng = np.random.default_rng(0)
     gained = 0
-    # The last one's near plane cuts a band.
+    # The near plane of the last camera cuts a band.
     X_WC = looking_along([0, 1, 0.1], 0.06)
     near = PinholeCamera("near", SIDE, SIDE, 60.0, 60.0, 80.2, 79.7, X_WC, near=0.02)
     for camera in [*cameras(rng), near]:
@@ -68,7 +68,7 @@ def test_kernel_and_brute_force_agree(tmp_path):
     assert gained > 100
 
 
-def test_many_poses_at_once_are_scored_as_one_by_one(tmp_path):
+def test_batch_scores_equal_single_scores(tmp_path):
     model = load_limb(tmp_path)
     surfaces = TreeSurfaces(model.pose_tree())
     rng = np.random.default_rng(1)
@@ -96,8 +96,8 @@ def test_many_poses_at_once_are_scored_as_one_by_one(tmp_path):
             np.testing.assert_array_equal(left, sets[0] & ~mask)
 
 
-def test_bits_have_the_band_of_their_sample(tmp_path):
-    """The beam search's pictures are the kernel's, for each of many samples of a node."""
+def test_bits_have_the_band_at_their_sample(tmp_path):
+    """Bit masks equal the kernel's masks at each of many samples of a node."""
     model = load_limb(tmp_path)
     tree = model.pose_tree()
     surfaces = TreeSurfaces(tree)
@@ -124,14 +124,14 @@ def test_bits_have_the_band_of_their_sample(tmp_path):
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_drake_draws_the_same(tmp_path, seed):
+def test_masks_with_bands_match_drake(tmp_path, seed):
     model = load_limb(tmp_path)
     rng = np.random.default_rng(10 + seed)
     for camera in cameras(rng):
-        share, _, areas = measure_agreement(model, camera, 8, seed)
-        assert share <= LARGEST_SHARE, (camera.name, share)
+        worst, _, areas = measure_agreement(model, camera, 8, seed)
+        assert worst <= MAX_DIFFERENCE, (camera.name, worst)
         assert (areas > 500).all()
-    # The band is drawn as its child link, wherever the plant's own world is.
+    # A band has its child link's label, at any pose of the plant's world.
     renderer = LabelRenderer(model, camera)
     q = rng.uniform(model.lower, model.upper)
     X_WB = np.eye(4)
@@ -143,8 +143,8 @@ def test_drake_draws_the_same(tmp_path, seed):
     assert names <= {"upper", "lower", "hand"}
 
 
-def test_each_thread_bends_its_own_copy(tmp_path):
-    """The main thread's band is read after another thread has bent it otherwise."""
+def test_each_thread_deforms_its_own_copy(tmp_path):
+    """Another thread deforms the band before the main thread reads it."""
     tree = load_limb(tmp_path).pose_tree()
     surfaces, rest = PackedSurfaces(TreeSurfaces(tree)), tree.default_values()
     ends = np.concatenate(rest), np.concatenate(rest) + 0.4
@@ -156,7 +156,7 @@ def test_each_thread_bends_its_own_copy(tmp_path):
     np.testing.assert_array_equal(held.points, before)
 
 
-def test_wrong_bands_are_refused():
+def test_bands_of_wrong_shape_are_refused():
     tetrahedron = TriangleMesh(
         np.vstack([np.zeros(3), np.eye(3)]), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
     )

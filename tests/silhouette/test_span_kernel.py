@@ -28,14 +28,14 @@ def name_of(camera):
 
 
 def require_exact(mesh, X_CN, camera):
-    """Compares a mesh's mask with cast rays; returns it."""
+    """Compare a mesh's mask with ray casting, and return the mask."""
     mask = draw_mask([outline_from_mesh(mesh)], X_CN[None], camera)
     np.testing.assert_array_equal(mask, brute_force_mask(mesh, X_CN, camera))
     return mask
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
-def test_any_triangle_soup_is_drawn_exactly(camera):
+def test_masks_of_triangle_soups_are_exact(camera):
     rng = np.random.default_rng(1)
     covered = 0
     for _ in range(40):
@@ -45,7 +45,7 @@ def test_any_triangle_soup_is_drawn_exactly(camera):
 
 
 @pytest.mark.parametrize("count", [60, 400])
-def test_rows_with_very_many_crossings(count):
+def test_rows_with_many_crossings_are_exact(count):
     rng = np.random.default_rng(5)
     corners = 0.03 * rng.normal(size=(count, 3, 3)) + 0.4 * rng.normal(size=(count, 1, 3))
     small = TriangleMesh(
@@ -55,7 +55,7 @@ def test_rows_with_very_many_crossings(count):
         require_exact(small, random_pose(rng, (0.0, 0.0, 3.0)), camera)
 
 
-def test_triangles_through_the_near_plane_are_cut_exactly():
+def test_near_plane_clipping_is_exact():
     rng = np.random.default_rng(2)
     covered = 0
     for camera in CAMERAS[1:]:
@@ -68,7 +68,7 @@ def test_triangles_through_the_near_plane_are_cut_exactly():
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
-def test_scores_are_sums_over_masks(camera):
+def test_scores_equal_sums_over_masks(camera):
     rng = np.random.default_rng(4)
     size = (camera.height, camera.width)
     sets = rng.random((3, *size)) < np.array([0.1, 0.5, 0.9])[:, None, None]
@@ -92,7 +92,7 @@ def test_scores_are_sums_over_masks(camera):
 
 
 @pytest.mark.parametrize("far", [1e3, 1e9, 1e300])
-def test_far_outside_the_picture(far):
+def test_surfaces_far_outside_the_image_have_no_area(far):
     camera = CAMERAS[0]
     outline = outline_from_mesh(box(1.0))
     X_CN = np.tile(np.eye(4), (5, 1, 1))
@@ -103,14 +103,14 @@ def test_far_outside_the_picture(far):
     assert areas[4, 0] == areas[4, 1] > 3000
 
 
-def test_a_surface_much_greater_than_the_picture():
+def test_surface_larger_than_the_image_fills_it():
     X_CN = np.eye(4)
     X_CN[2, 3] = 600.0
     for camera in CAMERAS:
         assert draw_mask([outline_from_mesh(box(1000.0))], X_CN[None], camera).all()
 
 
-def test_empty_surfaces():
+def test_empty_surfaces_have_no_area():
     empty = outline_from_mesh(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32)))
     cube = outline_from_mesh(box(0.5))
     camera = CAMERAS[0]
@@ -123,7 +123,7 @@ def test_empty_surfaces():
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
-def test_subtracting_a_body_keeps_the_prefix_sums(camera):
+def test_subtracting_a_body_updates_prefix_sums(camera):
     rng = np.random.default_rng(7)
     mask = rng.random((camera.height, camera.width)) < 0.7
     prefix = prefix_sums(mask)
@@ -163,14 +163,14 @@ def at(x, y, z):
     return X_CN
 
 
-def test_a_body_in_view_is_accepted():
+def test_visible_body_is_accepted():
     require_visible([CUBE], at(0, 0, 3)[None], PINHOLE)
     require_visible([CUBE], at(0, 0, -3)[None], PARALLEL)
     require_visible([CUBE, CUBE], np.array([at(0, 0, 3), at(0, 0, -3)]), PINHOLE)
     require_visible([CUBE], at(0.6, 0, 0)[None], PINHOLE)  # beside the camera, in part before it
 
 
-def test_a_body_out_of_sight_is_refused():
+def test_invisible_body_is_refused():
     with pytest.raises(CameraError, match=r"'eye'.*behind"):
         require_visible([CUBE, CUBE], np.array([at(0, 0, -3), at(1, 0, -2)]), PINHOLE)
     with pytest.raises(CameraError, match=r"'eye' is inside"):
@@ -185,7 +185,10 @@ EMPTY = 32766
 
 
 def require_nearest(meshes, X_CN, camera):
-    """Compares labels 1, 2, ... with cast rays; returns them, and how many pixels two share."""
+    """Compare labels 1, 2, ... with ray casting.
+
+    Returns the labels, and the number of pixels covered by several surfaces.
+    """
     labels = range(1, 1 + len(meshes))
     outlines = [outline_from_mesh(mesh) for mesh in meshes]
     image = draw_labels(outlines, labels, X_CN, camera, EMPTY)
@@ -193,13 +196,13 @@ def require_nearest(meshes, X_CN, camera):
     seen = np.isfinite(depths).any(axis=0)
     np.testing.assert_array_equal(image != EMPTY, seen)
     own = np.take_along_axis(depths, np.where(seen, image - 1, 0)[None], axis=0)[0]
-    # The kernel's depths are 32 bit floats: where two are as near, either may be seen.
+    # The kernel's depths are 32-bit floats: either surface may win where depths are equal.
     assert (own[seen] <= depths.min(axis=0)[seen] * (1.0 + 1e-5)).all()
     return image, int((np.isfinite(depths).sum(axis=0) > 1).sum())
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
-def test_the_nearest_of_any_triangles_is_seen(camera):
+def test_nearest_of_triangle_soups_is_labelled(camera):
     rng = np.random.default_rng(4)
     shared = 0
     for _ in range(15):
@@ -211,8 +214,8 @@ def test_the_nearest_of_any_triangles_is_seen(camera):
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
 @pytest.mark.parametrize("inside_out", [False, True])
-def test_the_nearest_of_closed_bodies_is_seen(camera, inside_out):
-    # They run into each other, and a part is cut by the near plane.
+def test_nearest_of_closed_bodies_is_labelled(camera, inside_out):
+    # The bodies intersect, and the near plane cuts some.
     rng = np.random.default_rng(5)
     shared = 0
     for trial in range(10):
@@ -228,7 +231,7 @@ def test_the_nearest_of_closed_bodies_is_seen(camera, inside_out):
     assert shared > 1000
 
 
-def test_surfaces_that_are_not_closed_hide_nothing_behind_them():
+def test_open_and_inconsistent_surfaces_are_not_closed():
     cube = box(1.0)
     assert outline_from_mesh(cube).is_closed
     assert not outline_from_mesh(TriangleMesh(cube.vertices, cube.triangles[1:])).is_closed
@@ -237,7 +240,7 @@ def test_surfaces_that_are_not_closed_hide_nothing_behind_them():
     assert not outline_from_mesh(TriangleMesh(cube.vertices, turned)).is_closed
 
 
-def test_parts_of_one_label_are_one():
+def test_surfaces_of_one_label_are_united():
     camera = CAMERAS[1]
     X_CN = np.tile(np.eye(4), (3, 1, 1))
     X_CN[:, :3, :3] = Rotation.random(3, random_state=6).as_matrix()
@@ -248,12 +251,12 @@ def test_parts_of_one_label_are_one():
     assert set(np.unique(labels)) == {0, 5}
 
 
-def test_nothing_to_draw():
+def test_no_surfaces_give_an_empty_label_image():
     assert (draw_labels([], [], np.empty((0, 4, 4)), CAMERAS[0], EMPTY) == EMPTY).all()
 
 
 def directed_edges(triangles):
-    """Every use of an edge: from, to, triangle."""
+    """Every use of an edge: from, to, triangle, sorted."""
     return sorted(
         (int(t[k]), int(t[(k + 1) % 3]), i) for i, t in enumerate(triangles) for k in range(3)
     )
@@ -270,23 +273,23 @@ def uses_of_records(edges):
     return sorted(uses)
 
 
-def test_records_hold_every_use_of_an_edge_once():
+def test_edge_records_contain_every_use_once():
     rng = np.random.default_rng(0)
     for _ in range(30):
-        # Few vertices, many triangles: edges of many triangles, and triangles given twice.
+        # Few vertices give edges of many triangles, and duplicate triangles.
         outline = outline_from_mesh(soup(rng, 7, 40, 1.0))
         assert uses_of_records(outline.edges) == directed_edges(outline.triangles)
 
 
-def test_records_are_as_few_as_can_be():
-    # Three triangles on one edge, two of them running the same way.
+def test_number_of_edge_records_is_minimal():
+    # Three triangles on one edge, two of which traverse it alike.
     triangles = np.array([[0, 1, 2], [0, 1, 3], [1, 0, 4]], dtype=np.int32)
     points = np.random.default_rng(1).normal(size=(5, 3))
     outline = outline_from_mesh(TriangleMesh(points, triangles))
     assert len(outline.edges) == 2 + 6
 
 
-def test_vertices_at_one_place_are_merged():
+def test_equal_vertices_are_merged():
     mesh = box(1.0)
     split = TriangleMesh(
         np.vstack([mesh.vertices[mesh.triangles].reshape(-1, 3), [[9.0, 9.0, 9.0]]]),
@@ -297,6 +300,6 @@ def test_vertices_at_one_place_are_merged():
     assert len(outline.edges) == 18
 
 
-def test_null_triangles_are_left_out():
+def test_degenerate_triangles_are_left_out():
     mesh = TriangleMesh(np.eye(3), np.array([[0, 1, 2], [0, 0, 1], [2, 2, 2]], dtype=np.int32))
     assert len(outline_from_mesh(mesh).triangles) == 1

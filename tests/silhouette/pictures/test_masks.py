@@ -29,7 +29,7 @@ def save(folder, picture, name="0007.png"):
     return path
 
 
-def test_round_trip(tmp_path):
+def test_written_mask_is_read_back(tmp_path):
     write_mask(tmp_path / "m.png", MASK)
     assert cv2.imread(str(tmp_path / "m.png"), cv2.IMREAD_UNCHANGED).max() == 255
     mask = read_mask(tmp_path / "m.png", 30, 20)
@@ -52,7 +52,7 @@ COLOUR = np.where(MASK[..., None], np.array([0, 200, 17]), 0).astype(np.uint8)
     ],
     ids=["1", "128", "255", "deep", "colour", "opaque", "transparent"],
 )
-def test_masks_of_every_kind_are_read(tmp_path, picture):
+def test_every_variant_of_mask_is_read(tmp_path, picture):
     np.testing.assert_array_equal(read_mask(save(tmp_path, picture)), MASK)
 
 
@@ -68,7 +68,7 @@ def test_masks_of_every_kind_are_read(tmp_path, picture):
     ],
     ids=["empty", "full", "soft", "two colours", "no black", "wrong size"],
 )
-def test_bad_masks_are_refused(tmp_path, picture, message):
+def test_invalid_masks_are_refused(tmp_path, picture, message):
     with pytest.raises(MaskError, match=rf"0007\.png.*{message}"):
         read_mask(save(tmp_path, picture), 30, 20)
 
@@ -87,7 +87,7 @@ def test_damaged_files_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("side", [10_000, 60_000])
-def test_pictures_that_would_fill_the_memory_are_refused(tmp_path, side):
+def test_huge_pictures_are_refused(tmp_path, side):
     header = struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)
     data = b"\x89PNG\r\n\x1a\n"
     for kind, content in ((b"IHDR", header), (b"IEND", b"")):
@@ -121,7 +121,7 @@ def test_unreadable_files_are_refused(tmp_path):
         read_mask(picture)
 
 
-def test_signed_distances_are_those_to_the_nearest_pixel_of_the_other_kind():
+def test_signed_distances_match_brute_force():
     mask = np.random.default_rng(4).random((14, 17)) < 0.6
     found = signed_distances(mask)
     inside, outside = np.argwhere(mask), np.argwhere(~mask)
@@ -132,7 +132,7 @@ def test_signed_distances_are_those_to_the_nearest_pixel_of_the_other_kind():
         assert found[row, column] == pytest.approx(expected, abs=1e-4)
 
 
-def test_label_images_are_masks():
+def test_mask_survives_conversion_to_label_image():
     image = mask_to_label_image(MASK)
     assert isinstance(image, ImageLabel16I)
     assert (image.width(), image.height()) == (30, 20)
@@ -143,7 +143,7 @@ def test_label_images_are_masks():
 def test_labels_can_be_chosen():
     labels = np.full((4, 5), int(RenderLabel.kEmpty), dtype=np.int16)
     labels[1, 2], labels[3, 3] = 7, 9
-    # Drake's reserved labels are no object's.
+    # Drake's reserved labels are not objects.
     labels[0, :3] = [
         int(getattr(RenderLabel, k)) for k in ("kDontCare", "kDoNotRender", "kUnspecified")
     ]
@@ -151,7 +151,7 @@ def test_labels_can_be_chosen():
     assert np.argwhere(label_image_to_mask(labels, [9])).tolist() == [[3, 3]]
 
 
-def test_importing_the_room_loads_neither_numba_nor_drake():
+def test_import_loads_neither_numba_nor_drake():
     code = (
         "import sys, drake_pose.silhouette, drake_pose.camera;"
         "print([m for m in ('numba', 'pydrake', 'cv2') if m in sys.modules])"
@@ -162,8 +162,8 @@ def test_importing_the_room_loads_neither_numba_nor_drake():
     assert result.stdout.strip() == "[]"
 
 
-def test_masks_agree_by_what_is_wrong_over_all_cameras_silhouettes():
-    """One is right; the other lacks 10 of its 85 pixels."""
+def test_E_total_is_the_differing_fraction_over_all_cameras():
+    """One mask is right; the other lacks 10 of 85 pixels."""
     body = MASK.copy()
     body[4:9, 3:5] = False
     found = compare_masks({"a": MASK, "b": MASK}, {"a": MASK, "b": body})

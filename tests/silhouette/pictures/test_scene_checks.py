@@ -1,4 +1,4 @@
-"""Faults of a scene's files, found without a capture."""
+"""Warnings and errors about the files of a scene."""
 
 import struct
 import time
@@ -25,7 +25,7 @@ NAMES = ("left", "middle", "right")
 
 
 def record(folder, frames, still=()):
-    """A square that moves to the right; from the third frame on it stands still in some cameras."""
+    """Masks of a moving square; cameras in ``still`` freeze from the third frame on."""
     cameras = [ParallelCamera(n, 60, 40, 10.0, 30.0, 20.0, np.eye(4)) for n in NAMES]
     save_cameras(folder / "cameras.yaml", cameras)
     (folder / "scene.yaml").write_text("sequence: true\n")
@@ -40,7 +40,7 @@ def record(folder, frames, still=()):
 
 
 def film(folder, rate, count=60, **changed):
-    """Videos of grey pictures beside cameras.yaml; changed: a camera's rate and count."""
+    """Grey videos for every camera; ``changed``: rate and count of single cameras."""
     (folder / "scene.yaml").write_text("sequence: true\n")
     (folder / "videos").mkdir(exist_ok=True)
     kind = cv2.VideoWriter.fourcc(*"MJPG")
@@ -53,7 +53,7 @@ def film(folder, rate, count=60, **changed):
         writer.release()
 
 
-def test_videos_that_do_not_fit_together_are_named(tmp_path):
+def test_videos_of_different_rates_or_lengths_are_reported(tmp_path):
     record(tmp_path, ["000000"])
     film(tmp_path, 30.0)
     assert check_scene(load_scene(tmp_path)).warnings == ()
@@ -75,17 +75,17 @@ def test_videos_that_do_not_fit_together_are_named(tmp_path):
 
 
 @pytest.mark.parametrize("count", [0, 10**9])
-def test_a_video_that_lies_about_its_length_is_refused(tmp_path, count):
+def test_video_with_invalid_count_is_refused(tmp_path, count):
     record(tmp_path, ["000000"])
     film(tmp_path, 30.0)
     video = tmp_path / "videos" / f"{NAMES[0]}.avi"
     data = bytearray(video.read_bytes())
-    # The number of pictures in AVI's headers of the file and of its stream.
+    # The number of pictures is in the AVI headers of the file and of its stream.
     for header, place in ((b"avih", 24), (b"strh", 40)):
         begin = data.index(header) + place
         assert data[begin : begin + 4] == struct.pack("<I", 60)
         data[begin : begin + 4] = struct.pack("<I", count)
-    # Without its index nothing else tells the number.
+    # Remove the index, from which the number could be found.
     video.write_bytes(data[: data.index(b"idx1")])
     begin = time.process_time()
     with pytest.raises(
@@ -98,7 +98,7 @@ def test_a_video_that_lies_about_its_length_is_refused(tmp_path, count):
 @pytest.mark.parametrize(
     ("frames", "still", "left_out", "words"),
     [
-        # 9 precedes 10.
+        # Natural order: 9 before 10.
         ("8 9 10 11 12", (), [], None),
         (
             "1 2 3 4 5",
@@ -115,7 +115,7 @@ def test_a_video_that_lies_about_its_length_is_refused(tmp_path, count):
         ),
     ],
 )
-def test_faults_of_a_sequence_are_named(tmp_path, frames, still, left_out, words):
+def test_faults_of_a_sequence_are_reported(tmp_path, frames, still, left_out, words):
     scene = record(tmp_path, frames.split(), still)
     assert " ".join(scene.frames) == frames
     checked = check_scene(scene)
@@ -125,7 +125,7 @@ def test_faults_of_a_sequence_are_named(tmp_path, frames, still, left_out, words
     assert "dropped" not in "".join(check_scene(replace(scene, sequence=False)).warnings)
 
 
-def test_frames_that_a_camera_lacks(tmp_path):
+def test_missing_frames_of_a_camera_are_reported(tmp_path):
     record(tmp_path, [f"{k:02d}" for k in range(8)])
     for frame in ("02", "03", "05"):
         (tmp_path / "masks" / "right" / f"{frame}.png").unlink()
@@ -133,7 +133,7 @@ def test_frames_that_a_camera_lacks(tmp_path):
     assert "camera 'right' has 5 of 8 frames; it lacks 02-03, 05" in warning
 
 
-def test_numbers_with_and_without_zeros_are_the_same_frames(tmp_path):
+def test_leading_zeros_do_not_distinguish_frames(tmp_path):
     record(tmp_path, ["0001", "0002"])
     for frame in ("0001", "0002"):
         path = tmp_path / "masks" / "left" / f"{frame}.png"
@@ -144,7 +144,7 @@ def test_numbers_with_and_without_zeros_are_the_same_frames(tmp_path):
     assert scene.mask_path("left", "0002").name == "2.png"
 
 
-def test_misspelt_camera(tmp_path):
+def test_misspelt_camera_is_reported(tmp_path):
     record(tmp_path, ["1", "2"])
     (tmp_path / "masks" / "middle").rename(tmp_path / "masks" / "Midle")
     first, second = check_scene(load_scene(tmp_path)).warnings
@@ -153,7 +153,7 @@ def test_misspelt_camera(tmp_path):
     assert "camera 'middle' of cameras.yaml has no masks" in second
 
 
-def test_unreadable_masks_are_left_out_where_others_have_the_frame(tmp_path):
+def test_unreadable_masks_are_left_out_if_others_have_the_frame(tmp_path):
     record(tmp_path, ["1", "2", "3"])
     for frame in ("2", "3"):
         (tmp_path / "masks" / "left" / f"{frame}.png").write_bytes(b"")
@@ -170,7 +170,7 @@ def test_unreadable_masks_are_left_out_where_others_have_the_frame(tmp_path):
 
 
 @pytest.mark.parametrize(("turn", "name"), [([180.0, 0.0, 0.0], "-z"), ([0.0, 90.0, 0.0], "+x")])
-def test_world_that_does_not_stand(turn, name):
+def test_world_with_wrong_up_axis_is_reported(turn, name):
     cameras = list(circle_of_cameras(4, size=(160, 120), face_camera=False).values())
     assert check_upright(cameras) == ()
     X = np.eye(4)
@@ -179,7 +179,7 @@ def test_world_that_does_not_stand(turn, name):
     assert f"is the world's {name}," in warning
 
 
-def test_ranges():
+def test_consecutive_frames_become_ranges():
     known = [f"{k:02d}" for k in range(40)]
     assert frame_ranges(["03", "02", "07", "04"], known) == "02-04, 07"
     assert frame_ranges(known[::3], known) == "00, 03, 06, 09, 12, 15 and 8 more"

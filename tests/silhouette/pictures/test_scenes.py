@@ -27,7 +27,7 @@ def make_scene(folder):
     return folder
 
 
-def test_a_scene(tmp_path):
+def test_scene_has_cameras_frames_and_masks(tmp_path):
     scene = load_scene(make_scene(tmp_path))
     assert list(scene.cameras) == ["left", "right"]
     assert scene.frames == ("0001", "0002", "0003")
@@ -38,7 +38,7 @@ def test_a_scene(tmp_path):
     assert (scene.sequence, scene.frame_rate_hz) == (False, None)
 
 
-def test_names_that_do_not_exist(tmp_path):
+def test_errors_list_existing_names(tmp_path):
     scene = load_scene(make_scene(tmp_path))
     with pytest.raises(UnknownNameError, match=r"camera 'middle'.*left, right"):
         scene.mask_path("middle", "0001")
@@ -48,7 +48,7 @@ def test_names_that_do_not_exist(tmp_path):
         scene.cameras_of("9")
 
 
-def test_every_other_frame_of_a_sequence_is_twice_as_long(tmp_path):
+def test_every_second_frame_halves_the_frame_rate(tmp_path):
     save_cameras(tmp_path / "cameras.yaml", [camera("left")])
     (tmp_path / "masks" / "left").mkdir(parents=True)
     for k in range(7):
@@ -81,14 +81,14 @@ def test_every_other_frame_of_a_sequence_is_twice_as_long(tmp_path):
         ("{", "not a YAML file"),
     ],
 )
-def test_bad_settings(tmp_path, text, message):
+def test_invalid_settings_are_refused(tmp_path, text, message):
     make_scene(tmp_path)
     (tmp_path / "scene.yaml").write_text(text)
     with pytest.raises(SceneError, match=rf"scene\.yaml: .*{message}"):
         load_scene(tmp_path)
 
 
-def test_a_flat_folder_needs_one_camera(tmp_path):
+def test_flat_mask_folder_needs_one_camera(tmp_path):
     (tmp_path / "masks").mkdir()
     write_mask(tmp_path / "masks" / "0000.png", MASK)
     with pytest.raises(SceneError, match="exactly one camera"):
@@ -97,8 +97,7 @@ def test_a_flat_folder_needs_one_camera(tmp_path):
     np.testing.assert_array_equal(scene.read("a", "0000"), MASK)
 
 
-def test_masks_without_a_camera_file(tmp_path):
-    """They belong to parallel cameras of unknown scale, one for each size of picture."""
+def test_masks_without_camera_file_get_one_camera_per_size(tmp_path):
     (tmp_path / "masks").mkdir()
     for name in "ab":
         write_mask(tmp_path / "masks" / f"{name}.png", MASK)
@@ -113,7 +112,7 @@ def test_masks_without_a_camera_file(tmp_path):
     assert not load_scene(tmp_path, {large: camera(large)}).scale_unknown
 
 
-def test_what_is_missing_is_named(tmp_path):
+def test_errors_name_missing_parts(tmp_path):
     with pytest.raises(SceneError, match="nowhere: no such folder"):
         load_scene(tmp_path / "nowhere")
     with pytest.raises(SceneError, match="no folder masks"):
@@ -134,7 +133,7 @@ def test_what_is_missing_is_named(tmp_path):
         load_scene(tmp_path)
 
 
-def test_masks_must_fit_their_camera_however_often_they_are_read(tmp_path):
+def test_mask_size_is_checked_on_every_read(tmp_path):
     scene = load_scene(make_scene(tmp_path))
     for _ in range(3):
         np.testing.assert_array_equal(scene.read("left", "0001"), MASK)
@@ -147,7 +146,7 @@ def test_masks_must_fit_their_camera_however_often_they_are_read(tmp_path):
 
 
 @pytest.mark.parametrize("width", [30, 31])
-def test_pictures_have_their_cameras_size(tmp_path, width):
+def test_picture_size_must_match_the_camera(tmp_path, width):
     save_cameras(tmp_path / "cameras.yaml", [camera("left")])
     folder = tmp_path / "images" / "left"
     folder.mkdir(parents=True)

@@ -1,5 +1,8 @@
 """Search a body's pose in silhouettes without an initial guess.
 
+The objective J is the area of the exclusive or of projected body and silhouette, summed over the
+views [pixel]; E_total is J divided by the silhouettes' area.
+
 ``PaperSearch`` (Kameda's method) and ``BeamSearch`` search grids of joint values. The multi-start
 search (``MultiStartSearch``) returns continuous values, and ``RootPlacementSearch`` also the root's
 position or the camera's scale.
@@ -27,13 +30,8 @@ from drake_pose.search.pose_modes import (
     renderer_tolerance,
     samples_at,
 )
-from drake_pose.search.root_placement import (
-    RootPlacementSearch,
-    hub,
-    scale_camera,
-    slide_root,
-    turns_freely,
-)
+from drake_pose.search.root_placement import RootPlacementSearch, hub, turns_freely
+from drake_pose.search.root_places import scale_camera, slide_root
 from drake_pose.search.sampled_body import PoseSearch, SampledTree, Scoring
 from drake_pose.search.settings import BeamSearchSettings, ExactSearchSettings, PaperSearchSettings
 from drake_pose.search.views_fit import ViewsFit, covariance_pose_set

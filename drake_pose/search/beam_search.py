@@ -1,4 +1,6 @@
-"""Search the pose of minimum J on a grid by a beam search over partial poses.
+"""Search the pose of minimum objective J on a grid by a beam search over partial poses.
+
+J is the area in which projected body and silhouette differ, summed over the views [pixel].
 
 Nodes are placed one after another, and after each the hypotheses with the least expected objective
 are kept. The first stages allow only the tolerance outside the silhouette and end at a pose with J
@@ -42,9 +44,7 @@ def grow(
     """Place one more node in every partial pose and keep the best results.
 
     Args:
-        store: the poses of all nodes.
         partial: the partial poses that are extended.
-        node: the node that is placed.
         width: beam width: greatest number of partial poses that are kept.
         outside_weight: cost of a pixel outside, relative to the gain of a newly covered one.
         limit: partial poses are dropped if no completion can have an objective up to this [pixel].
@@ -92,7 +92,6 @@ class BeamSearch:
     """Estimates poses on a grid of joint values by a beam search.
 
     Args:
-        tree: the pose tree.
         settings: the grid and the stages of the search.
         examination: parameters of the proof of optimality and of the search for poses as good;
             None: the best pose alone is returned.
@@ -155,7 +154,6 @@ class BeamSearch:
         area outside the silhouette is still run.
 
         Args:
-            views: the silhouettes of one frame.
             root_position: (3,) the root's position [m]; None: that of the tree.
             count: greatest number of poses.
             overlap: two poses are alike if for every node the intersection over union of its
@@ -180,9 +178,6 @@ class _BeamRun:
     """One run of the beam search.
 
     Args:
-        body: the sampled body.
-        views: the silhouettes.
-        settings: the stages and limits.
         root_position: (3,) the root's position [m]; None: that of the tree.
         collect: whether all whole poses met are collected, for ``distinct``.
         all_within: whether all poses within the tolerance are enumerated first.
@@ -317,7 +312,6 @@ class _BeamRun:
         """Place nodes one after another.
 
         Args:
-            store: the poses of all nodes.
             partial: the partial poses that are extended.
             order: the nodes, in the order in which they are placed.
             width, outside_weight, limit: as in ``grow``.
@@ -367,7 +361,6 @@ class _BeamRun:
         outer half.
 
         Args:
-            store: the poses of all nodes.
             order: the nodes, in the order in which they are placed.
             poses: (nodes,) the pose of each node in the store.
             J: the objective of these [pixel].

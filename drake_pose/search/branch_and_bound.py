@@ -31,7 +31,6 @@ class Layer:
     """The edges of the graph that place one node, sorted by origin and sample.
 
     Args:
-        node: the node that is placed.
         origins: (m,) int64 states of this layer from which the edges start.
         samples: (m,) int64 samples of the node.
         ends: (m,) int64 states of the next layer at which the edges end.
@@ -186,10 +185,7 @@ def branch_and_bound(
     beyond the bands around the silhouettes, where they are added.
 
     Args:
-        body: the sampled body.
-        views: the silhouettes of one frame.
         J_limit: the greatest objective [pixel].
-        limits: limits of the search.
         kept_samples: (nodes,) samples of a pose that is kept even if there are too many.
     """
     return _BranchAndBound(body, views, J_limit, limits or BoundLimits(), kept_samples).run()

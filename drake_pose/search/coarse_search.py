@@ -1,14 +1,19 @@
-"""The coarse search: poses from which a continuous refinement has a chance.
+"""Find approximate poses on a coarse grid as starts of a continuous refinement.
 
-On a grid as coarse as is affordable, the pose nearest to the truth may show less of the silhouette
-than a wrong one: a thin limb half a step off leaves it altogether. So this search compares places,
-not areas, and lets a distance of less than half a step pass. It places one node after another and
-keeps thousands of hypotheses; of those whose nodes with children to come stand alike only the best,
-because their future is the same.
+On a coarse grid the pose nearest to the true one may cover less of the silhouette than a wrong one:
+a thin limb half a step off lies outside it. This search therefore compares distances instead of
+areas, and distances below about half a step cost nothing. Nodes are placed one after another, and
+thousands of hypotheses are kept. Of hypotheses in which all nodes with children still to be placed
+have nearly the same pose, only the best is kept, since the further search is the same.
 
-A node is a few balls that its picture surely covers; nothing is drawn. A ball outside the
-silhouette costs its part of the node's area, a ball partly outside costs a part of that. What a
-ball covers is looked up among points spread over the silhouette.
+A node is represented by a few inscribed balls; nothing is drawn. Each ball stands for an equal part
+A of the node's mean projected area. With the signed distance d of its centre from the silhouette's
+edge (positive outside), its projected radius r and the slack s, it costs
+
+    A clip((d + r - s) / (2 r), 0, 1),
+
+and it covers those of up to 256 points spread over the silhouette that are within about r + s of
+its centre.
 """
 
 import math
@@ -29,15 +34,21 @@ from drake_pose.workers import map_ordered
 
 
 class CoarseView(NamedTuple):
-    """One silhouette as the coarse search sees it.
+    """One silhouette with the lookup tables of the coarse search.
 
-    camera: (8,) kernel parameters; X_CW: (4, 4); origin: (2,) first row and column of the cover
-    [pixel]; cell: the side of the cover's cells [pixel]; radii: (levels,) [pixel], in equal steps;
-    cover: (levels, rows, columns, 4) uint64 the points of the silhouette within a radius of each
-    cell's middle; parts: how many distances are known along a cell's side; distances: (parts *
-    rows, parts * columns) float32 signed distance of each part's middle from the silhouette's edge,
-    positive outside [pixel]; point_area: what a point stands for [pixel]; slack: distances up to
-    this do not count [pixel].
+    Attributes:
+        camera: (8,) kernel parameters.
+        X_CW: (4, 4) pose of the world in the camera.
+        origin: (2,) row and column of the corner of the first cell of the cover [pixel].
+        cell: side of the cover's cells [pixel].
+        radii: (levels,) radii for which the cover is tabulated, equally spaced [pixel].
+        cover: (levels, rows, columns, 4) uint64 for each radius and cell the set of points of the
+            silhouette within that radius of the cell's centre, one bit for each point.
+        parts: number of distances along a cell's side.
+        distances: (parts * rows, parts * columns) float32 signed distance of each part's centre
+            from the silhouette's edge, positive outside [pixel].
+        point_area: silhouette area for which a point stands [pixel].
+        slack: distance that costs nothing [pixel].
     """
 
     camera: np.ndarray
@@ -53,10 +64,12 @@ class CoarseView(NamedTuple):
 
 
 class Balls(NamedTuple):
-    """A node's balls.
+    """The k inscribed balls of a node.
 
-    p_PB: (k, 3, n) float32 their centres in the parent's frame at each of n samples [m]; radii:
-    (k,) float32 [m]; area: what each stands for of the node's mean projected area [m^2].
+    Attributes:
+        p_PB: (k, 3, n) float32 their centres in the parent's frame at each of n samples [m].
+        radii: (k,) float32 their radii [m].
+        area: the part of the node's mean projected area for which each stands [m^2].
     """
 
     p_PB: np.ndarray
@@ -68,7 +81,13 @@ class Balls(NamedTuple):
 def fill_cover(
     cover: np.ndarray, points: np.ndarray, origin: np.ndarray, cell: float, radii: np.ndarray
 ) -> None:
-    """Writes CoarseView.cover of points (n, 2) row, column."""
+    """Write the table ``CoarseView.cover`` of points.
+
+    Args:
+        cover: (levels, rows, columns, words) uint64 zeros, written in place.
+        points: (n, 2) row and column of the points [pixel].
+        origin, cell, radii: as in ``CoarseView``.
+    """
     for level in range(cover.shape[0]):
         limit = radii[level] ** 2
         for i in range(cover.shape[1]):
@@ -89,10 +108,15 @@ def _project_ball(
     rows: np.ndarray,
     scales: np.ndarray,
 ) -> None:
-    """Writes where a ball is seen at all samples: (n,) columns and rows [cell], scales [pixel/m].
+    """Project a ball at all samples, in single precision and without branches, for SIMD.
 
-    The scale is 0 where it is not seen. Single precision, and no branches: the processor does many
-    samples at once.
+    Args:
+        view: the camera and its cells.
+        X_CP: (4, 4) pose of the node's parent in the camera.
+        p_PB: (3, n) the ball's centre in the parent's frame at all samples [m].
+        columns, rows: (n,) written: the centre's projection [cell].
+        scales: (n,) written: image scale at the centre [pixel/m]; 0 if it is outside the image or
+            behind the camera.
     """
     camera, one, least = view.camera, np.float32(1.0), np.float32(view.camera[5])
     focal_x = np.float32(camera[1] / view.cell)
@@ -123,16 +147,23 @@ def _project_ball(
 
 
 @compiled
-def _look_at_samples(
+def _score_node(
     view: CoarseView,
     X_CP: np.ndarray,
     balls: Balls,
-    seen: tuple[np.ndarray, np.ndarray, np.ndarray],
+    scratch: tuple[np.ndarray, np.ndarray, np.ndarray],
     costs: np.ndarray,
     covered: np.ndarray,
 ) -> None:
-    """Writes what a node at all samples costs (n,) [pixel] and covers (n, 4); scratch: ``seen``."""
-    seen_columns, seen_rows, scales = seen
+    """Write the cost of a node at all samples, and the points that it covers.
+
+    Args:
+        X_CP: (4, 4) pose of the node's parent in the camera.
+        scratch: three arrays (n,) that are overwritten.
+        costs: (n,) written: area outside the silhouette [pixel].
+        covered: (n, 4) uint64 written: the covered points.
+    """
+    ball_columns, ball_rows, scales = scratch
     zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
     tiny = np.float32(1e-9)
     slack, parts = np.float32(view.slack), np.float32(view.parts)
@@ -143,17 +174,17 @@ def _look_at_samples(
     costs[:] = zero
     covered[:] = np.uint64(0)
     for ball in range(balls.radii.shape[0]):
-        _project_ball(view, X_CP, balls.p_PB[ball], seen_columns, seen_rows, scales)
+        _project_ball(view, X_CP, balls.p_PB[ball], ball_columns, ball_rows, scales)
         for k in range(costs.shape[0]):
             scale = scales[k]
             if scale == zero:
                 continue
-            column, row = seen_columns[k], seen_rows[k]
+            column, row = ball_columns[k], ball_rows[k]
             radius = scale * balls.radii[ball]
-            share = one
+            fraction = one
             if zero <= column < columns and zero <= row < rows:
                 beyond = view.distances[int(row * parts), int(column * parts)] + radius - slack
-                share = max(zero, min(one, half * beyond / max(radius, tiny)))
+                fraction = max(zero, min(one, half * beyond / max(radius, tiny)))
                 level = int(
                     max(zero, min(np.float32(levels - 1), (radius + slack - least) * steps))
                 )
@@ -162,7 +193,7 @@ def _look_at_samples(
                 covered[k, 1] |= view.cover[level, i, j, 1]
                 covered[k, 2] |= view.cover[level, i, j, 2]
                 covered[k, 3] |= view.cover[level, i, j, 3]
-            costs[k] += scale * scale * area * share
+            costs[k] += scale * scale * area * fraction
 
 
 @compiled
@@ -174,19 +205,19 @@ def score_samples(
     outside_weight: float,
     scores: np.ndarray,
 ) -> np.ndarray:
-    """Adds what a node at all its samples would add to hypotheses in one view.
+    """Add to scores the cost of a node at all its n samples, for B hypotheses in one view.
 
     Args:
         X_CP: (B, 4, 4) poses of the node's parent in the camera.
         masks: (B, 4) uint64 the points that the hypotheses cover.
-        outside_weight: what a pixel outside counts; one newly covered counts -1.
-        scores: (B, n) added to [pixel].
+        outside_weight: cost of a pixel outside, relative to the gain of a newly covered one.
+        scores: (B, n) the costs, to which those of the node are added [pixel].
 
     Returns:
-        (B, n, 4) the points that the hypotheses would cover.
+        (B, n, 4) uint64 the points that the hypotheses cover with the node.
     """
     count = scores.shape[1]
-    seen = (
+    scratch = (
         np.empty(count, dtype=np.float32),
         np.empty(count, dtype=np.float32),
         np.empty(count, dtype=np.float32),
@@ -194,7 +225,7 @@ def score_samples(
     costs, covered = np.empty(count, dtype=np.float32), np.empty((count, 4), dtype=np.uint64)
     united = np.empty((X_CP.shape[0], count, 4), dtype=np.uint64)
     for h in range(X_CP.shape[0]):
-        _look_at_samples(view, X_CP[h], balls, seen, costs, covered)
+        _score_node(view, X_CP[h], balls, scratch, costs, covered)
         for k in range(count):
             gain = 0
             for word in range(4):
@@ -206,28 +237,33 @@ def score_samples(
 
 @dataclass(frozen=True)
 class CoarseSettings:
-    """Numbers of the coarse search; sizes are fractions of the root of the mean area."""
+    """Parameters of the coarse search; lengths in units of the root of the mean area, the size."""
 
-    hypotheses: int = 2500  # Kept after each node,
-    again: int = 300  # and where a limb of a pose is searched again.
-    evaluations: int = 150_000  # Fewer are kept where the next node would take more,
-    least_hypotheses: int = 64  # but not fewer than this.
-    spares: tuple[int, ...] = (2, 8)  # Hypotheses compared for likeness, times those kept.
-    together: int = 5000  # Samples that a worker scores at once.
-    outside_weight: float = 0.8  # Cost of a pixel outside; one newly covered gains one.
-    slack: float = 0.05  # Distances up to this do not count.
-    alike: float = 0.04  # Frames stand alike if nearer [fraction of the body's reach].
-    cells: float = 40.0  # Of a cover, along the size.
-    most_cells: int = 500  # Rows and columns of a cover: 80 MB.
-    parts: int = 4  # Of a cell's side, whose distances are known.
-    nearer: float = 0.7  # Nodes come nearer to a camera than the root by this factor.
+    hypotheses: int = 2500  # Hypotheses kept after each node,
+    hypotheses_again: int = 300  # and when a limb of a pose is searched again.
+    evaluations: int = 150_000  # Fewer are kept if the next node would need more evaluations,
+    least_hypotheses: int = 64  # but at least this number.
+    # Hypotheses compared for equality, as multiples of those kept; the second if the first leaves
+    # too few.
+    spares: tuple[int, ...] = (2, 8)
+    batch: int = 5000  # Number of samples scored at a time by a worker.
+    outside_weight: float = 0.8  # Cost of a pixel outside, relative to the gain of a covered one.
+    slack: float = 0.05  # Distance from the silhouette that costs nothing.
+    same: float = 0.04  # Poses of frames are equal below this distance [fraction of body's reach].
+    cells: float = 40.0  # Number of cells of a cover along the silhouettes' size.
+    most_cells: int = 500  # Greatest number of rows or columns of a cover, which has 80 MB then.
+    parts: int = 4  # Number of distances along a cell's side.
+    nearest: float = 0.7  # Least distance of nodes from a camera, as a fraction of the root's.
 
 
 @dataclass(frozen=True)
 class CoarsePoses:
-    """Poses on the grid, best first: X_WN (n, nodes, 4, 4), costs (n,), comparable in one search.
+    """Poses of the grid, best first.
 
-    ``samples``: (n, nodes) of each node; -1 where it was not searched.
+    Args:
+        samples: (n, nodes) samples of all nodes; -1 for nodes that were not searched.
+        X_WN: (n, nodes, 4, 4) poses of the nodes.
+        costs: (n,) costs [pixel], comparable within one search.
     """
 
     samples: np.ndarray
@@ -239,7 +275,15 @@ class CoarsePoses:
 
 
 class CoarseSearch:
-    """Finds coarse poses of a sampled body in views of one instant."""
+    """Searches approximate poses of a sampled body in the views of one frame.
+
+    Attributes:
+        views: the silhouettes with their lookup tables.
+        balls: each node's balls.
+
+    Args:
+        hypotheses: number of hypotheses kept after each node; None: that of the settings.
+    """
 
     def __init__(
         self,
@@ -271,16 +315,17 @@ class CoarseSearch:
         ]
 
     def _prepare(self, view: View, levels: int = 10) -> CoarseView:
-        """A silhouette as the coarse search sees it, with points within ``levels`` radii."""
+        """Return a silhouette with its lookup tables; ``levels``: number of tabulated radii."""
         own, body = self._settings, self.body
         points = spread_points(view.mask)
         slack, least_cell = own.slack * self._size, max(1.0, self._size / own.cells)
         largest = max(max((float(r.max(initial=0.0)) for r in body.ball_radii), default=0.0), 1e-6)
-        # No ball counts whose middle is outside the picture, and one as large as it covers all.
+        # Balls with their centre outside the image do not count, and a ball as large as the image
+        # covers all points, so larger radii are not needed.
         scale = float(view.camera.kernel_parameters()[1])
         if not isinstance(view.camera, ParallelCamera):
             nearest = float(body.root_distances(view.camera).min())
-            scale /= max(1e-6, own.nearer * nearest)
+            scale /= max(1e-6, own.nearest * nearest)
         reach = min(largest * scale, math.hypot(*view.mask.shape)) + slack
         radii = np.linspace(0.15, 1.0, levels) * reach
         origin = np.maximum(points.min(axis=0) - reach, -1.0)
@@ -290,14 +335,14 @@ class CoarseSearch:
         parts = max(1, min(own.parts, round(cell)))
         cover = np.zeros((levels, rows, columns, 4), dtype=np.uint64)
         fill_cover(cover, points, origin, cell, radii)
-        # Signed distances in the middles of the cells' parts.
+        # Signed distances at the centres of the cells' parts.
         counts = zip(origin, (parts * rows, parts * columns), view.mask.shape, strict=True)
         places = [
             np.clip(np.rint(first + cell / parts * (np.arange(n) + 0.5)), 0, size - 1).astype(int)
             for first, n, size in counts
         ]
-        # What is nearest to a place lies between the places, the silhouette and what is just beside
-        # it.
+        # Distances are computed only in a window that contains the places and the silhouette with a
+        # margin of a pixel: the nearest edge of any place lies in it.
         left, top, width, height = cv2.boundingRect(view.mask.view(np.uint8))
         boxes = zip(places, (top, left), (top + height, left + width), strict=True)
         window = [
@@ -319,26 +364,30 @@ class CoarseSearch:
         )
 
     def find(self) -> CoarsePoses:
-        """Search all nodes."""
+        """Return the best poses of all nodes."""
         nodes = range(len(self._nodes))
         start = np.tile(np.eye(4), (len(self._nodes), 1, 1))
         return self._find(start, set(nodes), self._hypotheses)
 
     def find_again(self, X_WN: np.ndarray, again: Sequence[int]) -> CoarsePoses:
-        """Search some nodes of a pose X_WN (nodes, 4, 4) again, with all their descendants."""
-        return self._find(X_WN, set(again), self._settings.again)
+        """Search some nodes again, with the others at X_WN (nodes, 4, 4).
+
+        ``again``: these nodes, with all their descendants.
+        """
+        return self._find(X_WN, set(again), self._settings.hypotheses_again)
 
     def _find(self, start: np.ndarray, wanted: set[int], hypotheses: int) -> CoarsePoses:
+        """Return the best poses of the wanted nodes, with the others at ``start``, as X_WN."""
         nodes, weight = self._nodes, self._settings.outside_weight
         poses = CoarsePoses(np.full((1, len(nodes)), -1), start[None].copy(), np.zeros(1))
         masks = [np.zeros((1, 4), dtype=np.uint64) for _ in self.views]
         placed = set(range(len(nodes))) - wanted
         for node in placed:
-            # What one hypothesis covers together with a node that has its place.
-            still = self.balls[node]._replace(p_PB=_by_ball(self._p_NB[node][None]))
+            # Add the points that a node with a fixed pose covers.
+            fixed = self.balls[node]._replace(p_PB=_by_ball(self._p_NB[node][None]))
             for k, view in enumerate(self.views):
                 X_CN = (view.X_CW @ start[node])[None]
-                united = score_samples(view, X_CN, still, masks[k], weight, np.zeros((1, 1)))
+                united = score_samples(view, X_CN, fixed, masks[k], weight, np.zeros((1, 1)))
                 masks[k] = united[:, 0]
         for node in self.body.limb_order:
             if node in wanted:
@@ -347,9 +396,13 @@ class CoarseSearch:
         return poses
 
     def choose_distinct(self, poses: CoarsePoses, count: int, apart: float) -> CoarsePoses:
-        """The best poses some ball of which is seen apart from where it is in any better one.
+        """Return the best poses that differ visibly from all better ones.
 
-        ``apart``: in some view, as a share of the root of the silhouettes' area.
+        Args:
+            poses: the poses, best first.
+            count: greatest number of poses that are returned.
+            apart: poses differ if, in some view, the projection of some ball is farther than this
+                from that in the other pose [root of the silhouettes' mean area].
         """
         marks = [
             np.vstack([p_NB.mean(axis=0), p_NB[0]]) @ np.swapaxes(X[:, :3, :3], 1, 2)
@@ -359,7 +412,7 @@ class CoarseSearch:
         ]
         p_WB = np.concatenate(marks, axis=1).reshape(-1, 3)
         places = [camera.project(p_WB)[0].reshape(len(poses), -1) for camera in self._cameras]
-        # What is behind a camera is nowhere near.
+        # Points behind a camera have no projection: they get a far one.
         together = np.nan_to_num(np.hstack(places), nan=1e9)
         chosen: list[int] = []
         left = np.arange(len(together))
@@ -378,7 +431,16 @@ class CoarseSearch:
         placed: set[int],
         hypotheses: int,
     ) -> tuple[CoarsePoses, list[np.ndarray]]:
-        """Place one more node in every hypothesis and keep the best."""
+        """Place one more node in every hypothesis and keep the best.
+
+        Args:
+            masks: for each view (B, 4) uint64 the points that the hypotheses cover.
+            placed: the nodes that are placed, this one included.
+            hypotheses: greatest number that is kept.
+
+        Returns:
+            The new hypotheses, and the points that they cover.
+        """
         own, balls, X_PN = self._settings, self.balls[node], self.body.sampled.X_PN[node]
         parent = self._nodes[node].parent
         X_WP = np.tile(np.eye(4), (len(poses), 1, 1)) if parent < 0 else poses.X_WN[:, parent]
@@ -392,12 +454,12 @@ class CoarseSearch:
                 for view, X_CP, mask in zip(self.views, X_CPs, masks, strict=True)
             ]
 
-        step = max(1, own.together // len(X_PN))
+        step = max(1, own.batch // len(X_PN))
         parts = [slice(k, k + step) for k in range(0, len(poses), step)]
         united = [np.concatenate(one) for one in zip(*map_ordered(score, parts), strict=True)]
         costs = (poses.costs[:, None] + added).ravel()
         if self.body.sampled.tree.source(node) == parent:
-            # No other sample than its parent's.
+            # A node whose joints mimic its parent's takes the parent's sample.
             costs[(np.arange(len(X_PN)) != poses.samples[:, parent, None]).ravel()] = np.inf
         following = [i for i in self.body.limb_order if i not in placed]
         widest = len(self.body.sampled.X_PN[following[0]]) if following else 1
@@ -409,7 +471,7 @@ class CoarseSearch:
             best = best[np.lexsort((best, costs[best]))]
             of, sample = best // len(X_PN), best % len(X_PN)
             X_WN = X_WP[of] @ X_PN[sample]
-            kept = self._unlike(poses.X_WN, of, node, X_WN, placed)[:width]
+            kept = self._distinct(poses.X_WN, of, node, X_WN, placed)[:width]
             if pool == possible or len(kept) == width:
                 break
         of, sample = of[kept], sample[kept]
@@ -419,12 +481,18 @@ class CoarseSearch:
             one[of, sample] for one in united
         ]
 
-    def _unlike(
+    def _distinct(
         self, X_WN: np.ndarray, of: np.ndarray, node: int, own: np.ndarray, placed: set[int]
     ) -> np.ndarray:
-        """Indices of the poses whose open nodes stand unlike those of any better pose.
+        """Return indices of the hypotheses whose open nodes differ in pose from all better ones.
 
-        Each is that of ``X_WN`` that ``of`` says, but for a node's own pose (n, 4, 4).
+        Open nodes have children that are still to be placed.
+
+        Args:
+            X_WN: (B, nodes, 4, 4) poses before the node was placed.
+            of: (n,) index into these of each new hypothesis, best first.
+            own: (n, 4, 4) poses of the node that was placed.
+            placed: the nodes that are placed, this one included.
         """
         is_open = [i for i in sorted(placed) if not placed.issuperset(self._nodes[i].children)]
         if not is_open:
@@ -434,20 +502,20 @@ class CoarseSearch:
             X = own if i == node else X_WN[of, i]
             p = X[:, :3, 3]
             points += [p, p + lever * X[:, :3, 0], p + lever * X[:, :3, 2]]
-        side = self._settings.alike * self._reach
+        side = self._settings.same * self._reach
         cells = np.rint(np.hstack(points) / side).astype(np.int64)
-        # Any odd numbers will do; always the same, so that answers are.
+        # The keys of the hash are odd, and the seed is fixed so that results are repeatable.
         keys = np.random.default_rng(2718).integers(1, 2**62, cells.shape[1]) | 1
         return np.sort(np.unique((cells * keys).sum(axis=1), return_index=True)[1])
 
 
 def _by_ball(p_PB: np.ndarray) -> np.ndarray:
-    """(k, 3, n) float32 of centres (n, k, 3)."""
+    """Return centres (n, k, 3) of balls as (k, 3, n) float32."""
     return np.ascontiguousarray(p_PB.transpose(1, 2, 0), dtype=np.float32)
 
 
 def spread_points(mask: np.ndarray, most: int = 256) -> np.ndarray:
-    """At most ``most`` points (n, 2) row, column of a mask, evenly spread; at least one."""
+    """Return from 1 to ``most`` points (n, 2) row, column, evenly spread over a mask (H, W)."""
     step = max(1.0, math.sqrt(np.count_nonzero(mask) / most))
     while True:
         rows = np.arange(0.5 * (step - 1.0), mask.shape[0] - 0.5, step)

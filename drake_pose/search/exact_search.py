@@ -47,7 +47,6 @@ class ExactSearch:
 
     Args:
         grids: beam searches on grids of 20 and of 15 degrees, which the settings' stages refer to.
-        settings: parameters; None: the defaults.
     """
 
     def __init__(
@@ -64,7 +63,6 @@ class ExactSearch:
         """Return the best pose found.
 
         Args:
-            problem: the silhouettes.
             root_position: (3,) the root's position [m]; None: that of the tree.
             deadline: time.perf_counter() at which the search ends [s].
 
@@ -170,11 +168,9 @@ def find_intervals(
     drawn bodies 99 % of the intervals around the true optimum contained the true value.
 
     Args:
-        problem: the silhouettes.
         others: (m + 4,) each: alternative poses that are as good, best first.
         parameters: (m + 4,) the best pose, refined.
         tree: the pose tree, with its root where the body is; None: the body's.
-        settings: parameters; None: the defaults.
 
     Returns:
         The set, with the best pose as the representative of the first mode.

@@ -42,7 +42,6 @@ class PaperSearch:
     """Estimates poses on a grid of joint values by the paper's search.
 
     Args:
-        tree: the pose tree.
         settings: the grid and the paper's parameters; None: the defaults.
     """
 
@@ -85,8 +84,6 @@ class PaperRun:
     """One run of the search with a fixed threshold r.
 
     Args:
-        scoring: the sampled tree and the silhouettes.
-        settings: the paper's parameters.
         outside_limit: the threshold r in each view [pixel].
         runs: number of runs of step 3 before this run.
 

@@ -1,11 +1,14 @@
-"""Multi-start search: from silhouettes, also damaged or ill fitting, to continuous positions.
+"""Estimate continuous joint positions from silhouettes by a multi-start search.
 
-Poses that are roughly right are found by places (``coarse_search``) and drawn to the silhouettes'
-edges by saturating costs (``fit``). Where the best of them meets most of the masks' border to the
-pixel, masks are exact and searched by pixels (``exact_search``): a pose that leaves hardly a pixel
-wrong ends the search. Otherwise other explanations are sought about the best poses: a limb searched
-again, joints that turn against each other (``self_motions``). Where a piece as thick as a limb is
-left unexplained, a beam search by areas gives other starts.
+1. ``coarse_search`` finds approximate poses on a grid, and the robust fit (``views_fit``) refines
+   the best of them. Masks may be damaged, and the model may fit only approximately.
+2. If the border of the best pose coincides with most of the masks' border, the masks may be exact:
+   ``exact_search`` refines poses by pixels. A pose that leaves hardly a pixel wrong is the answer.
+3. Otherwise alternative poses around the best ones are tried: limbs searched again, and
+   ``self_motions``. If a wrong region as thick as a limb remains, the poses of a beam search are
+   further starts.
+4. Modes and intervals of the joints are computed (``RobustModes``, or ``find_intervals`` for exact
+   masks).
 """
 
 import copy
@@ -45,12 +48,13 @@ from drake_pose.workers import map_ordered
 
 
 class MultiStartSearch:
-    """Matches silhouettes with a pose tree at continuous values.
+    """Estimates poses with continuous values by a multi-start search.
 
     Args:
-        time_limit: of a match [s]; None: none.
-        exact_masks: whether masks are known to be exact, as Drake's label images are. Else a fitted
-            pose tells; where it is far off, exact masks may be taken for damaged ones.
+        time_limit: greatest time of a match [s]; None: no limit.
+        exact_masks: whether masks are known to be exact, like Drake's label images. If not, this is
+            decided by a fitted pose; if that pose is wrong, exact masks may be taken for damaged
+            ones.
     """
 
     def __init__(
@@ -71,22 +75,22 @@ class MultiStartSearch:
 
     @cached_property
     def beam(self) -> BeamSearch:
-        """The search by areas that gives other starts."""
+        """The beam search that gives further starts."""
         return BeamSearch(self.tree, BeamSearchSettings(stages=TOLERANT_STAGES))
 
     @cached_property
     def exact(self) -> ExactSearch:
-        """The search where masks are exact."""
+        """The search in exact masks."""
         return ExactSearch((self.beam, self._grid), self.exact_settings)
 
     def without_alternatives(self) -> "MultiStartSearch":
-        """The same search where only E_total is wanted: one round, and no set of poses."""
+        """Return the same search without alternative poses and without a pose set."""
         other = copy.copy(self)
         other._alternatives = False
         return other
 
     def with_time_limit(self, seconds: float) -> "MultiStartSearch":
-        """The same search with a limit on the time of a match [s], or with its own if shorter."""
+        """Return the same search with a time limit of a match [s]; a shorter own limit is kept."""
         other = copy.copy(self)
         other._time_limit = min(
             seconds, math.inf if other._time_limit is None else other._time_limit
@@ -97,7 +101,7 @@ class MultiStartSearch:
         """Estimate the pose that the views show; see ``PoseSearch``.
 
         Returns:
-            The best pose found. ``stopped_by`` is "end" if all was tried, or "time_limit".
+            The best pose found; ``stopped_by`` is "end" or "time_limit".
 
         Raises:
             SettingsError: if there is no view.
@@ -117,40 +121,47 @@ class MultiStartSearch:
         tracked: PoseEstimate,
         views: Sequence[View],
         root_position: np.ndarray | None = None,
-        begun: PoseEstimate | None = None,
+        first: PoseEstimate | None = None,
     ) -> PoseEstimate:
-        """A pose that was tracked, with what its silhouettes say of each joint; no other is sought.
+        """Return a tracked pose with the intervals of its joints; no alternative is searched.
 
-        As sure as if each instant stood alone: what masks and cameras err by stays from one to the
-        next, so that many of them tell little more.
+        The intervals are those of a single frame: the errors of masks and cameras are similar in
+        successive frames, so further frames add little information.
 
         Args:
-            begun: the answer that the track began with. Where it had several modes, they move
-                along: a joint that it left open stays open.
+            tracked: the pose.
+            root_position: (3,) the root's position [m]; None: that of the tree.
+            first: the pose with which the track began. If it has several modes, joints that are
+                ambiguous in it stay ambiguous.
         """
         _, fit, _ = self._fit(views, root_position)
         values = self._kinematics.flatten(tracked.node_values)
         found = RobustModes(fit, lambda: True).around(values, tracked.J)
-        return replace(tracked, pose_set=found).widened(begun)
+        return replace(tracked, pose_set=found).widened(first)
 
     def _fit(
         self, views: Sequence[View], root_position: np.ndarray | None
     ) -> tuple[SampledBody, ViewsFit, list[View]]:
-        """The body with its root where it is, its fit, and the views without specks."""
+        """Return the body with its root in place, the fit, and the views without specks."""
         clean = [View(view.camera, without_specks(view.mask)) for view in views]
         body, kinematics = self._body, self._kinematics
         if root_position is not None:
             body = body.with_root_position(root_position)
             kinematics = TreeKinematics(body.sampled.tree)
-        # In one view women and men are fitted worse with them.
+        # In a single view, poses of people are fitted worse with rough surfaces.
         rough = self._rough if len(clean) > 1 else None
         return body, ViewsFit(kinematics, self._outlines, clean, rough), clean
 
 
 class _MultiStartRun:
-    """One match of a body, sampled roughly, with clean silhouettes, until a deadline.
+    """One match.
 
-    Answers are judged by the silhouettes as they were given.
+    Args:
+        fit: the robust fit to the clean views.
+        clean: the views without specks.
+        views: the views as they were given; J is computed from these.
+        root_position: (3,) the root's position [m]; None: that of the tree.
+        deadline: time.perf_counter() at which the search ends [s].
     """
 
     def __init__(
@@ -174,8 +185,13 @@ class _MultiStartRun:
         self._survivors = self._passes[-1][1]
         self._done: list[np.ndarray] = []
 
-    def search(self, rounds: int, as_set: bool) -> PoseEstimate:
-        """Look for a pose by pixels, else for a robust one, and for all that are as good."""
+    def search(self, rounds: int, with_set: bool) -> PoseEstimate:
+        """Search the pose, by pixels if the masks are exact, else by the robust fit.
+
+        Args:
+            rounds: number of rounds of the search for alternative poses.
+            with_set: whether the pose set is computed.
+        """
         tree, exact, own = self._kinematics.tree, self._search.exact, self._search.exact_settings
         problem, found, poses = self._problem, None, list[FittedPose]()
         exactly = own.exact * problem.border_length
@@ -192,10 +208,10 @@ class _MultiStartRun:
             if looks_exact and (found is None or found.J > exactly):
                 found = self._refine_by_pixels(found, poses[0].values)
         begin, pose_set = time.perf_counter(), None
-        # Before the modes, whose evaluations are not the search's.
+        # Evaluations for the pose set, which come later, are not counted.
         steps = self._fit.evaluations
         if found is not None and found.J <= exactly:
-            if as_set:
+            if with_set:
                 found, pose_set = exact.modes(problem, found, tree)
             values = found.parameters[:-4]
             steps += found.steps
@@ -204,7 +220,7 @@ class _MultiStartRun:
                 by_pixels = self._kinematics.nearest_turns(found.parameters[:-4])
                 poses = distinct([FittedPose(by_pixels, -math.inf), *poses], len(poses))
             values = poses[0].values
-            if as_set:
+            if with_set:
                 pose_set = RobustModes(self._fit, self._proceed).find(poses, self._J)
         seconds = time.perf_counter() - begin
         return PoseEstimate.of_values(
@@ -220,9 +236,9 @@ class _MultiStartRun:
         )
 
     def _refine_by_pixels(self, found: ExactPose | None, values: np.ndarray) -> ExactPose | None:
-        """The better of a pose and values (m,) improved by pixels, if it explains the masks.
+        """Return the better of a pose and values (m,) refined by pixels.
 
-        None where neither does, or the values fit better as they are.
+        None if neither explains the masks, or if J at the values as they are is smaller.
         """
         exact, own, J = self._search.exact, self._search.exact_settings, self._J(values)
         length = self._problem.border_length
@@ -233,15 +249,15 @@ class _MultiStartRun:
         return found if explained else None
 
     def _begin(self) -> list[FittedPose]:
-        """The coarse search's poses, refined but not to the end, best first."""
+        """Return the poses of the coarse search, refined but for the final stage, best first."""
         own = self._settings
         self._coarse = CoarseSearch(self._body, self._clean.views, None if self._proceed() else 1)
         starts = self._coarse.choose_distinct(self._coarse.find(), own.starts, own.separation)
         return refine_best(self._fit, self._values(starts), self._passes, self._proceed)
 
     def _looks_exact(self, values: np.ndarray) -> bool:
-        """Whether masks may be exact: much of their border is that of the body at values (m,)."""
-        # What specks hide is not exact.
+        """Return whether masks may be exact: the border of the body at values (m,) coincides."""
+        # Masks with many specks are not exact.
         if self._clean is not self._problem or not self._proceed():
             return False
         if self._search.exact_masks:
@@ -258,14 +274,17 @@ class _MultiStartRun:
         return met >= self._search.exact_settings.coinciding * length
 
     def _search_robustly(self, pool: list[FittedPose], rounds: int) -> list[FittedPose]:
-        """The best poses by robust costs, from some that are not refined to the end."""
+        """Return the best poses by robust costs, refined to the end.
+
+        ``pool``: poses refined by all stages but the final; ``rounds``: as in ``search``.
+        """
         own, turns = self._settings, self._kinematics.turns_around
         pool = self._explore(pool, rounds)
         refined = self._finish(pool)
-        contradicting = self._contradicting(refined[0].values)
-        if contradicting and self._proceed():
+        unexplained = self._unexplained_views(refined[0].values)
+        if unexplained and self._proceed():
             left = max(0.0, self._deadline - time.perf_counter())
-            views = [coarsen(view, own.beam_pixels) for view in contradicting[: own.beam_views]]
+            views = [coarsen(view, own.beam_pixels) for view in unexplained[: own.beam_views]]
             by_areas = self._search.beam.best_poses(
                 views, self._root_position, own.beam_starts, time_limit=left
             )
@@ -279,7 +298,7 @@ class _MultiStartRun:
         ]
 
     def _explore(self, pool: list[FittedPose], rounds: int) -> list[FittedPose]:
-        """The best poses, with other explanations sought about them in some rounds."""
+        """Return the best poses after rounds of the search for alternatives around them."""
         own = self._settings
         for _ in range(rounds):
             found = []
@@ -287,7 +306,7 @@ class _MultiStartRun:
                 if any(pose.values is values for values in self._done) or not self._proceed():
                     continue
                 self._done.append(pose.values)
-                others = self._others(pose.values)
+                others = self._alternatives_to(pose.values)
                 found += others
                 least = min((one.cost for one in others), default=math.inf)
                 if self._several and least > own.improvement * pool[0].cost:
@@ -296,43 +315,45 @@ class _MultiStartRun:
         return pool
 
     def _finish(self, pool: Sequence[FittedPose]) -> list[FittedPose]:
-        """The best poses, refined to the end."""
+        """Return the best poses, refined by the final stage."""
         own = self._settings
         values = [pose.values for pose in pool[: own.finalists]]
         return refine_best(self._fit, values, [(own.final, own.finalists)], self._proceed)
 
-    def _contradicting(self, values: np.ndarray) -> list[View]:
-        """The views, worst first, where a disc as thick as a limb fits into what is wrong at (m,).
+    def _unexplained_views(self, values: np.ndarray) -> list[View]:
+        """Return all views, worst first, if a limb seems misplaced at values (m,), else none.
 
-        Of several views half at least show where a limb is and should not be, and half where it is
-        not; in a single one other parts may hide either. What masks lack, or have besides, is not
-        mended by another start: then there is none.
+        A limb is misplaced if a disc as thick as a limb fits into the mismatch: in several views,
+        outside the masks in at least half of them and inside in at least half. A defect of the
+        masks has only one of these, and another start would not help. In a single view either
+        suffices, since other parts may hide the second.
         """
-        share = self._settings.limb_radii[self._several]
-        radius, thick, wrongs = max(1.0, share * self._fit.size), np.zeros(2, dtype=np.int64), []
+        radius = max(1.0, self._settings.limb_radii[self._several] * self._fit.size)
+        thick, areas = np.zeros(2, dtype=np.int64), []
         views = self._clean.views
         for wrong, view in zip(self._clean.mismatch(self._parameters(values)), views, strict=True):
             for side, one in enumerate((wrong & ~view.mask, wrong & view.mask)):
                 distances = cv2.distanceTransform(one.astype(np.uint8), cv2.DIST_L2, 5)
                 thick[side] += distances.max() > radius
-            wrongs.append(np.count_nonzero(wrong))
+            areas.append(np.count_nonzero(wrong))
         half = 2 * thick >= len(views)
         is_wrong = half.all() if self._several else thick.any()
-        return [views[k] for k in np.argsort(wrongs)[::-1]] if is_wrong else []
+        return [views[k] for k in np.argsort(areas)[::-1]] if is_wrong else []
 
     def _proceed(self) -> bool:
+        """Return whether there is time left."""
         if time.perf_counter() < self._deadline:
             return True
         self._stopped_by = "time_limit"
         return False
 
-    def _others(self, values: np.ndarray) -> list[FittedPose]:
-        """Other explanations near a pose, refined."""
+    def _alternatives_to(self, values: np.ndarray) -> list[FittedPose]:
+        """Return refined alternatives to a pose (m,): flips, counter-turns, limbs placed anew."""
         kinematics, own = self._kinematics, self._settings
         flipped = [flip.values for flip in flips(kinematics, values)]
         tried = counter_turns(kinematics, values, own.interval)
         X_WN = kinematics.poses(values)
-        # The subtrees of no more than half of the nodes, which follow no node before them.
+        # Limbs are subtrees of at most half of the nodes whose joint does not mimic another.
         tree = kinematics.tree
         below = [one for one in tree.subtrees if tree.source(one[0]) == one[0]]
 
@@ -344,23 +365,26 @@ class _MultiStartRun:
 
         limbs = [one for one in below if 2 * len(one) <= len(X_WN)]
         tried += itertools.chain.from_iterable(map_ordered(search_again, limbs))
-        look = AnnealingStage(own.medium[0].scale, own.coarse[0].spacing)
-        best_looks = []
+        stage = AnnealingStage(own.medium[0].scale, own.coarse[0].spacing)
+        best: list[FittedPose] = []
         for group, count in ((flipped, own.flipped), (tried, own.alternatives)):
-            costs = map_ordered(lambda one: self._fit.cost(one, look), group)
-            looks = [FittedPose(*pair) for pair in zip(group, costs, strict=True)]
-            best_looks += distinct(looks, count, kinematics.turns_around, 0.5 * own.interval)
-        followed = [one.values for one in best_looks]
+            costs = map_ordered(lambda one: self._fit.cost(one, stage), group)
+            scored = [FittedPose(*pair) for pair in zip(group, costs, strict=True)]
+            best += distinct(scored, count, kinematics.turns_around, 0.5 * own.interval)
+        starts = [one.values for one in best]
         if self._several:
-            return refine_best(self._fit, followed, own.alternative_passes, self._proceed)
+            return refine_best(self._fit, starts, own.alternative_passes, self._proceed)
 
-        def follow(one: np.ndarray) -> FittedPose | None:
+        def refine(one: np.ndarray) -> FittedPose | None:
             return self._fit.refine(one, own.medium) if self._proceed() else None
 
-        return [one for one in map_ordered(follow, followed) if one is not None]
+        return [one for one in map_ordered(refine, starts) if one is not None]
 
     def _values(self, coarse: CoarsePoses, values: np.ndarray | None = None) -> list[np.ndarray]:
-        """All values (m,) of coarse poses; those of nodes not searched are taken from values."""
+        """Return the values (m,) of each coarse pose.
+
+        ``values``: (m,) the values of nodes that were not searched.
+        """
         grids = self._body.sampled.values
         base = np.zeros(len(self._kinematics.names)) if values is None else values
         found = []
@@ -373,17 +397,17 @@ class _MultiStartRun:
         return found
 
     def _parameters(self, values: np.ndarray) -> np.ndarray:
-        """The parameters (m + 4,) of a refinement by pixels at values (m,)."""
+        """Return the parameters (m + 4,) of a refinement by pixels at values (m,)."""
         own = self._kinematics.split(values)
         return self._search.exact.body.parameters(own, self._root_position)
 
     def _J(self, values: np.ndarray) -> float:
-        """The objective (1) at values (m,), skin included [pixel]."""
+        """Return the objective (1) at values (m,), skin included [pixel]."""
         return float(self._problem.J(self._parameters(values)))
 
 
 def small_match() -> tuple[PoseTree, View]:
-    """A small body and picture, by which kernels are compiled."""
+    """Return a small body and a view, with which all kernels are compiled quickly."""
     tree = load_model(bundled_model("two_finger_hand"), check=False).pose_tree()
     camera = ParallelCamera("warm-up", 64, 64, 300.0, 32.0, 32.0, np.eye(4))
     return tree, View(camera, cv2.circle(np.zeros((64, 64), np.uint8), (32, 32), 16, 1, -1) > 0)
@@ -391,24 +415,24 @@ def small_match() -> tuple[PoseTree, View]:
 
 @functools.cache
 def warm_up() -> None:
-    """Compile or load a search's kernels, by a match of a small body: not in a match's time."""
+    """Compile or load the kernels of a search, so that a match with a time limit does not."""
     tree, view = small_match()
     MultiStartSearch(tree).match([view])
 
 
 def without_specks(mask: np.ndarray, largest: int = 6, least: float = 0.02) -> np.ndarray:
-    """A mask (H, W) without salt and pepper noise, not emptied; with few specks it stays as it is.
+    """Remove salt-and-pepper noise from a mask by a median filter.
 
-    A median over 5 x 5 pixels takes specks away, but also what is thinner than three pixels, so it
-    is only used where specks are many.
+    The median over 5 x 5 pixels also removes structures thinner than three pixels, so masks with
+    few specks are returned unchanged. A mask that the filter would empty is, too.
 
     Args:
-        largest: connected pixels, or holes, no larger than this are specks [pixel].
-        least: masks are left alone whose specks have a smaller share of the silhouette's area.
+        largest: greatest area of a speck: a 4-connected component or hole [pixel].
+        least: least area of all specks for the mask to be filtered, as a fraction of the mask's.
     """
     inside = mask.astype(np.uint8)
     left, top, width, height = cv2.boundingRect(inside)
-    # Around this window, which is wider than a speck, there are none.
+    # Outside the mask's bounding box, enlarged by the size of a speck, there are no specks.
     window = inside[max(0, top - largest - 1) : top + height + largest + 1]
     window = window[:, max(0, left - largest - 1) : left + width + largest + 1]
     specks = 0

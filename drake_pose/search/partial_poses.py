@@ -75,8 +75,6 @@ class SilhouetteBits:
         all_pixels: (w,) uint64 bit mask of all pixels of the silhouettes.
 
     Args:
-        body: the sampled body.
-        views: the silhouettes.
         band: width of the bands [pixel]; 0: no bands.
         in_full: whether surfaces are never simplified, so that areas are exact.
     """
@@ -108,7 +106,6 @@ class SilhouetteBits:
         There must be bands.
 
         Args:
-            node: the node.
             samples: (n,) its samples.
             X_WN: (n, 4, 4) its poses at these samples.
             masks: (n, W) bit masks to which the node's pixels are added.
@@ -231,7 +228,6 @@ class PoseStore:
         words: number of words W of a bit mask.
 
     Args:
-        body: the sampled body.
         bits: the silhouettes.
         outside_fraction: greatest area outside of a node, all views together, as a fraction of its
             mean projected area.
@@ -497,7 +493,6 @@ class PoseStore:
         Args:
             partial: the partial poses before the node was placed.
             made: those made by the pairs.
-            node: the node that was placed.
             pairs: (p, 2) the pairs of partial pose and pose of the node.
             width: greatest number that is chosen.
             limit: if it is finite, the greatest lower bound of the objective [pixel]; also, one

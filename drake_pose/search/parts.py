@@ -115,7 +115,6 @@ class PartSearch:
         reflections: the parts that are mirrored with left and right exchanged.
 
     Args:
-        body: the body.
         grids: for each node (n, k) its values at its samples [rad or m].
     """
 
@@ -177,7 +176,6 @@ class PartSearch:
         """Return other placements of a part, the best first.
 
         Args:
-            problem: the body and the silhouettes.
             parameters: (m + 4,) the pose.
             part: the part that is placed anew.
             count: greatest number of placements.
@@ -303,7 +301,6 @@ class PartSearch:
 
         Args:
             parameters: (m + 4,) the pose.
-            part: the part.
             view: the view whose optical axis is the direction of depth.
             steps: greatest number of Gauss-Newton steps.
         """
@@ -410,7 +407,6 @@ class NeighbourhoodSearch:
     """Searches around a pose for other placements of parts, and stores alternative poses.
 
     Args:
-        problem: the body and the silhouettes.
         search: the parts of the body.
         reflections: whether, in a single view, parts are mirrored with left and right exchanged.
     """

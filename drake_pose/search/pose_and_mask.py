@@ -1,11 +1,15 @@
-"""Pose and mask in turn: a rough pose tells where to look for the mask, the mask tells the pose.
+"""Estimate a body's pose and its masks alternately, in the images of static cameras.
 
-How likely the body is at each pixel is sampled from the pose's uncertainty. Pictures of a camera
-that stands still show the background beside the body; where they do, colours tell the body from it,
-elsewhere GrabCut does. The first poses are searched by the cross-entropy method (Rubinstein 1999),
-since joints that are all a few degrees off put a hand far beside its picture; then the one fit
-draws the contour to the mask's edge. The last mask is the model's silhouette, along whose edge the
-colours decide.
+1. The foreground probability at each pixel is the frequency with which the body covers the pixel in
+   poses drawn from the uncertainty of the current pose.
+2. Pixels where other images show the background get a log-likelihood ratio of foreground and
+   background by their colour. The rest is decided by GrabCut; the result is a mask.
+3. In the first rounds the pose that covers the most foreground is searched by the cross-entropy
+   method (Rubinstein 1999), because errors of a few degrees in all joints move a hand far away.
+4. The contour of the body is fitted to the edge of the mask.
+
+The returned mask is the silhouette of the model, except near its edge, where it is the mask by
+colours.
 """
 
 import math
@@ -15,9 +19,8 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from drake_pose.arrays import Array, Mask, Picture
+from drake_pose.arrays import Array, Floats, Mask, Picture
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.fit.contour_fit import ContourFit, Prior, pack_views
@@ -34,51 +37,53 @@ from drake_pose.silhouette.scoring import (
 from drake_pose.silhouette.segmentation import foreground_log_ratios, grab_cut
 from drake_pose.workers import map_ordered
 
-Likelihood = NDArray[np.float32]
-
 
 @dataclass(frozen=True)
 class PoseAndMaskSettings:
-    """How far off the first poses may be, and how long they are improved.
+    """Parameters of the alternating estimation of pose and mask.
 
-    Sizes of silhouettes are roots of their areas. A pose's error is a fraction of the standard
-    deviations of the first ones.
+    The size of a silhouette is the root of its area. The error of a pose is given as a fraction of
+    the standard deviations of the initial poses.
     """
 
-    angle: float = math.radians(5.0)  # Standard deviation of each angle of the first poses [rad],
-    length_share: float = 0.5  # of each length, as a fraction of its range,
-    length: float = 0.05  # and of each length without limits [m].
-    rounds: int = 7  # The greatest number.
-    coarse_rounds: int = 3  # The first rounds look at smaller pictures,
+    # Standard deviation of the initial poses: of each angle [rad], of each length with limits, as a
+    # fraction of its range, and of each length without limits [m].
+    angle: float = math.radians(5.0)
+    length_fraction: float = 0.5
+    length: float = 0.05
+    rounds: int = 7  # Greatest number of rounds.
+    coarse_rounds: int = 3  # Number of first rounds with reduced images,
     coarse_side: float = 100.0  # in which silhouettes have this size [pixel].
-    searching: int = 2  # The first rounds search; later ones fit alone.
-    triangles: int = 600  # Of a part in the contour fit.
-    samples: int = 32  # Poses drawn to estimate the body's probability at each pixel.
-    surface: float = 0.02  # Error of the surface itself [silhouette sizes].
-    chances: tuple[float, float] = (0.01, 0.99)  # The least and the greatest probability.
-    search_rounds: int = 5  # Of the cross-entropy search,
-    searched: int = 60  # poses in each,
-    kept: int = 8  # and poses that shape the next.
-    widened: float = 1.1  # Factor on the spread of these,
-    least_spread: float = 0.15  # which stays above this fraction of the first one.
-    searched_share: float = 0.4  # Error of a pose that was searched.
-    finest_share: float = 0.14  # Error at which rounds end.
-    wide: float = 0.25  # The contour fit's first scale [silhouette sizes],
-    narrow: float = 0.03  # its last one,
+    searched_rounds: int = 2  # Number of first rounds with a cross-entropy search.
+    triangles: int = 600  # Triangles of a part in the contour fit.
+    samples: int = 32  # Number of poses drawn to estimate foreground probabilities.
+    surface_error: float = 0.02  # Error of the surface itself [silhouette sizes].
+    probabilities: tuple[float, float] = (0.01, 0.99)  # Least and greatest probability.
+    iterations: int = 5  # Iterations of the cross-entropy search,
+    iteration_poses: int = 60  # number of poses drawn in each,
+    elite_poses: int = 8  # and number of the best, whose mean and spread define the next.
+    spread_factor: float = 1.1  # Factor of the spread of the best poses,
+    least_spread: float = 0.15  # and its minimum, as a fraction of the spread at the start.
+    searched_error: float = 0.4  # Error of a pose after a search.
+    finest_error: float = 0.14  # Error at which rounds end.
+    first_scale: float = 0.25  # First scale of the contour fit at error 1 [silhouette sizes],
+    last_scale: float = 0.03  # its last scale,
     spacing: float = 0.05  # and its spacing.
-    settled: float = 0.995  # IoU of silhouettes of two rounds that are settled.
+    # A frame is settled if the IoU of its silhouettes in successive rounds exceeds this.
+    settled: float = 0.995
 
 
 @dataclass(frozen=True, eq=False)
 class FoundPose:
-    """One frame's pose, and its masks.
+    """The estimated pose of one frame, and its masks.
 
     Args:
-        values: (m,) of the pose tree [rad or m].
-        masks: (H, W) of each camera; None where it has no picture of the frame.
-        agreements: of each camera, IoU of the model's silhouette and of the mask that colours give
-            by themselves; nan where there is no picture.
-        deviations: (m,) how far the values are off the first ones, in their standard deviations.
+        values: (m,) values of the pose tree [rad or m].
+        masks: for each camera (H, W) the mask; None where it has no image of the frame.
+        agreements: for each camera the IoU of the model's silhouette and the mask by colours; nan
+            where there is no image.
+        deviations: (m,) difference of the values from the initial ones, in standard deviations of
+            the initial ones.
     """
 
     values: Array
@@ -88,16 +93,16 @@ class FoundPose:
 
 
 class PictureLevel(NamedTuple):
-    """Cameras, and of each frame each one's picture (H, W, 3), or None."""
+    """A pyramid level: cameras, and for each frame each camera's image (H, W, 3) or None."""
 
     cameras: tuple[Camera, ...]
     pictures: Sequence[Sequence[Picture | None]]
 
-    def smaller(self, share: float) -> "PictureLevel":
-        """The same with pictures smaller by a share; a parallel camera has them as they are."""
+    def downscaled(self, factor: float) -> "PictureLevel":
+        """Return the level with images of pinhole cameras reduced by a factor below 1."""
         cameras = tuple(
             camera.resized(
-                max(8, round(share * camera.width)), max(8, round(share * camera.height))
+                max(8, round(factor * camera.width)), max(8, round(factor * camera.height))
             )
             if isinstance(camera, PinholeCamera)
             else camera
@@ -118,22 +123,39 @@ class PictureLevel(NamedTuple):
 
 @dataclass(eq=False)
 class _Progress:
-    """A frame under way: what is known of it by now, as of ``FoundPose``."""
+    """The current estimate of one frame.
+
+    Args:
+        values: (m,) current values [rad or m].
+        start: (m,) initial values [rad or m].
+        rng: the frame's generator of random numbers.
+        error: error of the pose, as a fraction of the initial standard deviations.
+        probabilities: for each camera (H, W) the foreground probability.
+        cuts: for each camera (H, W) the mask by colours; None where there is no image.
+        drawn: for each camera (H, W) the model's silhouette.
+        agreements: as in ``FoundPose``.
+        unchanged: whether the silhouettes are those of the previous round.
+        settled: whether the frame is finished.
+    """
 
     values: Array
     start: Array
     rng: np.random.Generator
-    share: float = 1.0
-    chances: Sequence[Likelihood] = ()
+    error: float = 1.0
+    probabilities: Sequence[Floats] = ()
     cuts: Sequence[Mask | None] = ()
     drawn: Sequence[Mask] = ()
     agreements: tuple[float, ...] = ()
-    stays: bool = False
+    unchanged: bool = False
     settled: bool = False
 
 
 class PoseAndMask:
-    """Finds poses and masks of a body in the pictures of cameras that stand still."""
+    """Estimates poses and masks of a body in the images of static cameras.
+
+    Args:
+        seed: seed of the random poses.
+    """
 
     def __init__(
         self,
@@ -151,7 +173,7 @@ class PoseAndMask:
         self._fit = ContourFit(kinematics, fitted, pixels=100.0)
         ranges = kinematics.upper - kinematics.lower
         lengths = np.where(
-            np.isfinite(ranges), self._settings.length_share * ranges, self._settings.length
+            np.isfinite(ranges), self._settings.length_fraction * ranges, self._settings.length
         )
         spread = np.where(kinematics.is_angle, self._settings.angle, lengths)
         self._spread = np.where(ranges > 0.0, spread, 0.0)
@@ -162,21 +184,21 @@ class PoseAndMask:
         starts: Sequence[Array],
         on_round: Callable[[int], None] = lambda _: None,
     ) -> list[FoundPose]:
-        """Finds all frames' poses and masks.
+        """Estimate the poses and masks of all frames.
 
         Args:
-            pictures: of each frame, each camera's (H, W, 3); None where it has none.
-            starts: of each frame, (m,) a rough pose of the tree [rad or m].
-            on_round: is called with the number of rounds done.
+            pictures: for each frame and camera the image (H, W, 3); None where there is none.
+            starts: for each frame (m,) an approximate pose [rad or m].
+            on_round: called after each round with the number of rounds done.
         """
         values = [np.clip(one, self._kinematics.lower, self._kinematics.upper) for one in starts]
         whole = PictureLevel(self._cameras, pictures)
         own = self._settings
         drawn = [self._draw(one, camera, few=True) for one in values for camera in self._cameras]
         size = math.sqrt(float(np.mean([np.count_nonzero(one) for one in drawn])))
-        share = own.coarse_side / max(1.0, size)
-        level = whole if share >= 1.0 else whole.smaller(share)
-        # Each frame draws its own poses: frames are looked at side by side.
+        factor = own.coarse_side / max(1.0, size)
+        level = whole if factor >= 1.0 else whole.downscaled(factor)
+        # Each frame has its own generator, so results do not depend on the order of parallel tasks.
         rngs = np.random.default_rng(self._seed).spawn(len(values))
         frames = [_Progress(*one) for one in zip(values, starts, rngs, strict=True)]
         for k in range(own.rounds):
@@ -184,10 +206,10 @@ class PoseAndMask:
                 level = whole
                 for one in frames:
                     one.drawn = [self._draw(one.values, camera) for camera in self._cameras]
-            self._round(level, frames, searching=k < own.searching)
+            self._round(level, frames, searches=k < own.searched_rounds)
             on_round(k + 1)
             for one in frames:
-                one.settled = level is whole and one.stays and one.share <= own.finest_share
+                one.settled = level is whole and one.unchanged and one.error <= own.finest_error
             if all(one.settled for one in frames):
                 break
         spread = np.where(self._spread > 0.0, self._spread, np.inf)
@@ -204,31 +226,31 @@ class PoseAndMask:
             for one in frames
         ]
 
-    def _round(self, level: PictureLevel, frames: Sequence[_Progress], searching: bool) -> None:
-        """Betters the frames that are not settled."""
+    def _round(self, level: PictureLevel, frames: Sequence[_Progress], searches: bool) -> None:
+        """Improve the frames that are not settled; ``searches``: by a search before the fit."""
         moving = [k for k, one in enumerate(frames) if not one.settled]
 
-        def likely(k: int) -> None:
-            frames[k].chances = self._chances(level, frames[k])
+        def sample(k: int) -> None:
+            frames[k].probabilities = self._probabilities(level, frames[k])
 
-        map_ordered(likely, moving)
-        ratios = self._ratios(level, frames)
+        map_ordered(sample, moving)
+        log_ratios = self._log_ratios(level, frames)
 
-        def better(k: int) -> None:
+        def improve(k: int) -> None:
             frame, own = frames[k], self._settings
-            if searching:
-                frame.values = self._search(level, frame, ratios[k])
-                frame.share = min(frame.share, own.searched_share)
-                frame.chances = self._chances(level, frame)
+            if searches:
+                frame.values = self._search(level, frame, log_ratios[k])
+                frame.error = min(frame.error, own.searched_error)
+                frame.probabilities = self._probabilities(level, frame)
             frame.cuts = [
-                None if picture is None else cut_by_foreground(picture, chance, told)
-                for picture, chance, told in zip(
-                    level.pictures[k], frame.chances, ratios[k], strict=True
+                None if picture is None else cut_by_foreground(picture, probability, log_ratio)
+                for picture, probability, log_ratio in zip(
+                    level.pictures[k], frame.probabilities, log_ratios[k], strict=True
                 )
             ]
             before, frame.values = frame.drawn, self._refine(level, frame)
             frame.drawn = [self._draw(frame.values, camera) for camera in level.cameras]
-            frame.stays = bool(before) and all(
+            frame.unchanged = bool(before) and all(
                 intersection_over_union(*pair) > own.settled
                 for pair in zip(frame.drawn, before, strict=True)
             )
@@ -236,131 +258,136 @@ class PoseAndMask:
                 math.nan if mask is None else intersection_over_union(silhouette, mask)
                 for silhouette, mask in zip(frame.drawn, frame.cuts, strict=True)
             )
-            frame.share = narrowed(frame.share, frame.agreements, own)
+            frame.error = next_error(frame.error, frame.agreements, own)
 
-        map_ordered(better, moving)
+        map_ordered(improve, moving)
 
     def _draw(self, values: Array, camera: Camera, few: bool = False) -> Mask:
-        """The body's silhouette (H, W)."""
+        """Return the body's silhouette (H, W) at values (m,); ``few``: with few triangles."""
         X_CN = camera.X_CW @ self._kinematics.poses(values)
         if few:
             return draw_mask(self._few, X_CN, camera)
         return draw_mask(self._surfaces.at(self._kinematics.split(values)), X_CN, camera)
 
     def _sample(self, rng: np.random.Generator, values: Array, spread: Array, count: int) -> Array:
-        """(count, m) values about some, inside the limits."""
+        """Draw (count, m) values around some (m,) with standard deviations (m,), within limits."""
         drawn = values + spread * rng.standard_normal((count, len(values)))
         return np.clip(drawn, self._kinematics.lower, self._kinematics.upper)
 
-    def _chances(self, level: PictureLevel, frame: _Progress) -> list[Likelihood]:
-        """How likely the body is at each pixel, of each camera."""
-        spread, found, count = frame.share * self._spread, [], self._settings.samples
+    def _probabilities(self, level: PictureLevel, frame: _Progress) -> list[Floats]:
+        """Return for each camera (H, W) the foreground probability of a frame."""
+        spread, found, count = frame.error * self._spread, [], self._settings.samples
         poses = self._sample(frame.rng, frame.values, spread, count)
         for camera in level.cameras:
             total = np.zeros((camera.height, camera.width), dtype=np.float32)
             for pose in poses:
                 total += self._draw(pose, camera, few=True)
-            blur = max(1.0, self._settings.surface * math.sqrt(float(total.sum()) / count))
-            chance = cv2.GaussianBlur(total / count, (0, 0), blur)
-            found.append(np.clip(chance, *self._settings.chances).astype(np.float32))
+            blur = max(1.0, self._settings.surface_error * math.sqrt(float(total.sum()) / count))
+            blurred = cv2.GaussianBlur(total / count, (0, 0), blur)
+            found.append(np.clip(blurred, *self._settings.probabilities).astype(np.float32))
         return found
 
-    def _ratios(self, level: PictureLevel, frames: Sequence[_Progress]) -> list[list[Likelihood]]:
-        """What the background says, of each frame and camera.
+    def _log_ratios(self, level: PictureLevel, frames: Sequence[_Progress]) -> list[list[Floats]]:
+        """Return for each frame and camera (H, W) log-likelihood ratios by colour.
 
-        Nothing where there is no picture, or of settled frames.
+        They are 0 where there is no image, and in settled frames.
         """
-        found = [[np.zeros_like(chance) for chance in one.chances] for one in frames]
+        found = [[np.zeros_like(one) for one in frame.probabilities] for frame in frames]
         for c in range(len(level.cameras)):
-            seen = [(f, own[c]) for f, own in enumerate(level.pictures)]
-            there = [(f, picture) for f, picture in seen if picture is not None]
+            own = [(f, pictures[c]) for f, pictures in enumerate(level.pictures)]
+            there = [(f, picture) for f, picture in own if picture is not None]
             moving = [k for k, (f, _) in enumerate(there) if not frames[f].settled]
             if moving:
-                told = foreground_log_ratios(
+                log_ratios = foreground_log_ratios(
                     [picture for _, picture in there],
-                    [frames[f].chances[c] for f, _ in there],
+                    [frames[f].probabilities[c] for f, _ in there],
                     moving,
                 )
-                for k, ratio in zip(moving, told, strict=True):
-                    found[there[k][0]][c] = ratio
+                for k, log_ratio in zip(moving, log_ratios, strict=True):
+                    found[there[k][0]][c] = log_ratio
         return found
 
-    def _search(self, level: PictureLevel, frame: _Progress, ratios: Sequence[Likelihood]) -> Array:
-        """The pose near a frame's that covers most of what is not background."""
-        # Log-odds are summed as integers, in units of 1/64.
+    def _search(self, level: PictureLevel, frame: _Progress, log_ratios: Sequence[Floats]) -> Array:
+        """Return values (m,) near a frame's whose silhouette has the greatest sum of log ratios."""
+        # Log ratios are summed as integers, in units of 1/64.
         parts, own = 64.0, self._settings
-        told = [
+        shown = [
             (camera, prefix_sums(np.rint(parts * one).astype(np.int32))[None])
-            for camera, one in zip(level.cameras, ratios, strict=True)
+            for camera, one in zip(level.cameras, log_ratios, strict=True)
             if one.any()
         ]
-        if not told:
+        if not shown:
             return frame.values
-        first = frame.share * self._spread
-        middle, spread, best, most = frame.values, first, frame.values, -math.inf
-        for _ in range(own.search_rounds):
-            poses = self._sample(frame.rng, middle, spread, own.searched)
-            poses[0] = middle
+        first = frame.error * self._spread
+        mean, spread, best, most = frame.values, first, frame.values, -math.inf
+        for _ in range(own.iterations):
+            poses = self._sample(frame.rng, mean, spread, own.iteration_poses)
+            poses[0] = mean
             X_WN = np.array([self._kinematics.poses(pose) for pose in poses])
             scores = np.zeros(len(poses))
-            for camera, sums in told:
+            for camera, sums in shown:
                 scores += score_bodies(self._few, camera.X_CW @ X_WN, camera, sums)[:, 1]
-            order = np.argsort(-scores, kind="stable")[: own.kept]
+            order = np.argsort(-scores, kind="stable")[: own.elite_poses]
             if scores[order[0]] > most:
                 best, most = poses[order[0]], scores[order[0]]
-            middle = poses[order].mean(axis=0)
-            wider = own.widened * poses[order].std(axis=0)
+            mean = poses[order].mean(axis=0)
+            wider = own.spread_factor * poses[order].std(axis=0)
             spread = np.maximum(wider, own.least_spread * first)
         return best
 
     def _refine(self, level: PictureLevel, frame: _Progress) -> Array:
-        """The pose whose contour lies along the masks' edges."""
+        """Return values (m,) fitted to the edges of a frame's masks by colours."""
         masks, own = frame.cuts, self._settings
         areas = [np.count_nonzero(mask) for mask in masks if mask is not None and mask.any()]
         if not areas:
             return frame.values
         size = math.sqrt(float(np.mean(areas)))
         edges = [NO_EDGE if mask is None else find_edge_points(mask, 2.0) for mask in masks]
-        # Rounds are in hundreds of pixels.
-        rounds = [
+        # The fit's unit of length is 100 pixels.
+        first = max(own.spacing, own.first_scale * frame.error)
+        stages = [
             AnnealingStage(one * size / 200.0, own.spacing, 8)
-            for one in np.geomspace(max(own.spacing, own.wide * frame.share), own.narrow, 4)
+            for one in np.geomspace(first, own.last_scale, 4)
         ]
         held = self._spread <= 0.0
         prior = Prior(frame.start, np.where(held, 0.0, 1.0 / np.maximum(self._spread, 1e-9) ** 2))
         views = pack_views(level.cameras, edges)
-        return self._fit.fit(views, frame.values, rounds, prior, held).values
+        return self._fit.fit(views, frame.values, stages, prior, held).values
 
 
 def cut_by_foreground(
     picture: Picture,
-    chance: Likelihood,
-    ratio: Likelihood,
+    probability: Floats,
+    log_ratio: Floats,
     sure: float = 4.0,
-    least: float = PoseAndMaskSettings.chances[0],
+    least: float = PoseAndMaskSettings.probabilities[0],
 ) -> Mask:
-    """The object (H, W) in a picture (H, W, 3), by GrabCut where neither pose nor colour is sure.
+    """Return the mask (H, W) of the foreground, by GrabCut where the log-odds are not decisive.
+
+    The log-odds are log(p / (1 - p)) + log_ratio, with the foreground probability p by the pose.
 
     Args:
-        chance: (H, W) of the object, by its pose; ``least``: where it is surely not.
-        ratio: (H, W) log-odds by its colour.
-        sure: by such log-odds a pixel is surely the object, or surely not.
+        probability: (H, W) the foreground probability p.
+        log_ratio: (H, W) log-likelihood ratio of foreground and background, by colour.
+        sure: log-odds above this are certainly foreground, below minus this background.
+        least: pixels with a probability up to this are certainly background.
     """
-    foreground = np.log(chance / (1.0 - chance)) + ratio
-    labels = np.where(foreground > 0.0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-    labels[foreground > sure] = cv2.GC_FGD
-    labels[(foreground < -sure) | (chance <= least)] = cv2.GC_BGD
-    # GrabCut's two rounds learn colours of bodies 30 pixels large; a median filter takes specks
-    # away.
-    every = max(1, int(math.sqrt(np.count_nonzero(foreground > 0.0)) / 30.0))
+    log_odds = np.log(probability / (1.0 - probability)) + log_ratio
+    labels = np.where(log_odds > 0.0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    labels[log_odds > sure] = cv2.GC_FGD
+    labels[(log_odds < -sure) | (probability <= least)] = cv2.GC_BGD
+    # GrabCut learns colours in two iterations, from images in which the body is about 30 pixels
+    # large. The median filter removes specks.
+    every = max(1, int(math.sqrt(np.count_nonzero(log_odds > 0.0)) / 30.0))
     found = grab_cut(picture, labels, 2, every)
     return np.asarray(cv2.medianBlur(found.astype(np.uint8), 5) > 0)
 
 
 def follow_colours(silhouette: Mask, mask: Mask, band: float = 0.01) -> Mask:
-    """A silhouette (H, W) that is as a mask (H, W) is along its edge.
+    """Return a silhouette (H, W) whose edge is replaced by that of a mask (H, W) near to it.
 
-    ``band``: how far from the edge, as a share of the silhouette's size.
+    ``band``: half width of the band along the edge in which the mask decides, as a fraction of the
+    silhouette's size.
     """
     size = math.sqrt(max(1, int(np.count_nonzero(silhouette))))
     reach = max(1, round(band * size))
@@ -371,9 +398,13 @@ def follow_colours(silhouette: Mask, mask: Mask, band: float = 0.01) -> Mask:
     return np.asarray(inner | (outer & mask))
 
 
-def narrowed(share: float, agreements: Sequence[float], settings: PoseAndMaskSettings) -> float:
-    """How far off a pose may still be, as a share, after a round that agreed so well."""
-    agreed = float(np.nanmin(np.array(agreements)))
-    if agreed > 0.9:
-        return max(0.5 * share, settings.finest_share)
-    return max(0.7 * share, settings.searched_share) if agreed > 0.8 else share
+def next_error(error: float, agreements: Sequence[float], settings: PoseAndMaskSettings) -> float:
+    """Return the error of a pose after a round, from the error before and the round's agreements.
+
+    The error is halved if the least agreement is above 0.9, multiplied by 0.7 if above 0.8, and
+    else unchanged; ``finest_error`` and ``searched_error`` are its minima.
+    """
+    agreement = float(np.nanmin(np.array(agreements)))
+    if agreement > 0.9:
+        return max(0.5 * error, settings.finest_error)
+    return max(0.7 * error, settings.searched_error) if agreement > 0.8 else error

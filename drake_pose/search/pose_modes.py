@@ -57,7 +57,6 @@ def estimate_joints(
     both sides, because the true value may lie between the grid's values.
 
     Args:
-        sampled: the sampled tree.
         samples: for each node (n,) its samples that occur in the set.
         about: for each node (k,) the values of the answer; intervals of angles that turn around are
             given in the turn nearest to these [rad or m].
@@ -124,7 +123,6 @@ def split_into_modes(
     """Return the modes of a set of poses, sorted by J and, if equal, by size, largest first.
 
     Args:
-        graph: the set.
         labels: for each node (all samples,) the cluster of each sample.
         most_pairs: above this number of pairs of a state and a mode, the clusters of later nodes
             are ignored.
@@ -165,8 +163,6 @@ class GridPoseSet(PoseSet):
     """A set of poses of a grid, with a test of membership.
 
     Args:
-        graph: the poses.
-        sampled: the sampled tree.
         budget_spent: whether a limit of the search may have left out poses.
     """
 
@@ -198,15 +194,12 @@ def find_modes(
     """Find all poses of the grid that are as good as the best, and group them into modes.
 
     Args:
-        body: the sampled body.
-        views: the silhouettes of one frame.
         samples: (nodes,) samples of the best known pose.
         J: its objective [pixel].
         tolerance: greatest excess of the objective of a pose that is as good [pixel]. None: if the
             best pose is within ``renderer_tolerance``, all poses within that; else 5 % of the
             contours' length.
         most: greatest number of modes that are described.
-        limits: limits of the search.
         within: all exact poses, if they are known; the tolerance is then their limit of J.
 
     Returns:
@@ -340,10 +333,7 @@ def examine(
     """Prove that a pose of the grid is optimal, and find all poses that are as good.
 
     Args:
-        body: the sampled body.
-        views: the silhouettes of one frame.
         result: the pose that is examined.
-        settings: limits and tolerance.
         root_position: (3,) the root's position [m]; None: that of the tree.
         within: all exact poses, if they are known.
 

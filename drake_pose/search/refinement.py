@@ -143,7 +143,6 @@ class RefinementProblem:
     """One body and the silhouettes of one frame, compared pixel by pixel.
 
     Attributes:
-        body, views: the body and the silhouettes.
         area: total area of the silhouettes [pixel].
         border_length: approximate length of their borders [pixel].
 
@@ -164,7 +163,7 @@ class RefinementProblem:
         self.border_length = sum(border.length for border in self._silhouettes)
 
     def mismatch(self, parameters: np.ndarray) -> list[np.ndarray]:
-        """Return for each view (H, W) bool the pixels that either body or silhouette covers.
+        """Return for each view (H, W) bool the pixels covered by body or silhouette, but not both.
 
         ``parameters``: (m + 4,) the pose of the body.
         """
@@ -243,7 +242,6 @@ def descend(
     """Refine some of the parameters of a pose by passes of Levenberg-Marquardt steps.
 
     Args:
-        problem: the body and the silhouettes.
         parameters: (m + 4,) the start.
         freedom: the parameters that may change.
         passes: the passes, run one after another.

@@ -37,7 +37,6 @@ class SampledTree:
     A grid pose is given by its samples (nodes,): the index of each node's sample.
 
     Attributes:
-        tree: the pose tree.
         values: for each node (n, k) its k values at its n samples [rad or m].
         X_PN: for each node (n, 4, 4) its poses in its parent's frame P at its samples. A node whose
             joints mimic its parent's has a pose for each of the parent's samples, and always takes
@@ -94,10 +93,8 @@ class SampledTree:
         """Return areas of the union of some nodes' projections, for many poses.
 
         Args:
-            nodes: the nodes that are drawn.
             samples: (n, len(nodes)) their samples.
             X_CN: (n, len(nodes), 4, 4) their poses in the camera.
-            camera: the camera.
             prefixes: (k, H, W + 1) row-wise prefix sums of k sets of pixels.
 
         Returns:
@@ -265,7 +262,6 @@ class PoseSearch(Protocol):
         """Estimate the pose of the body in the views of one frame.
 
         Args:
-            views: the silhouettes, at least one.
             root_position: (3,) position of the root's origin in the world [m]; None: that of the
                 tree.
         """
@@ -275,7 +271,6 @@ class SampledBody:
     """A sampled tree with precomputed balls and orders for the searches on grids.
 
     Attributes:
-        sampled: the sampled tree.
         surface_areas: for each node the mean area of its parallel projections over all directions
             [m^2].
         order: the nodes in the order in which they are placed, ends of limbs last.

@@ -37,7 +37,6 @@ def counter_turns(
     """Return poses (m,) in which two joints with nearly parallel axes turn by opposite angles.
 
     Args:
-        kinematics: kinematics of the pose tree.
         values: (m,) the pose [rad or m].
         interval: the angles are multiples of this, up to a full turn [rad].
         parallel: least cosine of the angle between the axes.
@@ -64,7 +63,6 @@ def flips(kinematics: TreeKinematics, values: np.ndarray, count: int = 16) -> li
     """Return flipped poses within the limits in which the links behind the flipped joints stay.
 
     Args:
-        kinematics: kinematics of the pose tree.
         values: (m,) the pose [rad or m].
         count: greatest number of flips that are examined, those outside the limits included.
     """
@@ -102,7 +100,6 @@ def _single_flips(
     """Return poses with one more triple of joints flipped, regardless of limits.
 
     Args:
-        kinematics: kinematics of the pose tree.
         start: the pose.
         triples: (n, 3) indices of angles.
         stays: greatest motion of the last link, as a fraction of the body's size, or in the entries

@@ -80,9 +80,7 @@ class ViewsFit:
         evaluations: number of comparisons of contours until now.
 
     Args:
-        kinematics: kinematics of the pose tree.
         outlines: a surface for each node; few triangles suffice, see ``simplify_surfaces``.
-        views: the silhouettes.
         rough: surfaces with fewer triangles, for stages of large spacing; None: ``outlines``.
     """
 
@@ -178,7 +176,6 @@ def refine_best(
     """Refine many poses, and keep after each pass only the best distinct ones.
 
     Args:
-        fit: the body and the silhouettes.
         starts: each (m,), best first.
         passes: for each pass its stages, and the number of poses kept after it.
         proceed: returns whether there is time left; if not, only the first pose is refined.
@@ -209,7 +206,6 @@ def distinct(
     """Return the best distinct poses, sorted by cost.
 
     Args:
-        poses: the poses.
         count: greatest number of poses that are returned.
         turns_around: (m,) whether each value is an angle that is the same after a full turn.
         apart: a pose is distinct if some value differs by more than this from that of every better
@@ -238,8 +234,6 @@ def describe_modes(
     """Return the pose set of some modes.
 
     Args:
-        kinematics: kinematics of the pose tree.
-        tree: the pose tree.
         modes: the modes with their intervals, best first.
         Js: the objective (1) of each [pixel].
         tolerance: as in ``PoseSet`` [pixel].
@@ -269,8 +263,6 @@ def covariance_pose_set(
     """Return the pose set of a single pose, with intervals from a covariance.
 
     Args:
-        tree: the pose tree.
-        pose: the pose.
         covariance: (m, m) covariance of the tree's values.
         image_count: number of images from which the sizes of errors were estimated; it sets the
             degrees of freedom of Student's distribution.
@@ -300,9 +292,7 @@ class RobustModes:
     other values fitted, until the increase of the cost is significant (profile likelihood).
 
     Args:
-        fit: the body and the silhouettes.
         proceed: returns whether there is time left.
-        settings: parameters.
     """
 
     def __init__(
@@ -338,6 +328,7 @@ class RobustModes:
         return self._pose_set([self._with_intervals(values, moves=False)], [J])
 
     def _pose_set(self, modes: Sequence[FittedPose], Js: Sequence[float]) -> PoseSet:
+        """Return the pose set of modes with objectives ``Js`` [pixel]."""
         # If the cost exceeds one per pixel of edge, most of the contour does not fit, and the pose
         # may be entirely wrong: the intervals are not reliable.
         known = float(self._best_costs.sum()) <= self._fit.edge_length

@@ -1,4 +1,4 @@
-"""A small robot arm of capsules and boxes, two cameras around it, and damaged pictures of it."""
+"""A small robot arm of boxes, two cameras, and damaged masks of it."""
 
 import math
 from collections.abc import Sequence
@@ -15,7 +15,8 @@ from drake_pose.silhouette.outline import Outline, outline_from_mesh
 from drake_pose.silhouette.scoring import draw_mask
 from tests.body.models import joint, link
 
-# Each: name, parent's length, the joint's axis, its limits [deg], the box's sides and length [m].
+# For each link: name, joint's distance along the parent [m], axis and limits [deg], and the box's
+# sides and length [m].
 LINKS = (
     ("turret", 0.0, "0 0 1", (-150, 150), (0.16, 0.11), 0.2),
     ("shoulder", 0.2, "0 1 0", (-110, 110), (0.11, 0.1), 0.35),
@@ -26,7 +27,7 @@ LINKS = (
 
 
 def arm_urdf(links: Sequence[tuple] = LINKS) -> str:
-    """The arm on a plate in the world."""
+    """Return the URDF of the arm, fixed to the world."""
     parts, parent = [], "world"
     for name, z, axis, (low, high), (width, depth), length in links:
         visual = (
@@ -41,14 +42,14 @@ def arm_urdf(links: Sequence[tuple] = LINKS) -> str:
 
 
 def arm_tree(folder: Path) -> PoseTree:
-    """The arm's pose tree."""
+    """Return the arm's pose tree; ``folder``: where its URDF is written."""
     path = folder / "arm.urdf"
     path.write_text(arm_urdf())
     return load_model(path).pose_tree()
 
 
 def arm_cameras(width: int = 320, height: int = 240) -> tuple[PinholeCamera, ...]:
-    """Two cameras two metres away, 70 degrees apart, looking at the arm's middle."""
+    """Return two cameras 2.2 m away, 70 degrees apart, that look at the arm's centre."""
     cameras = []
     for name, turn in (("left", -35.0), ("right", 35.0)):
         c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
@@ -68,7 +69,7 @@ def draw_view(
     outlines: Sequence[Outline] | None = None,
     seen_by: Camera | None = None,
 ) -> View:
-    """The silhouette at values (m,); drawn in ``seen_by`` where the camera stands elsewhere."""
+    """Return the silhouette at values (m,), drawn by ``seen_by`` if that is given."""
     outlines = outlines or [outline_from_mesh(node.mesh) for node in tree.nodes]
     X_WN = tree.node_poses(split(tree, values))
     real = seen_by or camera
@@ -76,7 +77,7 @@ def draw_view(
 
 
 def is_held(answer: PoseSet, values: np.ndarray) -> bool:
-    """Whether some one mode's intervals hold all of a pose's values (m,)."""
+    """Return whether the intervals of a single mode contain all values (m,) of a pose."""
     return any(
         all(joint.holds(float(v)) for joint, v in zip(mode.joints, values, strict=True))
         for mode in answer.modes
@@ -84,13 +85,13 @@ def is_held(answer: PoseSet, values: np.ndarray) -> bool:
 
 
 def split(tree: PoseTree, values: np.ndarray) -> list[np.ndarray]:
-    """Each node's values of all values (m,)."""
+    """Split values (m,) into those of each node."""
     counts = np.cumsum([len(node.value_names) for node in tree.nodes])[:-1]
     return np.split(np.asarray(values, dtype=np.float64), counts)
 
 
 def draw_pose(tree: PoseTree, generator: np.random.Generator) -> np.ndarray:
-    """Values (m,) anywhere inside the limits."""
+    """Draw values (m,) uniformly within the limits."""
     bounds = [tree.value_bounds(i) for i in range(len(tree.nodes))]
     return generator.uniform(
         np.concatenate([low for low, _ in bounds]), np.concatenate([high for _, high in bounds])
@@ -100,9 +101,10 @@ def draw_pose(tree: PoseTree, generator: np.random.Generator) -> np.ndarray:
 def damaged_views(
     tree: PoseTree, values: np.ndarray, seed: int, width: int = 640, height: int = 480
 ) -> list[View]:
-    """What cameras that stand a little elsewhere see of an arm too thick or too thin, damaged.
+    """Return damaged masks of an arm with scaled links, in cameras with pose errors.
 
-    One part of it is missing in all views; in each a blob is attached, and edges are ragged.
+    In all views the region around one joint is missing. In each view a disc is added at the edge,
+    and the edge is ragged.
     """
     generator = np.random.default_rng(seed)
     outlines = []
@@ -132,7 +134,7 @@ def _draw_disc(mask: np.ndarray, uv: np.ndarray, radius: float, value: int) -> N
 
 
 def _ragged(mask: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """The mask with its edge moved by a smooth random field of 0.7 pixels."""
+    """Return the mask with its edge displaced by a smooth random field of 0.7 pixels."""
     inside, outside = (cv2.distanceTransform(m, cv2.DIST_L2, 5) for m in (mask, 1 - mask))
     field = cv2.GaussianBlur(generator.standard_normal(mask.shape), (0, 0), 3.0)
     return np.asarray(inside - outside + 0.7 / field.std() * field > 0.0)

@@ -15,22 +15,22 @@ _X_WC = np.array(
 
 
 def front_camera(side: int = 100, name: str = "front", shift: float = 0.0) -> ParallelCamera:
-    """The world's origin is at the picture's middle, between pixels, shifted by so many pixels.
+    """Return a camera with the world's origin at the image centre, plus a shift [pixel].
 
-    Shift it where poses are computed in two ways: edges that run through pixel centres, as edges
-    of boxes at multiples of 30 degrees do, would fall to either side by rounding alone.
+    A shift is needed where silhouettes of two computations are compared: edges through pixel
+    centres, such as those of boxes at multiples of 30 degrees, would depend on rounding.
     """
     centre = side / 2 - 0.5 + shift
     return ParallelCamera(name, side, side, 100.0, centre, centre, _X_WC)
 
 
 def near_camera(side: int = 480) -> ParallelCamera:
-    """As front_camera, but of 300 pixels a metre: segments are 36 to 72 pixels wide and long."""
+    """Return a front camera with 300 pixels per metre: segments are 36 to 72 pixels long."""
     return replace(front_camera(side, shift=0.2), pixels_per_metre=300.0)
 
 
 def box_link(name: str, width: float, height: float, y: float = 0.0, z: float = 0.0) -> str:
-    """A link with one box, sizes and centre in pixels (= cm)."""
+    """Return a link with one box; sizes and centre in pixels of ``front_camera``, which are cm."""
     return f"""<link name="{name}"><visual><origin xyz="0 {y / 100} {z / 100}"/><geometry>
     <box size="0.02 {width / 100} {height / 100}"/></geometry></visual></link>"""
 
@@ -39,27 +39,27 @@ def joint(
     name: str, kind: str, parent: str, child: str, limits: tuple[float, float],
     axis: str = "1 0 0", y: float = 0.0, z: float = 0.0,
 ) -> str:  # fmt: skip
-    """A joint at (y, z) [pixel] of its parent."""
+    """Return a joint at (y, z) in its parent [pixel, which is cm]."""
     return f"""<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>
     <origin xyz="0 {y / 100} {z / 100}"/><axis xyz="{axis}"/>
     <limit lower="{limits[0]}" upper="{limits[1]}" effort="1" velocity="1"/></joint>"""
 
 
 def load_body(folder: Path, *parts: str) -> ArticulatedModel:
-    """Load the body made of these links and joints, on a link named world."""
+    """Load the body of these links and joints, with a link named world."""
     path = folder / "body.urdf"
     path.write_text(f'<robot name="body"><link name="world"/>{"".join(parts)}</robot>')
     return load_model(path)
 
 
 def swinging_chain(folder: Path, segments: int) -> ArticulatedModel:
-    """A chain of unequal boxes, each turning in the picture about its upper end."""
+    """Return a chain of unequal boxes that turn in the image plane about their upper ends."""
     parts = []
     parent, y, z = "world", 0.0, 15.0
     for i in range(segments):
         name = f"segment_{i}"
         length, width = 16 - 2 * i, 7 - i
-        # The box is off its axis, so that no turn looks like another.
+        # The box is off its axis, so that different angles give different silhouettes.
         parts.append(box_link(name, width, length, y=1.0, z=-length / 2))
         parts.append(joint(f"turn_{i}", "revolute", parent, name, (-1.5, 1.8), y=y, z=z))
         parent, y, z = name, 0.0, -(length - 2)
@@ -67,7 +67,7 @@ def swinging_chain(folder: Path, segments: int) -> ArticulatedModel:
 
 
 def forked_body(folder: Path) -> ArticulatedModel:
-    """A trunk with two arms of different length: three nodes, two of them leaves."""
+    """Return a trunk with two arms of different lengths: three nodes, two of them leaves."""
     return load_body(
         folder,
         box_link("trunk", 10, 24, z=-12.0),

@@ -1,4 +1,4 @@
-"""Two bodies whose whole grids can be looked at."""
+"""Two bodies whose grids are small enough for brute force."""
 
 import pytest
 

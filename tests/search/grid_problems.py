@@ -1,4 +1,4 @@
-"""Small random matching problems whose whole grid can be looked at."""
+"""Small random problems with the objective of every pose of the grid."""
 
 import itertools
 import math
@@ -18,9 +18,9 @@ from .bodies import front_camera
 
 @dataclass(frozen=True)
 class GridProblem:
-    """Views of a body, with the objective of every pose of its grid: the definition alone.
+    """Views of a body, with the objective of every pose of its grid.
 
-    choices: (poses, nodes) samples; Js: (poses,).
+    ``choices``: (poses, nodes) samples; ``Js``: (poses,) objectives [pixel].
     """
 
     body: SampledBody
@@ -30,16 +30,16 @@ class GridProblem:
 
     @property
     def best(self) -> tuple[np.ndarray, float]:
-        """The samples and the objective of a best pose."""
+        """Samples (nodes,) and objective of a best pose."""
         return self.choices[int(np.argmin(self.Js))], float(self.Js.min())
 
     def within(self, J: float) -> set[tuple[int, ...]]:
-        """The poses whose objective is no greater."""
+        """Return the samples of all poses with an objective up to J."""
         return {tuple(row) for row in self.choices[self.Js <= J].tolist()}
 
 
 class ProblemMaker:
-    """Draws problems of one body, on a grid of an interval [rad]."""
+    """Makes problems of one body, on a grid with an interval [rad]."""
 
     def __init__(self, tree: PoseTree, interval: float) -> None:
         self.tree = tree
@@ -59,7 +59,7 @@ class ProblemMaker:
         on_grid: bool,
         side: int = 70,
     ) -> GridProblem:
-        """A problem with a random pose, whose masks have this share of their pixels turned."""
+        """Make a problem with a random pose; ``noise``: fraction of pixels that are inverted."""
         if on_grid:
             X_WN = self.X_WN[generator.integers(len(self.X_WN))]
         else:
@@ -72,13 +72,13 @@ class ProblemMaker:
         return self.problem(shown)
 
     def show(self, values: list[np.ndarray]) -> GridProblem:
-        """The problem of one view of a pose, given by each node's values."""
+        """Make the problem of one view of a pose, given by each node's values."""
         camera = cameras(1, 70)[0]
         X_CN = camera.X_CW @ self.tree.node_poses(values)
         return self.problem([View(camera, draw_mask(self._outlines(), X_CN, camera))])
 
     def problem(self, shown: list[View]) -> GridProblem:
-        """The problem of given views."""
+        """Make the problem of given views."""
         Js = Scoring(self.body.sampled, shown).J(self.choices)
         return GridProblem(self.body, shown, self.choices, Js)
 
@@ -87,14 +87,14 @@ class ProblemMaker:
 
 
 def show_pose(sampled: SampledTree, values: list[np.ndarray], camera: ParallelCamera) -> View:
-    """The silhouette of a pose of the grid, given by each node's values."""
+    """Return the silhouette of a pose of the grid, given by each node's values."""
     samples = samples_at(sampled, values)
     outlines = sampled.outlines_at(range(len(values)), samples)
     return View(camera, draw_mask(outlines, camera.X_CW @ sampled.tree.node_poses(values), camera))
 
 
 def cameras(count: int, side: int) -> list[ParallelCamera]:
-    """Cameras at 0 and 60 degrees about the vertical."""
+    """Return one or two cameras, at 0 and 60 degrees about the vertical."""
     front = front_camera(side, shift=0.137)
     turn = np.eye(4)
     c, s = math.cos(math.radians(60)), math.sin(math.radians(60))

@@ -1,4 +1,4 @@
-"""A gripper on an arm, whose fingers follow each other or are free."""
+"""A gripper on an arm, with mimic or independent fingers."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ def _box(middle: str, size: str) -> str:
 
 
 def gripper(folder: Path, *, follows: bool) -> ArticulatedModel:
-    """A gripper on an arm; its right finger follows the left one by a <mimic>, or both are free."""
+    """Return the gripper; ``follows``: whether the right finger mimics the left one."""
     mast, hand = ({"axis": "1 0 0", "limits": f'lower="-{r}" upper="{r}"'} for r in (1.2, 1.5))
     finger = {"limits": 'lower="0" upper="0.08"', "origin": 'xyz="0 0 .06"'}
     mimic = '<mimic joint="left_joint"/>' if follows else ""

@@ -1,7 +1,6 @@
-"""Sections 5.1 and 5.2 once more, on plain boolean pictures, for the tests to compare with.
+"""A naive implementation of sections 5.1 and 5.2 of Kameda's paper, as a reference for tests.
 
-Written from the paper's text with whole pictures instead of spans and prefix sums, without any of
-the shortcuts of the search under test. One view only.
+It follows the paper's text with boolean images instead of spans and prefix sums, in one view.
 """
 
 import itertools
@@ -24,7 +23,7 @@ class NaiveSearch:
         self.best = None
 
     def picture(self, i, values):
-        """P_i with the parents as adopted."""
+        """Return P_i, with the candidates adopted for the other nodes."""
         full = [grid[0] for grid in self.values]
         for k, t in self.u.items():
             full[k] = self.values[k][self.lists[k][t]]

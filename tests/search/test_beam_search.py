@@ -1,4 +1,4 @@
-"""The beam search against brute force over whole grids, and what it promises of its answers."""
+"""Compare the beam search with brute force over whole grids, and check its proofs and limits."""
 
 import itertools
 from dataclasses import replace
@@ -57,7 +57,7 @@ def test_finds_the_minimum_for_a_mask_that_no_pose_explains(maker):
     assert result.J == maker.problem(problem.views).best[1]
 
 
-def test_a_sliding_joint_and_a_fixed_one(tmp_path):
+def test_finds_prismatic_and_revolute_positions(tmp_path):
     model = load_body(
         tmp_path,
         box_link("rail", 30, 4),
@@ -74,7 +74,7 @@ def test_a_sliding_joint_and_a_fixed_one(tmp_path):
     np.testing.assert_allclose(result.q, [0.15, -0.5], atol=1e-9)
 
 
-def test_what_lies_outside_the_picture_costs_nothing(tmp_path):
+def test_area_outside_the_image_costs_nothing(tmp_path):
     tree = swinging_chain(tmp_path, 3).pose_tree()
     matcher = search(tree)
     camera = ParallelCamera("cut", 40, 25, 100.0, 19.637, 19.637, front_camera().X_WC)
@@ -85,7 +85,7 @@ def test_what_lies_outside_the_picture_costs_nothing(tmp_path):
     assert matcher.match([view]).stopped_by == "exact"
 
 
-def test_a_root_at_another_position(tmp_path):
+def test_matches_with_a_given_root_position(tmp_path):
     model = swinging_chain(tmp_path, 3)
     still = model.pose_tree()
     values = [np.array([INTERVAL])] * 3
@@ -97,7 +97,7 @@ def test_a_root_at_another_position(tmp_path):
     assert result.J <= 2.0
 
 
-def test_a_limit_still_answers_and_says_so(maker):
+def test_time_limit_returns_a_pose_and_is_reported(maker):
     problem = maker.make(np.random.default_rng(9), views=1, noise=0.0, on_grid=False)
     result = search(maker.tree, time_limit=0.0).match(problem.views)
     assert result.found
@@ -133,8 +133,8 @@ def test_settings_out_of_range_are_refused(kind, values):
 
 
 @pytest.mark.parametrize("side", [60, 240, 480])
-def test_what_drake_draws_is_matched_within_what_renderers_differ_by(tmp_path, side):
-    """Label images of Drake's VTK renderer; the areas that are scored are drawn otherwise."""
+def test_label_images_are_matched_within_the_renderer_tolerance(tmp_path, side):
+    """Label images are from Drake's VTK renderer; the scored areas are computed differently."""
     model = swinging_chain(tmp_path, 4)
     matcher = BeamSearch(
         model.pose_tree(), BeamSearchSettings(interval=INTERVAL), ExaminationSettings()
@@ -161,7 +161,7 @@ def test_what_drake_draws_is_matched_within_what_renderers_differ_by(tmp_path, s
     assert differ or side < 480
 
 
-def test_without_a_tolerance_only_equal_pixels_are_exact(tmp_path):
+def test_with_zero_tolerance_only_equal_masks_are_exact(tmp_path):
     matcher = search(swinging_chain(tmp_path, 3).pose_tree(), tolerance=0.0)
     camera = front_camera(100, shift=0.137)
     view = show_pose(matcher.sampled, [grid[1] for grid in matcher.sampled.values], camera)
@@ -177,7 +177,7 @@ def search_of(maker, examination):
     return BeamSearch(maker.tree, BeamSearchSettings(interval=INTERVAL), examination)
 
 
-def test_what_is_proved_is_the_best_of_the_grid(maker):
+def test_a_proved_pose_is_the_optimum_of_the_grid(maker):
     examined = search_of(maker, ExaminationSettings(proof_poses=10**6, mode_poses=10**6))
     generator = np.random.default_rng(5)
     for noise, views in itertools.product((0.0, 0.003, 0.01, 0.03), (1, 2)):
@@ -201,7 +201,7 @@ def test_what_is_proved_is_the_best_of_the_grid(maker):
         assert answer.size == len(problem.within(best + answer.tolerance))
 
 
-def test_a_worse_pose_is_replaced(maker):
+def test_examination_replaces_a_worse_pose(maker):
     search = search_of(maker, None)
     generator = np.random.default_rng(8)
     for noise in (0.0, 0.01) * 3:
@@ -220,7 +220,7 @@ def test_a_worse_pose_is_replaced(maker):
         assert tuple(samples.tolist()) in problem.within(mended.J)
 
 
-def test_a_pose_between_the_samples_is_refused(maker):
+def test_examination_refuses_a_pose_off_the_grid(maker):
     search = search_of(maker, None)
     problem = maker.make(np.random.default_rng(7), views=1, noise=0.0, on_grid=True)
     result = search.match(problem.views)
@@ -233,7 +233,7 @@ def test_a_pose_between_the_samples_is_refused(maker):
 @pytest.mark.parametrize(
     "limit", [{"proof_poses": 1}, {"memory": 8_000}, {"proof_time_limit": 0.0}]
 )
-def test_a_limit_leaves_a_true_bound_and_no_false_proof(maker, limit):
+def test_limits_give_a_valid_lower_bound_and_no_false_proof(maker, limit):
     search = search_of(maker, None)
     generator = np.random.default_rng(12)
     proved = []

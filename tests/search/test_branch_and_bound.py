@@ -1,4 +1,4 @@
-"""The branch and bound against the definition over whole grids."""
+"""Compare the branch and bound with brute force over whole grids."""
 
 import math
 
@@ -34,7 +34,7 @@ def test_finds_exactly_the_poses_within_the_limit(maker, views, extra):
                 assert found.lower_bound <= J
 
 
-def test_a_limit_that_no_pose_reaches_leaves_nothing(maker):
+def test_a_limit_below_the_optimum_gives_an_empty_set(maker):
     problem = maker.make(np.random.default_rng(2), views=1, noise=0.02, on_grid=False)
     found = branch_and_bound(maker.body, problem.views, problem.best[1] - 1.0)
     assert found.complete
@@ -42,7 +42,7 @@ def test_a_limit_that_no_pose_reaches_leaves_nothing(maker):
     assert found.lower_bound == problem.best[1]
 
 
-def test_what_was_left_out_is_no_better_than_the_bound(maker):
+def test_poses_left_out_are_not_below_the_lower_bound(maker):
     generator = np.random.default_rng(3)
     for limits in (BoundLimits(states=3), BoundLimits(pairs=5), BoundLimits(time_limit=0.0)):
         problem = maker.make(generator, views=1, noise=0.02, on_grid=False)
@@ -58,8 +58,8 @@ def test_what_was_left_out_is_no_better_than_the_bound(maker):
             assert found.graph.contains(samples)
 
 
-def test_hidden_limbs_multiply_and_are_counted(tmp_path):
-    """Two short arms of two links each that a broad trunk hides at every angle."""
+def test_all_poses_of_hidden_limbs_are_counted(tmp_path):
+    """A broad trunk hides two short arms of two links each at every angle."""
     parts = [
         box_link("trunk", 40, 40),
         joint("trunk_turn", "revolute", "world", "trunk", (0.0, 0.0)),
@@ -78,11 +78,11 @@ def test_hidden_limbs_multiply_and_are_counted(tmp_path):
     found = branch_and_bound(maker.body, problem.views, 0.0)
     assert found.complete
     assert found.graph.size == len(maker.choices) == 7**4
-    # Hidden limbs leave nothing to tell their poses apart by.
+    # All poses of a hidden limb lead to the same state.
     assert sum(len(layer.samples) for layer in found.graph.layers) < 2 * (7 + 7**2) + 2
 
 
-def test_a_narrower_limit_and_fewer_samples_leave_fewer_poses(maker):
+def test_restricting_limit_or_samples_removes_poses(maker):
     problem = maker.make(np.random.default_rng(7), views=1, noise=0.0, on_grid=False)
     best = problem.best[1]
     graph = branch_and_bound(maker.body, problem.views, best + 100.0).graph

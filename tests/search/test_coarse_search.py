@@ -1,4 +1,4 @@
-"""The coarse search: what is roughly right is among the few that are refined."""
+"""The coarse search finds a pose near the true one, and its kernels match plain numpy."""
 
 from dataclasses import replace
 
@@ -26,12 +26,12 @@ def body(tree):
 
 
 def nearest(tree, X_WN, values):
-    """How far the joints of the nearest pose are from where they should be, at most [m]."""
+    """Return the greatest error of a joint's position in the nearest pose [m]."""
     gaps = X_WN[:, :, :3, 3] - tree.node_poses(split(tree, values))[:, :3, 3]
     return float(np.linalg.norm(gaps, axis=2).max(axis=1).min())
 
 
-def test_the_pose_is_among_the_few(tree, body):
+def test_one_distinct_pose_is_near_the_true_pose(tree, body):
     values = draw_pose(tree, np.random.default_rng(41))
     search = CoarseSearch(body, damaged_views(tree, values, 1))
     poses = search.choose_distinct(search.find(), 40, 0.13)
@@ -41,7 +41,7 @@ def test_the_pose_is_among_the_few(tree, body):
     assert nearest(tree, poses.X_WN, values) < 0.15
 
 
-def test_poses_are_those_of_their_samples(tree, body):
+def test_poses_match_their_samples(tree, body):
     views = [draw_view(tree, draw_pose(tree, np.random.default_rng(1)), arm_cameras()[0])]
     poses = CoarseSearch(body, views).find()
     for samples, X_WN in zip(poses.samples[:20], poses.X_WN[:20], strict=True):
@@ -49,7 +49,7 @@ def test_poses_are_those_of_their_samples(tree, body):
         np.testing.assert_allclose(X_WN, tree.node_poses(values), atol=1e-9)
 
 
-def test_a_limb_searched_again_leaves_the_rest(tree, body):
+def test_searching_a_limb_again_keeps_the_other_nodes(tree, body):
     values = draw_pose(tree, np.random.default_rng(2))
     views = [draw_view(tree, values, camera) for camera in arm_cameras()]
     X_WN = tree.node_poses(split(tree, values))
@@ -62,7 +62,7 @@ def test_a_limb_searched_again_leaves_the_rest(tree, body):
 
 
 @pytest.mark.parametrize("longer", [1e3, 1e9])
-def test_a_lens_that_is_far_too_long_does_not_fill_the_memory(tree, body, longer):
+def test_a_huge_focal_length_does_not_exhaust_memory(tree, body, longer):
     view = draw_view(tree, draw_pose(tree, np.random.default_rng(3)), arm_cameras()[0])
     focal = longer * arm_cameras()[0].focal_x
     wrong = View(replace(arm_cameras()[0], focal_x=focal, focal_y=focal), view.mask)
@@ -71,7 +71,7 @@ def test_a_lens_that_is_far_too_long_does_not_fill_the_memory(tree, body, longer
     assert len(search.find()) >= 1
 
 
-def test_cover_holds_the_points_within_the_radius():
+def test_cover_contains_the_points_within_each_radius():
     generator = np.random.default_rng(3)
     points, origin = generator.uniform(0.0, 30.0, (100, 2)), np.array([-3.0, -4.0])
     radii = np.array([2.0, 5.0])
@@ -85,8 +85,8 @@ def test_cover_holds_the_points_within_the_radius():
 
 
 @pytest.mark.parametrize("parallel", [False, True])
-def test_scores_are_those_of_balls_looked_at_one_by_one(tree, body, parallel):
-    """Against plain numpy: a ball's place, how far it leaves the mask, and the points within it."""
+def test_scores_match_a_direct_computation_for_each_ball(tree, body, parallel):
+    """Compare with plain numpy: a ball's projection, its area outside, and the points it covers."""
     generator = np.random.default_rng(5)
     camera = arm_cameras()[0]
     values = draw_pose(tree, generator)
@@ -122,11 +122,11 @@ def test_scores_are_those_of_balls_looked_at_one_by_one(tree, body, parallel):
         far = np.linalg.norm(points[:, None] - uv[:, ::-1], axis=2)
         covered = (far <= within).any(axis=1).sum()
         gaps.append(scores[h, sample] - (0.8 * cost - covered * view.point_area))
-    # The tables know places to a cell and distances to a quarter of one only.
+    # The tables have the resolution of a cell, and of a quarter of a cell for distances.
     assert np.abs(gaps).max() < 0.1 * seen.mask.sum()
     assert np.abs(np.mean(gaps)) < 0.005 * seen.mask.sum()
     again = np.zeros_like(scores)
     score_samples(view, X_CP, search.balls[node], united[:, 2].copy(), 0.8, again)
-    # What is covered already counts no more.
+    # Points that are already covered gain nothing.
     assert (again[:, 2] >= 0.0).all()
     assert (again[:, 2] > scores[:, 2]).any()

@@ -1,4 +1,4 @@
-"""The list of the best poses against brute force, and that no two of it look alike."""
+"""Compare ``BeamSearch.best_poses`` with brute force; its poses differ pairwise."""
 
 import itertools
 
@@ -30,13 +30,13 @@ def settings(**more):
 
 
 def objectives(problem, poses):
-    """J of poses of the grid, by the definition."""
+    """Return J of poses of the grid, from brute force."""
     found = [samples_at(problem.body.sampled, values) for values in poses]
     return np.array([problem.Js[(problem.choices == one).all(axis=1)][0] for one in found])
 
 
 def node_masks(tree, views, values):
-    """(views, nodes, H, W) masks of single nodes."""
+    """Return masks (views, nodes, H, W) of single nodes."""
     outlines = [outline_from_mesh(node.mesh) for node in tree.nodes]
     X_WN = tree.node_poses(values)[:, None]
     return np.array(
@@ -51,20 +51,20 @@ def node_masks(tree, views, values):
 
 
 def look_alike(first, second):
-    """The definition, from masks of two poses' single nodes."""
+    """Return whether two poses are alike, by definition, from masks of their single nodes."""
     for node in range(first.shape[1]):
-        is_seen = [
+        is_visible = [
             (pose[:, node] & ~np.delete(pose, node, axis=1).any(axis=1)).any()
             for pose in (first, second)
         ]
         one, other = first[:, node], second[:, node]
-        if any(is_seen) and (one & other).sum() < OVERLAP * (one | other).sum():
+        if any(is_visible) and (one & other).sum() < OVERLAP * (one | other).sum():
             return False
     return True
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_the_list_begins_with_the_best_and_no_two_look_alike(maker, count):
+def test_poses_start_with_the_best_and_differ_pairwise(maker, count):
     problem = maker.make(np.random.default_rng(1), views=count, noise=0.0, on_grid=False)
     search = BeamSearch(maker.tree, settings())
     poses = search.best_poses(problem.views, count=8, overlap=OVERLAP)
@@ -77,13 +77,13 @@ def test_the_list_begins_with_the_best_and_no_two_look_alike(maker, count):
         assert not look_alike(one, other)
 
 
-def test_all_poses_of_the_grid_differ_if_that_is_wanted(maker, problem):
+def test_an_overlap_above_one_keeps_all_poses(maker, problem):
     poses = BeamSearch(maker.tree, settings()).best_poses(problem.views, count=10, overlap=2.0)
     np.testing.assert_array_equal(objectives(problem, poses), np.sort(problem.Js)[:10])
     assert len({tuple(np.concatenate(values)) for values in poses}) == 10
 
 
-def test_alternatives_to_an_exact_pose_are_listed_too(maker):
+def test_alternatives_to_an_exact_pose_are_found(maker):
     search = BeamSearch(maker.tree, settings())
     problem = maker.show([grid[1] for grid in search.sampled.values])
     poses = search.best_poses(problem.views, count=6)

@@ -1,4 +1,4 @@
-"""What answers say of joints, widened and turned, against what values they hold."""
+"""Views, joint intervals, and pose estimates with full turns and widened intervals."""
 
 import math
 from dataclasses import replace
@@ -44,7 +44,7 @@ def test_any_array_of_two_values_is_a_mask(largest):
         (np.ones((6, 4), int), "size the camera was calibrated for"),
     ],
 )
-def test_what_is_no_mask_is_refused(mask, reason):
+def test_invalid_masks_are_refused(mask, reason):
     with pytest.raises(MaskError, match=f"'front'.*{reason}"):
         View(CAMERA, mask)
 
@@ -55,8 +55,8 @@ def tree(tmp_path_factory):
 
 
 @pytest.mark.parametrize("around", [0.0, TURN, -2.0 * TURN])
-def test_a_widened_interval_holds_what_either_held(around):
-    """The other one moves with the value, and full turns make no difference where it turns."""
+def test_a_widened_interval_contains_both(around):
+    """The other interval is shifted by the motion; full turns of an angle make no difference."""
     now = JointEstimate("a", True, 1.0, 1.4, turns_around=around != 0.0)
     then = replace(now, low=0.4 + around, high=0.9 + around, determined=False)
     both = now.widened(then, 0.2)
@@ -70,7 +70,7 @@ def test_a_widened_interval_holds_what_either_held(around):
 
 
 def estimate(tree, values, modes):
-    """A pose with intervals of 0.1 about its values, one of so many modes."""
+    """Return a pose with intervals of +-0.1 about its values; ``modes``: the number of modes."""
     kinematics = TreeKinematics(tree)
     own = kinematics.split(np.array(values))
     joints = tuple(
@@ -82,21 +82,21 @@ def estimate(tree, values, modes):
     return PoseEstimate.of_values(tree, own, 7.0, 100.0, stopped_by="end", pose_set=known)
 
 
-def test_a_track_is_as_open_as_the_modes_that_it_began_with(tree):
+def test_tracked_intervals_include_the_modes_of_the_first_pose(tree):
     now, begun = estimate(tree, [0.5, 0.2], 1), estimate(tree, [0.3, 0.3], 2)
     wide = [replace(one, low=one.low - 1.0) for one in begun.pose_set.joints]
     begun = replace(begun, pose_set=replace(begun.pose_set, joints=tuple(wide)))
     widened = now.widened(begun).pose_set
     assert widened.mode_count == 2
     ends = [(one.low, one.high) for one in widened.joints]
-    # By 0.2 and -0.1 both have moved since.
+    # Since then the values have changed by 0.2 and -0.1.
     np.testing.assert_allclose(ends, [(-0.6, 0.6), (-0.9, 0.3)])
-    sure = estimate(tree, [0.3, 0.3], 1)
-    for nothing in (None, replace(begun, pose_set=None), sure):
+    single = estimate(tree, [0.3, 0.3], 1)
+    for nothing in (None, replace(begun, pose_set=None), single):
         assert now.widened(nothing) is now
 
 
-def test_full_turns_leave_a_pose_where_it_is(tree):
+def test_full_turns_do_not_change_a_pose(tree):
     pose = estimate(tree, [0.5, 0.2], 1)
     turns = [
         np.array([TURN]) if k == 1 else np.zeros(len(node.value_names))
@@ -117,8 +117,8 @@ def test_full_turns_leave_a_pose_where_it_is(tree):
         np.testing.assert_allclose([one.high for one in joints], by + np.array([0.6, 0.3]))
 
 
-def test_a_covariance_is_told_as_intervals_inside_the_limits(tree):
-    """Student's quantile, of six motions of each camera; halved where a limit cuts."""
+def test_covariance_gives_student_intervals_within_limits(tree):
+    """Student's quantile has six degrees of freedom for each camera; limits cut the interval."""
     kinematics = TreeKinematics(tree)
     pose = replace(estimate(tree, [0.5, 0.2], 1), q=np.array([7.0, 8.0]))
     deviations = np.array([0.02, 0.05])
@@ -143,8 +143,8 @@ def model(tmp_path_factory):
 
 
 @pytest.mark.parametrize("truth", [(178.0, 331.5), (-181.0, -28.5), (-100.0, 190.0)])
-def test_drakes_pictures_are_answered_in_the_turn_about_the_default(model, truth):
-    """The limits of the second joint hold the truth in two turns."""
+def test_angles_are_returned_in_the_turn_around_the_default(model, truth):
+    """The limits of the second joint contain the true angle in two turns."""
     result = MultiStartSearch(model.pose_tree()).match(views_of(model, np.radians(truth)))
     nearest = [math.degrees(math.remainder(math.radians(angle), 2 * math.pi)) for angle in truth]
     assert np.abs(np.degrees(result.q)).max() <= 180.0 + 1e-6
@@ -166,12 +166,12 @@ def test_drakes_pictures_are_answered_in_the_turn_about_the_default(model, truth
 
 
 def test_directions_on_both_sides_of_half_a_turn_are_one_mode(model):
-    """A pose on the grid at 180 degrees, with room for its neighbours at 160 and -160."""
+    """The pose is on the grid at 180 degrees, with neighbours at 160 and -160 degrees."""
     search = BeamSearch(model.pose_tree(), None, ExaminationSettings(tolerance=400.0))
     result = search.match(views_of(model, np.radians([180.0, 0.0])))
     np.testing.assert_allclose(np.degrees(np.abs(result.q)), [180.0, 0.0], atol=1e-6)
     first = result.pose_set.modes[0].joints[0]
-    # Values rise without a gap through half a turn, and the answer is amidst.
+    # The interval is continuous across half a turn, with the answer at its centre.
     ends = np.degrees(np.array([first.low, first.high]) - result.q[0])
     np.testing.assert_allclose(ends, [-20.0, 20.0], atol=1e-6)
     assert result.pose_set.mode_count == 1

@@ -1,4 +1,4 @@
-"""A gripper whose fingers follow one another: one unknown in every search, the right answer."""
+"""Searches with a mimic joint: the gripper's fingers are one unknown."""
 
 import itertools
 import math
@@ -28,7 +28,7 @@ ON_GRID = np.array([math.radians(15.0), math.radians(-30.0), 0.04, 0.04])
 
 
 def gripper_views(model, q):
-    """What two cameras see of it, drawn by Drake."""
+    """Return two views of the gripper, drawn by Drake."""
     return [View(camera, LabelRenderer(model, camera).mask(q)) for camera in arm_cameras()]
 
 
@@ -38,7 +38,7 @@ def models(tmp_path_factory):
     return {follows: gripper(folder, follows=follows) for follows in (True, False)}
 
 
-def test_the_continuous_search_finds_one_value_for_both_fingers(models):
+def test_multi_start_search_finds_one_value_for_both_fingers(models):
     matcher = MultiStartSearch(models[True].pose_tree())
     for q in ([0.3, -0.5, 0.04, 0.04], [-0.4, 0.7, 0.01, 0.01]):
         found = matcher.match(gripper_views(models[True], np.array(q)))
@@ -51,7 +51,7 @@ def test_the_continuous_search_finds_one_value_for_both_fingers(models):
         assert names == ["mast_joint", "hand_joint", "left_joint"]
 
 
-def test_searches_on_grids_find_it_and_prove_it(models):
+def test_grid_searches_find_the_pose_and_prove_it(models):
     for follows, model in models.items():
         tree, views = model.pose_tree(), gripper_views(model, ON_GRID)
         for search in (
@@ -65,7 +65,7 @@ def test_searches_on_grids_find_it_and_prove_it(models):
         assert len(found.pose_set.joints) == (3 if follows else 4)
 
 
-def test_all_poses_within_a_limit_are_those_of_brute_force(models):
+def test_poses_within_a_limit_equal_those_of_brute_force(models):
     body = SampledBody(models[True].pose_tree(), BeamSearchSettings(**GRID))
     tree = body.sampled.tree
     assert [tree.nodes[tree.source(i)].name for i in range(4)] == ["mast", "hand", "left", "left"]

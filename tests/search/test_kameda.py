@@ -29,7 +29,7 @@ def random_silhouette(search, camera, generator):
 
 @pytest.fixture
 def sliders(tmp_path):
-    """A 20 x 10 box that slides right, and on it a 6 x 8 box that slides up: areas by hand."""
+    """A 20 x 10 box that slides right, and on it a 6 x 8 box that slides up [pixel]."""
     return load_body(
         tmp_path,
         box_link("wide", 20, 10),
@@ -44,10 +44,11 @@ def slider_search(tree, **settings):
 
 
 def test_step_6_goes_back_to_the_nearest_ancestor_with_an_untried_candidate(tmp_path):
-    """The first box fits a blot best, but only from the other place can the second one reach on.
+    """The best candidate of the first box is wrong: there is no place for the arm below it.
 
-    A blot of 12 x 10 pixels on the left draws the 10 x 10 box; on the right stands the true
-    body: 10 x 8 for the first box (so its score is smaller there) and its arm of 20 x 4 below.
+    The mask has a blot of 10 x 10 pixels on the left, which the first box covers entirely. On the
+    right is the true body: 10 x 8 pixels of the first box, so its score is smaller there, and an
+    arm of 20 x 4 below.
     """
     model = load_body(
         tmp_path,
@@ -65,12 +66,12 @@ def test_step_6_goes_back_to_the_nearest_ancestor_with_an_untried_candidate(tmp_
     mask[45:55, 25:35] = True  # the blot, at slide = -0.2
     result = search.match([View(camera, mask)])
     np.testing.assert_allclose(result.q, [0.2, 0.0])
-    # Step 3 for the box, for the arm in vain, and for the arm again.
+    # Step 3 runs for the box, for the arm without success, and for the arm again.
     assert result.runs == 3
     assert result.J == 20 + 100
 
 
-def test_no_pose_is_an_answer(sliders):
+def test_a_failed_search_is_reported(sliders):
     mask = np.zeros((100, 100), dtype=bool)
     mask[2:4, 2:4] = True
     result = slider_search(sliders, outside_limit=0.0).match([View(front_camera(), mask)])
@@ -82,7 +83,7 @@ def test_automatic_threshold_doubles_until_a_pose_is_found(sliders):
     mask = np.zeros((100, 100), dtype=bool)
     mask[46:54, 41:59] = True
     result = slider_search(sliders).match([View(front_camera(), mask)])
-    # 12.6 % of the mean of 200 and 48 pixels is 15.6; the wide box leaves the mask by 56.
+    # 12.6 % of the mean of 200 and 48 pixels is 15.6; the wide box has 56 pixels outside.
     assert result.found
     assert result.outside_limit[0] == pytest.approx(0.126 * 124 * 4)
     assert result.runs == 1 + 1 + 2
@@ -90,8 +91,8 @@ def test_automatic_threshold_doubles_until_a_pose_is_found(sliders):
 
 @pytest.mark.parametrize("K", [1, 5])
 @pytest.mark.parametrize("body", ["chain3", "chain4", "fork"])
-def test_search_does_what_the_paper_says(tmp_path, body, K):
-    """Against the same procedure on plain pictures: pose, J, first J and runs of step 3."""
+def test_search_equals_a_naive_implementation_of_the_paper(tmp_path, body, K):
+    """Pose, J, first J and runs of step 3 equal those of the naive implementation."""
     model = forked_body(tmp_path) if body == "fork" else swinging_chain(tmp_path, int(body[-1]))
     r = 12.0
     settings = PaperSearchSettings(
@@ -115,8 +116,8 @@ def test_search_does_what_the_paper_says(tmp_path, body, K):
                 np.testing.assert_array_equal(result.node_values[i], values)
 
 
-def test_several_views_are_one_search(tmp_path):
-    """Two cameras at right angles settle a turn that one camera cannot see."""
+def test_a_second_view_determines_a_turn_invisible_in_the_first(tmp_path):
+    """Of two cameras at right angles one sees the disc's sign of rotation."""
     model = load_body(
         tmp_path,
         box_link("disc", 12, 12, y=3.0),
@@ -137,7 +138,7 @@ def test_several_views_are_one_search(tmp_path):
     assert len(result.outside_limit) == 2
 
 
-def test_run_limit_stops_and_says_so(tmp_path):
+def test_the_run_limit_is_reported(tmp_path):
     settings = PaperSearchSettings(run_limit=2, outside_limit=50.0)
     search = PaperSearch(swinging_chain(tmp_path, 3).pose_tree(), settings)
     camera = front_camera()

@@ -1,4 +1,4 @@
-"""The multi-start search on arms and chains, clean and damaged, and on bad input."""
+"""The multi-start search on arms and chains, with exact and damaged masks."""
 
 import numpy as np
 import pytest
@@ -51,7 +51,7 @@ def all_values(result):
 
 
 def worst_place(tree, result, values):
-    """How far the beginning of a link, or the hand's end, is from where it should be [m]."""
+    """Return the greatest position error of a link's origin or the hand's end [m]."""
     ends = []
     for one in (all_values(result), values):
         X_WN = tree.node_poses(split(tree, one))
@@ -60,7 +60,7 @@ def worst_place(tree, result, values):
 
 
 def recount(tree, result, views):
-    """J by its definition (1): pixels that differ."""
+    """Return J by its definition (1): the number of pixels that differ."""
     drawn = [draw_view(tree, all_values(result), view.camera) for view in views]
     return sum(int((one.mask ^ view.mask).sum()) for one, view in zip(drawn, views, strict=True))
 
@@ -75,7 +75,7 @@ def chain_values(tree, rng):
     return [rng.uniform(*tree.value_bounds(i)) for i in range(len(tree.nodes))]
 
 
-def test_an_exact_pose_is_found_by_pixels_and_said_to_be_known(tree, search, pose):
+def test_exact_masks_give_an_accurate_pose_with_intervals(tree, search, pose):
     views = clean_views(tree, pose)
     result = search.match(views)
     assert result.explained
@@ -124,7 +124,7 @@ def test_modes_are_as_good_as_the_best(chain):
         assert mode.joints[0].holds(mode.node_values[0][0])
 
 
-def test_nothing_is_determined_where_the_body_does_not_fit(chain):
+def test_no_value_is_determined_if_the_model_does_not_fit(chain):
     view = chain_view(chain.tree, chain_values(chain.tree, np.random.default_rng(6)))
     assert any(joint.determined for joint in chain.match([view]).pose_set.joints)
     spoilt = view.mask.copy()
@@ -133,7 +133,7 @@ def test_nothing_is_determined_where_the_body_does_not_fit(chain):
     assert not any(joint.determined for joint in joints)
 
 
-def test_the_search_by_pixels_certifies_exact_masks_and_gives_up_others(chain):
+def test_exact_search_accepts_exact_masks_and_gives_up_on_others(chain):
     view = chain_view(chain.tree, chain_values(chain.tree, np.random.default_rng(3)))
     problem = RefinementProblem(chain.exact.body, [view])
     found = chain.exact.find(problem, None, np.inf)
@@ -146,24 +146,24 @@ def test_the_search_by_pixels_certifies_exact_masks_and_gives_up_others(chain):
 
 
 @pytest.mark.slow
-def test_damaged_and_ill_fitting_arms(tree, search):
+def test_damaged_masks_of_misfitting_arms_give_accurate_poses(tree, search):
     places, held = [], []
     for seed in range(8):
         values = draw_pose(tree, np.random.default_rng(100 + seed))
         result = search.match(damaged_views(tree, values, seed))
         places.append(worst_place(tree, result, values))
-        shares = [
+        fractions = [
             np.mean([one.holds(v) for one, v in zip(mode.joints, values, strict=True)])
             for mode in result.pose_set.modes
         ]
-        held.append(max(shares))
-    # Flips leave the hand where it is, but not what is between.
+        held.append(max(fractions))
+    # Flips keep the hand in place, but move the links between.
     assert np.median(places) < 0.02
     assert np.mean(held) >= 0.85
 
 
 @pytest.mark.parametrize("make", [damaged_views, lambda tree, pose, _: clean_views(tree, pose)])
-def test_the_same_every_time(tree, search, pose, make):
+def test_results_do_not_depend_on_the_number_of_workers(tree, search, pose, make):
     views, found = make(tree, pose, 3), []
     for workers in (1, 3):
         with use_workers(workers):
@@ -174,7 +174,7 @@ def test_the_same_every_time(tree, search, pose, make):
         assert (one.low, one.high) == (other.low, other.high)
 
 
-def test_no_time_at_all(tree, pose):
+def test_a_zero_time_limit_returns_a_pose(tree, pose):
     views = clean_views(tree, pose)
     result = MultiStartSearch(tree, time_limit=0.0).match(views)
     assert (result.found, result.stopped_by) == (True, "time_limit")
@@ -187,7 +187,7 @@ def test_no_time_at_all(tree, pose):
     [np.s_[:, :], np.s_[100:101, 150:151], np.s_[:12, :]],
     ids=["all", "one pixel", "strip"],
 )
-def test_a_mask_that_no_pose_explains(search, where):
+def test_masks_that_no_pose_explains_are_reported(search, where):
     (camera, _) = arm_cameras()
     mask = np.zeros((camera.height, camera.width), dtype=bool)
     mask[where] = True
@@ -196,8 +196,8 @@ def test_a_mask_that_no_pose_explains(search, where):
     assert result.E_total > 0.5
 
 
-def test_body_cut_off_by_the_pictures_edge(tree, search, pose):
-    """What would lie outside the picture does not count against a pose."""
+def test_a_body_cut_off_by_the_image_border_is_found(tree, search, pose):
+    """The area outside the image costs nothing."""
     views = []
     for camera, columns in zip(arm_cameras(320, 240), (slice(0, 250), slice(60, 320)), strict=True):
         whole = draw_view(tree, pose, camera)
@@ -214,14 +214,14 @@ def test_body_cut_off_by_the_pictures_edge(tree, search, pose):
     assert worst_place(tree, result, pose) < 0.02
 
 
-def test_salt_noise(tree, search, pose):
+def test_salt_noise_does_not_spoil_the_pose(tree, search, pose):
     generator = np.random.default_rng(8)
     views = clean_views(tree, pose)
     for view in views:
         view.mask[generator.random(view.mask.shape) < 0.1] = True
     result = search.match(views)
     assert worst_place(tree, result, pose) < 0.02
-    # J is still that of the silhouettes as they were given.
+    # J is that of the given silhouettes, with the noise.
     assert result.J == recount(tree, result, views)
 
 
@@ -238,7 +238,7 @@ def shape():
     return mask
 
 
-def test_only_masks_full_of_specks_are_cleaned():
+def test_only_masks_with_many_specks_are_filtered():
     mask = shape()
     mask[5, 5] = True
     assert without_specks(mask) is mask

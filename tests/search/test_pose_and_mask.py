@@ -1,4 +1,4 @@
-"""Poses and masks that better each other, of an arm painted over Drake's label images."""
+"""Alternating estimation of pose and mask, on an arm painted over Drake's label images."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from drake_pose.search.pose_and_mask import (
     PictureLevel,
     cut_by_foreground,
     follow_colours,
-    narrowed,
+    next_error,
 )
 from drake_pose.silhouette.pictures.masks import intersection_over_union
 from drake_pose.silhouette.scoring import draw_mask
@@ -28,8 +28,8 @@ def drawn(episode, values):
     return draw_mask(body.full, episode.camera.X_CW @ body.kinematics.poses(values), episode.camera)
 
 
-def test_poses_come_nearer_and_masks_are_what_is_drawn(episode):
-    """Where a camera has no picture it has no mask; what is far off is told in deviations."""
+def test_poses_and_masks_approach_the_ground_truth(episode):
+    """A camera without an image has no mask; deviations are in units of the first error."""
     rng = np.random.default_rng(0)
     deviation = np.radians(4.0)
     starts = episode.values + rng.normal(0.0, deviation, episode.values.shape)
@@ -54,7 +54,7 @@ def test_poses_come_nearer_and_masks_are_what_is_drawn(episode):
     assert np.median(off) < 0.5 * np.median(np.abs(starts - episode.values))
 
 
-def test_a_silhouette_follows_a_mask_near_its_edge_alone():
+def test_a_silhouette_follows_a_mask_only_near_its_edge():
     silhouette = np.zeros((120, 120), bool)
     silhouette[10:110, 10:110] = True
     mask = silhouette.copy()
@@ -63,12 +63,12 @@ def test_a_silhouette_follows_a_mask_near_its_edge_alone():
     mask[50:60, 50:60] = False
     mask[10:110, 110] = True
     found = follow_colours(silhouette, mask)
-    assert found[50:60, 50:60].all(), "amidst the body it does not follow"
-    # A hundredth of the size is one pixel, inwards and outwards.
+    assert found[50:60, 50:60].all(), "inside the silhouette the mask is ignored"
+    # The band has a half width of a hundredth of the size: one pixel.
     np.testing.assert_array_equal(found[40, 105:114], [1, 1, 1, 1, 0, 1, 0, 0, 0])
 
 
-def test_a_cut_is_sure_where_odds_are_and_follows_colours_elsewhere():
+def test_foreground_is_cut_by_log_odds_and_by_colours():
     picture = np.full((60, 80, 3), 40, np.uint8)
     cv2.circle(picture, (40, 30), 15, (200, 180, 60), -1)
     object_ = picture[..., 0] > 100
@@ -80,12 +80,12 @@ def test_a_cut_is_sure_where_odds_are_and_follows_colours_elsewhere():
     np.testing.assert_array_equal(
         cut_by_foreground(picture, np.full_like(chance, 0.5), ratio)[5:-5], ratio[5:-5] > 0.0
     )
-    # What a pose rules out is nowhere.
+    # Pixels of the least probability are background.
     assert not cut_by_foreground(picture, np.full_like(chance, 0.01), ratio).any()
 
 
 @pytest.mark.parametrize(
-    ("share", "agreements", "left"),
+    ("error", "agreements", "expected"),
     [
         (1.0, (0.95, 0.92), 0.5),
         (0.2, (0.95,), 0.14),
@@ -95,11 +95,11 @@ def test_a_cut_is_sure_where_odds_are_and_follows_colours_elsewhere():
         (1.0, (np.nan, 0.95), 0.5),
     ],
 )
-def test_what_agrees_better_is_searched_nearer(share, agreements, left):
-    assert narrowed(share, agreements, PoseAndMaskSettings()) == pytest.approx(left)
+def test_error_decreases_with_agreement(error, agreements, expected):
+    assert next_error(error, agreements, PoseAndMaskSettings()) == pytest.approx(expected)
 
 
-def test_smaller_pictures_are_those_of_smaller_cameras(episode):
+def test_reduced_images_match_their_cameras(episode):
     small = PictureLevel((episode.camera,), [[episode.pictures[0]], [None]]).downscaled(0.5)
     (camera,), ((picture,), (nothing,)) = small
     assert picture.shape == (camera.height, camera.width, 3) == (60, 80, 3)

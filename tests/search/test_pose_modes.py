@@ -1,4 +1,4 @@
-"""The set of poses as good as the best: against the definition, and on experiment A."""
+"""Compare the set of poses as good as the best, and its modes, with their definitions."""
 
 import math
 
@@ -21,7 +21,7 @@ from tests.search.grid_problems import ProblemMaker
 
 @pytest.fixture(scope="module")
 def flipping_body(tmp_path_factory):
-    """A trunk, an arm whose turn towards the camera looks like one away from it, a hidden hand."""
+    """A trunk, an arm that turns towards or away from the camera alike, and a hidden knob."""
     model = load_body(
         tmp_path_factory.mktemp("flipping"),
         box_link("trunk", 14, 20),
@@ -44,7 +44,7 @@ def seen_values(problem, J, node):
     return np.unique(problem.body.sampled.values[node][rows[:, node], 0])
 
 
-def test_towards_and_away_from_the_camera_are_two_modes(flipping_body):
+def test_turns_towards_and_away_from_the_camera_are_two_modes(flipping_body):
     values = [np.array([0.4]), np.array([0.8]), np.array([-1.2])]
     problem = flipping_body.show(values)
     answer = found_modes(problem)
@@ -68,7 +68,7 @@ def test_towards_and_away_from_the_camera_are_two_modes(flipping_body):
     assert not is_held(answer, np.array([0.4, 0.0, 0.0]))
 
 
-def test_the_set_is_that_of_the_definition(tmp_path):
+def test_pose_set_matches_its_definition(tmp_path):
     generator = np.random.default_rng(21)
     for model in (swinging_chain(tmp_path, 3), forked_body(tmp_path)):
         maker = ProblemMaker(model.pose_tree(), 0.4)
@@ -90,21 +90,21 @@ def test_the_set_is_that_of_the_definition(tmp_path):
                 assert report.determined or ends == pytest.approx((seen[0], seen[-1]))
 
 
-def test_modes_are_the_connected_groups_of_clusters(flipping_body):
+def test_modes_are_combinations_of_connected_clusters(flipping_body):
     problem = flipping_body.make(np.random.default_rng(22), views=1, noise=0.01, on_grid=False)
     answer = found_modes(problem, 120.0)
     J, groups = problem.best[1] + 120.0, []
     rows = np.array([*problem.within(J)])
     for node, grid in enumerate(flipping_body.body.sampled.values):
         seen = seen_values(problem, J, node)
-        # A gap is more than a step of the grid.
+        # Clusters are separated by more than a step of the grid.
         breaks = seen[1:][np.diff(seen) > 0.4 * 1.01]
         groups.append((grid[rows[:, node]] >= breaks - 1e-9).sum(axis=1))
     assert answer.mode_count == len(np.unique(groups, axis=1).T)
     assert [f.J for f in answer.modes] == sorted(f.J for f in answer.modes)
 
 
-def test_a_better_pose_that_turns_up_takes_the_place_of_the_known_one(flipping_body):
+def test_a_better_pose_replaces_the_known_one(flipping_body):
     problem = flipping_body.make(np.random.default_rng(23), views=1, noise=0.0, on_grid=True)
     worse = int(np.argsort(problem.Js)[40])
     J = float(problem.Js[worse])
@@ -115,7 +115,7 @@ def test_a_better_pose_that_turns_up_takes_the_place_of_the_known_one(flipping_b
 
 
 @pytest.mark.parametrize("limits", [{"time_limit": 0.0}, {"states": 1}, {"pairs": 1}])
-def test_a_limit_still_leaves_the_best_pose_and_is_reported(flipping_body, limits):
+def test_a_limit_keeps_the_best_pose_and_is_reported(flipping_body, limits):
     problem = flipping_body.make(np.random.default_rng(24), views=1, noise=0.0, on_grid=False)
     samples, J = problem.best
     answer = find_modes(problem.body, problem.views, samples, J, 60.0, limits=BoundLimits(**limits))
@@ -124,18 +124,18 @@ def test_a_limit_still_leaves_the_best_pose_and_is_reported(flipping_body, limit
     assert answer.modes[0].J == J
 
 
-def test_by_default_the_noise_is_a_share_of_the_contour(flipping_body):
+def test_default_tolerance_is_a_fraction_of_the_contour_length(flipping_body):
     problem = flipping_body.make(np.random.default_rng(25), views=1, noise=0.01, on_grid=True)
     assert found_modes(problem).tolerance == pytest.approx(0.05 * contour_length(problem.views))
     mask = np.zeros((70, 70), dtype=np.bool_)
     mask[10:20, 30:50] = True
-    # Along the picture's edge there is no contour: what lies beyond is not known.
+    # The image border is no contour.
     mask[60:, 10:12] = True
     expected = 2 * 20 + 2 * 8 + 20
     assert contour_length([View(problem.views[0].camera, mask)]) == expected
 
 
-def test_samples_that_turn_a_node_alike_are_one_cluster(tmp_path):
+def test_samples_with_equal_rotations_are_one_cluster(tmp_path):
     model = load_body(
         tmp_path,
         box_link("wheel", 10, 4),
@@ -149,7 +149,7 @@ def test_samples_that_turn_a_node_alike_are_one_cluster(tmp_path):
     assert set(labels.tolist()) == {-1, 0}
 
 
-def test_steps_of_grids():
+def test_grid_steps_of_products_and_other_grids():
     product = np.array([[0.0, 1.0, 5.0], [0.0, 3.0, 5.0], [0.5, 1.0, 5.0], [0.5, 3.0, 5.0]])
     np.testing.assert_allclose(grid_steps(product), [0.5, 2.0, np.inf])
     circle = np.array([[math.cos(a), math.sin(a)] for a in np.arange(6) * math.pi / 3])

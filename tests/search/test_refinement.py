@@ -1,4 +1,4 @@
-"""Refinement against what is drawn and against finite differences."""
+"""Compare refinement by pixels with drawn bodies and with small changes of the pose."""
 
 import math
 
@@ -48,13 +48,13 @@ def search(body):
 
 
 def drawn(body, parameters, camera):
-    """The silhouette, drawn by the exact renderer of whole bodies."""
+    """Return the silhouette (H, W), drawn by the span kernel."""
     outlines = TreeSurfaces(body.tree).at(body.node_values(parameters))
     return draw_mask(outlines, camera.X_CW @ body.poses(parameters), camera)
 
 
 def random_pose(body, seed, share=0.8):
-    """A pose inside the middle of the limits, the root where it is."""
+    """Draw a pose in the middle fraction of the limits, with the root at its position."""
     rng = np.random.default_rng(seed)
     lower, upper = body.lower[:-4], body.upper[:-4]
     middle, half = 0.5 * (upper + lower), 0.5 * share * (upper - lower)
@@ -67,8 +67,8 @@ def problem_of(body, pose, cameras):
 
 
 @pytest.mark.parametrize("kind", ["parallel", "pinhole"])
-def test_J_is_that_of_the_drawn_body(body, kind):
-    """Skin, shift and growth included, whatever poses were asked for before."""
+def test_J_equals_the_area_of_the_drawn_difference(body, kind):
+    """Skin, shift and log scale are included, and earlier poses have no effect."""
     camera = camera_of(kind)
     problem = problem_of(body, random_pose(body, 1), [camera])
     for seed in (2, 3):
@@ -79,7 +79,7 @@ def test_J_is_that_of_the_drawn_body(body, kind):
     assert problem.J(random_pose(body, 1)) == 0
 
 
-def test_areas_and_borders_near(body, search):
+def test_errors_near_parts_and_border_length(body, search):
     camera = camera_of("parallel")
     problem = problem_of(body, random_pose(body, 1), [camera])
     pose = random_pose(body, 2)
@@ -87,7 +87,7 @@ def test_areas_and_borders_near(body, search):
     reaches = search.reaches(problem, pose)[0]
     expected = [np.count_nonzero((u - x) ** 2 + (v - y) ** 2 < r**2) for x, y, r in reaches]
     np.testing.assert_allclose(search.errors_near(problem, pose), expected, rtol=0.03, atol=15.0)
-    # A square's border is as long as its sides but for what crosses at 0 and 90 degrees only.
+    # The estimated length of a border along rows and columns is pi / 4 of the true one.
     square = np.zeros((400, 400), dtype=bool)
     square[100:200, 100:300] = True
     lone = RefinementProblem(body, [View(camera, square)])
@@ -95,8 +95,8 @@ def test_areas_and_borders_near(body, search):
 
 
 @pytest.mark.parametrize("kind", ["parallel", "pinhole"])
-def test_one_step_takes_a_small_change_back(body, kind):
-    """The normal equations know how far each value is off: their derivatives are right."""
+def test_one_step_reverts_a_small_change(body, kind):
+    """The normal equations give the change of each value, so their derivatives are right."""
     true = random_pose(body, 5)
     problem = problem_of(body, true, [camera_of(kind), camera_of(kind, turned=True)])
     freedom, step, off = body.freedom(None, (0, 1, 2, 3)), 0.02, []
@@ -105,12 +105,12 @@ def test_one_step_takes_a_small_change_back(body, kind):
         moved[j] += step
         equations, _ = problem.equations(moved, freedom, Pass(1, 1, 3.0, 1.0))
         off.append(abs(equations.g[0, one] / equations.H[0, one, one] / step - 1.0))
-    # Pixels, and what the change covers and uncovers, leave some doubt.
+    # Pixels, and parts that the change covers and uncovers, cause errors.
     assert np.median(off) < 0.1
     assert np.quantile(off, 0.85) < 0.35
 
 
-def test_a_refined_pose_is_a_local_optimum_inside_the_limits(body):
+def test_a_refined_pose_is_a_local_optimum_within_the_limits(body):
     cameras = [camera_of("parallel"), camera_of("parallel", turned=True)]
     for seed in (7, 8):
         true = random_pose(body, seed, share=1.0)
@@ -136,7 +136,7 @@ def test_a_refined_pose_is_a_local_optimum_inside_the_limits(body):
                 assert problem.J(moved) >= 0.9 * least
 
 
-def test_a_part_in_the_wrong_place_is_found_again(body, search):
+def test_a_misplaced_part_is_corrected(body, search):
     true = random_pose(body, 11, share=0.5)
     problem = problem_of(body, true, [camera_of("parallel")])
     wrong = true.copy()
@@ -152,8 +152,8 @@ def test_a_part_in_the_wrong_place_is_found_again(body, search):
     np.testing.assert_array_equal(once, wrong)
 
 
-def test_pixels_that_are_right_pull_little(body):
-    """Refined to the end fewer pixels are wrong, and the pose is nearer, than by least squares."""
+def test_slack_leaves_fewer_wrong_pixels_than_least_squares(body):
+    """The last passes leave fewer wrong pixels and smaller errors than least squares."""
     gains, freedom = [], body.freedom()
     for seed in (51, 52, 53, 54):
         true = random_pose(body, seed, share=0.5)
@@ -180,21 +180,21 @@ def test_parts_are_ends_of_limbs_and_nodes_of_the_trunk(body):
         assert part.held == tuple(nodes[part.nodes[-1]].children)
 
 
-def test_no_part_reaches_over_a_fork(tmp_path):
-    """A trunk and what is hung on it, which are as short as limbs can be."""
+def test_parts_do_not_extend_over_a_fork(tmp_path):
+    """The limbs of this body have the least possible length."""
     tree = forked_body(tmp_path).pose_tree()
     for part in find_parts(tree):
         assert all(len(tree.nodes[node].children) == 1 for node in part.nodes[:-1])
 
 
 def middles(body, parameters, part):
-    """The middles of a part's nodes (k, 3)."""
+    """Return the centres (k, 3) of a part's nodes [m]."""
     X_WN = body.poses(parameters)[list(part.nodes)]
     p_N = np.array([body.surfaces.rigid[node].ball[:3] for node in part.nodes])
     return np.einsum("kij,kj->ki", X_WN[:, :3, :3], p_N) + X_WN[:, :3, 3]
 
 
-def test_a_mirrored_part_looks_nearly_the_same(body, search):
+def test_a_mirrored_part_has_nearly_mirrored_centers(body, search):
     camera = camera_of("parallel")
     true = random_pose(body, 4, share=0.5)
     problem = problem_of(body, true, [camera])
@@ -208,13 +208,13 @@ def test_a_mirrored_part_looks_nearly_the_same(body, search):
         before, after = middles(body, true, part), middles(body, mirrored, part)
         wanted = before - 2.0 * np.outer((before - joint) @ depth, depth)
         shares.append(np.linalg.norm(after - wanted) / np.linalg.norm(before - wanted))
-    # Limits do not let every part be mirrored.
+    # Joint limits prevent some parts from being mirrored.
     assert max(shares) < 1.0
     assert np.median(shares) < 0.4
 
 
-def test_halves_of_a_body_seen_from_its_side_look_alike_mirrored(body, search):
-    """The mirror image of a symmetric body has its left and its right exchanged, and no limits."""
+def test_mirrored_halves_seen_from_the_side_have_the_same_silhouette(body, search):
+    """The mirror image of a symmetric body is the body with left and right exchanged."""
     camera = camera_of("parallel", turned=True)
     for part in find_reflections(body.tree):
         shares = []
@@ -227,8 +227,8 @@ def test_halves_of_a_body_seen_from_its_side_look_alike_mirrored(body, search):
         assert np.median(shares) < 0.003
 
 
-def test_a_body_mirrored_with_left_and_right_exchanged_looks_nearly_the_same(body, search):
-    """Seen by parallel rays, a body that is its own mirror image is the other one's equal."""
+def test_a_mirrored_body_has_nearly_the_same_silhouette(body, search):
+    """Under parallel projection a symmetric body mirrored in depth has the same silhouette."""
     camera = camera_of("parallel")
     whole = [r for r in find_reflections(body.tree) if len(r.nodes) == len(body.tree.nodes)]
     assert len(whole) == 1
@@ -245,11 +245,11 @@ def test_a_body_mirrored_with_left_and_right_exchanged_looks_nearly_the_same(bod
         other, _, _ = descend(problem, reflected, body.freedom(), PASSES.coarse + PASSES.fine)
         assert np.abs(other - true).max() > 0.3
         shares.append(problem.J(other) / problem.area)
-    # Limits do not let every pose be mirrored.
+    # Joint limits prevent some poses from being mirrored.
     assert np.median(shares) < 0.1
 
 
-def test_intervals_hold_the_truth_and_say_what_is_free(body, search):
+def test_intervals_of_exact_masks_contain_the_true_values(body, search):
     cameras = [camera_of("parallel"), camera_of("parallel", turned=True)]
     held, claimed = 0, 0
     for seed in (21, 22, 23):

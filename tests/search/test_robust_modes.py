@@ -1,4 +1,4 @@
-"""The answer as a set where bodies fit badly: intervals, free joints, flips."""
+"""Pose sets from damaged masks: intervals, undetermined joints, flips."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def kinematics(tmp_path_factory):
     return TreeKinematics(arm_tree(tmp_path_factory.mktemp("arm")))
 
 
-def test_intervals_hold_the_truth_and_widen_with_the_damage(kinematics):
+def test_intervals_contain_the_true_values_and_widen_with_damage(kinematics):
     tree = kinematics.tree
     clean = [draw_view(tree, TRUTH, camera) for camera in arm_cameras(640, 480)]
     widths = []
@@ -43,12 +43,12 @@ def test_intervals_hold_the_truth_and_widen_with_the_damage(kinematics):
         for one, value in zip(mode.joints, mode.q, strict=True):
             assert one.holds(value)
     assert np.all(np.array(widths[0]) < np.radians(10.0))
-    # A pixel of error in every camera is assumed where nothing is damaged, too.
+    # Also without damage an error of a pixel in each camera is assumed.
     assert np.median(np.array(widths[1]) / widths[0]) > 1.03
 
 
-def test_flips_are_modes_of_their_own(kinematics):
-    """Where nothing is significant, all that flips make is as good; nothing is determined."""
+def test_flips_are_separate_modes(kinematics):
+    """If no difference is significant, all flips are modes and no value is determined."""
     tree = kinematics.tree
     views = [draw_view(tree, TRUTH, camera) for camera in arm_cameras()]
     nothing = RobustSettings(significance=1e6, modes=5)
@@ -60,8 +60,8 @@ def test_flips_are_modes_of_their_own(kinematics):
         assert min(gaps) < np.radians(15.0)
 
 
-def test_a_round_hand_may_turn_as_it_likes(tmp_path):
-    """A cylinder's turn about its axis does not show: free, and over the whole range."""
+def test_a_turn_about_an_axis_of_symmetry_is_not_determined(tmp_path):
+    """A cylinder's turn about its axis is invisible: its interval is the whole range."""
     box, cylinder = '<box size="0.1 0.2 0.6"/>', '<cylinder radius="0.05" length="0.3"/>'
     shape = '<visual><origin xyz="0 0 {}"/><geometry>{}</geometry></visual>'
     tilts, spins = 'lower="-1.5" upper="1.5"', 'lower="-2" upper="2.5"'
@@ -81,7 +81,7 @@ def test_a_round_hand_may_turn_as_it_likes(tmp_path):
     assert (spin.low, spin.high) == (-2.0, 2.5)
 
 
-def test_time_that_is_up_leaves_the_intervals_of_the_curvature(kinematics):
+def test_without_time_intervals_follow_from_the_covariance(kinematics):
     views = damaged_views(kinematics.tree, TRUTH, 1)
     fit = ViewsFit(kinematics, simplify_surfaces(TreeSurfaces(kinematics.tree)), views)
     pose = fit.refine(TRUTH, FINE)
@@ -92,7 +92,7 @@ def test_time_that_is_up_leaves_the_intervals_of_the_curvature(kinematics):
     assert all(one.low < one.high for one in answer.joints)
 
 
-def test_refinement_keeps_limits_and_what_is_held(kinematics):
+def test_refinement_respects_limits_and_held_values(kinematics):
     views = [draw_view(kinematics.tree, TRUTH, camera) for camera in arm_cameras()]
     fit = ViewsFit(kinematics, simplify_surfaces(TreeSurfaces(kinematics.tree)), views)
     outside = kinematics.upper + 0.5
@@ -107,7 +107,7 @@ def test_refinement_keeps_limits_and_what_is_held(kinematics):
     assert np.abs(near.values - TRUTH).max() < np.radians(1.5)
 
 
-def test_distinct_keeps_the_best_of_those_alike():
+def test_distinct_keeps_the_best_of_equal_poses():
     poses = [FittedPose(np.array([x, 0.0]), cost) for x, cost in ((0, 3), (0.01, 1), (1, 2))]
     assert [pose.cost for pose in distinct(poses, 5)] == [1, 2]
     assert [pose.cost for pose in distinct(poses, 1)] == [1]

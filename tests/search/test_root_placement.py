@@ -8,7 +8,8 @@ from drake_pose.body import RootRotation, bundled_model, load_model
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.errors import SettingsError
 from drake_pose.search import BeamSearchSettings, RootPlacementSearch, View, hub, turns_freely
-from drake_pose.search.root_placement import choose_root_samples, find_root_places, whereabouts
+from drake_pose.search.root_placement import choose_root_samples
+from drake_pose.search.root_places import find_root_places, root_steps
 from drake_pose.search.sampled_body import SampledBody
 from drake_pose.silhouette.scoring import draw_mask
 from drake_pose.workers import use_workers
@@ -19,7 +20,7 @@ SETTINGS = BeamSearchSettings(interval=math.radians(30.0))
 
 @pytest.fixture(scope="module")
 def body(tmp_path_factory):
-    """A trunk with two unequal arms, which turns in the picture and slides anywhere."""
+    """A trunk with two unequal arms that turns in the image plane and slides anywhere."""
     slides, parent = [], "world"
     for name, axis in (("x", "1 0 0"), ("y", "0 1 0"), ("z", "0 0 1")):
         carriage = f"carriage_{name}"
@@ -44,7 +45,7 @@ EYE = PinholeCamera("eye", 200, 200, 300.0, 300.0, 99.5, 99.5, front_camera().X_
 
 
 def picture(body, camera, position, angles=TRUE_ANGLES):
-    """The silhouette of the body as its own joints place it, by the plant's own kinematics."""
+    """Return the silhouette (H, W) of the body, placed by the plant's own joints."""
     q = np.array(body.default_positions)
     named = dict(zip(("slide_x", "slide_y", "slide_z"), position, strict=True)) | angles
     for name, value in named.items():
@@ -71,8 +72,8 @@ def angle_errors(body, result):
         ((2.0, 2.0, 1.0, 1.0), False),
     ],
 )
-def test_three_angles_at_the_root_turn_it_in_all_ways(tmp_path, ranges, free):
-    """Ranges in half turns: all directions are two whole turns and a half one between them."""
+def test_three_angles_at_the_root_give_every_rotation(tmp_path, ranges, free):
+    """``ranges`` in half turns: two full turns and a half turn give every rotation."""
     names = [f"gimbal_{k}" for k in range(len(ranges) - 1)] + ["ball"]
     parts = [f'<link name="{name}"/>' for name in names[:-1]]
     for k, (one, share) in enumerate(zip(names, ranges, strict=True)):
@@ -89,7 +90,7 @@ def test_three_angles_at_the_root_turn_it_in_all_ways(tmp_path, ranges, free):
 
 @pytest.fixture(scope="module")
 def seen(body):
-    """The body before a parallel camera of 100 pixels a metre, its trunk at PLACE."""
+    """The body in a parallel camera of 100 pixels per metre, with the trunk at PLACE."""
     camera = front_camera(160)
     return View(camera, picture(body, camera, PLACE))
 
@@ -117,7 +118,7 @@ def test_position_and_scale_of_a_parallel_camera_are_found(body, seen):
 def test_depth_of_a_pinhole_is_found(body):
     result = placed(body.pose_tree(), [View(EYE, picture(body, EYE, (3.8, 0.05, 0.1)))])
     assert result.E_total < 0.05
-    # The camera stands at x = 5.
+    # The camera is at x = 5 m.
     assert 5.0 - result.root_position[0] == pytest.approx(1.2, rel=0.06)
     assert result.root_position[1:] == pytest.approx([0.05, 0.1], abs=0.03)
 
@@ -130,14 +131,14 @@ def test_two_cameras_find_the_position_in_space(body):
     side = replace(front, name="side", X_WC=turn @ front.X_WC)
     position = (0.21, -0.12, 0.18)
     views = [View(camera, picture(body, camera, position)) for camera in (front, side)]
-    # A camera may be missing; what the other one cannot see stays arbitrary.
+    # With a single camera the position along its axis is arbitrary.
     for count, known in ((2, slice(0, 3)), (1, slice(1, 3))):
         result = placed(body.pose_tree(), views[:count])
         assert result.E_total < 0.06
         assert result.root_position[known] == pytest.approx(position[known], abs=0.03)
 
 
-def test_what_touches_the_pictures_edge_may_reach_beyond_it(body):
+def test_a_root_may_lie_beyond_the_image_border(body):
     camera = front_camera(160)
     mask = picture(body, camera, (0.0, 0.1, 0.8))
     assert mask[0].any()
@@ -146,14 +147,14 @@ def test_what_touches_the_pictures_edge_may_reach_beyond_it(body):
     assert np.linalg.norm(layer.positions[:, 1:] - [0.1, 0.8], axis=1).min() < 0.04
 
 
-def test_a_turned_over_tree_finds_as_good_a_pose(body, seen):
-    """The same silhouette, searched from the trunk and from the end of an arm."""
+def test_another_root_gives_an_equally_good_pose(body, seen):
+    """The same silhouette is searched with the trunk and with an arm as the root."""
     own = placed(body.pose_tree(), [seen])
     rotation = RootRotation.limited([("x", -180.0, 180.0)])
     tree = body.pose_tree("left", root_position=np.zeros(3), root_rotation=rotation)
     turned = placed(tree, [seen])
     assert abs(own.E_total - turned.E_total) < 0.03
-    # The plant's own joints cannot turn the body about the arm: its world is turned instead.
+    # The plant's joints cannot turn the body about the arm, so X_WB is turned instead.
     assert max(angle_errors(body, own)) < 0.1
     assert max(angle_errors(body, turned)[1:]) < 0.1
     assert math.atan2(*turned.X_WB[[2, 1], 1]) == pytest.approx(TRUE_ANGLES["trunk_turn"], abs=0.1)
@@ -165,13 +166,13 @@ def test_a_known_position_is_kept(body, seen):
     assert result.E_total < 0.04
 
 
-def test_no_time_gives_an_answer_all_the_same(body, seen):
+def test_a_zero_time_limit_returns_a_placement(body, seen):
     settings = replace(SETTINGS, time_limit=0.0)
     result = RootPlacementSearch(body.pose_tree(), settings).match([seen])
     assert (result.found, result.stopped_by) == (True, "time_limit")
 
 
-def test_scale_needs_one_parallel_camera(body):
+def test_an_unknown_scale_needs_one_parallel_camera(body):
     search = RootPlacementSearch(body.pose_tree(), SETTINGS, scale_unknown=True)
     with pytest.raises(SettingsError, match="eye"):
         search.match([View(EYE, np.ones((200, 200), dtype=np.bool_))])
@@ -179,12 +180,12 @@ def test_scale_needs_one_parallel_camera(body):
         search.match([])
 
 
-def test_whereabouts_count_the_steps_that_are_tried():
+def test_root_steps_have_the_spacing_of_the_candidates():
     mask = np.zeros((200, 200), dtype=np.bool_)
     mask[50:170, 50:170] = True
-    # The camera stands at x = 5; a twelfth of the silhouette's extent is 10 pixels.
+    # The camera is at x = 5 m; a twelfth of the silhouette's extent is 10 pixels.
     near, far, aside = (
-        whereabouts([View(EYE, mask)], np.array([5.0 - depth, y, 0.0]))
+        root_steps([View(EYE, mask)], np.array([5.0 - depth, y, 0.0]))
         for depth, y in ((1.12, 0.0), (1.12**2, 0.0), (1.12, 2.0 * 10.0 / 300.0 * 1.12))
     )
     assert near - far == pytest.approx([0.0, 0.0, 1.0])
@@ -192,8 +193,8 @@ def test_whereabouts_count_the_steps_that_are_tried():
 
 
 @pytest.mark.parametrize("parallel", [True, False])
-def test_the_roots_best_rotations_are_chosen(parallel):
-    """Against drawing every rotation at every position."""
+def test_the_best_rotations_of_the_root_are_chosen(parallel):
+    """Compare with drawing every rotation at every position."""
     tree = load_model(bundled_model("hand")).pose_tree(
         "palm", root_position=np.zeros(3), root_rotation=RootRotation.free(interval_deg=60.0)
     )
@@ -220,6 +221,6 @@ def test_the_roots_best_rotations_are_chosen(parallel):
         masks = [drawn(position, rotation) for rotation in range(len(X_WR))]
         costs = [2.0 * (one & ~mask).sum() - (one & mask).sum() for one in masks]
         best = np.argsort(costs)[:10]
-        # A whole pixel's shift is all that the pictures may be off by.
+        # Shifting by whole pixels may exchange rotations of nearly equal cost.
         missing = set(best) - set(rotations[places == k])
         assert len(missing) <= 1

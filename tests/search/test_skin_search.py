@@ -1,4 +1,4 @@
-"""The searches with a body whose skin bends, against brute force and against turned-over trees."""
+"""Compare searches of a body with deformable skin with brute force."""
 
 import itertools
 
@@ -29,7 +29,7 @@ def limb(tmp_path_factory):
 
 
 def side_camera():
-    """Looks along -x from an odd angle; the shoulder is at the middle of the picture."""
+    """Return a camera at an oblique angle, with the shoulder near the image centre."""
     turn = 0.3
     c, s = np.cos(turn), np.sin(turn)
     X_WC = np.array([[-s, 0, -c, 4.0], [c, 0, -s, 1.0], [0, -1, 0, 0.2], [0, 0, 0, 1.0]])
@@ -46,7 +46,7 @@ def random_samples(sampled, rng):
     return np.array([rng.integers(len(values)) for values in sampled.values])
 
 
-def test_the_objective_counts_the_skin(limb):
+def test_the_objective_includes_the_skin(limb):
     tree = limb.pose_tree()
     sampled = SampledTree(tree, PaperSearchSettings(interval=INTERVAL))
     rng = np.random.default_rng(0)
@@ -62,7 +62,7 @@ def test_the_objective_counts_the_skin(limb):
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_the_papers_search_is_that_of_plain_pictures(limb, seed):
+def test_paper_search_with_skin_equals_a_naive_implementation(limb, seed):
     tree = limb.pose_tree()
     settings = PaperSearchSettings(interval=INTERVAL, outside_limit=8.0, candidate_limit=3)
     search = PaperSearch(tree, settings)
@@ -77,7 +77,7 @@ def test_the_papers_search_is_that_of_plain_pictures(limb, seed):
         assert result.J == naive.best[0]
 
 
-def test_the_beam_search_finds_the_minimum(limb):
+def test_beam_search_with_skin_finds_the_minimum(limb):
     tree = limb.pose_tree()
     search = BeamSearch(tree, BeamSearchSettings(interval=INTERVAL))
     sampled = search.sampled

@@ -1,4 +1,4 @@
-"""A crane whose joints turn all the way round, and Drake's pictures of it."""
+"""A crane whose joints make full turns, and label images of it."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +12,7 @@ from tests.jobs.scenes import LINK, camera
 
 
 def crane(folder: Path, luff: str = 'lower="-6.2831853" upper="6.2831853"') -> ArticulatedModel:
-    """A boom that turns freely, and a jib on it whose limits are two turns apart, as a UR5's."""
+    """Return a boom with a continuous joint, and a jib with limits two turns apart, as in a UR5."""
     path = folder / "turning.urdf"
     path.write_text(
         '<robot name="crane"><link name="world"/>'
@@ -28,6 +28,6 @@ def crane(folder: Path, luff: str = 'lower="-6.2831853" upper="6.2831853"') -> A
 
 
 def views_of(model: ArticulatedModel, q: Sequence[float]) -> list[View]:
-    """What Drake's renderer sees from the front at positions q [rad]."""
+    """Return the view of Drake's renderer from the front at positions q [rad]."""
     front = camera("front")
     return [View(front, LabelRenderer(model, front).mask(np.asarray(q)))]

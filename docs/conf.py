@@ -62,6 +62,7 @@ autosummary_generate = False
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 napoleon_use_rtype = False
+napoleon_custom_sections = [("Input ports", "params_style"), ("Output ports", "params_style")]
 # Two modules may define a type of the same name.
 suppress_warnings = ["ref.python"]
 napoleon_attr_annotations = False

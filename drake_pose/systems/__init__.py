@@ -1,1 +1,1 @@
-"""The estimators as Drake systems, and ready diagrams of them."""
+"""Estimators, cameras and players as Drake systems, and diagrams built of them."""

@@ -1,7 +1,4 @@
-"""Bodies in a diagram that stand as given positions say, with their skin and no dynamics.
-
-Positions as LCM messages, too.
-"""
+"""Bodies posed by position inputs in a diagram, their skin, and position messages (LCM)."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -29,7 +26,10 @@ from drake_pose.systems.ports import PortedSystem
 
 
 def body_poses(plant: MultibodyPlant, q: Array, X_WB: Array | None = None) -> list[RigidTransform]:
-    """The poses of all bodies at positions (nq,), in the plant's order; X_WB: of its world."""
+    """Return the poses of all bodies in the plant's order at positions q (nq,).
+
+    ``X_WB`` (4, 4) is the pose of the plant's world; None: identity.
+    """
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, q)
     base = RigidTransform() if X_WB is None else RigidTransform(X_WB)
@@ -44,10 +44,11 @@ def add_posed_plant(
     name: str,
     prefix: str = "",
 ) -> MultibodyPlant:
-    """Add a body that stands as positions (nq,) in its own order say; its plant, finalized.
+    """Add a body without dynamics that is posed by an output port; return its finalized plant.
 
     Args:
-        name: of the system between positions and SceneGraph.
+        positions: port of the positions (nq,) in the plant's order.
+        name: of the MultibodyPositionToGeometryPose that is added.
         prefix: of the body's name in the SceneGraph.
     """
     plant = MultibodyPlant(0.0)
@@ -72,19 +73,22 @@ def add_avatar(
     prefix: str,
     period: float,
 ) -> None:
-    """Show a body in Meshcat, in a SceneGraph of its own that no sensor sees.
+    """Show a body in Meshcat from a SceneGraph of its own, which sensors do not see.
 
     Args:
-        positions: (nq,) in its plant's order; while they are nan it stands at its model's default.
-        prefix: the path below which it is drawn.
+        positions: port of the positions (nq,) in the plant's order; while they are NaN the body has
+            the model's default positions.
+        prefix: Meshcat path under which it is drawn.
         period: time between two drawings [s].
     """
     scene_graph = builder.AddNamedSystem("avatar_scene_graph", SceneGraph())
     default = model.default_positions
-    # A plant refuses nan, which estimators say before they found a body.
+    # Estimators output NaN until a body is found; a plant does not accept NaN.
     known = builder.AddNamedSystem(
         "avatar_positions",
-        OnePort(len(default), len(default), lambda q: q if np.isfinite(q).all() else default),
+        PositionFunction(
+            len(default), len(default), lambda q: q if np.isfinite(q).all() else default
+        ),
     )
     builder.Connect(positions, known.get_input_port())
     add_posed_plant(builder, scene_graph, model, known.get_output_port(), "avatar_pose")
@@ -93,42 +97,50 @@ def add_avatar(
 
 
 MESHCAT_PERIOD = 1.0 / 64.0
-"""Time between two drawings [s]: that of Drake's MeshcatVisualizer."""
+"""Time between two drawings [s], as in Drake's MeshcatVisualizer."""
 
 
-class OnePort(PortedSystem):
-    """Gives a function of positions.
+class PositionFunction(PortedSystem):
+    """Outputs a function of positions.
 
     .. pydrake_system::
 
-        name: OnePort
+        name: PositionFunction
         input_ports: [positions]
         output_ports: [value]
 
     Args:
-        count: how many positions.
-        like: what the value is like.
+        count: number of positions.
+        model_value: model value of the output port.
+        function: maps positions (count,) to the value.
     """
 
-    def __init__(self, count: int, like: Any, function: Callable[[Array], Any]) -> None:
+    def __init__(self, count: int, model_value: Any, function: Callable[[Array], Any]) -> None:
         super().__init__()
         given = self.add_input("positions", count)
-        self.add_output("value", like, lambda context: function(given.Eval(context)))
+        self.add_output("value", model_value, lambda context: function(given.Eval(context)))
 
 
 class MeshcatSkin(LeafSystem):
-    """Draws a skin in Meshcat, whose visualizer passes over deformable geometry.
+    """Draws a skin in Meshcat; MeshcatVisualizer does not draw deformable geometry.
 
     .. pydrake_system::
 
         name: MeshcatSkin
         input_ports: [positions]
 
+    A periodic publish event draws the skin every MESHCAT_PERIOD if the positions changed.
+
+    Input ports:
+        positions (nq): in the model's order [rad or m].
+
     Args:
-        path: where in Meshcat's tree.
-        colour: in place of the bands' own colours.
-        recorded: Meshcat records the motion of objects, not of their vertices: draw each new shape
-            as an object of its own, that is seen for its time only.
+        position_count: nq.
+        path: Meshcat path of the skin.
+        colour: of all bands; None: the bands' own colours.
+        is_recorded: whether a Meshcat recording must show the motion. Meshcat records the motion of
+            objects but not of vertices, so that each new shape becomes an object that is visible
+            until the next one.
     """
 
     def __init__(
@@ -139,14 +151,14 @@ class MeshcatSkin(LeafSystem):
         path: str,
         colour: Rgba | None = None,
         *,
-        recorded: bool = False,
+        is_recorded: bool = False,
     ) -> None:
         super().__init__()
         self._meshcat = meshcat
         self._skin = skin
         self._path = path
         self._colour = colour
-        self._recorded = recorded
+        self._recorded = is_recorded
         self._shapes = 0
         self._drawn: np.ndarray | None = None
         self._positions = self.DeclareVectorInputPort("positions", position_count)
@@ -173,7 +185,7 @@ class MeshcatSkin(LeafSystem):
         return EventStatus.Succeeded()
 
     def _show_alone(self, time: float) -> None:
-        """From now on show the shape that is about to be drawn, and not the one before."""
+        """Show the shape that is drawn next, and hide the previous one, from ``time`` [s] on."""
         here = f"{self._path}/{self._shapes}"
         if self._shapes:
             self._meshcat.SetProperty(f"{self._path}/{self._shapes - 1}", "visible", False, time)
@@ -190,18 +202,18 @@ def add_skin(
     name: str,
     labels: Mapping[str, int] | None = None,
 ) -> None:
-    """Add a model's skin to a diagram, so that cameras see it; nothing where it has none.
+    """Add a model's skin to a SceneGraph, so that sensors see it; do nothing if it has none.
 
     Args:
-        scene_graph: the SceneGraph that the body's rigid parts are in.
-        positions: the body's positions (nq,) in its model's order.
-        name: of the new source and, with ``_skin_poser``, of the new system.
-        labels: the render label of each link, by name; Drake's own are the links' body indices.
+        scene_graph: which contains the body's rigid parts.
+        positions: port of the positions (nq,) in the model's order.
+        name: of the new geometry source, and with ``_skin_poser`` of the new system.
+        labels: render label by link; Drake's own are the links' body indices.
     """
     if not model.skin:
         return
     deformable = DeformableSkin(ModelSkin(model), scene_graph, labels or {}, f"{name}_skin")
-    bend = OnePort(
+    bend = PositionFunction(
         model.plant.num_positions(),
         GeometryConfigurationVector(),
         lambda q: deformable.configuration(deformable.skin.vertices(q)),
@@ -222,15 +234,15 @@ def add_meshcat_skin(
     colour: Rgba | None = None,
     *,
     prefix: str = "visualizer",
-    recorded: bool = False,
+    is_recorded: bool = False,
 ) -> None:
-    """Show a model's skin in Meshcat; nothing where it has none.
+    """Show a model's skin in Meshcat; do nothing if it has none.
 
     Args:
-        positions: the body's positions (nq,) in its model's order.
-        name: of the skin in Meshcat's tree and, with ``_meshcat_skin``, of the new system.
-        prefix: what it lies under in Meshcat's tree: that of the MeshcatVisualizer.
-        colour, recorded: as in MeshcatSkin.
+        positions: port of the positions (nq,) in the model's order.
+        name: of the skin in Meshcat, and with ``_meshcat_skin`` of the new system.
+        colour, is_recorded: as in MeshcatSkin.
+        prefix: Meshcat path under which it is drawn: that of the MeshcatVisualizer.
     """
     if not model.skin:
         return
@@ -242,20 +254,20 @@ def add_meshcat_skin(
             model.plant.num_positions(),
             f"{prefix}/{name}_skin",
             colour,
-            recorded=recorded,
+            is_recorded=is_recorded,
         ),
     )
     builder.Connect(positions, drawer.get_input_port())
 
 
 def held_positions(q: Array, period: float) -> Trajectory:
-    """Positions (n, nq), the k-th held from half a period before k periods to half a one after."""
+    """Return positions (n, nq) as a zero-order hold: row k from k - 1/2 to k + 1/2 periods."""
     times = period * (np.arange(len(q) + 1) - 0.5)
     return PiecewisePolynomial.ZeroOrderHold(times, np.vstack([q, q[-1:]]).T)
 
 
 class RobotStateMessage(PortedSystem):
-    """Names positions in an lcmt_robot_state, for an LcmPublisherSystem.
+    """Outputs positions as an lcmt_robot_state, for an LcmPublisherSystem.
 
     .. pydrake_system::
 
@@ -263,10 +275,14 @@ class RobotStateMessage(PortedSystem):
         input_ports: [positions]
         output_ports: [lcmt_robot_state]
 
-    A message holds 32 bit floats, and the context's time in microseconds.
+    Input ports:
+        positions (nq): [rad or m].
+
+    Output ports:
+        lcmt_robot_state: joint names and positions as 32-bit floats, and the context's time [us].
 
     Args:
-        names: (nq) a name for each position, ``model.position_names``.
+        names: (nq) name of each position, ``model.position_names``.
     """
 
     def __init__(self, names: Sequence[str]) -> None:

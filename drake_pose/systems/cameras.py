@@ -32,12 +32,11 @@ _System = TypeVar("_System", bound=System)
 
 @dataclass(frozen=True, eq=False)
 class CameraRig:
-    """A diagram of a body and the cameras around it.
+    """A diagram of a body and the cameras that see it.
 
-    The diagram's input ``positions`` (nq) poses the body, or a trajectory does. Its outputs are
-    ``color_image_<camera>``, ``label_image_<camera>`` and ``depth_image_<camera>``; an image is
-    rendered when it is asked for. Render in one thread only: an engine first used in another thread
-    gives wrong images.
+    The body is posed by the input port ``positions`` (nq) or by a trajectory. The output ports
+    ``color_image_<camera>``, ``label_image_<camera>`` and ``depth_image_<camera>`` render when they
+    are evaluated. Render in one thread only: Drake's engine gives wrong images in another thread.
     """
 
     diagram: Diagram
@@ -45,15 +44,23 @@ class CameraRig:
     sensors: Mapping[str, RgbdSensor]
 
     def set_positions(self, context: Context, q: Array) -> None:
-        """Pose the body: (nq,) the plant's positions [rad or m]."""
+        """Fix the body's positions (nq,) in a context [rad or m]."""
         self.diagram.GetInputPort("positions").FixValue(context, q)
 
     def picture(self, context: Context, camera: str) -> Picture:
-        """What a camera sees: (H, W, 3) red, green, blue; UnknownNameError: there is none such."""
+        """Return a camera's colour image (H, W, 3), red, green, blue.
+
+        Raises:
+            UnknownNameError: the rig has no such camera.
+        """
         return colour_image_to_picture(self._port("color_image", camera).Eval(context))
 
     def mask(self, context: Context, camera: str) -> Mask:
-        """Where a camera sees the body: (H, W); UnknownNameError: there is none such."""
+        """Return the body's silhouette (H, W) in a camera.
+
+        Raises:
+            UnknownNameError: the rig has no such camera.
+        """
         return label_image_to_mask(self._port("label_image", camera).Eval(context))
 
     def _port(self, kind: str, camera: str) -> OutputPort:
@@ -67,21 +74,21 @@ def build_camera_rig(
     cameras: Mapping[str, PinholeCamera],
     true_positions: Trajectory | None = None,
 ) -> CameraRig:
-    """Wire a body and the cameras that see it.
+    """Build a diagram of a body and the cameras that see it.
 
     Args:
-        cameras: any number, anywhere: from circle_of_cameras or load_cameras.
-        true_positions: the body's positions (nq,) over time; where not given, the diagram has the
-            input ``positions``.
+        cameras: by name, from circle_of_cameras or load_cameras.
+        true_positions: positions (nq,) over time; None: the diagram has the input port
+            ``positions``.
 
     Raises:
-        CameraError: there is no camera, or one of parallel rays.
+        CameraError: there is no camera, or one is not a pinhole camera.
     """
     if not cameras:
         raise CameraError("a rig needs at least one camera")
     for name, camera in cameras.items():
         if not isinstance(camera, PinholeCamera):
-            raise CameraError(f"camera '{name}': a rig's sensors are pinholes, not parallel")
+            raise CameraError(f"camera '{name}': a rig needs pinhole cameras, not parallel ones")
     builder = DiagramBuilder()
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
     source: System
@@ -91,7 +98,7 @@ def build_camera_rig(
     else:
         source = builder.AddNamedSystem("true_positions", TrajectorySource(true_positions))
     add_posed_plant(builder, scene_graph, model, source.get_output_port(), "geometry_pose")
-    # 16 bits of millimetres hold 60 m; nothing of a room is farther away.
+    # 16-bit depth images in millimetres reach 65 m.
     ranges = {name: (camera.near, 60.0) for name, camera in cameras.items()}
     parameters = RenderEngineVtkParams(default_clear_color=np.array([0.55, 0.58, 0.62]))
     sensors = add_sensors(builder, scene_graph, cameras, ranges, parameters)
@@ -109,12 +116,12 @@ def add_sensors(
     depth_ranges: Mapping[str, tuple[float, float]],
     parameters: RenderEngineVtkParams,
 ) -> dict[str, RgbdSensor]:
-    """Add a renderer, and an RgbdSensor ``camera_<name>`` for each camera, returned by name.
+    """Add a renderer, and an RgbdSensor ``camera_<name>`` for each camera; return these by name.
 
-    Call it after the models are added: the renderer refuses OBJ files without normals when it is.
+    Call it after the models are added, because the renderer checks their files when it is added.
 
     Args:
-        depth_ranges: as of camera_to_drake, by camera that has its own [m].
+        depth_ranges: nearest and farthest depth [m] by camera, see camera_to_drake.
     """
     renderer = "rig_renderer"
     scene_graph.AddRenderer(renderer, MakeRenderEngineVtk(parameters))
@@ -123,7 +130,8 @@ def add_sensors(
         color, depth, X_WC = camera_to_drake(
             camera, renderer_name=renderer, depth_range=depth_ranges.get(name)
         )
-        # A parallel camera is a tele camera far beyond what depth images hold, which are not used.
+        # A parallel camera becomes a distant tele camera, beyond the range of depth images; Drake
+        # warns, but they are not used.
         with captured_warnings():
             sensor = RgbdSensor(scene_graph.world_frame_id(), X_WC, color, depth)
         sensors[name] = builder.AddNamedSystem(f"camera_{name}", sensor)
@@ -134,16 +142,16 @@ def add_sensors(
 def cameras_from_drake(
     diagram: Diagram | DiagramBuilder, names: Collection[str] | None = None
 ) -> dict[str, PinholeCamera]:
-    """The cameras of the RgbdSensors in a diagram, by the systems' names, at their default poses.
+    """Return the cameras of a diagram's RgbdSensors at their default poses, by system name.
 
-    A Scenario's cameras (``rgbd_sensor_<name>``) have the name that they have there.
+    The prefix ``rgbd_sensor_``, which Drake adds to a Scenario's cameras, is removed.
 
     Args:
-        diagram: looked through with all diagrams in it; or the builder of one.
+        diagram: the diagram, searched recursively, or its builder.
         names: the cameras to take; None: all.
 
     Raises:
-        CameraError: there is none, or one rides on a link that moves, so that it is nowhere fixed.
+        CameraError: there is no camera, or one is attached to a link that moves.
         UnknownNameError: there is no camera of a name.
     """
     found = {
@@ -151,7 +159,7 @@ def cameras_from_drake(
         for sensor in _systems_of(diagram, RgbdSensor)
     }
     if not found:
-        raise CameraError("there is no RgbdSensor in the diagram whose cameras were asked for")
+        raise CameraError("the diagram has no RgbdSensor")
     for name in names or ():
         if name not in found:
             raise UnknownNameError("camera", name, found, "the diagram")
@@ -164,11 +172,13 @@ def cameras_from_drake(
             carriers = [(plant, plant.GetBodyFromFrameId(frame)) for plant in plants]
             plant, body = next((pair for pair in carriers if pair[1] is not None), (None, None))
             if plant is None or body is None:
-                raise CameraError(f"camera '{name}' rides on a frame of no plant in the diagram")
+                raise CameraError(
+                    f"camera '{name}' is attached to a frame of no plant in the diagram"
+                )
             if body not in plant.GetBodiesWeldedTo(plant.world_body()):
                 raise CameraError(
-                    f"camera '{name}' rides on link '{body.name()}', which moves, so that it "
-                    "stands elsewhere at each time; names=[...] leaves it out"
+                    f"camera '{name}' is attached to link '{body.name()}', which moves, so that "
+                    "it has no fixed pose; names=[...] leaves it out"
                 )
             X_WP = plant.EvalBodyPoseInWorld(plant.CreateDefaultContext(), body)
         core = sensor.default_color_render_camera().core()
@@ -177,7 +187,7 @@ def cameras_from_drake(
 
 
 def _systems_of(diagram: Diagram | DiagramBuilder, kind: type[_System]) -> list[_System]:
-    """All systems of a kind in a diagram and in those inside it."""
+    """Return all systems of a type in a diagram, recursively."""
     found: list[_System] = []
     for system in diagram.GetSystems():
         if isinstance(system, kind):
@@ -188,7 +198,7 @@ def _systems_of(diagram: Diagram | DiagramBuilder, kind: type[_System]) -> list[
 
 
 class SilhouetteCamera(PortedSystem):
-    """Gives label images of a plant's bodies, as an RgbdSensor does, without VTK, GL or a display.
+    """Renders label images of a plant's bodies without VTK, OpenGL or a display.
 
     .. pydrake_system::
 
@@ -196,25 +206,29 @@ class SilhouetteCamera(PortedSystem):
         input_ports: [body_poses]
         output_ports: [label_image, body_pose_in_world, image_time]
 
-    - ``body_poses``: the plant's output port of that name.
-    - ``label_image``: in each pixel the render label of the body that is nearest at the pixel's
-      centre, RenderLabel.kEmpty where there is none. Links hide each other.
-    - ``body_pose_in_world``: the camera's pose X_WC; ``image_time`` (1): the context's time [s].
-      Both are named as RgbdSensor's.
+    The system is continuous and has no state, as an RgbdSensor.
 
-    Surfaces are the plant's visual geometry (perception role) at full detail, as it is when the
-    camera is made. What is not the plant's is not seen, nor are half spaces (ground planes); a
-    camera has a near plane and no far one. Unlike RgbdSensor it may have parallel rays. A pose that
-    is not finite is an error: an image without that link would look like a right one.
+    Input ports:
+        body_poses: the plant's output port of that name.
+
+    Output ports:
+        label_image (ImageLabel16I): at each pixel the render label of the nearest body at the
+            pixel's centre, RenderLabel.kEmpty if there is none. Links occlude each other.
+        body_pose_in_world (RigidTransform): the camera's pose X_WC.
+        image_time (1): the context's time [s].
+
+    Surfaces are the plant's visual geometry (perception role) at full detail, read at construction.
+    Geometry of other sources and half spaces (ground planes) are invisible. There is a near plane,
+    but no far one. Unlike an RgbdSensor, the camera may be a parallel camera.
 
     Args:
-        plant: the bodies; finalized, and registered with the SceneGraph.
+        plant: finalized, and registered with the SceneGraph.
         camera: its X_WC is the pose in the parent's frame.
-        parent: the body that carries the camera; None: the world.
+        parent: body that carries the camera; None: the world.
 
     Raises:
-        ModelError: the plant is not finalized, is not registered with a SceneGraph, or has nothing
-            to be seen; a link has geometry that cannot be drawn; geometry is deformable. On
+        ModelError: the plant is not finalized, is not registered with the SceneGraph or has no
+            visual geometry; a link has geometry that cannot be drawn; geometry is deformable. On
             evaluation: a body's pose is not finite.
     """
 
@@ -250,7 +264,7 @@ class SilhouetteCamera(PortedSystem):
             if not mesh.is_empty and label != EMPTY
         ]
         if not found:
-            raise ModelError("the plant has no visual geometry: the camera would see nothing")
+            raise ModelError("the plant has no visual geometry")
         self.camera = camera
         self._names = [body.name() for body in bodies]
         self._parent = 0 if parent is None else int(parent.index())

@@ -1,4 +1,7 @@
-"""Date's capture as Drake systems: preparation, stages, pose, and the diagram (figure 1)."""
+"""Date's capture of a person as Drake systems: preparation, stages, pose, and diagram (figure 1).
+
+Section numbers are those of Date's paper.
+"""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -46,26 +49,29 @@ from drake_pose.systems.ports import (
     MemorySystem,
     PortedSystem,
     StagedDiagram,
-    connect_same,
+    connect_matching_ports,
     export_outputs,
-    require_different,
+    require_distinct_cameras,
     require_period,
 )
 
 
 @dataclass(frozen=True, eq=False)
 class CaptureSetup:
-    """What stays the same from frame to frame.
+    """The constants of a capture.
 
     Args:
         cameras: on the circle, by name.
-        backgrounds: by camera, the face camera's among them; a camera without one needs masks.
+        face_camera: sees the face; None: there is none.
+        backgrounds: background models by camera, including the face camera; a camera without one
+            needs masks.
+        skin: colour of the person's skin.
         search: whether elbows and knees are searched on their circles; see estimate_pose.
-        recognition: similarity from which the registered pose overwrites the state.
-        farthest_face: how far from the eigenspace a face may be [grey levels].
+        recognition: similarity from which the registered pose replaces the state.
+        farthest_face: largest distance of a face from the eigenspace [grey levels].
 
     Raises:
-        SettingsError: fewer than two cameras, or the face camera has the name of another.
+        SettingsError: there are fewer than two cameras, or the face camera has the name of another.
     """
 
     skeleton: Skeleton
@@ -98,22 +104,22 @@ def prepare_paper_capture(
     backgrounds: Mapping[str, Background],
     faces: FaceTemplates | None = None,
 ) -> CaptureSetup:
-    """Makes the setup of a capture while the person shows the registered pose.
+    """Prepare a capture while the person shows the registered pose.
 
-    The pictures say where the person's skin is seen; the pose's templates are rendered.
+    The pictures show where the person's skin is visible; the registered pose is rendered.
 
     Args:
-        cameras: all of them, by name.
-        face_camera: which of them is the face camera; None: there is none.
-        q: (nq,) where the person stands, in the registered pose [rad or m].
-        pictures: (H, W, 3) that the cameras on the circle take of it, red, green, blue.
-        backgrounds: by camera.
-        faces: templates of the person's face; rendered ones where not given.
+        cameras: all cameras, by name.
+        face_camera: name of the face camera; None: there is none.
+        q: (nq,) the person's positions in the registered pose [rad or m].
+        pictures: (H, W, 3), red, green, blue, of the cameras on the circle.
+        backgrounds: background models by camera.
+        faces: templates of the person's face; None: rendered ones.
 
     Raises:
         UnknownNameError: there is no such face camera.
-        SettingsError: fewer than two other cameras.
-        ModelError: the model is not made like the bundled person.
+        SettingsError: there are fewer than two other cameras.
+        ModelError: the model's structure is not that of the bundled person.
     """
     if face_camera is not None and face_camera not in cameras:
         raise UnknownNameError("camera", face_camera, cameras, "the rig")
@@ -136,7 +142,10 @@ def prepare_paper_capture(
 def render_registered_pose(
     skeleton: Skeleton, q: Array, cameras: Mapping[str, PinholeCamera]
 ) -> RegisteredPose:
-    """The registered pose at q (nq,) [rad or m] as Drake renders it; raises as register_pose."""
+    """Return the registered pose at q (nq,) [rad or m], rendered by Drake.
+
+    Raises as register_pose.
+    """
     rig = build_camera_rig(skeleton.model, cameras)
     context = rig.diagram.CreateDefaultContext()
 
@@ -150,7 +159,7 @@ def render_registered_pose(
 def learn_rendered_faces(
     model: ArticulatedModel, skeleton: Skeleton, q: Array, skin: SkinColour
 ) -> FaceTemplates:
-    """Templates of a model's face: 300 rendered pictures, 20 turns times 15 nods, at q (nq,)."""
+    """Return face templates from 300 rendered pictures, 20 turns times 15 nods, at q (nq,)."""
     head = skeleton.features(q)[0]
     view, size = math.radians(11.0), (200, 200)
     placed = circle_of_cameras(1, height=float(head[2]), target=head, field_of_view=view, size=size)
@@ -177,12 +186,15 @@ def learn_rendered_faces(
 def _add_views(
     system: PortedSystem, cameras: Sequence[Camera]
 ) -> Callable[[Context], tuple[list[Camera], list[PersonView]]]:
-    """The input ports ``person_view_<camera>`` of a system, and what comes in.
+    """Add the input ports ``person_view_<camera>`` to a system.
 
-    The returned function gives the cameras that go, and what they saw; unconnected ones and None
-    are left out. Raises SettingsError for fewer than two cameras, or two of one name.
+    Returns:
+        A function that maps a context to the cameras with a view, and their views.
+
+    Raises:
+        SettingsError: there are fewer than two cameras, or two have the same name.
     """
-    require_different(cameras, 2, "two or more different cameras are needed, not")
+    require_distinct_cameras(cameras, 2, "two or more different cameras are needed, not")
     given = system.add_camera_inputs({one.name: f"person_view_{one.name}" for one in cameras})
 
     def seen(context: Context) -> tuple[list[Camera], list[PersonView]]:
@@ -201,8 +213,15 @@ class HorizontalImage(PersonRegion):
         input_ports: [color_image, label_image (optional)]
         output_ports: [region, person_view]
 
-    The paper's horizontal image processing module (3.1.1). Outputs: ``region``, see PersonRegion,
-    and ``person_view``, a ``person.date.features.PersonView``, None where either image is lost.
+    The paper's horizontal image processing module (3.1.1). The system has no state. Inputs,
+    arguments and errors are those of ``PersonRegion``, and:
+
+    Output ports:
+        region: see ``PersonRegion``.
+        person_view: a ``person.date.features.PersonView``; None if an image is missing.
+
+    Args:
+        skin: colour of the person's skin; None: the default.
     """
 
     def __init__(
@@ -229,15 +248,23 @@ class FeatureFinder(PortedSystem):
         input_ports: [person_view_<camera>, last_features]
         output_ports: [found, features, support]
 
-    The first part of the paper's 3-D module (3.1.2). A camera that is unconnected or gives None is
-    left out. ``last_features`` (15) are the last frame's: head, left hand, right hand, left foot,
-    right foot [m]; while they are nan nothing is found. Outputs: ``features`` (15), the last
-    frame's where nothing was measured [m]; ``support`` (5), from how many 3-D points each was
-    taken, 0: not measured; and both with all 3-D points as ``found``, a
-    ``person.date.features.Features`` or None. Cameras are in the order of the input ports.
+    The first part of the paper's 3-D module (3.1.2). The system has no state.
+
+    Input ports:
+        person_view_<camera>: a PersonView; a camera that is not connected or gives None is ignored.
+        last_features (15): positions in the last frame of head, left hand, right hand, left foot
+            and right foot [m]; nothing is found while they are NaN.
+
+    Output ports:
+        found: a ``person.date.features.Features`` with all 3-D points, or None.
+        features (15): as ``last_features``, and equal to them where nothing was measured [m].
+        support (5): number of 3-D points that gave each feature; 0: not measured.
+
+    Args:
+        cameras: in the order of the input ports.
 
     Raises:
-        SettingsError: fewer than two cameras, or two of one name.
+        SettingsError: there are fewer than two cameras, or two have the same name.
     """
 
     def __init__(self, cameras: Sequence[Camera]) -> None:
@@ -275,10 +302,18 @@ class FaceDirectionFinder(PortedSystem):
         input_ports: [color_image, person_view]
         output_ports: [face_direction]
 
-    The paper's face processing module (3.2). ``person_view`` is ``HorizontalImage``'s of the same
-    picture. ``face_direction`` (2) is turn to the person's left and nod downwards, away from facing
-    the camera [rad]; nan where no face is seen, or the camera has stopped. No face is farther from
-    the eigenspace than ``farthest`` [grey levels].
+    The paper's face processing module (3.2). The system has no state.
+
+    Input ports:
+        color_image (ImageRgba8U): of the face camera.
+        person_view: of the same picture, from a ``HorizontalImage``.
+
+    Output ports:
+        face_direction (2): turn to the person's left and nod downwards, relative to facing the
+            camera [rad]; NaN if no face is visible or an input is missing.
+
+    Args:
+        farthest: largest distance of a face from the eigenspace [grey levels].
     """
 
     def __init__(self, camera: Camera, templates: FaceTemplates, farthest: float = 30.0) -> None:
@@ -287,7 +322,10 @@ class FaceDirectionFinder(PortedSystem):
         self.add_input("person_view", None)
 
         def find(context: Context) -> Array:
-            image, view = self.given(context, "color_image"), self.given(context, "person_view")
+            image, view = (
+                self.eval_input(context, "color_image"),
+                self.eval_input(context, "person_view"),
+            )
             if image is None or not image.size() or view is None:
                 return np.full(2, np.nan)
             return find_face(colour_image_to_picture(image), view.blobs, templates, farthest)
@@ -296,7 +334,7 @@ class FaceDirectionFinder(PortedSystem):
 
 
 class PoseRecogniser(PortedSystem):
-    """Recognises the registered pose in what all cameras see, whatever went before (section 5).
+    """Recognises the registered pose in the current views, without earlier frames (section 5).
 
     .. pydrake_system::
 
@@ -304,11 +342,20 @@ class PoseRecogniser(PortedSystem):
         input_ports: [person_view_<camera>]
         output_ports: [recognition, recognised_positions, similarity]
 
-    A camera that is unconnected or gives None is left out. Outputs: ``recognised_positions`` (nq)
-    of the person in the registered pose [rad or m], nan where it is not recognised;
-    ``similarity`` of the contours, 0 where not recognised; and both as ``recognition``, a tuple, or
-    None. It is recognised from a similarity of
-    ``threshold`` on. Cameras are in the order of the input ports, as of the registered pose.
+    The system has no state.
+
+    Input ports:
+        person_view_<camera>: a PersonView; a camera that is not connected or gives None is ignored.
+
+    Output ports:
+        recognition: the tuple (positions, similarity), or None if the pose is not recognised.
+        recognised_positions (nq): of the person in the registered pose [rad or m]; NaN if not
+            recognised.
+        similarity (1): of the contours; 0 if not recognised.
+
+    Args:
+        cameras: in the order of the input ports, as in the registered pose.
+        threshold: smallest similarity at which the pose is recognised.
     """
 
     def __init__(
@@ -340,7 +387,7 @@ class PoseRecogniser(PortedSystem):
 
 
 class PaperPoseEstimator(MemorySystem):
-    """Estimates the person's positions, and keeps all that one frame hands to the next.
+    """Estimates the person's positions, and keeps the state that one frame passes to the next.
 
     .. pydrake_system::
 
@@ -349,19 +396,29 @@ class PaperPoseEstimator(MemorySystem):
           recognised_positions (optional), fresh (optional)]
         output_ports: [estimated_positions, last_features, last_support, limb_points]
 
-    Stepwise inverse kinematics of the upper body, waist and legs, and the search for elbows and
-    knees. ``recognised_positions`` that are not nan overwrite all without a reset. A camera that is
-    unconnected or gives None is left out. While ``fresh`` is 0 nothing is done.
+    A periodic update computes stepwise inverse kinematics of upper body, waist and legs, and
+    searches elbows and knees; output ports read the result, NaN until the person is known.
+    ``recognised_positions`` that are finite replace the state.
 
-    Outputs, all of them state, nan until the person is known: ``estimated_positions`` (nq) [rad or
-    m]; ``last_features`` (15), where head, hands and feet were [m], and ``last_support`` (5), from
-    how many 3-D points (``FeatureFinder`` needs them in the next frame); and ``limb_points`` (36),
-    root, middle joint and end of left arm, right arm, left leg and right leg as found [m], nan
-    where the pose was recognised: no limb was searched then. The time between two frames is
-    ``period`` [s].
+    Input ports:
+        person_view_<camera>: a PersonView; a camera that is not connected or gives None is ignored.
+        features, support: from a ``FeatureFinder``.
+        face_direction (2): from a ``FaceDirectionFinder``.
+        recognised_positions (nq): from a ``PoseRecogniser``.
+        fresh (1): 0: the update does nothing.
+
+    Output ports:
+        estimated_positions (nq): [rad or m].
+        last_features (15): features of this frame [m], which ``FeatureFinder`` needs in the next.
+        last_support (5): their support.
+        limb_points (36): root, middle joint and end of left arm, right arm, left leg and right leg
+            [m]; NaN if the pose was recognised, because no limb was searched.
+
+    Args:
+        period: time between two frames [s].
 
     Raises:
-        SettingsError: a period that is not positive.
+        SettingsError: the period is not positive.
     """
 
     def __init__(self, setup: CaptureSetup, period: float) -> None:
@@ -381,17 +438,17 @@ class PaperPoseEstimator(MemorySystem):
             "limb_points": 9 * len(LIMBS),
         }  # fmt: skip
         unknown = {name: np.full(size, np.nan) for name, size in states.items()}
-        self.keep_vectors(unknown, unknown, period)
+        self.declare_vectors(unknown, unknown, period)
 
     def set_person(self, context: Context, q: Array, features: Array | None = None) -> None:
-        """Say where the person is.
+        """Set the person's pose in a context.
 
         Args:
             q: (nq,) positions [rad or m].
-            features: (5, 3) head, hands and feet [m]; those at q where not given.
+            features: (5, 3) head, hands and feet [m]; None: those at q.
 
         Raises:
-            SettingsError: another number of positions or features, or one that is not finite.
+            SettingsError: the number of positions or features is wrong, or one is not finite.
         """
         checked: list[tuple[str, Array, tuple[int, ...]]] = [
             ("positions", q, (len(self.setup.skeleton.lower),))
@@ -403,24 +460,24 @@ class PaperPoseEstimator(MemorySystem):
                 raise SettingsError(
                     f"the person's {what} must be {shape} finite numbers, not {values}"
                 )
-        self.set_vectors(context.get_mutable_discrete_state(), self._anew(q, features))
+        self.set_vectors(context.get_mutable_discrete_state(), self._restarted(q, features))
 
     def next_vectors(self, context: Context, known: dict[str, Array]) -> Mapping[str, Array]:
-        """The pose in the pictures of one moment more."""
-        fresh = self._known(context, "fresh")
+        """Return the state vectors that the current frame changes."""
+        fresh = self._finite_input(context, "fresh")
         if fresh is not None and not fresh[0]:
             return {}
         recognised, features = (
-            self._known(context, name) for name in ("recognised_positions", "features")
+            self._finite_input(context, name) for name in ("recognised_positions", "features")
         )
         if recognised is not None:
-            return self._anew(recognised, None)
+            return self._restarted(recognised, None)
         if features is None or not np.isfinite(known["estimated_positions"]).all():
             return {}
         features = features.reshape(-1, 3)
         support = self.GetInputPort("support").Eval(context).astype(np.int64)
         face_camera, angles = self.setup.face_camera, None
-        direction = self._known(context, "face_direction")
+        direction = self._finite_input(context, "face_direction")
         if face_camera is not None and direction is not None:
             angles = head_angles(direction, features[0], face_camera)
         cameras, views = self._seen(context)
@@ -440,8 +497,8 @@ class PaperPoseEstimator(MemorySystem):
             "limb_points": np.array([limbs[name] for name in LIMBS]),
         }
 
-    def _anew(self, q: Array, features: Array | None) -> dict[str, Array]:
-        """What is known where nothing before counts."""
+    def _restarted(self, q: Array, features: Array | None) -> dict[str, Array]:
+        """Return state vectors that do not depend on earlier frames."""
         places = self.setup.skeleton.features(q) if features is None else features
         return {
             "estimated_positions": q,
@@ -450,9 +507,9 @@ class PaperPoseEstimator(MemorySystem):
             "limb_points": np.full(9 * len(LIMBS), np.nan),
         }
 
-    def _known(self, context: Context, name: str) -> Array | None:
-        """The value of an input port; None: unconnected, or unknown (nan)."""
-        value: Array | None = self.given(context, name)
+    def _finite_input(self, context: Context, name: str) -> Array | None:
+        """Return the value at an input port; None if not connected or not finite."""
+        value: Array | None = self.eval_input(context, name)
         return value if value is not None and np.isfinite(value).all() else None
 
 
@@ -462,23 +519,25 @@ def build_paper_capture(
     period: float = 1.0 / 30.0,
     meshcat: Meshcat | None = None,
 ) -> StagedDiagram[PaperPoseEstimator]:
-    """Wire images to the paper's stages, these to the pose, and that to the avatar.
+    """Build a diagram that captures a person: images, the paper's stages, the pose, and the avatar.
 
-    The diagram's outputs are those of ``PaperPoseEstimator``, ``person_view_<camera>``, where
-    the setup has what they need ``face_direction``, ``recognised_positions`` and ``similarity``,
-    and where the source has it ``time``. The source's inputs are the diagram's, by their names.
+    Its output ports are those of ``PaperPoseEstimator``, ``person_view_<camera>``, if the setup has
+    what they need ``face_direction``, ``recognised_positions`` and ``similarity``, and if the
+    source has it ``time``. The source's input ports are exported under their names.
 
     Args:
-        setup: without a registered pose the person is not found by itself: see
-            ``PaperPoseEstimator.set_person``.
-        source: what has the output ``color_image_<camera>`` of each camera: a rig's diagram
-            (``build_camera_rig``), recorded pictures, live cameras. A camera without a background
-            in the setup needs ``label_image_<camera>``, too. A source that is not new in every
-            period has the output ``fresh``. None: the images are the diagram's inputs.
+        setup: constants of the capture. Without a registered pose, the person's initial pose must
+            be set: see ``PaperPoseEstimator.set_person``.
+        source: has an output port ``color_image_<camera>`` for each camera, for example a rig's
+            diagram (``build_camera_rig``), recorded pictures or live cameras. A camera without a
+            background in the setup also needs ``label_image_<camera>``. A source without new
+            pictures in each period has the output port ``fresh``. None: the images are inputs of
+            the diagram.
         period: time between two frames [s].
+        meshcat: where to show the avatar.
 
     Raises:
-        SettingsError: the source lacks an output, or the period is not positive.
+        SettingsError: the source lacks an output port, or the period is not positive.
     """
     builder = DiagramBuilder()
     if source is not None:
@@ -499,7 +558,7 @@ def build_paper_capture(
         builder.ExportOutput(views[name], f"person_view_{name}")
         wanted |= {f"{kind}_{name}": [image.GetInputPort(kind)] for kind in image.wanted}
     stages = {"region": tuple(regions), "skin": tuple(views.values())}
-    # By stage what comes between images and pose, and its outputs, the estimator's first.
+    # By stage, the system between images and pose, and its outputs, that for the estimator first.
     parts: dict[str, tuple[System, tuple[str, ...]]] = {}
     if setup.registered is not None:
         recogniser = PoseRecogniser(setup.skeleton, setup.registered, cameras, setup.recognition)
@@ -524,11 +583,11 @@ def build_paper_capture(
         builder.Connect(views[face.name], finder.GetInputPort("person_view"))
         wanted[f"color_image_{face.name}"].append(finder.GetInputPort("color_image"))
     for system, _ in parts.values():
-        connect_same(builder, system, estimator)
-        connect_same(builder, estimator, system)
+        connect_matching_ports(builder, system, estimator)
+        connect_matching_ports(builder, estimator, system)
     connect_images(builder, source, wanted)
     if source is not None:
-        connect_same(builder, source, estimator)
+        connect_matching_ports(builder, source, estimator)
         if source.HasOutputPort("time"):
             builder.ExportOutput(source.GetOutputPort("time"), "time")
     export_outputs(builder, estimator)

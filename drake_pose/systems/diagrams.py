@@ -1,4 +1,7 @@
-"""Ready diagrams: a simulated camera or recorded masks, an estimator, the estimated body, logs."""
+"""Camera registration as a system, and diagrams of matching and registration.
+
+A diagram connects simulated cameras or recorded masks to an estimator, Meshcat and logs.
+"""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -39,15 +42,20 @@ from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.bodies import add_meshcat_skin, add_posed_plant, add_skin
 from drake_pose.systems.cameras import add_sensors
 from drake_pose.systems.images import MaskPlayer
-from drake_pose.systems.ports import BeliefSystem, camera_port, connect_same, require_period
+from drake_pose.systems.ports import (
+    BeliefSystem,
+    camera_port,
+    connect_matching_ports,
+    require_period,
+)
 from drake_pose.systems.silhouette_matcher import SilhouetteMatcher, SilhouetteTracker
 
 REGISTRATION = ("keyframes", "contradictions", "moves", "mean_iou")
-"""What the elements of the output ``registration`` of CameraRegistration are."""
+"""Names of the elements of the output port ``registration`` of CameraRegistration."""
 
 
 class CameraRegistration(BeliefSystem[OnlineState]):
-    """Finds where a camera stands from a body at measured positions, and whether it was moved.
+    """Finds a camera's pose from a body at measured positions, and detects its displacement.
 
     .. pydrake_system::
 
@@ -55,35 +63,38 @@ class CameraRegistration(BeliefSystem[OnlineState]):
         input_ports: [label_image, measured_positions]
         output_ports: [X_WC, covariance, status, registration]
 
-    No guess of the pose is needed. A periodic update keeps frames in which the body stands
-    differently, and searches when there are enough of them; from then on the pose is fitted anew
-    whenever another one is kept, the oldest are forgotten, and a camera that was moved is found
-    again. See ``labels`` for the pixels that belong to the body. An image that is not
-    connected or shows nothing of the body says nothing, nor do positions that are not finite. Image
-    and positions must be of the same moment.
+    No initial guess is needed. A periodic update keeps frames in which the body's pose differs and
+    searches for the camera when there are enough; output ports read the result. Then the pose is
+    fitted again with each new kept frame, the oldest ones are dropped, and a camera that was moved
+    is searched again. All state is in the context.
 
-    - ``X_WC``: a RigidTransform, the camera's pose in the world of the body's plant. Until it is
-      found its translation is nan; later it is the last one found.
-    - ``covariance`` (6 x 6, row by row): of the pose's error, a rotation vector [rad] and a shift
-      [m] along the world's axes, in this order. Infinite unless the status is 1.
-    - ``status``: 0 while the camera is not found yet; 1 while the pose holds; 2 while the last
-      frames contradict it, because the camera has been moved, or the body is hidden: then X_WC must
-      not be used. It is 1 again as soon as a frame agrees, or the camera is found elsewhere.
-    - ``registration``: see ``REGISTRATION``. How many frames are kept; how many frames in a row
-      contradict the pose; how often the camera was found elsewhere; and intersection over union of
-      body and mask, the mean over the kept frames, nan until the camera is found.
+    Input ports:
+        label_image (ImageLabel16I): an image that is not connected, or without the body, is
+            ignored.
+        measured_positions (nq): of the body, synchronised with the image [rad or m]; ignored if not
+            finite.
 
-    All that is known is state of the context; copies share it.
+    Output ports:
+        X_WC (RigidTransform): the camera's pose in the plant's world, as last found; its
+            translation is NaN before.
+        covariance (6 x 6, row by row): of the pose's error, a rotation vector [rad] and a
+            translation [m] in world axes. Infinite unless the status is 1.
+        status (1): 0 before the camera is found; 1 while the pose is valid; 2 while the last frames
+            are outliers, because the camera was moved or the body is occluded. X_WC must then not
+            be used; the status returns to 1 when a frame fits or the camera is found elsewhere.
+        registration (4): see ``REGISTRATION``. Number of kept frames; number of consecutive outlier
+            frames; number of times that the camera was found elsewhere; mean intersection over
+            union of body and mask over the kept frames, NaN before the camera is found.
 
     Args:
         period: time between two updates [s].
-        labels: the labels that belong to the body; None: those of its model where that was made of
-            a plant (``ArticulatedModel.from_plant``), else all but Drake's reserved ones.
-        most_covered: largest fraction of the picture that the body may cover.
+        labels: render labels of the body; None: those of its model if made of a plant
+            (``ArticulatedModel.from_plant``), else all but Drake's reserved ones.
+        max_coverage: largest fraction of the image that the body may cover.
 
     Raises:
-        SettingsError: a period that is not positive.
-        MaskError: in a simulation, when the body's labels cover more of the picture.
+        SettingsError: the period is not positive.
+        MaskError: in a simulation, if the body's labels cover more of the image.
     """
 
     def __init__(
@@ -91,30 +102,30 @@ class CameraRegistration(BeliefSystem[OnlineState]):
         registration: OnlineRegistration,
         period: float,
         labels: Collection[int] | None = None,
-        most_covered: float = 0.6,
+        max_coverage: float = 0.6,
     ) -> None:
         super().__init__()
         require_period("registration", period)
-        self._registration, self._most_covered = registration, most_covered
+        self._registration, self._max_coverage = registration, max_coverage
         self._tree, camera = registration.body.tree, registration.camera
         labels = self._tree.model.labels if labels is None else labels
         self._labels = None if labels is None else frozenset(labels)
         self.add_input("label_image", ImageLabel16I(camera.width, camera.height))
         self.add_input("measured_positions", len(self._tree.model.position_names))
-        self.keep_belief(OnlineState(), period)
-        self.show("X_WC", RigidTransform(), _X_WC)
-        self.show("covariance", 36, self._covariance)
-        self.show("status", 1, lambda known: [float(registration.status(known))])
-        self.show("registration", len(REGISTRATION), _numbers)
+        self.declare_belief(OnlineState(), period)
+        self.add_belief_output("X_WC", RigidTransform(), _X_WC)
+        self.add_belief_output("covariance", 36, self._covariance)
+        self.add_belief_output("status", 1, lambda known: [float(registration.status(known))])
+        self.add_belief_output("registration", len(REGISTRATION), _registration_numbers)
 
     def registered_camera(self, context: Context) -> PinholeCamera | None:
-        """The camera with its pose, for searches and estimators; None unless the status is 1."""
-        believed = self._believed(self.belief(context))
-        return None if believed is None else believed.camera
+        """Return the camera at its pose; None unless the status is 1."""
+        valid = self._valid_camera(self.belief(context))
+        return None if valid is None else valid.camera
 
     def next_belief(self, context: Context, last: OnlineState) -> OnlineState:
-        """What is known with one frame more."""
-        image = self.given(context, "label_image")
+        """Return the state after the current frame."""
+        image = self.eval_input(context, "label_image")
         if image is None:
             return last
         q = np.array(self.GetInputPort("measured_positions").Eval(context))
@@ -123,35 +134,35 @@ class CameraRegistration(BeliefSystem[OnlineState]):
         values = np.concatenate(self._tree.values_from_positions(q))
         mask = label_image_to_mask(image, self._labels)
         covered = float(mask.mean())
-        if covered > self._most_covered:
+        if covered > self._max_coverage:
             raise MaskError(
-                f"{self.get_name()}: labels of the body cover {covered:.0%} of the picture of "
-                f"camera '{self._registration.camera.name}' ({self._most_covered:.0%} at most): "
-                "does the ground count? Name the body's own labels (labels=), or use a model of "
-                "ArticulatedModel.from_plant"
+                f"{self.get_name()}: labels of the body cover {covered:.0%} of the image of "
+                f"camera '{self._registration.camera.name}' ({self._max_coverage:.0%} at most); "
+                "they may include the ground. Give the body's own labels (labels=), or use a model "
+                "from ArticulatedModel.from_plant"
             )
         return self._registration.next(last, PosedFrame(f"{context.get_time():g} s", values, mask))
 
-    def _believed(self, known: OnlineState) -> RegisteredCamera | None:
-        """The camera as it was found; None unless the status is 1."""
+    def _valid_camera(self, known: OnlineState) -> RegisteredCamera | None:
+        """Return the camera as it was found; None unless the status is 1."""
         is_believed = self._registration.status(known) is CameraStatus.REGISTERED
         return known.registered if is_believed else None
 
     def _covariance(self, known: OnlineState) -> Array:
-        believed = self._believed(known)
-        covariance = np.diag(np.full(6, np.inf)) if believed is None else believed.covariance
+        valid = self._valid_camera(known)
+        covariance = np.diag(np.full(6, np.inf)) if valid is None else valid.covariance
         return covariance.ravel()
 
 
 def _X_WC(known: OnlineState) -> RigidTransform:
-    """The camera's pose as it was last found."""
+    """Return the camera's pose as it was last found."""
     if known.registered is None:
         return RigidTransform(np.full(3, np.nan))
     return RigidTransform(known.registered.camera.X_WC)
 
 
-def _numbers(known: OnlineState) -> list[float]:
-    """REGISTRATION."""
+def _registration_numbers(known: OnlineState) -> list[float]:
+    """Return the elements of REGISTRATION."""
     iou = np.nan
     if known.registered is not None:
         iou = float(np.mean([frame.iou for frame in known.registered.frames]))
@@ -163,11 +174,12 @@ ESTIMATE_COLOUR = Rgba(0.0, 0.45, 0.70, 0.6)
 
 @dataclass(frozen=True)
 class MatchingDiagram:
-    """A diagram that matches silhouettes, and the parts of it that one asks afterwards.
+    """A diagram that estimates poses from silhouettes, and its parts.
 
     Args:
-        positions_log, error_log: log ``estimated_positions`` and ``error`` once a period.
-        player: what plays the masks; None where a camera is simulated.
+        positions_log, error_log: logs of ``estimated_positions`` and ``error``, one sample a
+            period.
+        player: of the masks; None for a simulated camera.
     """
 
     diagram: Diagram
@@ -177,19 +189,22 @@ class MatchingDiagram:
     player: MaskPlayer | None = None
 
     def estimate(self, context: Context) -> PoseEstimate | None:
-        """The last update's estimate; None: nothing was seen. context: the diagram's."""
+        """Return the last update's estimate; None: no body was visible."""
         own = self.matcher.GetMyContextFromRoot(context)
         estimate: PoseEstimate | None = self.matcher.GetOutputPort("pose_estimate").Eval(own)
         return estimate
 
     def was_tracked(self, context: Context) -> bool:
-        """Whether the last update's pose was tracked, no search asked. context: the diagram's."""
+        """Return whether the last update tracked the pose without a search.
+
+        ``context`` is the diagram's.
+        """
         own = self.matcher.GetMyContextFromRoot(context)
         tracks = isinstance(self.matcher, SilhouetteTracker)
         return tracks and bool(self.matcher.GetOutputPort("track").Eval(own)[0])
 
     def with_intervals(self, context: Context) -> PoseEstimate:
-        """The last update's pose, which was tracked, with what its contours say of each joint."""
+        """Return the last update's tracked pose with intervals from its contours."""
         assert isinstance(self.matcher, SilhouetteTracker)
         return self.matcher.with_intervals(self.matcher.GetMyContextFromRoot(context))
 
@@ -204,28 +219,27 @@ def build_recorded_matching(
     tracking: TrackingSettings | None = None,
     starts: Mapping[str, np.ndarray] | None = None,
 ) -> MatchingDiagram:
-    """Wire recorded masks to the matcher: MaskPlayer -> SilhouetteMatcher -> logs, Meshcat.
+    """Build a diagram that estimates poses in recorded masks.
+
+    It contains a MaskPlayer, a SilhouetteMatcher or SilhouetteTracker, and logs. Frame k is matched
+    at time k times the player's period.
 
     Args:
         cameras: the cameras to use, matched together.
-        frames: the frames to play; all where not given.
-        root_positions: the root's position (3,) in the world for each frame [m]; the pose tree's
-            own where not given.
+        frames: the frames to play; None: all.
+        root_positions: by frame, the root's position (3,) in the world [m]; None: as in the pose
+            tree.
         meshcat: where to show the estimated body.
-        tracking: how the body moves from frame to frame: it is matched in the first one, tracked
-            from there, and matched again after a loss. Every frame is matched where not given.
-        starts: (nq,) by frame where the body is known to be: a track begins there, also after a
-            loss, without a search.
-
-    Returns:
-        The diagram; frame k is matched at time k times the player's period.
+        tracking: of the tracker; None: each frame is matched on its own.
+        starts: by frame, approximate positions (nq,): a track starts there without a search, also
+            after a loss.
     """
     player = MaskPlayer(scene, cameras, frames, positions=starts, root_positions=root_positions)
     matcher = _matcher(search, cameras, player.period, tracking, player.color_cameras)
     builder = DiagramBuilder()
     builder.AddNamedSystem("mask_player", player)
     builder.AddNamedSystem("silhouette_matcher", matcher)
-    connect_same(builder, player, matcher)
+    connect_matching_ports(builder, player, matcher)
     if meshcat is not None:
         scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
         estimate = matcher.GetOutputPort("estimated_positions")
@@ -241,16 +255,16 @@ def build_simulated_matching(
     meshcat: Meshcat | None = None,
     tracking: TrackingSettings | None = None,
 ) -> MatchingDiagram:
-    """Wire a simulated body and camera to the matcher, and show the estimate beside the truth.
+    """Build a diagram that estimates the poses of a simulated body in rendered images.
 
-    The true body moves on a given trajectory; RgbdSensors see it; the matcher's estimate poses a
-    second body in the same SceneGraph, which the sensors do not see.
+    RgbdSensors see a body that moves on a trajectory. The estimate poses a second body, which the
+    sensors do not see.
 
     Args:
         true_positions: the true body's positions (nq,), constant or over time.
-        period: time between two images, and two matches [s].
+        period: time between two images and updates [s].
         meshcat: where to show both bodies.
-        tracking: as for ``build_recorded_matching``.
+        tracking: as in ``build_recorded_matching``.
     """
     builder = DiagramBuilder()
     model = search.tree.model
@@ -263,7 +277,7 @@ def build_simulated_matching(
     if meshcat is not None:
         estimate = matcher.GetOutputPort("estimated_positions")
         show_estimate(builder, scene_graph, model, estimate, meshcat, ESTIMATE_COLOUR)
-        # The visualizer begins by clearing its part of Meshcat's tree.
+        # After show_estimate, because its visualizer clears its part of Meshcat's tree.
         add_meshcat_skin(builder, meshcat, model, truth, "true")
     return _finish(builder, matcher, period, None)
 
@@ -275,7 +289,7 @@ def add_simulated_cameras(
     cameras: Sequence[Camera],
     true_positions: Trajectory | np.ndarray,
 ) -> tuple[OutputPort, list[OutputPort]]:
-    """Add a body at positions (nq,), constant or over time, and RgbdSensors that see it.
+    """Add a body at given positions (nq,), constant or over time, and RgbdSensors that see it.
 
     Returns:
         The port of the positions, and that of each camera's label image.
@@ -291,8 +305,7 @@ def add_simulated_cameras(
     for camera in cameras:
         nearest, farthest = _depth_range(camera, model, true_positions)
         if isinstance(camera, PinholeCamera):
-            # Beyond the body there is nothing; a farther plane than this is a warning of Drake's.
-            # A pinhole's pictures end 60 m away at least.
+            # Drake warns of farther planes, which are not needed behind the body.
             nearest, farthest = camera.near, max(60.0, farthest)
         ranges[camera.name] = nearest, farthest
     sensors = add_sensors(
@@ -304,9 +317,9 @@ def add_simulated_cameras(
 def _depth_range(
     camera: Camera, model: ParsedModel, true_positions: Trajectory
 ) -> tuple[float, float]:
-    """The depths about a moving body [m]: a parallel camera is drawn as a tele camera, clipped."""
+    """Return the nearest and farthest depth of a moving body, with margins [m]."""
     start, end = true_positions.start_time(), true_positions.end_time()
-    # A constant has no end.
+    # A constant trajectory has infinite times.
     times = np.linspace(start, end, 100) if np.isfinite([start, end]).all() else np.zeros(1)
     tree = build_pose_tree(model)
     depths = []
@@ -316,7 +329,7 @@ def _depth_range(
             p_N = node.surface(taken).vertices
             depths.append(camera.project(p_N @ X_WN[:3, :3].T + X_WN[:3, 3])[1])
     everything = np.concatenate(depths)
-    # A body that moves fast may reach further between the times looked at.
+    # The body may leave the range between the sampled times.
     margin = 0.5 + 0.1 * float(np.ptp(everything))
     return float(everything.min()) - margin, float(everything.max()) + margin
 
@@ -330,7 +343,7 @@ def _matcher(
 ) -> SilhouetteMatcher:
     if tracking is None:
         return SilhouetteMatcher(search, cameras, period)
-    # What is recorded or simulated waits: its answer depends on no clock.
+    # Recordings and simulations need no time limit; without one the result is repeatable.
     return SilhouetteTracker(
         search, cameras, period, tracking=tracking, color_cameras=color_cameras, search_time=None
     )
@@ -344,10 +357,12 @@ def show_estimate(
     meshcat: Meshcat,
     colour: Rgba | None = None,
 ) -> None:
-    """Show a SceneGraph in Meshcat, with a body at estimated positions that no sensor sees.
+    """Show a SceneGraph in Meshcat, with a body at estimated positions that sensors do not see.
 
     Args:
-        colour: in place of the body's own colours.
+        positions: port of the estimated positions (nq,).
+        meshcat: where to show them.
+        colour: of the body; None: its own colours.
     """
     plant = add_posed_plant(
         builder, scene_graph, model, positions, "estimated_geometry_pose", "estimated"
@@ -356,7 +371,7 @@ def show_estimate(
     for index in range(plant.num_bodies()):
         frame = plant.GetBodyFrameIdOrThrow(BodyIndex(index))
         for geometry in inspector.GetGeometries(frame):
-            # Other bodies' skin hangs on the world's frame, too.
+            # The world's frame also carries other bodies' skin.
             if not inspector.BelongsToSource(geometry, source):
                 continue
             if inspector.GetPerceptionProperties(geometry) is not None:
@@ -372,8 +387,8 @@ def show_estimate(
 def _finish(
     builder: DiagramBuilder, matcher: SilhouetteMatcher, period: float, player: MaskPlayer | None
 ) -> MatchingDiagram:
-    """Add the logs and build."""
-    # A log samples just before the update of the same time: sample k + 1 holds frame k's estimate.
+    """Add the logs and build the diagram."""
+    # A log samples before the update at the same time: sample k + 1 has the estimate of frame k.
     positions_log = LogVectorOutput(
         matcher.GetOutputPort("estimated_positions"), builder, publish_period=period
     )
@@ -383,11 +398,11 @@ def _finish(
 
 @dataclass(frozen=True)
 class RegistrationDiagram:
-    """A diagram that registers a simulated camera, and the parts of it that one asks afterwards.
+    """A diagram that registers a simulated camera, and its parts.
 
     Args:
         sensor: the simulated camera; ``sensor.SetX_PB(context, X_WC)`` moves it.
-        status_log: logs ``status`` once a period.
+        status_log: log of ``status``, one sample a period.
     """
 
     diagram: Diagram
@@ -403,13 +418,11 @@ def build_simulated_registration(
     period: float,
     meshcat: Meshcat | None = None,
 ) -> RegistrationDiagram:
-    """Wire a simulated body and camera to the registration, which is not told the camera's pose.
+    """Build a diagram that registers a simulated camera; its pose is not an input.
 
     Args:
-        true_positions: the body's positions (nq,), constant or over time, measured without an
-            error.
-        period: time between two images, and two updates [s].
-        meshcat: where to show the body.
+        true_positions: the body's positions (nq,), constant or over time, measured without error.
+        period: time between two images and updates [s].
     """
     builder = DiagramBuilder()
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())

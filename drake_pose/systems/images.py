@@ -1,6 +1,6 @@
 """Pictures to and from Drake's colour images, and recorded masks as a Drake system.
 
-A camera that has nothing to show gives an image of no pixels: a port of images cannot be silent.
+An image without pixels (0 x 0) means that a camera has no picture.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -21,7 +21,10 @@ from drake_pose.systems.ports import PortedSystem, camera_port
 
 
 def picture_to_colour_image(picture: Picture | None) -> ImageRgba8U:
-    """A picture (H, W, 3) in red, green, blue as a colour image; None becomes one of no pixels."""
+    """Return a picture (H, W, 3), red, green, blue, as an ImageRgba8U.
+
+    None gives an image without pixels.
+    """
     if picture is None:
         return ImageRgba8U()
     image = ImageRgba8U()
@@ -30,27 +33,30 @@ def picture_to_colour_image(picture: Picture | None) -> ImageRgba8U:
 
 
 def fill_colour_image(image: ImageRgba8U, picture: Picture) -> None:
-    """Makes a colour image that of a picture (H, W, 3) in red, green, blue, in its size."""
+    """Resize an ImageRgba8U to a picture (H, W, 3), red, green, blue, and copy it."""
     image.resize(picture.shape[1], picture.shape[0])
     cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA, dst=image.mutable_data)
 
 
 def colour_image_to_picture(image: ImageRgba8U) -> Picture:
-    """Returns the picture (H, W, 3) in red, green, blue of a colour image; (0, 0, 3): no pixels."""
+    """Return the picture (H, W, 3), red, green, blue, of an image; (0, 0, 3) without pixels."""
     if not image.size():
         return np.empty((0, 0, 3), dtype=np.uint8)
     return np.asarray(cv2.cvtColor(image.data, cv2.COLOR_RGBA2RGB))
 
 
 class ColourPorts:
-    """The input ports for colour images of some of a system's cameras.
-
-    Attributes:
-        cameras: the names of the cameras that have a port.
+    """Input ports for the colour images of some of a system's cameras.
 
     Args:
-        wanted: the names of these cameras; UnknownNameError: one is no camera's.
-        port: the name of a camera's port.
+        wanted: names of the cameras that get a port.
+        port: maps a camera to its port's name.
+
+    Attributes:
+        cameras: names of the cameras that have a port, in the order of all cameras.
+
+    Raises:
+        UnknownNameError: a name in ``wanted`` is no camera's.
     """
 
     def __init__(
@@ -71,16 +77,17 @@ class ColourPorts:
         )
 
     def pictures(self, context: Context) -> dict[str, Picture]:
-        """The pictures (H, W, 4) that are there, by camera: valid until the context changes.
+        """Return the available pictures (H, W, 4) by camera.
 
-        They are the images' own, as kernels take them, which are for arrays that can be written.
+        They are views of the images' writable data, as compiled kernels require, and are valid
+        until the context changes.
         """
         images = self._given(context).items()
         return {name: image.mutable_data for name, image in images if image.size()}
 
 
 DEFAULT_FRAME_RATE_HZ = 1.0
-"""Where a scene says nothing, as stills do."""
+"""Frame rate of a scene that has none, such as stills [Hz]."""
 
 
 class MaskPlayer(PortedSystem):
@@ -90,23 +97,30 @@ class MaskPlayer(PortedSystem):
 
         name: MaskPlayer
         output_ports: [label_image, color_image (of cameras with pictures), measured_positions
-          (where they are given), root_position (where it is given), frame_index]
+          (where given), root_position (where given), frame_index]
 
-    With several cameras the output ports are ``label_image_<camera>``. Frame k is shown from k
-    periods on for one period; before the first and after the last, the nearest one. Where a camera
-    has no mask of a frame, its image is all background, which a matcher leaves out.
+    Output ports depend on time alone. Frame k is shown for one period from time k * period on; the
+    first and the last frame also before and after. With several cameras, the image ports are
+    ``label_image_<camera>`` and ``color_image_<camera>``.
+
+    Output ports:
+        label_image (ImageLabel16I): the mask; all background if the camera has no mask of the
+            frame, which a matcher ignores.
+        color_image (ImageRgba8U): the picture; without pixels if there is none of the frame.
+        measured_positions (nq): NaN if not given for the frame [rad or m].
+        root_position (3): NaN if not given for the frame [m].
+        frame_index (1): index of the frame in ``frames``.
 
     Args:
         cameras: the cameras to play, in the order of the output ports.
-        frames: the frames to play; all of the scene's where not given.
-        positions: (nq,) by frame, given out as ``measured_positions``; NaN in other frames.
-        root_positions: (3,) by frame [m], given out as ``root_position``; NaN in other frames.
+        frames: the frames to play; None: all of the scene's.
+        positions: (nq,) by frame, for ``measured_positions``.
+        root_positions: (3,) by frame [m], for ``root_position``.
 
     Attributes:
-        period: time between two frames [s], by the scene's frame rate.
-        color_cameras: the names of the cameras that have pictures (``Scene.images``) and so a port
-            ``color_image_<camera>``, or ``color_image`` if there is one camera. An image of no
-            pixels is given out where there is no picture.
+        frames: the frames played.
+        period: time between two frames [s].
+        color_cameras: names of the cameras that have pictures (``Scene.images``), and so a port.
     """
 
     def __init__(
@@ -139,7 +153,7 @@ class MaskPlayer(PortedSystem):
         for name, values in given.items():
             if values:
                 unknown = np.full(len(next(iter(values.values()))), np.nan)
-                self._play(name, len(unknown), partial(_known, values, unknown))
+                self._play(name, len(unknown), partial(_value_at, values, unknown))
         self.add_output(
             "frame_index",
             1,
@@ -148,16 +162,16 @@ class MaskPlayer(PortedSystem):
         )
 
     def frame_index(self, time: float) -> int:
-        """Which of ``frames`` is shown at a time [s]."""
-        # Half a millionth of a period keeps k * period on frame k in spite of rounding.
+        """Return the index in ``frames`` of the frame shown at a time [s]."""
+        # The offset of 5e-7 periods keeps k * period on frame k in spite of rounding.
         index = int(np.floor(time / self.period + 5e-7))
         return min(max(index, 0), len(self.frames) - 1)
 
-    def _play(self, port: str, like: Any, read: Callable[[str], Any]) -> None:
-        """An output of what a function says of the frame that is shown."""
+    def _play(self, port: str, model_value: Any, read: Callable[[str], Any]) -> None:
+        """Declare an output port that is a function of the name of the frame shown."""
         self.add_output(
             port,
-            like,
+            model_value,
             lambda context: read(self.frames[self.frame_index(context.get_time())]),
             {self.time_ticket()},
         )
@@ -173,5 +187,5 @@ class MaskPlayer(PortedSystem):
         return picture_to_colour_image(picture)
 
 
-def _known(values: Mapping[str, Array], unknown: Array, frame: str) -> Array:
+def _value_at(values: Mapping[str, Array], unknown: Array, frame: str) -> Array:
     return values.get(frame, unknown)

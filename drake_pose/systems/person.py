@@ -1,4 +1,4 @@
-"""A person captured by all silhouettes at once, as Drake systems: pictures in, poses out."""
+"""Capture of a person from all silhouettes at once, as Drake systems: pictures in, poses out."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
@@ -33,52 +33,59 @@ from drake_pose.systems.ports import (
     MemorySystem,
     StagedDiagram,
     export_outputs,
-    require_different,
+    require_distinct_cameras,
     require_period,
 )
 
 
 class PersonTracker(MemorySystem):
-    """Follows a person from what several cameras' pictures say.
+    """Tracks a person in the pictures of several cameras.
 
     .. pydrake_system::
 
         name: PersonTracker
         input_ports: [silhouette_<camera>, color_image_<camera> (of color_cameras), time]
-        output_ports: [estimated_positions, last_positions, body_poses, share, time, seen, others,
-          deviations]
+        output_ports: [estimated_positions, last_positions, body_poses, inlier_ratio, time, visible,
+          others, deviations (if asked for)]
 
-    ``silhouette_<camera>`` is a SilhouetteView, as SilhouetteSensor gives it; where it is None or
-    not connected the others go on without the camera. ``time`` is the pictures' time stamp [s]:
-    while it stays the same, or is nan, there is nothing new; where it is not connected, every
-    period brings new pictures.
+    A periodic update fits the pose to the current pictures; output ports read the result. All input
+    ports are optional. If fewer than two cameras give a silhouette with somebody in it, a known
+    person is tracked by the colours in ``color_image_<camera>``, which are learned from frame to
+    frame. Silhouettes of one set of synchronised frames are enough for that, or ``set_person``. A
+    person lost by colour is searched in the next silhouettes.
 
-    ``estimated_positions`` are nan until the person is found, while lost, and while fewer than two
-    cameras see the person; ``last_positions`` are the last ones known, at first the model's
-    default, and ``body_poses`` those of all bodies there, in the plant's order. ``share`` is that
-    of the contours that fits, 0 where no person was seen; ``time`` the stamp of the last pictures
-    used; ``seen`` for each camera whether it saw the person in them, 1 or 0; ``others`` 1 where
-    other persons were in them. Others are cut out; a camera in which the person and another are one
-    figure is left out where three others see the person alone, else not judged by. ``deviations``,
-    where asked for, are standard deviations [rad or m] by the pictures and the limits
-    alone.
+    Other persons are cut out. A camera in which the person and another are one figure is ignored if
+    three other cameras see the person alone; otherwise it does not count for ``inlier_ratio``.
 
-    Where fewer than two cameras give a silhouette that shows somebody, a person who is known is
-    followed by colour in ``color_image_<camera>``, an ``ImageRgba8U``; the colours are learned from
-    frame to frame. So silhouettes of one moment will do, or ``set_person``. A person who is lost by
-    colour is searched in the next silhouettes.
+    Input ports:
+        silhouette_<camera> (SilhouetteView): from a SilhouetteSensor; None: no picture.
+        color_image_<camera> (ImageRgba8U): for the cameras in ``color_cameras``.
+        time (1): time stamp of the pictures [s]. Nothing is new while it is NaN or unchanged; if it
+            is not connected, each update has new pictures.
+
+    Output ports:
+        estimated_positions (nq): NaN until the person is found, while lost, and while fewer than
+            two cameras see the person [rad or m].
+        last_positions (nq): the last known ones, initially the model's default [rad or m].
+        body_poses: poses of all bodies at ``last_positions``, in the plant's order.
+        inlier_ratio (1): fraction of the contours that fits; 0 if no person is visible.
+        time (1): time stamp of the last pictures used [s].
+        visible (cameras): 1 if the person is visible in the camera's last picture, else 0.
+        others (1): 1 if other persons are in the last pictures, else 0.
+        deviations (nq): standard deviations from pictures and limits alone [rad or m].
 
     Args:
         cameras: calibrated, in the order of the input ports.
-        period: time between two looks at the inputs [s].
-        with_deviations: whether the deviations are an output.
+        period: time between two updates [s].
+        with_deviations: whether there is an output port ``deviations``.
         color_cameras: names of the cameras that have a port for a colour image.
-        remembered: in how many more frames others are looked for after they were seen; to look
-            takes long.
+        watch_frames: number of frames for which others are looked for after they were visible; this
+            is slow.
 
     Raises:
-        UnknownNameError: a name of ``color_cameras`` is no camera's.
-        SettingsError: fewer than two cameras, two of one name, or a period that is not positive.
+        UnknownNameError: a name in ``color_cameras`` is no camera's.
+        SettingsError: there are fewer than two cameras, two have the same name, or the period is
+            not positive.
     """
 
     def __init__(
@@ -88,43 +95,43 @@ class PersonTracker(MemorySystem):
         period: float,
         with_deviations: bool = False,
         color_cameras: Collection[str] = (),
-        remembered: int = 15,
+        watch_frames: int = 15,
     ) -> None:
         super().__init__()
         cameras = camera_tuple(cameras)
-        require_different(cameras, 2, "a person is tracked by two or more different cameras")
+        require_distinct_cameras(cameras, 2, "a person is tracked by two or more different cameras")
         require_period("tracker", period)
         self._tracker, self._cameras = tracker, cameras
-        self._with_deviations, self._remembered = with_deviations, remembered
+        self._with_deviations, self._watch_frames = with_deviations, watch_frames
         self._views = self.add_camera_inputs({c.name: f"silhouette_{c.name}" for c in cameras})
         self.add_input("time", 1)
         self._colours = ColourPorts(
             self, cameras, color_cameras, lambda one: f"color_image_{one.name}"
         )
-        # What is known of the person's colours: state, so that a simulation can be replayed.
+        # The learned colours are state, so that a simulation can be repeated.
         self._colours_shape = (len(self._colours.cameras), len(tracker.fit.outlines), 3, COLOURS)
         model = tracker.fit.tree.model
         values = tracker.values(model.default_positions)
         unknown = np.full(len(model.default_positions), np.nan)
-        shown = {
+        outputs = {
             "estimated_positions": unknown,
             "last_positions": tracker.positions(values),
-            "share": np.zeros(1),
+            "inlier_ratio": np.zeros(1),
             "time": np.full(1, np.nan),
-            "seen": np.zeros(len(cameras)),
+            "visible": np.zeros(len(cameras)),
             "others": np.zeros(1),
         }
         if with_deviations:
-            shown["deviations"] = unknown
-        # The usual share is 0 until the person is known; in as many more frames as are watched
-        # others are looked for; elapsed is the time between the last two frames.
+            outputs["deviations"] = unknown
+        # usual: usual inlier ratio, 0 before a person is found; watched: number of frames in which
+        # others are still looked for; elapsed: time between the last two frames [s].
         inner = {
             "values": values,
             "step": np.zeros(len(values)),
             **{name: np.zeros(1) for name in ("usual", "troubled", "watched", "elapsed")},
             "colours": np.zeros(int(np.prod(self._colours_shape))),
         }
-        self.keep_vectors(shown | inner, shown, period)
+        self.declare_vectors(outputs | inner, outputs, period)
         last = self.GetOutputPort("last_positions")
         self.add_output(
             "body_poses",
@@ -134,19 +141,19 @@ class PersonTracker(MemorySystem):
         )
 
     def known_person(self, context: Context) -> TrackState | None:
-        """What is known of the person, lost or not; None: no person was found yet."""
+        """Return the tracked person's state, lost or not; None before a person was found."""
         return _person(self.vectors(context), 0.0)
 
     def set_person(self, context: Context, person: TrackState) -> None:
-        """Say what is known of the person; the next pictures follow within a period."""
+        """Set the tracked person's state; the next pictures are expected within a period."""
         fresh = {"watched": np.zeros(1), "time": np.full(1, np.nan), "elapsed": np.zeros(1)}
         state = context.get_mutable_discrete_state()
         self.set_vectors(state, self._packed(person) | fresh)
 
     def next_vectors(self, context: Context, known: dict[str, Array]) -> Mapping[str, Array]:
-        """What is known with the pictures of one moment more."""
+        """Return the state vectors that the current pictures change."""
         before, time = float(known["time"][0]), context.get_time()
-        stamp = self.given(context, "time")
+        stamp = self.eval_input(context, "time")
         if stamp is not None:
             time = float(stamp[0])
             if np.isnan(time) or time == before:
@@ -155,24 +162,27 @@ class PersonTracker(MemorySystem):
         last = _person(known, elapsed)
         views = self._views(context)
         cameras = [camera for camera in self._cameras if camera.name in views]
-        moment = _Moment(FrameViews(cameras, list(views.values())))
+        separated = _SeparatedViews(FrameViews(cameras, list(views.values())))
         colours = self._colour_views(context, known["colours"])
         seen: FrameViews | ColourViews
         found: TrackState | None
-        if len(moment.seen.showing) < 2 and colours is not None and last is not None:
+        if len(separated.views.showing) < 2 and colours is not None and last is not None:
             if not colours.known and not last.is_lost:
-                # The person was set: these are the first pictures.
+                # These are the first pictures after set_person.
                 learned = colours.updated_colours(self._tracker.fit, last.values)
                 colours = ColourViews(colours.cameras, colours.pictures, learned)
             found, seen = self._tracker.follow_by_colour(last, colours), colours
-            moment, seers = _Moment(FrameViews((), ())), {one.name for one in seen.cameras}
+            separated, visible = (
+                _SeparatedViews(FrameViews((), ())),
+                {one.name for one in seen.cameras},
+            )
         else:
-            found, moment = self._followed(last, moment, known["watched"][0] > 0)
-            seen, seers = moment.seen, {*moment.seen.showing, *moment.merged}
+            found, separated = self._follow(last, separated, known["watched"][0] > 0)
+            seen, visible = separated.views, {*separated.views.showing, *separated.merged}
         changed = {
             "time": np.array([time]),
-            "seen": np.array([float(camera.name in seers) for camera in self._cameras]),
-            "others": np.array([float(moment.others)]),
+            "visible": np.array([float(camera.name in visible) for camera in self._cameras]),
+            "others": np.array([float(separated.others)]),
         }
         if self._with_deviations:
             changed["deviations"] = np.full(len(known["last_positions"]), np.nan)
@@ -180,13 +190,13 @@ class PersonTracker(MemorySystem):
             found = TrackState(last.values, np.zeros(len(last.step)), 0.0, last.usual_ratio)
         if found is None:
             return changed
-        clean = moment.seen.without(moment.merged)
-        if 0 < len(clean.cameras) < len(moment.seen.cameras):
-            # Its inlier ratio is that of the cameras that show this person alone.
+        clean = separated.views.without(separated.merged)
+        if 0 < len(clean.cameras) < len(separated.views.cameras):
+            # The inlier ratio counts only cameras that show this person alone.
             fit, step = self._tracker.fit, self._tracker.settings.follow[-1]
             sums = clean.compare(fit, fit.body.place(found.values), step).sums
             found = replace(found, inlier_ratio=inlier_ratio_of(sums))
-        watched = self._remembered if moment.others else max(known["watched"][0] - 1.0, 0.0)
+        watched = self._watch_frames if separated.others else max(known["watched"][0] - 1.0, 0.0)
         changed |= {"watched": np.array([watched]), "elapsed": np.array([elapsed])}
         changed |= self._packed(found)
         if not found.is_lost:
@@ -204,10 +214,10 @@ class PersonTracker(MemorySystem):
         return changed
 
     def _packed(self, person: TrackState) -> dict[str, Array]:
-        """What is known of the person, as vectors."""
+        """Return a person's state as vectors."""
         q = self._tracker.positions(person.values)
         numbers = {
-            "share": person.inlier_ratio,
+            "inlier_ratio": person.inlier_ratio,
             "usual": person.usual_ratio,
             "troubled": person.troubled_frames,
         }
@@ -219,7 +229,7 @@ class PersonTracker(MemorySystem):
         }
 
     def _colour_views(self, context: Context, colours: Array) -> ColourViews | None:
-        """The pictures that are there, and what is known of the colours; None: no picture."""
+        """Return the available pictures with the colours learned so far; None without a picture."""
         pictures = self._colours.pictures(context)
         if not pictures:
             return None
@@ -228,74 +238,84 @@ class PersonTracker(MemorySystem):
         cameras = [camera for camera in self._cameras if camera.name in pictures]
         return ColourViews(cameras, [pictures[camera.name] for camera in cameras], known)
 
-    def _followed(
-        self, last: TrackState | None, moment: "_Moment", is_watching: bool
-    ) -> "tuple[TrackState | None, _Moment]":
-        """The next state, and what the cameras see of the person alone."""
+    def _follow(
+        self, last: TrackState | None, separated: "_SeparatedViews", is_watching: bool
+    ) -> "tuple[TrackState | None, _SeparatedViews]":
+        """Return the person's next state, and the views without other persons.
+
+        Others are looked for at first, while tracking is in trouble, and if ``is_watching``.
+        """
         is_sorted = last is None or last.troubled_frames != 0 or is_watching
         if is_sorted:
-            moment = self._alone(moment.seen, last)
-        found = self._follow_one(last, moment.seen)
+            separated = self._without_others(separated.views, last)
+        found = self._follow_one(last, separated.views)
         if not is_sorted and (found is None or found.troubled_frames != 0):
-            alone = self._alone(moment.seen, last)
-            if alone.others:
-                return self._follow_one(last, alone.seen), alone
-        return found, moment
+            single = self._without_others(separated.views, last)
+            if single.others:
+                return self._follow_one(last, single.views), single
+        return found, separated
 
     def _follow_one(self, last: TrackState | None, seen: FrameViews) -> TrackState | None:
-        """The next state; None where fewer than two cameras see anybody."""
+        """Return the person's next state; None if fewer than two cameras see somebody."""
         return self._tracker.follow(last, seen) if len(seen.showing) >= 2 else None
 
-    def _alone(self, seen: FrameViews, last: TrackState | None) -> "_Moment":
-        """What cameras see without other persons than the one who was seen last.
+    def _without_others(self, seen: FrameViews, last: TrackState | None) -> "_SeparatedViews":
+        """Return the views without other persons than the one in the last state.
 
-        Cameras in which the person and another are one figure are left out where three others show
+        Cameras in which the person and another are one figure are left out if three others see
         somebody.
         """
         place = None if last is None else self._tracker.trunk_middle(last.values)
-        alone, cut, merged = keep_views(seen, place)
-        clean = alone.without(merged)
+        single, cut, merged = keep_views(seen, place)
+        clean = single.without(merged)
         if merged and len(clean.showing) >= 3:
-            alone = clean
-        return _Moment(alone, bool(cut or merged), merged)
+            single = clean
+        return _SeparatedViews(single, bool(cut or merged), merged)
 
 
-class _Moment(NamedTuple):
-    """What cameras see; whether others were cut out, and who merges person and others."""
+class _SeparatedViews(NamedTuple):
+    """Views of one person.
 
-    seen: FrameViews
+    ``others``: whether other persons were cut out. ``merged``: cameras in which the person and
+    another are one figure.
+    """
+
+    views: FrameViews
     others: bool = False
     merged: tuple[str, ...] = ()
 
 
 def _person(known: Mapping[str, Array], elapsed: float, longest: float = 3.0) -> TrackState | None:
-    """The last frame's state after a time [s]; None where the person is not known yet.
+    """Return the person's state with its motion scaled to ``elapsed`` [s]; None if not yet found.
 
-    After a pause a motion is expected to go on for no more than `longest` frames.
+    If frames were skipped, the motion continues for at most ``longest`` frames.
     """
     share, usual, troubled, usually = (
-        float(known[name][0]) for name in ("share", "usual", "troubled", "elapsed")
+        float(known[name][0]) for name in ("inlier_ratio", "usual", "troubled", "elapsed")
     )
     if not usual:
         return None
-    # Where frames were skipped, the motion has gone on for longer than from frame to frame.
+    # Skipped frames extend the motion.
     frames = min(elapsed / usually, longest) if usually > 0 and elapsed > 0 else 1.0
     return TrackState(known["values"], frames * known["step"], share, usual, int(troubled))
 
 
 class SilhouetteSensor(PersonRegion):
-    """What one camera's picture says of the person.
+    """Extracts the person's silhouette from one camera's picture.
 
     .. pydrake_system::
 
         name: SilhouetteSensor
-        input_ports: [color_image, label_image]
+        input_ports: [color_image (optional), label_image (optional)]
         output_ports: [region, silhouette]
 
-    ``silhouette`` is a SilhouetteView of the region (see PersonRegion), or None.
+    The system has no state. Ports, arguments and errors are those of ``PersonRegion``, and:
+
+    Output ports:
+        silhouette: a SilhouetteView of the region, or None.
 
     Args:
-        edge_points: the picture's height over the spacing of the edge points.
+        edge_points: the picture's height divided by the spacing of edge points.
     """
 
     def __init__(
@@ -318,14 +338,18 @@ def add_silhouette_sensors(
     backgrounds: Mapping[str, Background],
     edge_points: float = EDGE_POINTS,
 ) -> dict[str, SilhouetteSensor]:
-    """Add a source of images, and a sensor for each camera; without a source images are inputs.
+    """Add a SilhouetteSensor for each camera, and the source of their images; return the sensors.
 
     Args:
-        source: what has ``color_image_<camera>``, or ``label_image_<camera>`` of a camera without
-            background.
+        source: has an output port ``color_image_<camera>`` for each camera, or
+            ``label_image_<camera>`` for a camera without background; None: the images are inputs of
+            the diagram.
+        backgrounds: by camera.
+        edge_points: as in SilhouetteSensor.
 
     Raises:
-        SettingsError: without a source a camera has no background; or the source lacks an output.
+        SettingsError: a camera has neither a background nor a source, or the source lacks an output
+            port.
     """
     for name in cameras:
         if source is None and name not in backgrounds:
@@ -353,22 +377,24 @@ def build_silhouette_capture(
     meshcat: Meshcat | None = None,
     with_deviations: bool = False,
 ) -> StagedDiagram[PersonTracker]:
-    """Wire the cameras' images to their sensors, and these to what follows the person.
+    """Build a diagram that tracks a person in the cameras' images.
 
-    The diagram's inputs are ``color_image_<camera>``, its outputs those of PersonTracker and
+    Its input ports are ``color_image_<camera>``, its output ports those of PersonTracker and
     ``silhouette_<camera>``, and its stages ``region`` and ``edge``.
 
     Args:
-        backgrounds: of all cameras, two or more, unless a source gives label images.
+        cameras: two or more, by name.
+        backgrounds: of all cameras, unless a source gives label images.
         period: time between two frames [s].
-        edge_points: a picture's height over the spacing of the edge points.
-        source: of the images in place of the inputs, as a rig's diagram or a PictureCapture; see
-            add_silhouette_sensors. Without an output ``time`` every period brings new pictures.
+        edge_points: as in SilhouetteSensor.
+        source: of the images instead of input ports, for example a rig's diagram or a
+            PictureCapture; see add_silhouette_sensors. Without an output port ``time``, each update
+            has new pictures.
         meshcat: where to show the person.
-        with_deviations: whether the positions' standard deviations are an output.
+        with_deviations: whether there is an output port ``deviations``.
 
     Raises:
-        SettingsError: fewer than two cameras, one without a background, or a period that is not
+        SettingsError: there are fewer than two cameras, one has no background, or the period is not
             positive.
     """
     builder = DiagramBuilder()
@@ -398,7 +424,7 @@ def add_person_tracker(
     source: System | None = None,
     with_deviations: bool = False,
 ) -> tuple[PersonTracker, dict[str, SilhouetteSensor]]:
-    """Add what follows a person, its sensors and the source; as of build_silhouette_capture."""
+    """Add a PersonTracker, its sensors and their source; see build_silhouette_capture."""
     sensors = add_silhouette_sensors(builder, source, cameras, backgrounds, edge_points)
     person = PersonTracker(tracker, list(cameras.values()), period, with_deviations)
     builder.AddNamedSystem("person_tracker", person)

@@ -1,4 +1,4 @@
-"""Recorded or live pictures as Drake systems: synchronised ones, and the person's region in one."""
+"""Recorded or live pictures as Drake systems: synchronised frames, and a person's region in one."""
 
 import math
 import time
@@ -33,13 +33,13 @@ from drake_pose.systems.ports import PortedSystem, require_period
 
 @dataclass(frozen=True)
 class CameraCount:
-    """How a camera did.
+    """Counters of a camera's pictures.
 
     Args:
-        used: pictures that were part of a moment shown.
-        dropped: pictures that could not be used.
-        late: pictures that came after their moment.
-        changes: when it stopped and returned.
+        used: number of pictures in synchronised frames that were shown.
+        dropped: number of pictures that could not be used.
+        late: number of pictures that arrived after their synchronised frames.
+        changes: when the camera stopped and returned.
     """
 
     used: int
@@ -49,34 +49,41 @@ class CameraCount:
 
 
 class PictureCapture(PortedSystem):
-    """Gives the synchronised pictures of several cameras.
+    """Outputs the synchronised pictures of several cameras.
 
     .. pydrake_system::
 
         name: PictureCapture
         output_ports: [color_image_<camera>, label_image_<camera>, time, fresh]
 
-    A camera whose source delivers masks has the port ``label_image_<camera>``, any other
-    ``color_image_<camera>``. An image without pixels says that the camera gave no picture at that
-    moment. ``time`` is the moment's time stamp [s], counted from the first one, nan before it;
-    ``fresh`` is 1 where the moment is new in this period, else 0.
+    A periodic update reads the sources; output ports show the last synchronised frames. Recorded
+    sources follow the simulation's time: all frames are shown, and the simulation terminates after
+    the last. If ``live``, sources follow the computer's clock: the newest frames are shown, after
+    waiting for all cameras to open. External devices cannot be part of a Context, so that a
+    PictureCapture works in one simulator only.
 
-    Recorded sources follow the simulation's time: each moment is shown, and the simulation ends
-    after the last one. If ``live``, moments follow the computer's clock: the newest one is shown;
-    at first the system waits some seconds for all cameras to open. What comes from outside cannot
-    be in a Context: one simulator runs one such system.
+    Output ports:
+        color_image_<camera> (ImageRgba8U): without pixels if the camera has no picture in these
+            frames.
+        label_image_<camera> (ImageLabel16I): in place of it, for a source of masks.:
+        time (1): time stamp of the frames, counted from the first ones [s]; NaN before them.
+        fresh (1): 1 if this update brought new frames, else 0.
 
     Args:
-        sources: where each camera's pictures come from, opened.
-        period: time between two looks at the sources [s]; the sources' own where not given.
-        live: whether the pictures come by the computer's clock; true where a source is live.
-        tolerance: how far apart the pictures of one moment may be [s]; half a period where not
-            given, 0.9 periods for live cameras, which are not triggered together.
-        clock: the computer's [s]; the one that live sources use.
-        opening: how long to wait for the first pictures of live cameras [s].
+        sources: opened sources of pictures, by camera.
+        period: time between two updates [s]; None: that of the fastest source.
+        live: whether the pictures come by the computer's clock; None: whether a source is live.
+        tolerance: largest difference of time stamps in synchronised frames [s]; None: half a
+            period, or 0.9 periods for live cameras, which are not triggered together.
+        clock: returns the computer's time [s]; that of the live sources.
+        opening_timeout: longest time to wait for the first pictures of live cameras [s].
+
+    Attributes:
+        frames: the synchronised frames shown; None before the first ones.
+        skipped: number of synchronised frames that were skipped for newer ones.
 
     Raises:
-        SettingsError: no source, or times that cannot be.
+        SettingsError: there is no source, or a time is invalid.
         UnknownNameError: a source belongs to no camera.
     """
 
@@ -89,7 +96,7 @@ class PictureCapture(PortedSystem):
         live: bool | None = None,
         tolerance: float | None = None,
         clock: Clock = time.monotonic,
-        opening: float = 8.0,
+        opening_timeout: float = 8.0,
     ) -> None:
         super().__init__()
         for name in sources:
@@ -110,14 +117,13 @@ class PictureCapture(PortedSystem):
         self._synchroniser: Synchroniser[TimedPicture] = Synchroniser(
             self._sources, tolerance, timeout=max(4.0 * self.period, tolerance)
         )
-        self._clock, self._opening = clock, opening
+        self._clock, self._opening_timeout = clock, opening_timeout
         self._since: float | None = None
         self._opened: set[str] = set()
         self._begin: float | None = None
         self._origins: dict[str, float] = {}
         self._pending: dict[str, TimedPicture | None] = dict.fromkeys(self._sources)
-        # The one that is shown; its time counts from the first one.
-        self.moment: SynchronisedFrames[TimedPicture] | None = None
+        self.frames: SynchronisedFrames[TimedPicture] | None = None
         self._used = dict.fromkeys(self._sources, 0)
         self._changes: dict[str, list[CameraChange]] = {name: [] for name in self._sources}
         self._reports: list[str] = []
@@ -136,11 +142,11 @@ class PictureCapture(PortedSystem):
             self.DeclareAbstractOutputPort(port, AbstractValue.Make(image).Clone, calc, ticket)
         self.DeclareStateOutputPort("time", self._time)
         self.DeclareStateOutputPort("fresh", self._fresh)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(self.period, 0.0, self._look)
-        self.DeclareForcedUnrestrictedUpdateEvent(self._look)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(self.period, 0.0, self._update)
+        self.DeclareForcedUnrestrictedUpdateEvent(self._update)
 
     def counts(self) -> dict[str, CameraCount]:
-        """How each camera did so far."""
+        """Return the counters of each camera."""
         return {
             name: CameraCount(
                 self._used[name],
@@ -152,7 +158,7 @@ class PictureCapture(PortedSystem):
         }
 
     def take_reports(self) -> list[str]:
-        """What the user should know and was not told yet: cameras that stopped, bad pictures."""
+        """Return new messages for the user: stopped cameras, bad pictures."""
         for source in self._sources.values():
             self._reports += source.problems
             source.problems.clear()
@@ -160,43 +166,43 @@ class PictureCapture(PortedSystem):
         return reports
 
     def close(self) -> None:
-        """Closes files and cameras."""
+        """Close all sources."""
         for source in self._sources.values():
             source.close()
 
-    def _look(self, context: Context, state: State) -> EventStatus:
+    def _update(self, context: Context, state: State) -> EventStatus:
         if self._begin is None:
             self._begin = self._start()
         if self._begin is None:
             return EventStatus.Succeeded()
         now = self._clock() - self._begin if self.live else context.get_time()
         for name, source in self._sources.items():
-            # Half a millionth of a period keeps what is due at a tick in spite of rounding.
+            # The offset of 5e-7 periods makes pictures due at an update in spite of rounding.
             self._feed(name, source, now + 5e-7 * self.period)
-        moment = self._synchroniser.take(now)
-        while self.live and moment is not None:
+        frames = self._synchroniser.take(now)
+        while self.live and frames is not None:
             newer = self._synchroniser.take(now)
             if newer is None:
                 break
-            moment, self.skipped = newer, self.skipped + 1
+            frames, self.skipped = newer, self.skipped + 1
         self._note_changes()
-        state.get_mutable_discrete_state(self._fresh).SetFromVector([float(moment is not None)])
-        if moment is None:
+        state.get_mutable_discrete_state(self._fresh).SetFromVector([float(frames is not None)])
+        if frames is None:
             ended = all(source.ended for source in self._sources.values())
-            rest = any(self._synchroniser.waiting(name) for name in self._sources)
-            if ended and not rest and not any(self._pending.values()):
+            has_waiting = any(self._synchroniser.waiting(name) for name in self._sources)
+            if ended and not has_waiting and not any(self._pending.values()):
                 return EventStatus.ReachedTermination(self, "the recording has ended")
             return EventStatus.Succeeded()
-        self.moment = moment
-        for name in moment.items:
+        self.frames = frames
+        for name in frames.items:
             self._used[name] += 1
-        state.get_mutable_discrete_state(self._time).SetFromVector([moment.time])
+        state.get_mutable_discrete_state(self._time).SetFromVector([frames.time])
         return EventStatus.Succeeded()
 
     def _start(self) -> float | None:
-        """Time 0 by the clock [s], from which time stamps are counted; None: cameras are opening.
+        """Return time 0 by the clock [s]; None while cameras are opening.
 
-        Time stamps of recorded pictures are counted from the first one's.
+        Recorded time stamps are counted from the earliest first picture, live ones from time 0.
         """
         recorded = [name for name, one in self._sources.items() if not one.specification.live]
         for name, source in self._sources.items():
@@ -204,7 +210,7 @@ class PictureCapture(PortedSystem):
                 self._opened.add(name)
         now = self._clock()
         self._since = now if self._since is None else self._since
-        if len(self._opened) < len(self._sources) and now - self._since < self._opening:
+        if len(self._opened) < len(self._sources) and now - self._since < self._opening_timeout:
             return None
         for name in recorded:
             self._pending[name] = self._sources[name].read()
@@ -214,9 +220,10 @@ class PictureCapture(PortedSystem):
         return begin
 
     def _feed(self, name: str, source: FrameSource, now: float, ahead: int = 8) -> None:
-        """Hands on the pictures of a source that are due; the first later one is kept.
+        """Pass the pictures of a source that are due at ``now`` [s] to the synchroniser.
 
-        ahead: number of pictures that a recorded source is read ahead of its slowest neighbour.
+        The next picture of a recorded source is kept until it is due. ``ahead``: number of pictures
+        by which a recorded source is read ahead of the slowest.
         """
         origin, synchroniser = self._origins[name], self._synchroniser
         if source.specification.live:
@@ -231,7 +238,7 @@ class PictureCapture(PortedSystem):
             if one is None:
                 one = self._pending[name] = source.read()
             if one is None:
-                # Live, one that is silent is waited for; a recording has waited itself.
+                # A live source without a picture may have one later, a recorded one has ended.
                 if source.ended or not self.live:
                     synchroniser.finish(name)
                 return
@@ -255,7 +262,7 @@ class PictureCapture(PortedSystem):
         self, name: str, fill: Callable[[Any, np.ndarray], None], _: Context, output: AbstractValue
     ) -> None:
         image = output.get_mutable_value()
-        one = None if self.moment is None else self.moment.items.get(name)
+        one = None if self.frames is None else self.frames.items.get(name)
         if one is None:
             image.resize(0, 0)
         else:
@@ -268,23 +275,30 @@ class PersonRegion(PortedSystem):
     .. pydrake_system::
 
         name: PersonRegion
-        input_ports: [color_image, label_image]
+        input_ports: [color_image (optional), label_image (optional)]
         output_ports: [region]
 
-    The region, a mask (H, W), is that of ``label_image``, where not connected that of the
-    background model; None where the image that tells it is unconnected or has no pixels: then the
-    camera gave no picture at that moment.
+    The system has no state.
 
-    Attributes:
-        wanted: the inputs that tell the region.
+    Input ports:
+        color_image (ImageRgba8U): used with the background model if ``label_image`` is not
+            connected.
+        label_image (ImageLabel16I): gives the region if connected.
+
+    Output ports:
+        region: a mask (H, W); None if the image that gives it is not connected or without pixels,
+            because the camera has no picture.
 
     Args:
-        background: the camera's view of the empty room; None if ``label_image`` is connected.
+        background: background model of the camera; None if ``label_image`` is connected.
+
+    Attributes:
+        wanted: names of the input ports that give the region.
 
     Raises:
-        SettingsError: the background's size is not the camera's. When evaluated: there is neither a
+        SettingsError: the background's size is not the camera's. On evaluation: there is neither a
             background nor a label image.
-        CameraError: when evaluated: an image has another size than the camera's.
+        CameraError: on evaluation: an image has another size than the camera.
     """
 
     def __init__(self, camera: Camera, background: Background | None = None) -> None:
@@ -304,8 +318,12 @@ class PersonRegion(PortedSystem):
         self.region = self.add_output("region", None, self._region)
 
     def _image(self, context: Context, name: str) -> Any:
-        """A given image; None while the camera has stopped; CameraError: it has another size."""
-        image, camera = self.given(context, name), self._camera
+        """Return an input image; None if the camera has no picture.
+
+        Raises:
+            CameraError: the image has another size than the camera.
+        """
+        image, camera = self.eval_input(context, name), self._camera
         if image is None or not image.size():
             return None
         if (image.width(), image.height()) != (camera.width, camera.height):
@@ -317,12 +335,12 @@ class PersonRegion(PortedSystem):
         return image
 
     def _picture(self, context: Context) -> Picture | None:
-        """The picture (H, W, 3); None while the camera has stopped."""
+        """Return the picture (H, W, 3); None if the camera has no picture."""
         image = self._image(context, "color_image")
         return None if image is None else colour_image_to_picture(image)
 
     def _region(self, context: Context) -> Mask | None:
-        """Where the person is (H, W); None while the camera has stopped."""
+        """Return the person's region (H, W); None if the camera has no picture."""
         if self.GetInputPort("label_image").HasValue(context):
             image = self._image(context, "label_image")
             return None if image is None else label_image_to_mask(image)
@@ -331,19 +349,24 @@ class PersonRegion(PortedSystem):
             return None
         if self._background is None:
             raise SettingsError(
-                f"camera '{self._camera.name}': nothing tells the person from what is behind; give "
-                "a background model or connect label_image"
+                f"camera '{self._camera.name}': give a background model or connect label_image, "
+                "to find the person's region"
             )
-        # It copies, piece by piece, only what it looks at, without the fourth channel.
+        # The four channels need no copy: person_region copies the pieces that it uses.
         return person_region(image.data, self._background)
 
 
 def connect_images(
     builder: DiagramBuilder, source: System | None, wanted: Mapping[str, Sequence[InputPort]]
 ) -> None:
-    """Connects images by the names of a source's outputs, or as inputs of the diagram.
+    """Connect input ports to a source's output ports by name, or export them from the diagram.
 
-    Raises SettingsError where the source lacks one.
+    Args:
+        source: of images; None: the inputs are exported.
+        wanted: input ports by the name of the output port.
+
+    Raises:
+        SettingsError: the source lacks an output port.
     """
     for name, ports in wanted.items():
         if source is None:

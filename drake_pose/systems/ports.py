@@ -1,4 +1,8 @@
-"""What the systems here are made of: ports by name, and what they know, renewed once a period."""
+"""Base classes of the systems in this subpackage, and helpers for ports and diagrams.
+
+``PortedSystem`` declares ports from model values. ``BeliefSystem`` keeps an abstract value,
+``MemorySystem`` named vectors, as state that a periodic update replaces and output ports read.
+"""
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -31,60 +35,66 @@ T = TypeVar("T")
 
 
 def require_period(whose: str, period: float) -> None:
-    """Refuse (SettingsError) a time between two updates that is not positive [s]."""
+    """Raise SettingsError unless a period [s] is positive and finite."""
     if not 0.0 < period < math.inf:
         raise SettingsError(f"the {whose}'s period must be positive, not {period}")
 
 
-def require_different(cameras: Sequence[Camera], fewest: int, said: str) -> None:
-    """Refuse (SettingsError) fewer cameras, or two of one name; `said` of those that are given."""
+def require_distinct_cameras(cameras: Sequence[Camera], fewest: int, said: str) -> None:
+    """Raise SettingsError if there are fewer than ``fewest`` cameras or two have the same name.
+
+    ``said`` begins the message.
+    """
     names = [camera.name for camera in cameras]
     if len(names) < fewest or len(set(names)) != len(names):
         raise SettingsError(f"{said}: {names}")
 
 
 def require_time_forward(system: LeafSystem, context: Context, last: float) -> None:
-    """Refuse (SettingsError) an update before the last one, whose filter knows the future."""
+    """Raise SettingsError if the context's time precedes that of the last update [s]."""
     now = context.get_time()
     if now < last:
         raise SettingsError(
-            f"{system.get_name()}: time ran backwards, from {last:g} s to {now:g} s; to begin "
-            "anew, set the context to its defaults (SetDefaultContext)"
+            f"{system.get_name()}: time ran backwards, from {last:g} s to {now:g} s; to start "
+            "again, set the context to its defaults (SetDefaultContext)"
         )
 
 
 def camera_port(kind: str, camera: Camera, cameras: Sequence[Camera]) -> str:
-    """Name of the port that carries a camera's image of a kind, where there are ``cameras``."""
+    """Return a camera's port name: ``kind`` for a single camera, else ``<kind>_<camera>``."""
     return kind if len(cameras) == 1 else f"{kind}_{camera.name}"
 
 
-def connect_same(builder: DiagramBuilder, giver: System, taker: System) -> None:
-    """Connect all outputs of a system to inputs of the same names of another, where there are."""
-    for index in range(giver.num_output_ports()):
-        port = giver.get_output_port(index)
-        if taker.HasInputPort(port.get_name()):
-            builder.Connect(port, taker.GetInputPort(port.get_name()))
+def connect_matching_ports(builder: DiagramBuilder, source: System, target: System) -> None:
+    """Connect each output port of ``source`` to the input port of ``target`` with the same name.
+
+    Output ports without such an input port are not connected.
+    """
+    for index in range(source.num_output_ports()):
+        port = source.get_output_port(index)
+        if target.HasInputPort(port.get_name()):
+            builder.Connect(port, target.GetInputPort(port.get_name()))
 
 
 def export_outputs(builder: DiagramBuilder, system: System) -> None:
-    """Make all outputs of a system the diagram's, under their names."""
+    """Export all output ports of a system from the diagram, under their names."""
     for index in range(system.num_output_ports()):
         port = system.get_output_port(index)
         builder.ExportOutput(port, port.get_name())
 
 
 def evaluate(port: OutputPort, context: Context) -> Any:
-    """What an output port of a system inside a diagram gives; context: the diagram's."""
+    """Evaluate an output port of a subsystem in the root diagram's context."""
     return port.Eval(port.get_system().GetMyContextFromRoot(context))
 
 
 @dataclass(frozen=True, eq=False)
 class StagedDiagram(Generic[T]):
-    """A diagram with an estimator, and what is computed in it before its state is updated.
+    """A diagram with an estimator, whose computation can be timed by stages.
 
     Args:
-        stages: the output ports of each stage, in their order: whoever evaluates one after the
-            other sees what each costs.
+        stages: output ports by stage, in the order of computation.
+        estimator: the system that computes the pose.
     """
 
     diagram: Diagram
@@ -92,114 +102,135 @@ class StagedDiagram(Generic[T]):
     estimator: T
 
     def evaluate(self, context: Context, stage: str) -> None:
-        """Have a stage, one of stages, compute what it has not computed yet."""
+        """Evaluate the ports of a stage; ``context`` is the diagram's."""
         for port in self.stages[stage]:
             evaluate(port, context)
 
 
 class PortedSystem(LeafSystem):
-    """A system whose ports are declared by what is like their values: an int is a vector's size."""
+    """A LeafSystem that declares ports from model values; an int n is a vector of size n."""
 
-    def add_input(self, name: str, like: Any) -> InputPort:
-        """An input port."""
-        if isinstance(like, int):
-            return self.DeclareVectorInputPort(name, like)
-        return self.DeclareAbstractInputPort(name, AbstractValue.Make(like))
+    def add_input(self, name: str, model_value: Any) -> InputPort:
+        """Declare an input port."""
+        if isinstance(model_value, int):
+            return self.DeclareVectorInputPort(name, model_value)
+        return self.DeclareAbstractInputPort(name, AbstractValue.Make(model_value))
 
     def add_output(
         self,
         name: str,
-        like: Any,
-        calc: Callable[[Context], Any],
+        model_value: Any,
+        function: Callable[[Context], Any],
         tickets: set[DependencyTicket] | None = None,
     ) -> OutputPort:
-        """An output port that a function of the context gives, and what of; None: all inputs."""
-        of = {self.all_input_ports_ticket()} if tickets is None else tickets
-        if isinstance(like, int):
+        """Declare an output port that a function of the context computes.
+
+        ``tickets`` are its prerequisites; None: all input ports.
+        """
+        prerequisites = {self.all_input_ports_ticket()} if tickets is None else tickets
+        if isinstance(model_value, int):
             return self.DeclareVectorOutputPort(
-                name, like, lambda context, output: output.SetFromVector(calc(context)), of
+                name,
+                model_value,
+                lambda context, output: output.SetFromVector(function(context)),
+                prerequisites,
             )
         return self.DeclareAbstractOutputPort(
             name,
-            AbstractValue.Make(like).Clone,
-            lambda context, output: output.set_value(calc(context)),
-            of,
+            AbstractValue.Make(model_value).Clone,
+            lambda context, output: output.set_value(function(context)),
+            prerequisites,
         )
 
-    def add_cache(self, name: str, calc: Callable[[Context], Any]) -> CacheEntry:
-        """What a function makes of the inputs, for several outputs."""
+    def add_cache(self, name: str, function: Callable[[Context], Any]) -> CacheEntry:
+        """Declare a cache entry that a function of the input ports computes."""
         return self.DeclareCacheEntry(
             name,
             ValueProducer(
                 AbstractValue.Make(None).Clone,
-                lambda context, output: output.set_value(calc(context)),
+                lambda context, output: output.set_value(function(context)),
             ),
             {self.all_input_ports_ticket()},
         )
 
     def add_camera_inputs(
-        self, ports: Mapping[str, str], like: Callable[[str], Any] = lambda _: None
+        self, ports: Mapping[str, str], model_value: Callable[[str], Any] = lambda _: None
     ) -> Callable[[Context], dict[str, Any]]:
-        """Input ports by camera, and what is like a camera's values.
+        """Declare an input port for each camera.
+
+        Args:
+            ports: port names by camera.
+            model_value: maps a camera's name to the model value of its port.
 
         Returns:
-            What gives, by camera, what comes in; without those that are not connected, or None.
+            A function that maps a context to the values by camera, without those that are None or
+                not connected.
         """
         for name, port in ports.items():
-            self.add_input(port, like(name))
+            self.add_input(port, model_value(name))
 
-        def given(context: Context) -> dict[str, Any]:
-            found = {name: self.given(context, port) for name, port in ports.items()}
+        def eval_inputs(context: Context) -> dict[str, Any]:
+            found = {name: self.eval_input(context, port) for name, port in ports.items()}
             return {name: value for name, value in found.items() if value is not None}
 
-        return given
+        return eval_inputs
 
-    def add_parameter(self, first: Any) -> Callable[[Context], Any]:
-        """An abstract parameter of the context, the next by index; what reads it."""
-        index = self.DeclareAbstractParameter(AbstractValue.Make(first))
+    def add_parameter(self, initial: Any) -> Callable[[Context], Any]:
+        """Declare an abstract parameter; return a function that reads it from a context.
+
+        Parameters are numbered in the order of declaration.
+        """
+        index = self.DeclareAbstractParameter(AbstractValue.Make(initial))
         return lambda context: context.get_abstract_parameter(int(index)).get_value()
 
-    def given(self, context: Context, name: str) -> Any:
-        """What comes in at a port, a vector as a copy; None: it is not connected."""
+    def eval_input(self, context: Context, name: str) -> Any:
+        """Return the value at an input port, vectors as a copy; None if it is not connected."""
         port = self.GetInputPort(name)
         value = port.Eval(context) if port.HasValue(context) else None
         return np.array(value) if isinstance(value, np.ndarray) else value
 
 
-class SharedValue:
-    """A value that nobody changes: Drake would copy abstract state twice in every update."""
+class ImmutableValue:
+    """Base class of immutable values; a deep copy is the value itself.
+
+    Drake would otherwise copy abstract state twice in each update.
+    """
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Any:
         return self
 
 
 class BeliefSystem(PortedSystem, Generic[T]):
-    """Renews a value, its belief, once a period; outputs read it.
+    """A system whose state is one abstract value, the belief, replaced by a periodic update.
 
-    The update is an unrestricted one, as abstract state needs.
+    The update is unrestricted, as abstract state requires.
     """
 
-    def keep_belief(self, first: T, period: float) -> None:
-        """Declares the belief, and the time between two renewals [s]."""
-        self._belief = self.DeclareAbstractState(AbstractValue.Make(first))
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._renew)
-        self.DeclareForcedUnrestrictedUpdateEvent(self._renew)
+    def declare_belief(self, initial: T, period: float) -> None:
+        """Declare the belief with its initial value, and its update every ``period`` [s]."""
+        self._belief = self.DeclareAbstractState(AbstractValue.Make(initial))
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
+        self.DeclareForcedUnrestrictedUpdateEvent(self._update)
 
-    def show(self, name: str, like: Any, read: Callable[[T], Any]) -> OutputPort:
-        """An output port that reads the belief."""
+    def add_belief_output(
+        self, name: str, model_value: Any, read: Callable[[T], Any]
+    ) -> OutputPort:
+        """Declare an output port that is a function of the belief."""
         ticket = {self.abstract_state_ticket(self._belief)}
-        return self.add_output(name, like, lambda context: read(self.belief(context)), ticket)
+        return self.add_output(
+            name, model_value, lambda context: read(self.belief(context)), ticket
+        )
 
     def belief(self, context: Context) -> T:
-        """What is known in a context."""
+        """Return the belief in a context."""
         known: T = context.get_abstract_state(int(self._belief)).get_value()
         return known
 
     def next_belief(self, context: Context, last: T) -> T:
-        """What is known after an update."""
+        """Return the belief after an update, given the last one; ``last`` itself if unchanged."""
         raise NotImplementedError
 
-    def _renew(self, context: Context, state: State) -> EventStatus:
+    def _update(self, context: Context, state: State) -> EventStatus:
         last = self.belief(context)
         known = self.next_belief(context, last)
         if known is last:
@@ -209,38 +240,44 @@ class BeliefSystem(PortedSystem, Generic[T]):
 
 
 class MemorySystem(PortedSystem):
-    """Renews named vectors once a period.
+    """A system whose state is named vectors, replaced by a periodic update.
 
-    The update is a discrete one: it sees what unrestricted ones of the same time have changed.
+    The update is discrete: it sees the results of unrestricted updates at the same time.
     """
 
-    def keep_vectors(
-        self, starts: Mapping[str, Array], shown: Collection[str], period: float
+    def declare_vectors(
+        self, initial: Mapping[str, Array], output_names: Collection[str], period: float
     ) -> None:
-        """Declares vectors, which of them are outputs, and when they are renewed [s]."""
-        self._vectors = {name: self.DeclareDiscreteState(first) for name, first in starts.items()}
-        for name in shown:
+        """Declare state vectors and their update.
+
+        Args:
+            initial: initial values by name.
+            output_names: names of the vectors that have an output port.
+            period: time between two updates [s].
+        """
+        self._vectors = {name: self.DeclareDiscreteState(value) for name, value in initial.items()}
+        for name in output_names:
             self.DeclareStateOutputPort(name, self._vectors[name])
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._renew)
-        self.DeclareForcedDiscreteUpdateEvent(self._renew)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclareForcedDiscreteUpdateEvent(self._update)
 
     def vectors(self, context: Context) -> dict[str, Array]:
-        """Copies of what is known in a context."""
+        """Return copies of the state vectors in a context, by name."""
         return {
             name: np.array(context.get_discrete_state(index).value())
             for name, index in self._vectors.items()
         }
 
     def set_vectors(self, state: DiscreteValues, known: Mapping[str, Array]) -> None:
-        """Writes what is known from now on."""
+        """Write state vectors by name."""
         for name, value in known.items():
             state.set_value(self._vectors[name], np.ravel(value))
 
     def next_vectors(self, context: Context, known: dict[str, Array]) -> Mapping[str, Array]:
-        """What is known after an update, and was not before; may change ``known``."""
+        """Return the vectors that an update changes; ``known``, a copy of all, may be modified."""
         raise NotImplementedError
 
-    def _renew(self, context: Context, state: DiscreteValues) -> EventStatus:
+    def _update(self, context: Context, state: DiscreteValues) -> EventStatus:
         changed = self.next_vectors(context, self.vectors(context))
         self.set_vectors(state, changed)
         return EventStatus.Succeeded() if changed else EventStatus.DidNothing()

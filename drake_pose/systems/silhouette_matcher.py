@@ -21,25 +21,26 @@ from drake_pose.systems.bodies import body_poses
 from drake_pose.systems.images import ColourPorts
 from drake_pose.systems.ports import (
     BeliefSystem,
-    SharedValue,
+    ImmutableValue,
     camera_port,
-    require_different,
+    require_distinct_cameras,
     require_period,
     require_time_forward,
 )
 
 STATISTICS = ("found", "J", "E_total", "first_E_total", "runs", "outside_limit", "seconds")
-"""What the elements of the output ``statistics`` are."""
+"""Names of the elements of the output port ``statistics``."""
 
 
 @dataclass(frozen=True, eq=False)
-class Matched(SharedValue):
-    """What is known after an update.
+class MatcherState(ImmutableValue):
+    """The state of a SilhouetteMatcher.
 
     Args:
-        q, X_WB: (nq,) the last pose that was found, and (4, 4) its base.
-        estimate: this update's; None: there was nothing to see.
-        memory: what a tracker hands to its next update.
+        q: (nq,) positions of the last pose found.
+        X_WB: (4, 4) pose of its base.
+        estimate: of the last update; None: no camera saw the body.
+        memory: a subclass's own state.
     """
 
     q: Array
@@ -48,7 +49,7 @@ class Matched(SharedValue):
     memory: Any
 
 
-class SilhouetteMatcher(BeliefSystem[Matched]):
+class SilhouetteMatcher(BeliefSystem[MatcherState]):
     """Estimates the positions of an articulated body from label images.
 
     .. pydrake_system::
@@ -58,37 +59,46 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
         output_ports: [estimated_positions, error, base_pose, body_poses, statistics,
           proved_optimal, determined, lower, upper, mode_positions, pose_estimate]
 
-    With several cameras the input ports are ``label_image_<camera>``; an unconnected one, or an
-    image without any pixel of the body, is left out of the match. See ``labels``
-    for the pixels that belong to the body.
+    A periodic update searches for the pose; output ports read the result. Before the first update,
+    and if no pose is found, the estimated positions are the last ones (initially the model's
+    default) and the error is infinite.
 
-    The match is made in a periodic update. Until the first one, and where no pose is found, the
-    estimated positions are the last ones (at first the model's default), and the error is infinite.
-    ``body_poses`` are the poses of all bodies in the scene's world, in the plant's order, as a
-    plant's output of that name gives them. ``pose_estimate`` is the whole ``PoseEstimate`` of the
-    last update, None where no camera saw the body.
+    Input ports:
+        label_image (ImageLabel16I): ``label_image_<camera>`` with several cameras. A camera whose
+            port is not connected, or whose image shows no pixel of the body, is ignored.
+        root_position (3): known position of the root in the world [m].
 
-    What the answer is worth: ``proved_optimal`` is 1 where it is proved that no pose of the grid
-    that was searched fits better. ``determined`` is 1 for each position that the silhouettes
-    determine, 0 for one that is free; ``lower`` and ``upper`` are the ends of its interval, or of
-    the range seen. ``mode_positions`` are the positions of the modes that look the same, best
-    first, one after another. All are NaN where the search does not say, as one without examination.
+    Output ports:
+        estimated_positions (nq): in the plant's order [rad or m].
+        error (1): E_total, the differing area as a fraction of the masks' area.
+        base_pose (RigidTransform): pose X_WB of the plant's world.
+        body_poses: poses of all bodies in the scene's world, as a plant's port of that name.
+        statistics (7): see ``STATISTICS``.
+        proved_optimal (1): 1 if it is proved that no pose of the searched grid fits better.
+        determined (nq): 1 for a position that the silhouettes determine, else 0.
+        lower, upper (nq): ends of each position's interval, or of the range found [rad or m].
+        mode_positions (mode_limit x nq, row by row): positions of the modes that look the same,
+            best first.
+        pose_estimate: the ``PoseEstimate`` of the last update; None if no camera saw the body.
+
+    The ports from ``proved_optimal`` to ``mode_positions`` are NaN if the search does not examine
+    its result.
 
     Args:
-        cameras: the calibrated cameras, in the order of the input ports, or by name.
-        period: time between two matches [s].
-        labels: the labels that belong to the body; None: those of its model where that was made of
-            a plant (``ArticulatedModel.from_plant``), else all but Drake's reserved ones. A
-            frozenset, or None, is abstract parameter 0 of the context, where it can be varied.
-        mode_limit: how many modes are given out at most.
+        cameras: calibrated, in the order of the input ports, or by name.
+        period: time between two updates [s].
+        labels: render labels of the body; None: those of its model if made of a plant
+            (``ArticulatedModel.from_plant``), else all but Drake's reserved ones. They are abstract
+            parameter 0 of the context (a frozenset or None).
+        mode_limit: largest number of modes in ``mode_positions``.
 
     Raises:
-        SettingsError: if there is no search or no camera, two cameras share a name, the period is
-            not positive, or the mode limit is below 1.
+        SettingsError: there is no search or no camera, two cameras share a name, the period is not
+            positive, or the mode limit is below 1.
     """
 
     _first_memory: Any = None
-    """What the first update gets as its memory."""
+    """Initial value of ``MatcherState.memory``."""
 
     def __init__(
         self,
@@ -104,7 +114,9 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
                 f"a matcher needs a search, as MultiStartSearch(tree): {type(search).__name__}"
             )
         cameras = camera_tuple(cameras)
-        require_different(cameras, 1, "a matcher needs one or more cameras of different names")
+        require_distinct_cameras(
+            cameras, 1, "a matcher needs one or more cameras of different names"
+        )
         require_period("matcher", period)
         if mode_limit < 1:
             raise SettingsError(f"the mode limit must be 1 or more, not {mode_limit}")
@@ -118,29 +130,33 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
         )
         self.add_input("root_position", 3)
         q = search.tree.model.default_positions
-        self.keep_belief(Matched(q, np.eye(4), None, self._first_memory), period)
+        self.declare_belief(MatcherState(q, np.eye(4), None, self._first_memory), period)
         self._declare_outputs(search.tree.model.plant)
 
     def _declare_outputs(self, plant: MultibodyPlant) -> None:
         nq = plant.num_positions()
-        self.show("estimated_positions", nq, lambda known: known.q)
-        self.show("error", 1, lambda known: _statistics(known.estimate)[2:3])
-        self.show("statistics", len(STATISTICS), lambda known: _statistics(known.estimate))
-        self.show("base_pose", RigidTransform(), lambda known: RigidTransform(known.X_WB))
-        self.show(
+        self.add_belief_output("estimated_positions", nq, lambda known: known.q)
+        self.add_belief_output("error", 1, lambda known: _statistics(known.estimate)[2:3])
+        self.add_belief_output(
+            "statistics", len(STATISTICS), lambda known: _statistics(known.estimate)
+        )
+        self.add_belief_output(
+            "base_pose", RigidTransform(), lambda known: RigidTransform(known.X_WB)
+        )
+        self.add_belief_output(
             "body_poses", [RigidTransform()], lambda known: body_poses(plant, known.q, known.X_WB)
         )
-        self.show("pose_estimate", None, lambda known: known.estimate)
+        self.add_belief_output("pose_estimate", None, lambda known: known.estimate)
         sizes = {"proved_optimal": 1, "determined": nq, "lower": nq, "upper": nq}
         for name, size in (sizes | {"mode_positions": self._mode_limit * nq}).items():
 
-            def worth(known: Matched, name: str = name, size: int = size) -> Array:
-                return self._worth(known.estimate).get(name, np.full(size, np.nan))
+            def read(known: MatcherState, name: str = name, size: int = size) -> Array:
+                return self._pose_set_values(known.estimate).get(name, np.full(size, np.nan))
 
-            self.show(name, size, worth)
+            self.add_belief_output(name, size, read)
 
-    def next_belief(self, context: Context, last: Matched) -> Matched:
-        """The match of what the cameras see now."""
+    def next_belief(self, context: Context, last: MatcherState) -> MatcherState:
+        """Return the state after matching the current images."""
         images, labels = self._images(context), self._labels(context)
         masks = {name: label_image_to_mask(image, labels) for name, image in images.items()}
         views = [
@@ -150,23 +166,23 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
         ]
         estimate, memory = self._find(context, last.memory, views)
         if estimate is None or not (estimate.found or self._is_predicted(memory)):
-            return Matched(last.q, last.X_WB, estimate, memory)
-        return Matched(estimate.q, estimate.X_WB, estimate, memory)
+            return MatcherState(last.q, last.X_WB, estimate, memory)
+        return MatcherState(estimate.q, estimate.X_WB, estimate, memory)
 
     def _is_predicted(self, memory: Any) -> bool:
-        """Whether an estimate that was not found is a prediction."""
+        """Return whether an estimate that was not found is a prediction."""
         return False
 
     def _find(
         self, context: Context, memory: Any, views: Sequence[View]
     ) -> tuple[PoseEstimate | None, Any]:
-        """The pose that the views show, if any, and what the next update gets as its memory."""
+        """Return the pose that the views show, if any, and the next memory."""
         if not views:
             return None, memory
-        return self._search.match(views, self.given(context, "root_position")), memory
+        return self._search.match(views, self.eval_input(context, "root_position")), memory
 
-    def _worth(self, estimate: PoseEstimate | None) -> dict[str, Array]:
-        """What an answer is worth, by port; nothing where it is not said."""
+    def _pose_set_values(self, estimate: PoseEstimate | None) -> dict[str, Array]:
+        """Return the outputs that come from the pose set, by port; empty without a pose set."""
         if estimate is None or not estimate.found or estimate.pose_set is None:
             return {}
         names = self._search.tree.model.position_names
@@ -184,7 +200,7 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
 
 
 def _statistics(estimate: PoseEstimate | None) -> Array:
-    """An update's STATISTICS."""
+    """Return the elements of STATISTICS."""
     values = np.zeros(len(STATISTICS))
     values[1:4] = np.inf
     if estimate is not None:
@@ -196,66 +212,72 @@ def _statistics(estimate: PoseEstimate | None) -> Array:
 
 
 TRACK = ("tracked", "matches", "distance")
-"""What the elements of the output ``track`` are."""
+"""Names of the elements of the output port ``track``."""
 
 
 class _Memory(NamedTuple):
-    """What the next update begins with: what is followed, TRACK, and the last update's time [s]."""
+    """The state of a SilhouetteTracker.
 
-    followed: TrackerState
+    ``track`` has the elements of TRACK; ``time`` is that of the last update [s].
+    """
+
+    tracker_state: TrackerState
     track: tuple[float, float, float]
     time: float
 
 
 class SilhouetteTracker(SilhouetteMatcher):
-    """Estimates a moving body's positions: matched at first and after a loss, else tracked.
+    """Estimates the positions of a moving body: matched at first and after a loss, else tracked.
 
     .. pydrake_system::
 
         name: SilhouetteTracker
         input_ports: [label_image, root_position (optional), measured_positions (optional),
-          first_positions (optional), color_image (where asked for)]
+          first_positions (optional), color_image (of color_cameras)]
         output_ports: [estimated_positions, error, base_pose, body_poses, statistics,
           proved_optimal, determined, lower, upper, mode_positions, pose_estimate,
           position_deviations, estimated_state, track]
 
-    The ports are those of ``SilhouetteMatcher``, which it can replace in any diagram, and:
+    A periodic update tracks or searches for the pose; output ports read the result. Ports and
+    arguments are those of ``SilhouetteMatcher``, which it can replace in a diagram, and those
+    below. All state is in the context.
 
-    - ``color_image`` (``color_image_<camera>`` where there are several cameras) of each camera
-      named in ``color_cameras``: an ``ImageRgba8U``. The colours along the body's contour stand in
-      where there is no label image, or one without any pixel of the body. So a label image of the
-      first frame will do; or none, where measured positions say where the body is at first.
-    - ``measured_positions`` (nq): about where the body is now, of encoders for example. The track
-      begins there, and again after a loss; the search is asked only where the masks contradict it,
-      and overrules it only by a pose that explains the masks. NaN: it is not known now.
-    - ``first_positions`` (nq): about where the body is in the first image; ignored afterwards.
-    - ``position_deviations`` (nq): the standard deviation of each position [rad or m]; NaN where a
-      position is no part of what is tracked (held, or solved from the root's pose). Where nothing
-      is seen, or no pose explains the masks because the body is hidden, the positions are predicted
-      and their deviations grow; see ``tracked``. At most a tenth of the silhouettes' area may be
-      hidden in a frame that is tracked.
-    - ``estimated_state`` (nq + nv): the estimated positions, then the plant's velocities [rad/s or
-      m/s]; these are NaN where there is no track, and where ``position_deviations`` are. They are
-      what the filter believes: rates fade within ``tracking.memory``, so in steady motion they are
-      too small (by a fifth at 30 frames a second with the default of 0.15 s), and right with 5 s.
-    - ``track``: see ``TRACK``. ``tracked`` is 1 where the last pose was tracked and 0 where the
-      search found it, or it was only predicted (``error`` is infinite then); ``matches`` counts
-      how often the search was asked; ``distance`` is between
-      the body's contour and the masks' edge (root mean square, robust) [pixel].
+    Input ports:
+        color_image (ImageRgba8U): ``color_image_<camera>`` with several cameras; for the cameras in
+            ``color_cameras``. The colours along the body's contour are used if there is no label
+            image, or none with a pixel of the body. One label image of the first frame is enough,
+            or none if measured positions say where the body is at first.
+        measured_positions (nq): approximate positions now, for example of encoders; NaN if unknown.
+            The track starts from them, also after a loss. The search is used only if the masks do
+            not fit them, and replaces them only by a pose that explains the masks.
+        first_positions (nq): approximate positions in the first image; ignored later.
 
-    All that is known is state of the context. Arguments are those of ``SilhouetteMatcher``, and:
+    Output ports:
+        position_deviations (nq): standard deviation of each position [rad or m]; NaN for positions
+            that are not tracked (fixed, or solved from the root's pose). Without evidence, or if no
+            pose explains the masks because the body is occluded, positions are predicted and their
+            deviations grow. At most a tenth of the silhouettes' area may be occluded in a tracked
+            frame.
+        estimated_state (nq + nv): the estimated positions, then the plant's velocities [rad/s or
+            m/s]; velocities are NaN without a track and where ``position_deviations`` are. The
+            filter's rates decay with the time constant ``tracking.memory``: in steady motion at 30
+            Hz they are a fifth too small with the default of 0.15 s, and right with 5 s.
+        track (3): see ``TRACK``. ``tracked`` is 1 if the last pose was tracked, 0 if it was
+            searched or only predicted (``error`` is infinite then). ``matches`` is the number of
+            searches. ``distance`` is the robust root mean square distance of the body's contour
+            from the edges [pixel].
 
     Args:
-        tracking: how the body may move, and when its track is lost: abstract parameter 1 of the
-            context, but for ``root_moves`` and ``scale_unknown``, on which the state depends.
+        tracking: of the tracker: abstract parameter 1 of the context, where all but ``root_moves``
+            and ``scale_unknown`` can be changed.
         color_cameras: names of the cameras that have a port for a colour image.
-        search_time: longest search by a ``MultiStartSearch`` [s]. A search that it cuts short is
-            asked again in the next updates; None: no limit.
+        search_time: time limit of a ``MultiStartSearch`` [s]; a search that reaches it is repeated
+            in the next updates. None: no limit.
 
     Raises:
-        SettingsError: as for ``SilhouetteMatcher``; and in a simulation, when time runs backwards,
-            or the context's settings have another state.
-        UnknownNameError: a name of ``color_cameras`` is no camera's.
+        SettingsError: as for ``SilhouetteMatcher``. In a simulation: time runs backwards, or the
+            context's settings have another state.
+        UnknownNameError: a name in ``color_cameras`` is no camera's.
     """
 
     _first_memory = _Memory(TrackerState(), (0.0, 0.0, 0.0), -np.inf)
@@ -278,7 +300,7 @@ class SilhouetteTracker(SilhouetteMatcher):
         self._period, self._layout = period, follower.tracker.filter.layout
         model = search.tree.model
         nq = len(model.position_names)
-        # Elements of the state that are positions, and which; the others are the root's.
+        # Elements of the filter's state that are positions; the others are the root's.
         self._moving, self._still = (
             [name for name in some if name in model.position_names]
             for some in (self._layout.moving, self._layout.constant)
@@ -288,20 +310,20 @@ class SilhouetteTracker(SilhouetteMatcher):
         self._colours = ColourPorts(
             self, cameras, color_cameras, lambda one: camera_port("color_image", one, cameras)
         )
-        self.show("position_deviations", nq, self._deviations)
-        self.show("estimated_state", model.plant.num_multibody_states(), self._state)
-        self.show("track", len(TRACK), lambda known: known.memory.track)
+        self.add_belief_output("position_deviations", nq, self._deviations)
+        self.add_belief_output("estimated_state", model.plant.num_multibody_states(), self._state)
+        self.add_belief_output("track", len(TRACK), lambda known: known.memory.track)
 
     def _find(
         self, context: Context, memory: _Memory, views: Sequence[View]
     ) -> tuple[PoseEstimate | None, _Memory]:
         pictures = self._colours.pictures(context)
-        last, root_position = memory.followed, self.given(context, "root_position")
+        last, root_position = memory.tracker_state, self.eval_input(context, "root_position")
         if not views and not pictures and last.track is None:
             return None, memory
         require_time_forward(self, context, memory.time)
         ports = ["measured_positions", *(["first_positions"] if last.track is None else [])]
-        starts = (self.given(context, port) for port in ports)
+        starts = (self.eval_input(context, port) for port in ports)
         start = next((q for q in starts if q is not None and np.isfinite(q).all()), None)
         follower = self._follower(self._tracking(context))
         now, result = follower.next(last, views, root_position, pictures, start)
@@ -312,34 +334,34 @@ class SilhouetteTracker(SilhouetteMatcher):
         return result, _Memory(now, track, context.get_time())
 
     def _is_predicted(self, memory: _Memory) -> bool:
-        return memory.followed.track is not None
+        return memory.tracker_state.track is not None
 
     def with_intervals(self, context: Context) -> PoseEstimate:
-        """The pose of the last update, which was tracked, with intervals; see ``MatchAndTrack``.
+        """Return the tracked pose of the last update with intervals; see ``MatchAndTrack``.
 
-        They cost about as much as the update, so no port has them.
+        This costs about as much as an update, so that no output port has them.
         """
         known = self.belief(context)
         assert known.estimate is not None, "nothing was tracked"
         follower = self._follower(self._tracking(context))
-        return follower.with_intervals(known.memory.followed, known.estimate)
+        return follower.with_intervals(known.memory.tracker_state, known.estimate)
 
     def _follower(self, tracking: TrackingSettings) -> MatchAndTrack:
-        """What follows as a context's settings say; made of them once."""
+        """Return the ``MatchAndTrack`` for a context's settings, created on first use."""
         if tracking not in self._followers:
             made = MatchAndTrack(
                 self._search, self._cameras, self._period, tracking, self._search_time
             )
             if made.tracker.filter.layout.names != self._layout.names:
                 raise SettingsError(
-                    f"{self.get_name()}: root_moves and scale_unknown cannot be varied in a "
-                    "context, whose state depends on them; make another system with them"
+                    f"{self.get_name()}: root_moves and scale_unknown cannot be changed in a "
+                    "context, because the size of the state depends on them; create another system"
                 )
             self._followers[tracking] = made
         return self._followers[tracking]
 
-    def _deviations(self, known: Matched) -> Array:
-        deviations, track = np.full(len(known.q), np.nan), known.memory.followed.track
+    def _deviations(self, known: MatcherState) -> Array:
+        deviations, track = np.full(len(known.q), np.nan), known.memory.tracker_state.track
         if track is not None:
             seen = [*self._moving, *self._still]
             found = track.state.best.deviations()[self._layout.indices(seen)]
@@ -348,9 +370,9 @@ class SilhouetteTracker(SilhouetteMatcher):
                 deviations[follower] = abs(multiplier) * deviations[leader]
         return deviations
 
-    def _state(self, known: Matched) -> Array:
+    def _state(self, known: MatcherState) -> Array:
         plant = self._search.tree.model.plant
-        qdot, track = np.full(len(known.q), np.nan), known.memory.followed.track
+        qdot, track = np.full(len(known.q), np.nan), known.memory.tracker_state.track
         if track is not None:
             rates = self._layout.indices([f"rate_{name}" for name in self._moving])
             qdot[self._indices(self._still)] = 0.0

@@ -1,6 +1,6 @@
-"""The truncated filter as a Drake system: measurements in, a belief within limits out.
+"""The truncated filter as a Drake system, and a sensor that measures a hand's silhouette for it.
 
-And the hand's sensor of section 6, which measures a silhouette for it.
+The hand follows section 6 of Shimada, Shirai, Kuno and Miura.
 """
 
 import math
@@ -31,20 +31,24 @@ from drake_pose.systems.diagrams import add_simulated_cameras
 from drake_pose.systems.images import MaskPlayer
 from drake_pose.systems.ports import (
     BeliefSystem,
+    ImmutableValue,
     PortedSystem,
-    SharedValue,
-    connect_same,
+    connect_matching_ports,
     require_period,
     require_time_forward,
 )
 
 STATISTICS = ("step", "hypotheses", "distance", "count", "lost")
-"""What the elements of the output ``statistics`` are."""
+"""Names of the elements of the output port ``statistics``."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Known(SharedValue):
-    """What is known after an update: how many there were, and unlikely ones in a row; time [s]."""
+class _EkfState(ImmutableValue):
+    """The state of a TruncatedEkf.
+
+    ``step`` is the number of updates, ``unlikely`` the number of consecutive unlikely measurements,
+    ``time`` that of the last update [s].
+    """
 
     state: FilterState
     step: int = 0
@@ -53,12 +57,12 @@ class _Known(SharedValue):
     time: float = -math.inf
 
     def statistics(self) -> list[float]:
-        """STATISTICS."""
+        """Return the elements of STATISTICS."""
         state = self.state
         return [self.step, len(state.hypotheses), state.distance, state.count, self.lost]
 
 
-class TruncatedEkf(BeliefSystem[_Known]):
+class TruncatedEkf(BeliefSystem[_EkfState]):
     """Estimates a state from measurements, inside linear inequalities.
 
     .. pydrake_system::
@@ -69,38 +73,44 @@ class TruncatedEkf(BeliefSystem[_Known]):
         output_ports: [estimated_state, covariance, overall_state, overall_covariance,
           hypothesis_weights, hypothesis_states, hypothesis_covariances, active_limits, statistics]
 
-    A periodic update predicts and uses the measurement: NaN where something is occluded; all NaN,
-    or an unconnected port, where a camera is late or missing, which leaves the prediction.
-    ``measurement_covariance`` (m x m, row by row) is that of this one's noise, finite where it is;
-    the observation model's own where the port is not connected.
+    A periodic update predicts the state and uses the measurement; output ports read the result. At
+    the first update, while the track is lost, and whenever ``restart`` is not 0, the filter
+    restarts from ``reset_state``, if this is finite, with the covariance of ``start``.
 
-    - ``estimated_state`` (n), ``covariance`` (n x n, row by row): of the heaviest hypothesis.
-    - ``overall_state`` (n), ``overall_covariance`` (n x n): of all hypotheses together, wide where
-      they disagree.
-    - ``hypothesis_weights`` (cap), ``hypothesis_states`` (cap x n, row by row): the heaviest first,
-      weights 0 and states NaN where there are fewer; ``hypothesis_covariances`` (cap x n x n).
-    - ``active_limits`` (K): 1 where that row of ``filter.inequalities`` cut the best belief.
-    - ``statistics``: see ``STATISTICS``. ``lost`` is 1 while measurements have been as unlikely as
-      one in a million for several steps.
+    Input ports:
+        measurement (m): NaN where occluded; if all are NaN, or the port is not connected, the
+            update only predicts.
+        measurement_covariance (m x m, row by row): noise covariance of this measurement, finite
+            where the measurement is; the observation model's if not connected.
+        reset_state (n): state to restart from, for example a matcher's.
+        restart (1): not 0: restart.
 
-    At the first update, while the track is lost, and whenever ``restart`` (1) is not 0, the filter
-    starts again from ``reset_state`` (n), for example from a matcher, if all its elements are
-    finite; with the covariance of the belief given here.
+    Output ports:
+        estimated_state (n): mean of the heaviest hypothesis.
+        covariance (n x n, row by row): of the heaviest hypothesis.
+        overall_state (n): mean of the mixture of all hypotheses.
+        overall_covariance (n x n): of this mixture.
+        hypothesis_weights (cap): sorted, descending; 0 where there are fewer hypotheses.
+        hypothesis_states (cap x n, row by row): in the same order; NaN where there are fewer.
+        hypothesis_covariances (cap x n x n): in the same order; NaN where there are fewer.
+        active_limits (K): 1 if this row of ``filter.inequalities`` changed the heaviest hypothesis.
+        statistics (5): see ``STATISTICS``. ``lost`` is 1 after ``patience`` consecutive unlikely
+            measurements.
 
-    A context holds how the filter works: abstract parameter 0 is its ``FilterSettings``, numeric
-    parameter 0 is (patience, loss_probability).
+    Parameters of the context: abstract parameter 0 is the ``FilterSettings``, numeric parameter 0
+    is (patience, loss_probability).
 
     Args:
-        start: the belief before the first measurement.
-        period: time between two updates, one step of the prediction [s]; needed where the motion's
-            rates are per step. None: the motion's.
-        patience: how many unlikely measurements in a row make a loss.
+        start: belief before the first measurement.
+        period: time between two updates, one step of the motion [s]; required if the motion's rates
+            are per step. None: the motion's.
+        patience: number of consecutive unlikely measurements after which the track is lost.
         loss_probability: p-value below which a measurement is unlikely.
 
     Raises:
-        SettingsError: a filter of another class, a start that does not fit, a period that is not
-            the motion's, a patience below 1; and, in a simulation, time that runs backwards, or
-            parameters that do not fit.
+        SettingsError: an argument has the wrong type, the start does not fit the filter, the period
+            is not the motion's, or the patience is below 1. In a simulation: time runs backwards,
+            or parameters do not fit.
     """
 
     def __init__(
@@ -118,7 +128,7 @@ class TruncatedEkf(BeliefSystem[_Known]):
             )
         if not isinstance(start, Belief):
             raise SettingsError(
-                "start must be a Belief, as make_belief(mean, covariance) gives it, not a "
+                "start must be a Belief, made by make_belief(mean, covariance), not a "
                 f"{type(start).__name__}"
             )
         period = _period_of(belief_filter.motion, period)
@@ -133,65 +143,71 @@ class TruncatedEkf(BeliefSystem[_Known]):
         self.add_input("measurement_covariance", self._measured**2)
         self.add_input("reset_state", n)
         self.add_input("restart", 1)
-        self.keep_belief(_Known(belief_filter.start(self._start)), period)
+        self.declare_belief(_EkfState(belief_filter.start(self._start)), period)
         rows = belief_filter.inequalities.rows
 
         def filled(size: int, read: Callable[[Hypothesis], Any], empty: float) -> Any:
-            def show(known: _Known) -> Array:
+            def read_all(known: _EkfState) -> Array:
                 found = np.full((cap, size), empty)
                 for k, one in enumerate(known.state.hypotheses):
                     found[k] = np.ravel(read(one))
                 return found.ravel()
 
-            return show
+            return read_all
 
-        def active(known: _Known) -> Array:
+        def active(known: _EkfState) -> Array:
             cut = np.zeros(max(len(rows), 1))
             if known.step and rows:
                 cut[:] = np.isin(rows, known.state.hypotheses[0].active)
             return cut
 
-        self.show("estimated_state", n, lambda known: known.state.best.mean)
-        self.show("covariance", n * n, lambda known: known.state.best.covariance.ravel())
-        self.show("overall_state", n, lambda known: known.state.overall.mean)
-        self.show("overall_covariance", n * n, lambda known: known.state.overall.covariance.ravel())
-        self.show("hypothesis_weights", cap, filled(1, lambda one: one.weight, 0.0))
-        self.show("hypothesis_states", cap * n, filled(n, lambda one: one.belief.mean, math.nan))
+        self.add_belief_output("estimated_state", n, lambda known: known.state.best.mean)
+        self.add_belief_output(
+            "covariance", n * n, lambda known: known.state.best.covariance.ravel()
+        )
+        self.add_belief_output("overall_state", n, lambda known: known.state.overall.mean)
+        self.add_belief_output(
+            "overall_covariance", n * n, lambda known: known.state.overall.covariance.ravel()
+        )
+        self.add_belief_output("hypothesis_weights", cap, filled(1, lambda one: one.weight, 0.0))
+        self.add_belief_output(
+            "hypothesis_states", cap * n, filled(n, lambda one: one.belief.mean, math.nan)
+        )
         covariances = filled(n * n, lambda one: one.belief.covariance, math.nan)
-        self.show("hypothesis_covariances", cap * n * n, covariances)
-        self.show("active_limits", max(len(rows), 1), active)
-        self.show("statistics", len(STATISTICS), _Known.statistics)
+        self.add_belief_output("hypothesis_covariances", cap * n * n, covariances)
+        self.add_belief_output("active_limits", max(len(rows), 1), active)
+        self.add_belief_output("statistics", len(STATISTICS), _EkfState.statistics)
 
     def filter_state(self, context: Context) -> FilterState:
-        """The filter's state in a context."""
+        """Return the filter's state in a context."""
         return self.belief(context).state
 
-    def next_belief(self, context: Context, last: _Known) -> _Known:
-        """A step of the filter."""
+    def next_belief(self, context: Context, last: _EkfState) -> _EkfState:
+        """Return the state after one step of the filter."""
         require_time_forward(self, context, last.time)
         settings = self._settings(context)
         belief_filter = self.filter.with_settings(settings)
         if settings.hypothesis_cap > self.filter.settings.hypothesis_cap:
             raise SettingsError(
-                f"{self.get_name()}: its ports are of {self.filter.settings.hypothesis_cap} "
-                f"hypotheses at most; the context's hypothesis_cap is {settings.hypothesis_cap}"
+                f"{self.get_name()}: its ports hold {self.filter.settings.hypothesis_cap} "
+                f"hypotheses; the context's hypothesis_cap is {settings.hypothesis_cap}"
             )
         patience, loss_probability = context.get_numeric_parameter(int(self._loss)).value()
         _require_loss(patience, loss_probability)
-        now, unlikely, is_fresh = last.state, last.unlikely, last.step == 0
-        restart = self.given(context, "restart")
-        if is_fresh or last.lost or (restart is not None and restart[0] != 0):
-            mean = self.given(context, "reset_state")
+        now, unlikely, skips_prediction = last.state, last.unlikely, last.step == 0
+        restart = self.eval_input(context, "restart")
+        if skips_prediction or last.lost or (restart is not None and restart[0] != 0):
+            mean = self.eval_input(context, "reset_state")
             if mean is not None and np.isfinite(mean).all():
                 now = belief_filter.start(Belief(mean, self._start.covariance))
-                is_fresh, unlikely = True, 0
-        if not is_fresh:
+                skips_prediction, unlikely = True, 0
+        if not skips_prediction:
             now = belief_filter.predict(now)
-        y, noise = self.given(context, "measurement"), None
+        y, noise = self.eval_input(context, "measurement"), None
         if y is None:
             y = np.full(self._measured, np.nan)
         else:
-            noise = self.given(context, "measurement_covariance")
+            noise = self.eval_input(context, "measurement_covariance")
         if noise is not None:
             noise = noise.reshape(self._measured, self._measured)
         now = belief_filter.update(now, y, variances=noise)
@@ -199,7 +215,7 @@ class TruncatedEkf(BeliefSystem[_Known]):
             is_unlikely = now.distance > chdtri(now.count, loss_probability)
             unlikely = unlikely + 1 if is_unlikely else 0
         lost = bool(unlikely >= patience)
-        return _Known(now, last.step + 1, unlikely, lost, context.get_time())
+        return _EkfState(now, last.step + 1, unlikely, lost, context.get_time())
 
 
 def plant_motion(
@@ -209,18 +225,19 @@ def plant_motion(
     period: float,
     context: Context | None = None,
 ) -> FunctionMotion:
-    """A plant's own dynamics as a filter's motion, Jacobian by differences.
+    """Return a plant's dynamics as a filter's motion model, with a numerical Jacobian.
 
     Args:
-        plant: finalized; each of its joints that moves has one position, and the joint's name is a
-            moving element of the state. Its constants stay as they are.
-        noise: (n, n) the covariance of what a step adds.
-        period: the time of a step [s], a multiple of a discrete plant's time step.
-        context: the plant's, with inputs and parameters that are fixed; None: the default.
+        plant: finalized. Each joint that moves has one position and the name of a moving element of
+            the state.
+        layout: the elements of the state; its constants do not change.
+        noise: (n, n) process noise covariance of a step.
+        period: duration of a step [s], a multiple of a discrete plant's time step.
+        context: the plant's, with fixed inputs and parameters; None: the default.
 
     Raises:
-        SettingsError: joints that are not the state's moving elements, or a period that does not
-            fit the plant's time step.
+        SettingsError: the plant's joints are not the state's moving elements, or the period is not
+            a multiple of the plant's time step.
     """
     joints = {
         joint.name(): joint
@@ -230,7 +247,7 @@ def plant_motion(
     single = all(one.num_positions() == one.num_velocities() == 1 for one in joints.values())
     if not single or set(joints) != set(layout.moving):
         raise SettingsError(
-            f"the plant's joints that move are {listed(list(joints))}; the state's moving elements "
+            f"the plant's moving joints are {listed(list(joints))}; the state's moving elements "
             f"are {listed(layout.moving)}: they must be the same, with one position each"
         )
     require_period("motion", period)
@@ -239,7 +256,8 @@ def plant_motion(
         raise SettingsError(f"a period of {period:g} s is no multiple of the plant's {step:g} s")
     simulator = Simulator(plant, context.Clone() if context else plant.CreateDefaultContext())
     if not step:
-        # Steps that a required accuracy chose would differ between neighbouring states.
+        # Error control would choose different steps for neighbouring states, and so perturb the
+        # numerical Jacobian.
         ResetIntegratorFromFlags(simulator, "runge_kutta3", min(period / 4, 1e-2))
         simulator.get_mutable_integrator().set_fixed_step_mode(True)
     m, own = len(layout.moving), simulator.get_mutable_context()
@@ -269,19 +287,23 @@ def _require_loss(patience: float, probability: float) -> None:
 
 
 def _period_of(motion: MotionModel, period: float | None) -> float:
-    """The time between two updates [s]; SettingsError where it is not that of a step."""
+    """Return the time between two updates [s].
+
+    Raises:
+        SettingsError: no period is known, or the given one differs from the motion's.
+    """
     if period is None and motion.period is None:
         raise SettingsError("the motion's rates are per step: give TruncatedEkf a period")
-    given = period if motion.period is None else motion.period
-    assert given is not None
-    require_period("filter", given)
-    if period is not None and period != given:
-        raise SettingsError(f"a step of the motion takes {given:g} s: its period is not {period:g}")
-    return given
+    step_period = period if motion.period is None else motion.period
+    assert step_period is not None
+    require_period("filter", step_period)
+    if period is not None and period != step_period:
+        raise SettingsError(f"the motion's period is {step_period:g} s, not {period:g} s")
+    return step_period
 
 
 class HandSensor(PortedSystem):
-    """Measures a hand's axes and tips in a silhouette, lengths unknown: figure 17.
+    """Measures a hand's lines and fingertips in a silhouette, lengths unknown: figure 17.
 
     .. pydrake_system::
 
@@ -289,12 +311,21 @@ class HandSensor(PortedSystem):
         input_ports: [label_image, estimated_state, covariance, statistics]
         output_ports: [measurement, measurement_covariance, rough_state, difference]
 
-    The inputs but the image come from the ``TruncatedEkf`` that takes the first two outputs. Of the
-    label image only the silhouette is used; an image that is not connected, or blank, shows
-    nothing. ``rough_state`` (n) and ``difference`` (1) are as of ``HandMeasurement``.
+    The system has no state. It is connected in a loop with the ``TruncatedEkf`` that uses its
+    measurements.
+
+    Input ports:
+        label_image (ImageLabel16I): only the silhouette is used; a blank or unconnected image
+            measures nothing.
+        estimated_state, covariance, statistics: of the ``TruncatedEkf``.
+
+    Output ports:
+        measurement, measurement_covariance: for the ``TruncatedEkf``.
+        rough_state (n): see ``HandMeasurement``.
+        difference (1): see ``HandMeasurement``.
 
     Args:
-        silhouette: measures; its filter is the ``TruncatedEkf``'s.
+        silhouette: makes the measurements; its filter is the ``TruncatedEkf``'s.
     """
 
     def __init__(self, silhouette: HandSilhouette) -> None:
@@ -308,27 +339,30 @@ class HandSensor(PortedSystem):
         self.add_input("statistics", len(STATISTICS))
         measured = self.add_cache("measured", self._measure)
 
-        def show(name: str, size: int, read: Callable[[HandMeasurement], Array]) -> None:
+        def add_measured(name: str, size: int, read: Callable[[HandMeasurement], Array]) -> None:
             self.add_output(name, size, lambda context: read(measured.Eval(context)))
 
-        show("measurement", m, lambda one: one.y)
-        show("measurement_covariance", m * m, lambda one: one.covariance.ravel())
-        show("rough_state", n, lambda one: one.rough)
-        show("difference", 1, lambda one: np.array([one.difference]))
+        add_measured("measurement", m, lambda one: one.y)
+        add_measured("measurement_covariance", m * m, lambda one: one.covariance.ravel())
+        add_measured("rough_state", n, lambda one: one.rough)
+        add_measured("difference", 1, lambda one: np.array([one.difference]))
 
     def _measure(self, context: Context) -> HandMeasurement:
-        image, mean = self.given(context, "label_image"), self.given(context, "estimated_state")
-        covariance = self.given(context, "covariance").reshape(len(mean), len(mean))
-        begun = self.given(context, "statistics")[STATISTICS.index("step")] > 0
+        image, mean = (
+            self.eval_input(context, "label_image"),
+            self.eval_input(context, "estimated_state"),
+        )
+        covariance = self.eval_input(context, "covariance").reshape(len(mean), len(mean))
+        has_started = self.eval_input(context, "statistics")[STATISTICS.index("step")] > 0
         belief = Belief(mean, covariance)
         silhouette = self._silhouette
         if image is None:
             mask = np.zeros((silhouette.height, silhouette.width), dtype=np.bool_)
         else:
             mask = label_image_to_mask(image)
-        if begun:
+        if has_started:
             return silhouette.measure(mask, silhouette.belief_filter.predicted(belief))
-        # Table 2 gives the scale of the first frame.
+        # Table 2 of Shimada et al. gives the scale of the first frame.
         return silhouette.measure(mask, belief, 1.0)
 
 
@@ -340,12 +374,17 @@ def build_hand_estimation(
     true_positions: Trajectory,
     period: float,
 ) -> tuple[Diagram, TruncatedEkf, HandSensor]:
-    """Plant, Drake's renderer, ``HandSensor``, ``TruncatedEkf``: angles, lengths from pictures.
+    """Build a diagram that estimates a simulated hand's angles and lengths from rendered images.
+
+    It contains a posed plant, Drake's renderer, a ``HandSensor`` and a ``TruncatedEkf``.
 
     Args:
-        model: the hand that is seen, in the plant's positions over time.
-        start: the belief before the first picture.
-        period: time between two pictures [s].
+        start: belief before the first image.
+        true_positions: the true hand's positions (nq,) over time.
+        period: time between two images [s].
+
+    Returns:
+        The diagram, the filter and the sensor.
     """
     builder = DiagramBuilder()
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
@@ -356,11 +395,14 @@ def build_hand_estimation(
 def build_recorded_hand_estimation(
     scene: Scene, silhouette: HandSilhouette, start: Belief
 ) -> tuple[Diagram, TruncatedEkf, HandSensor]:
-    """The same of a scene's recorded silhouettes: ``MaskPlayer``, ``HandSensor``, ``TruncatedEkf``.
+    """Build the same diagram for recorded silhouettes, with a ``MaskPlayer``.
 
     Args:
         scene: of one camera.
-        start: the belief before the first picture.
+        start: belief before the first image.
+
+    Returns:
+        The diagram, the filter and the sensor.
     """
     builder, player = DiagramBuilder(), MaskPlayer(scene, scene.cameras)
     builder.AddNamedSystem("mask_player", player)
@@ -376,6 +418,6 @@ def _add_hand_filter(
     builder.AddNamedSystem("truncated_ekf", ekf)
     sensor = builder.AddNamedSystem("hand_sensor", HandSensor(silhouette))
     builder.Connect(image, sensor.GetInputPort("label_image"))
-    connect_same(builder, sensor, ekf)
-    connect_same(builder, ekf, sensor)
+    connect_matching_ports(builder, sensor, ekf)
+    connect_matching_ports(builder, ekf, sensor)
     return builder.Build(), ekf, sensor

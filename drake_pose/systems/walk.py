@@ -1,4 +1,4 @@
-"""The walk-through (Date, section 6.2): a captured person walks through a garden by gestures."""
+"""A walk-through (Date, section 6.2): a captured person walks through a garden by gestures."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -37,7 +37,7 @@ from drake_pose.person.date.walking import (
     stance_of,
 )
 from drake_pose.systems.bodies import add_avatar
-from drake_pose.systems.ports import MemorySystem, connect_same, require_period
+from drake_pose.systems.ports import MemorySystem, connect_matching_ports, require_period
 
 KEYS = {"ahead": "ArrowUp", "behind": "ArrowDown", "left": "ArrowLeft", "right": "ArrowRight"}
 """Meshcat's buttons and the keys that press them."""
@@ -49,27 +49,35 @@ class Walker(MemorySystem):
     .. pydrake_system::
 
         name: Walker
-        input_ports: [positions, keys]
+        input_ports: [positions, keys (optional)]
         output_ports: [walker_pose, command, rest, avatar_positions]
 
-    The first pose in which the person stands still is the rest: where and which way the person
-    stands without a command. Until then, and while ``positions`` are not finite, there is no
-    command. Whoever turns around from one frame to the next was taken for facing the
-    wrong way, at rest too: the rest turns around with the person. ``keys`` (turn, walk) may stay
-    unconnected; where not 0 it goes before the gestures. Outputs: the walker's x, y [m] and heading
-    [rad] in the garden; the command (turn, walk); the rest (5), nan until somebody was seen; and
-    the last known positions (nq).
+    A periodic update recognises the command and moves the walker; output ports read the result. The
+    rest stance is the first in which the person stands still. There is no command before it, or
+    while ``positions`` are not finite. If the face turns by more than 100 degrees between two
+    frames, its direction was wrong before, also at rest: the rest stance turns with it.
+
+    Input ports:
+        positions (nq): the person's [rad or m].
+        keys (2): turn and walk; where not 0, used instead of the gestures.
+
+    Output ports:
+        walker_pose (3): the walker's x, y [m] and heading [rad] in the garden.
+        command (2): turn (1 left, -1 right) and walk (1 ahead, -1 behind).
+        rest (5): the rest stance; NaN before it is known.
+        avatar_positions (nq): the last known positions [rad or m].
 
     Args:
         model: the person, with the links head, left_foot and right_foot.
-        standing: (nq,) avatar_positions until somebody was seen [rad or m].
-        period: time between two frames [s].
+        standing: (nq,) initial ``avatar_positions`` [rad or m].
+        period: time between two updates [s].
         on_spot: whether standing ahead or behind is a command only while the person also walks on
             the spot, as in the paper.
-        settle: how long the person must stand still at first [s]; 0: the first pose is the rest.
+        settle: time for which the person must stand still at first [s]; 0: the first pose is the
+            rest stance.
 
     Raises:
-        SettingsError: the period is not positive, or the time to settle negative.
+        SettingsError: the period is not positive, or ``settle`` is negative.
         UnknownNameError: a link is missing.
     """
 
@@ -96,29 +104,29 @@ class Walker(MemorySystem):
         self._obstacles = garden_obstacles()
         self.add_input("positions", len(standing))
         self.add_input("keys", 2)
-        shown = {
+        outputs = {
             "walker_pose": np.array(WALK.start),
             "command": np.zeros(2),
             "rest": np.full(5, np.nan),
             "avatar_positions": standing,
         }
         inner = {
-            # The stance that the person may be settling in, and since when [s].
+            # Candidate of the rest stance, and the time since which the person stands in it [s].
             "settling": np.append(np.full(5, np.nan), 0.0),
             "heading": np.full(1, np.nan),
             "steps": np.zeros(3),
         }
-        self.keep_vectors(shown | inner, shown, period)
+        self.declare_vectors(outputs | inner, outputs, period)
 
     def next_vectors(self, context: Context, known: dict[str, Array]) -> Mapping[str, Array]:
-        """The walk's next step."""
+        """Return the state vectors after the next step of the walk."""
         q = self.GetInputPort("positions").Eval(context)
         turn, walk = 0, 0
         if np.isfinite(q).all():
             turn, walk = self._recognise(q, known, context.get_time())
         else:
             known["heading"], known["steps"] = np.full(1, np.nan), np.zeros(3)
-        pressed = self.given(context, "keys")
+        pressed = self.eval_input(context, "keys")
         if pressed is not None:
             turn, walk = int(pressed[0]) or turn, int(pressed[1]) or walk
         known["command"] = np.array([turn, walk], dtype=float)
@@ -137,12 +145,15 @@ class Walker(MemorySystem):
         facing: float = 0.25,
         around: float = math.radians(100.0),
     ) -> tuple[int, int]:
-        """The command of a person who is seen; what is known by state's name is brought up.
+        """Return the command (turn, walk) of a visible person, and update ``known``.
 
         Args:
-            still, facing: who stands still moves head and feet by no more [m], and turns the face
-                by no more [rad].
-            around: a larger turn of the face from one frame to the next is an error [rad].
+            q: (nq,) the person's positions [rad or m].
+            known: state vectors by name.
+            time: now [s].
+            still, facing: a person who stands still moves head and feet by less [m], and turns the
+                face by less [rad].
+            around: larger turns of the face between two frames are errors [rad].
         """
         known["avatar_positions"] = q
         self._plant.SetPositions(self._plant_context, q)
@@ -176,14 +187,17 @@ class WalkKeys(MemorySystem):
         name: WalkKeys
         output_ports: [keys, positions]
 
-    ``keys`` is turn (1 left, -1 right) and walk (1 ahead, -1 behind); ``positions`` is a person who
-    strides while a key is held, and stands otherwise.
+    A periodic update reads the buttons; output ports read the result.
+
+    Output ports:
+        keys (2): turn (1 left, -1 right) and walk (1 ahead, -1 behind).
+        positions (nq): of a person who strides while a key is held, and stands otherwise.
 
     Args:
         stride: (n, nq) positions of one stride that ends standing [rad or m].
-        period: time between two looks at the buttons, and between two of these [s].
-        held: how long a press counts [s]: a key that is held down is pressed again and again, but
-            first after half a second.
+        period: time between two updates [s].
+        held: time for which a press counts [s]. A key that is held down repeats its press, the
+            first time after half a second.
     """
 
     def __init__(self, meshcat: Meshcat, stride: Array, period: float, held: float = 0.55) -> None:
@@ -192,9 +206,9 @@ class WalkKeys(MemorySystem):
         self._held = held
         for name, key in KEYS.items():
             meshcat.AddButton(name, key)
-        # By button: how often it was pressed, and how much longer that counts [s].
+        # By button: number of presses, and the time for which the last one still counts [s].
         starts = {name: np.zeros(len(KEYS)) for name in ("pressed", "left")}
-        self.keep_vectors(starts | {"frame": np.zeros(1)}, (), period)
+        self.declare_vectors(starts | {"frame": np.zeros(1)}, (), period)
         tickets = {self.all_state_ticket()}
 
         def command(context: Context) -> list[float]:
@@ -210,7 +224,7 @@ class WalkKeys(MemorySystem):
         )
 
     def next_vectors(self, context: Context, known: dict[str, Array]) -> Mapping[str, Array]:
-        """What the buttons say, and the stride's next frame."""
+        """Return the state of the buttons, and the stride's next frame."""
         pressed = np.array([float(self._meshcat.GetButtonClicks(name)) for name in KEYS])
         held = np.maximum(known["left"] - self._period, 0.0)
         left = np.where(pressed > known["pressed"], self._held, held)
@@ -221,16 +235,21 @@ class WalkKeys(MemorySystem):
 
 
 class WalkView(LeafSystem):
-    """Moves the avatar through the place in Meshcat, and the view with it.
+    """Moves the avatar through the garden in Meshcat, and the view with it.
 
     .. pydrake_system::
 
         name: WalkView
         input_ports: [walker_pose, rest]
 
+    A periodic publish event updates Meshcat.
+
+    Input ports:
+        walker_pose, rest: of a ``Walker``.
+
     Args:
-        meshcat: where the avatar is drawn, below the path ``walker``.
-        period: time between two pictures [s].
+        meshcat: where the avatar is drawn, under the path ``walker``.
+        period: time between two updates [s].
     """
 
     def __init__(self, meshcat: Meshcat, period: float) -> None:
@@ -250,7 +269,7 @@ class WalkView(LeafSystem):
 
 
 AddPositions = Callable[[DiagramBuilder], OutputPort]
-"""Adds systems to a diagram under construction; the port is that of the person's positions (nq)."""
+"""Adds systems to a diagram's builder, and returns their port of the person's positions (nq)."""
 
 
 def build_walk(
@@ -262,15 +281,16 @@ def build_walk(
     on_spot: bool = False,
     settle: float = 0.0,
 ) -> Diagram:
-    """A garden in Meshcat and a person who walks through it by gestures or keys.
+    """Build a diagram of a person who walks through a garden in Meshcat by gestures or keys.
 
-    The diagram's outputs are ``walker_pose`` and ``command``.
+    Its output ports are ``walker_pose`` and ``command``.
 
     Args:
-        positions: the person's positions (nq,) over time, in a room with z upward, nan where not
-            found; or what adds the systems that give them; None: the keys alone.
+        meshcat: where to show the garden.
+        positions: the person's positions (nq,) over time, in a room with z upward, NaN where
+            unknown; or a function that adds systems which output them; None: keys only.
         stride: (n, nq) one stride on the spot that ends standing, for the keys.
-        period, on_spot, settle: as of Walker.
+        period, on_spot, settle: as in Walker.
     """
     builder = DiagramBuilder()
     garden = add_garden(builder)
@@ -289,7 +309,7 @@ def build_walk(
     builder.Connect(source, walker.GetInputPort("positions"))
     builder.Connect(keys.GetOutputPort("keys"), walker.GetInputPort("keys"))
     view = builder.AddNamedSystem("view", WalkView(meshcat, period))
-    connect_same(builder, walker, view)
+    connect_matching_ports(builder, walker, view)
     avatar = walker.GetOutputPort("avatar_positions")
     add_avatar(builder, model, avatar, meshcat, "walker/avatar", period)
     for name in ("walker_pose", "command"):
@@ -298,7 +318,7 @@ def build_walk(
 
 
 def add_garden(builder: DiagramBuilder, X_WG: RigidTransform | None = None) -> SceneGraph:
-    """Add urdf/garden/garden.sdf, and a SceneGraph that holds it, at a pose."""
+    """Add urdf/garden/garden.sdf at a pose X_WG; return the SceneGraph that is added for it."""
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
     ModelSource(package_folder() / "garden" / "garden.sdf", {}).parse(plant, scene_graph)
     frame = plant.GetFrameByName("garden")
@@ -308,7 +328,7 @@ def add_garden(builder: DiagramBuilder, X_WG: RigidTransform | None = None) -> S
 
 
 def garden_obstacles() -> Array:
-    """(n, 3) x, y and radius [m] of what one cannot walk through: cylinders and spheres."""
+    """Return obstacles (n, 3): x, y and radius [m] of the garden's cylinders and spheres."""
     inspector = add_garden(DiagramBuilder()).model_inspector()
     obstacles = []
     for geometry in inspector.GetAllGeometryIds(Role.kPerception):
@@ -319,7 +339,7 @@ def garden_obstacles() -> Array:
 
 
 def _light(meshcat: Meshcat) -> None:
-    """Daylight, below a sky; Meshcat's own point lights stand near the origin."""
+    """Set up daylight and a sky in Meshcat, and turn off its point lights near the origin."""
     for name in ("/Grid", "/Axes"):
         meshcat.SetProperty(name, "visible", False)
     for name, intensity in {"AmbientLight": 1.6, "FillLight": 1.6}.items():
@@ -331,7 +351,11 @@ def _light(meshcat: Meshcat) -> None:
 
 
 def view_from_behind(pose: Array) -> tuple[Array, Array]:
-    """Eye and target (3,) [m] of who looks at x, y [m] and heading [rad] from behind and above."""
+    """Return eye and target (3,) [m] of a view from behind and above a walker.
+
+    Args:
+        pose: (3,) the walker's x, y [m] and heading [rad].
+    """
     forward = np.array([math.cos(pose[2]), math.sin(pose[2]), 0.0])
     ground = np.array([pose[0], pose[1], 0.0])
     inside = WALK.half_size - 0.3
@@ -341,11 +365,11 @@ def view_from_behind(pose: Array) -> tuple[Array, Array]:
 
 
 def walker_transform(pose: Array, rest: Array) -> RigidTransform:
-    """X_PR: the room in the place, so that who stands at rest in it is where the walker is.
+    """Return X_PR, the room's pose in the place, which moves a person at rest to the walker's pose.
 
     Args:
         pose: (3,) x, y [m] and heading [rad] of the walker in the place.
-        rest: (5,) stance at rest in the room; the feet's place counts.
+        rest: (5,) rest stance in the room; its heading and the feet's position are used.
     """
     turn = RollPitchYaw(0.0, 0.0, pose[2] - rest[0])
     X_PF = RigidTransform(turn, [pose[0], pose[1], 0.0])

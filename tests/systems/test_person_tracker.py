@@ -65,7 +65,7 @@ def test_moving_person_is_followed_and_shown(person, cameras):
     simulator = Simulator(diagram)
     simulator.AdvanceTo(0.101)
     run = Bench(diagram, simulator.get_context())
-    assert run["share"][0] > 0.8
+    assert run["inlier_ratio"][0] > 0.8
     np.testing.assert_allclose(run["estimated_positions"][:3], end[:3], atol=0.02)
     for name in ("left_upper_arm_z", "right_upper_arm_z", "left_thigh_x", "left_shin_x"):
         index = person.position_index(name)
@@ -82,7 +82,7 @@ def test_person_is_lost_kept_in_mind_and_found_again(person, cameras, tracker, r
         q = posed(person, x=x)
         masks = {name: one.mask(q) for name, one in renderers.items() if name not in blind}
         run.advance(run.context.get_time() + 0.1, **views(masks), time=[time])
-        names = ("estimated_positions", "last_positions", "share", "seen")
+        names = ("estimated_positions", "last_positions", "inlier_ratio", "visible")
         return [run[name] for name in names]
 
     none = tuple(cameras)
@@ -122,7 +122,7 @@ def alone(person, cameras, poses):
 @pytest.fixture(scope="module")
 def watch(cameras, tracker, views):
     """What comes out for masks (T,), by port: (T, n)."""
-    names = ("estimated_positions", "others", "deviations", "seen")
+    names = ("estimated_positions", "others", "deviations", "visible")
 
     def watch(frames):
         run = Bench(PersonTracker(tracker, list(cameras.values()), 0.1, with_deviations=True))
@@ -172,7 +172,7 @@ def test_the_one_is_followed_as_if_alone(person, cameras, watch, poses, alone):
     single, double = watch(alone), watch(both)
     assert not single["others"].any()
     assert double["others"][:, 0].tolist() == [0.0] * OTHER_COMES + [1.0] * 7
-    np.testing.assert_array_equal(double["seen"], 1.0)
+    np.testing.assert_array_equal(double["visible"], 1.0)
     off, off_alone = (
         np.degrees(np.abs(one["estimated_positions"] - poses)[:, 3:]) for one in (double, single)
     )
@@ -227,7 +227,7 @@ def test_a_person_who_is_set_is_followed_by_colour_images(person, cameras, track
         found = show(q)
     assert found[x] == pytest.approx(0.06, abs=0.01)
     assert np.degrees(found[arm]) == pytest.approx(12.0, abs=4.0)
-    assert run["seen"].all()
+    assert run["visible"].all()
     assert np.all((run["deviations"] >= 0.0) & (run["deviations"] < np.pi))
     for lost in (False, True):
         if lost:

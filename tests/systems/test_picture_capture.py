@@ -156,18 +156,18 @@ def test_live_cameras_may_take_their_time_to_open(silent):
     for k in range(200):
         clock["now"] += PERIOD
         simulator.AdvanceTo((k + 0.5) * PERIOD)
-        if capture.moment is not None:
-            times.append(capture.moment.time)
+        if capture.frames is not None:
+            times.append(capture.frames.time)
     reports = "\n".join(capture.take_reports())
     # Without the second camera, the first moment waits for it once.
     assert times[0] < (2 if silent == 3 else 6) * PERIOD
     if silent == 3:
         assert not reports
-        assert set(capture.moment.items) == {"camera_0", "camera_1"}
+        assert set(capture.frames.items) == {"camera_0", "camera_1"}
         assert len(times) > 190
     else:
         assert "'camera_1' gives no picture" in reports
-        assert set(capture.moment.items) == {"camera_0"}
+        assert set(capture.frames.items) == {"camera_0"}
         assert 100 < len(times) < 130, "it was waited for, but not for ever"
 
 

@@ -11,21 +11,21 @@ class Counter(MemorySystem):
     def __init__(self) -> None:
         super().__init__()
         self.add_input("step", 1)
-        self.keep_vectors({"count": np.zeros(1)}, ["count"], 0.5)
+        self.declare_vectors({"count": np.zeros(1)}, ["count"], 0.5)
 
     def next_vectors(self, context, known):
-        return {"count": known["count"] + self.given(context, "step")}
+        return {"count": known["count"] + self.eval_input(context, "step")}
 
 
 class Abstract(BeliefSystem[int]):
     def __init__(self) -> None:
         super().__init__()
         self.add_input("step", 1)
-        self.keep_belief(0, 0.5)
-        self.show("count", 1, lambda known: [known])
+        self.declare_belief(0, 0.5)
+        self.add_belief_output("count", 1, lambda known: [known])
 
     def next_belief(self, context, last):
-        return last + int(self.given(context, "step")[0])
+        return last + int(self.eval_input(context, "step")[0])
 
 
 @pytest.mark.parametrize("make", [Counter, Abstract])

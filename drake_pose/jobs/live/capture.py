@@ -344,7 +344,9 @@ class _FrameWriter:
         masks = {camera: view.region for camera, view in seen.items() if view is not None}
         for camera in masks:
             self._seen[camera, name] = Path(self._scene.specifications[camera].location)
-        share, others = (float(self._value(context, what)[0]) for what in ("share", "others"))
+        share, others = (
+            float(self._value(context, what)[0]) for what in ("inlier_ratio", "others")
+        )
         seconds = time.perf_counter() - self._begin
         error = float("nan")
         ious: Mapping[str, float] = {}

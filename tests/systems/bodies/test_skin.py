@@ -48,7 +48,7 @@ class _Recorder:
 def test_meshcat_is_sent_the_bent_bands(limb: ArticulatedModel, recorded: bool) -> None:
     recorder = _Recorder()
     skin = ModelSkin(limb)
-    drawer = MeshcatSkin(recorder, skin, 5, "body/skin", recorded=recorded)
+    drawer = MeshcatSkin(recorder, skin, 5, "body/skin", is_recorded=recorded)
     context = drawer.CreateDefaultContext()
     q = np.array([0.1, 1.2, 0.3, -0.4, 0.5])
     for time, positions in ((0.0, np.zeros(5)), (0.5, np.zeros(5)), (1.0, q)):

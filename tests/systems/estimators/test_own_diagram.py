@@ -78,7 +78,7 @@ def test_cameras_of_a_diagram_are_those_of_its_sensors(tmp_path):
     station.add_sensor("front", "world", X_WC)
     station.add_sensor("hand", "segment_2", RigidTransform())
     diagram = station.builder.Build()
-    with pytest.raises(CameraError, match="'hand' rides on link 'segment_2', which moves"):
+    with pytest.raises(CameraError, match="'hand' is attached to link 'segment_2', which moves"):
         cameras_from_drake(diagram)
     with pytest.raises(UnknownNameError, match="no camera 'back'"):
         cameras_from_drake(diagram, ["back"])

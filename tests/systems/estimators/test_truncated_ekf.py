@@ -162,7 +162,7 @@ def test_a_context_says_how_the_filter_works():
 
 def test_the_period_is_the_motions():
     assert Bench(TruncatedEkf(swinging(0.02), ABOUT)).advance(0.1)["statistics"][0] == 5
-    with pytest.raises(SettingsError, match=r"takes 0\.1 s: its period is not 0\.5"):
+    with pytest.raises(SettingsError, match=r"the motion's period is 0\.1 s, not 0\.5"):
         TruncatedEkf(swinging(), ABOUT, 0.5)
     with pytest.raises(SettingsError, match="per step"):
         TruncatedEkf(experiment_filter()[0], ABOUT)

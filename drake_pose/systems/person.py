@@ -123,12 +123,15 @@ class PersonTracker(MemorySystem):
         }
         if with_deviations:
             outputs["deviations"] = unknown
-        # usual: usual inlier ratio, 0 before a person is found; watched: number of frames in which
+        # usual_ratio: 0 before a person is found; watched: number of frames in which
         # others are still looked for; elapsed: time between the last two frames [s].
         inner = {
             "values": values,
             "step": np.zeros(len(values)),
-            **{name: np.zeros(1) for name in ("usual", "troubled", "watched", "elapsed")},
+            **{
+                name: np.zeros(1)
+                for name in ("usual_ratio", "troubled_frames", "watched", "elapsed")
+            },
             "colours": np.zeros(int(np.prod(self._colours_shape))),
         }
         self.declare_vectors(outputs | inner, outputs, period)
@@ -218,8 +221,8 @@ class PersonTracker(MemorySystem):
         q = self._tracker.positions(person.values)
         numbers = {
             "inlier_ratio": person.inlier_ratio,
-            "usual": person.usual_ratio,
-            "troubled": person.troubled_frames,
+            "usual_ratio": person.usual_ratio,
+            "troubled_frames": person.troubled_frames,
         }
         return {
             "estimated_positions": np.full(len(q), np.nan) if person.is_lost else q,
@@ -290,14 +293,16 @@ def _person(known: Mapping[str, Array], elapsed: float, longest: float = 3.0) ->
 
     If frames were skipped, the motion continues for at most ``longest`` frames.
     """
-    share, usual, troubled, usually = (
-        float(known[name][0]) for name in ("inlier_ratio", "usual", "troubled", "elapsed")
+    inlier_ratio, usual_ratio, troubled_frames, period = (
+        float(known[name][0])
+        for name in ("inlier_ratio", "usual_ratio", "troubled_frames", "elapsed")
     )
-    if not usual:
+    if not usual_ratio:
         return None
     # Skipped frames extend the motion.
-    frames = min(elapsed / usually, longest) if usually > 0 and elapsed > 0 else 1.0
-    return TrackState(known["values"], frames * known["step"], share, usual, int(troubled))
+    frames = min(elapsed / period, longest) if period > 0 and elapsed > 0 else 1.0
+    step = frames * known["step"]
+    return TrackState(known["values"], step, inlier_ratio, usual_ratio, int(troubled_frames))
 
 
 class SilhouetteSensor(PersonRegion):

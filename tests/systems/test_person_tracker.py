@@ -86,21 +86,21 @@ def test_person_is_lost_kept_in_mind_and_found_again(person, cameras, tracker, r
         return [run[name] for name in names]
 
     none = tuple(cameras)
-    unknown, _, share, seen = show(0.0, np.nan, none)
+    unknown, _, ratio, seen = show(0.0, np.nan, none)
     assert np.isnan(unknown).all()
-    assert not share.any()
+    assert not ratio.any()
     assert not seen.any()
     assert np.isnan(run["time"][0])
-    found, last, share, seen = show(0.0, 1.0)
+    found, last, ratio, seen = show(0.0, 1.0)
     assert found[0] == pytest.approx(0.0, abs=0.02)
-    assert share[0] > 0.8
+    assert ratio[0] > 0.8
     assert seen.tolist() == [1, 1, 1, 1]
     # The same time stamp: nothing new, whatever the pictures show.
     np.testing.assert_array_equal(show(0.0, 1.0, none)[0], found)
-    lost, kept, share, seen = show(0.0, 1.1, none)
+    lost, kept, ratio, seen = show(0.0, 1.1, none)
     assert np.isnan(lost).all()
     np.testing.assert_array_equal(kept, last)
-    assert not share.any()
+    assert not ratio.any()
     assert not seen.any()
     # Back, a step away, and one camera is blind: the search goes on for some frames.
     for time in (1.4, 1.5, 1.6, 1.7):

@@ -1,8 +1,9 @@
-"""A camera, and its clock, from pictures and a joint log: found, fitted, and as sure as it is.
+"""Register a camera and its clock from pictures and a joint log.
 
-Frames in which the robot hardly moves carry the search, for there a clock that is off does little
-harm. Then the pictures' clock is tried against the log's, the pose held; and pose, offset and, if
-asked for, focal length are fitted together on those frames and the ones that move most.
+The search uses frames in which the robot hardly moves, so that a time offset does little harm. With
+the pose held, time offsets between the pictures' clock and the log's are then scanned. Finally
+pose, time offset and, if requested, focal length and joint offsets are fitted together to these
+frames and the fastest ones.
 """
 
 from collections.abc import Callable, Sequence
@@ -42,15 +43,15 @@ from drake_pose.workers import map_ordered
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Pictures of one camera, and the joints at their moments.
+    """Pictures of one camera, and a joint log.
 
     Args:
-        names: (n,) of the pictures.
-        values_at: (n, m) values of the pose tree at the pictures' times plus an offset [s]: one
-            for all, or (n,).
-        read: gives picture k (H, W, 3).
-        times: (n,) of the pictures [s]; None: the joints have none, and the values are the same
-            whatever the offset.
+        names: names of the n pictures.
+        values_at: returns the pose tree's values (n, m) at the pictures' times plus an offset [s],
+            one for all pictures or (n,).
+        read: returns picture k (H, W, 3).
+        times: (n,) times of the pictures [s]; None: the log has no times, and the values do not
+            depend on the offset.
     """
 
     names: tuple[str, ...]
@@ -59,7 +60,7 @@ class Recording:
     times: Array | None
 
     def rates_at(self, offset: float) -> Array | None:
-        """(n, m) how fast the values change [rad/s or m/s]; None: unknown."""
+        """Return the values' velocities (n, m) [rad/s or m/s]; None: unknown."""
         if self.times is None:
             return None
         step = PICTURES.rate_step
@@ -67,19 +68,19 @@ class Recording:
         return np.asarray(np.nan_to_num((ahead - behind) / (2.0 * step)))
 
     def picture(self, name: str) -> Picture:
-        """A picture (H, W, 3) by its name."""
+        """Return a picture (H, W, 3) by its name."""
         return self.read(self.names.index(name))
 
     def mirrored(self) -> "Recording":
-        """The same with left and right exchanged in all pictures."""
+        """Return the same recording with all pictures mirrored left to right."""
         return replace(self, read=lambda k: np.ascontiguousarray(self.read(k)[:, ::-1]))
 
-    def with_offsets(self, zeros: Array) -> "Recording":
-        """The same with (m,) added to all values."""
-        return replace(self, values_at=lambda offset: self.values_at(offset) + zeros)
+    def with_offsets(self, joint_offsets: Array) -> "Recording":
+        """Return the same recording with offsets (m,) added to all values."""
+        return replace(self, values_at=lambda offset: self.values_at(offset) + joint_offsets)
 
     def with_drift(self, drift: float, since: float) -> "Recording":
-        """The same where the joints' clock runs faster by a drift [s/s], and is right at a time."""
+        """Return the same recording with a log clock faster by a drift [s/s], right at `since`."""
         if not drift or self.times is None:
             return self
         later = drift * (self.times - since)
@@ -88,13 +89,14 @@ class Recording:
 
 @dataclass(frozen=True, eq=False)
 class TimeOffset:
-    """By how much later than the pictures' times their joints are in the log.
+    """Time offset of a camera: how much later than the pictures' times their joints are logged.
 
     Args:
-        value, deviation: [s]; the deviation is infinite where the pictures do not tell.
-        drift, drift_deviation: by how much more in each second [s/s]; 0 where that is not told from
-            chance. The value is that of the frames' mean time.
-        scores: (k, 2) offsets that were tried [s], and what they explain, over the best.
+        value, deviation: the offset at the frames' mean time, and its standard deviation [s];
+            infinite if the pictures do not determine it.
+        scores: (k, 2) scanned offsets [s], and their scores over the best one's.
+        drift, drift_deviation: growth of the offset and its standard deviation [s/s]; the drift is
+            0 where it is not significant.
     """
 
     value: float
@@ -105,37 +107,37 @@ class TimeOffset:
 
     @property
     def determined(self) -> bool:
-        """Whether the pictures tell it."""
+        """Whether the pictures determine it."""
         return bool(np.isfinite(self.deviation))
 
 
 NO_CLOCK = TimeOffset(0.0, np.inf, np.zeros((0, 2)))
-"""Of pictures whose offset is unknown."""
+"""The offset of pictures without information about it."""
 
 
 @dataclass(frozen=True, eq=False)
 class PictureRegistration:
-    """A camera that was found in its pictures.
+    """A camera registered from its pictures.
 
     Args:
         found: the camera.
-        frames: its frames, with masks and log-odds, at the joints' values of their moments.
-        pictures: of these frames, by name.
-        fit: that found it.
-        offset: of its clock; None: the joints have no times.
-        focal_deviation: over the focal length; 0: it was held.
-        recording: it was found in, the joints' clock drifting no more.
-        zeros: (m,) that were added to the frames' values where masks and log-odds were found.
+        frames: its frames, with masks and foreground log-odds, at the logged joint values.
+        pictures: the pictures of these frames, by name.
+        fit: the final fit.
+        time_offset: of the camera's clock; None: the log has no times.
+        focal_deviation: relative standard deviation of the focal length; 0: it was not fitted.
+        recording: the recording, with the drift of its clock removed.
+        joint_offsets: (m,) added to the frames' values for their masks and log-odds.
     """
 
     found: RegisteredCamera
     frames: tuple[PosedFrame, ...]
     pictures: dict[str, Picture]
     fit: PictureFit
-    offset: TimeOffset | None
+    time_offset: TimeOffset | None
     focal_deviation: float
     recording: Recording
-    zeros: Array
+    joint_offsets: Array
 
 
 def register_pictures(
@@ -143,31 +145,31 @@ def register_pictures(
     camera: PinholeCamera,
     recording: Recording,
     focal: bool = False,
-    zeros: Sequence[str] = (),
+    offset_joints: Sequence[str] = (),
 ) -> PictureRegistration:
-    """Finds where a camera stands that has seen a body move.
+    """Estimate a camera's pose and time offset from pictures of a moving robot.
 
     Args:
-        camera: its pose is not used.
-        focal: whether its focal length is only about known.
-        zeros: joints whose zeros are only about known. What is found is not told apart from chance
-            here (``calibrate_joints`` does that), but masks follow it.
+        camera: the camera; its pose is not used.
+        focal: whether the focal length is fitted.
+        offset_joints: joints whose offsets are fitted. Their significance is not tested here
+            (``calibrate_joints`` does), but masks follow them.
 
-    Raises RegistrationError: too few pictures with joint positions, a body that does not move, or
-        no pose that explains the pictures; says so where one explains them mirrored.
+    Raises RegistrationError: there are too few pictures with joint positions, the robot does not
+        move, or no pose explains the pictures; the message says so if mirrored pictures fit.
     """
     chosen = choose_pictures(body, camera, recording)
     try:
-        return _register(body, camera, recording, chosen, focal, zeros)
+        return _register(body, camera, recording, chosen, focal, offset_joints)
     except RegistrationError as error:
         mirrored = camera.mirrored(), recording.mirrored()
         try:
-            _register(body, *mirrored, chosen, focal, zeros)
+            _register(body, *mirrored, chosen, focal, offset_joints)
         except RegistrationError:
             raise error from None
         raise RegistrationError(
-            f"camera '{camera.name}': its pictures are mirrored, left and right exchanged: a pose "
-            "explains them that way round only. Mirror them again. Nothing was written"
+            f"camera '{camera.name}': its pictures are mirrored: a pose explains them only with "
+            "left and right exchanged. Mirror them again. Nothing was written"
         ) from error
 
 
@@ -177,24 +179,26 @@ def _register(
     recording: Recording,
     frames: tuple[list[int], list[int]],
     focal: bool,
-    zeros: Sequence[str],
-    looks: int = 3,
+    offset_joints: Sequence[str],
+    most: int = 3,
 ) -> PictureRegistration:
-    """As register_pictures, the pictures being as they are, from some of them.
+    """As register_pictures, without a test for mirrored pictures.
 
-    looks: number of poses that are fitted.
+    frames: indices of slow and of fast frames. most: number of hypotheses that are fitted.
     """
     chosen, moving = frames
     search = PictureSearch(body, camera, posed_pictures(recording, chosen, 0.0))
-    fitted = map_ordered(search.coarse_fit, search.search()[:looks])
+    fitted = map_ordered(search.coarse_fit, search.search()[:most])
     near = sorted((one for one in fitted if one is not None), key=lambda one: -evidence(*one[1]))
     if not near:
         raise _unexplained(camera, "no pose shows the body in two pictures")
     level, start = search.compared, near[0][0]
-    pieces = level.pieces(start.X_CW)
-    # Once more, for those that are as good, but for chance, and on their way to the best.
+    gains = level.tile_gains(start.X_CW)
+    # Hypotheses that explain about as much are fitted again: they may converge to the best one.
     close = [
-        one.X_CW for one, _ in near[1:] if vuong_statistic(pieces, level.pieces(one.X_CW)) <= 1.96
+        one.X_CW
+        for one, _ in near[1:]
+        if vuong_statistic(gains, level.tile_gains(one.X_CW)) <= 1.96
     ]
     again = map_ordered(search.coarse_fit, close)
     alike = [one[0].X_CW for one in again if one is not None]
@@ -202,13 +206,16 @@ def _register(
     both, clock = [*chosen, *moving], NO_CLOCK
     if recording.times is not None:
         clock = scan_time_offsets(body, start, recording, both)
-    return fit_pictures(
-        body, PictureStart(start, both, clock, alternatives), recording, focal, zeros
-    )
+    found = PictureStart(start, both, clock, alternatives)
+    return fit_pictures(body, found, recording, focal, offset_joints)
 
 
 class PictureStart(NamedTuple):
-    """A search that is done: the camera, frames that are fitted, the clock, other poses X_CW."""
+    """Result of a search.
+
+    camera: at its approximate pose. rows: indices of the frames to fit. clock: the time offset.
+    alternatives: other poses X_CW (4, 4).
+    """
 
     camera: PinholeCamera
     rows: Sequence[int]
@@ -217,10 +224,10 @@ class PictureStart(NamedTuple):
 
     @classmethod
     def of(cls, one: PictureRegistration) -> "PictureStart":
-        """A camera that was found already."""
+        """Return a start from an earlier registration."""
         rows = [one.recording.names.index(frame.name) for frame in one.frames]
         others = [np.linalg.inv(X) for X in one.found.alternatives]
-        return cls(one.found.camera, rows, one.offset or NO_CLOCK, others)
+        return cls(one.found.camera, rows, one.time_offset or NO_CLOCK, others)
 
 
 def fit_pictures(
@@ -228,35 +235,39 @@ def fit_pictures(
     start: PictureStart,
     recording: Recording,
     focal: bool = False,
-    zeros: Sequence[str] = (),
+    offset_joints: Sequence[str] = (),
     *,
     most_fits: int = 5,
     min_drift: float = 0.005,
     drift_sds: float = 4.0,
 ) -> PictureRegistration:
-    """What a search has begun, fitted until clock and zeros move no more.
+    """Fit a camera with its clock from a search result.
 
     Args:
-        recording: as it is, whose joints' clock may drift.
-        focal: whether the focal length is only about known.
-        zeros: joints whose zeros are only about known.
-        most_fits: how often a drift is fitted anew that is more than its deviation, which what it
-            spoils makes large, and more than min_drift over all pictures [s].
-        drift_sds: a clock drifts if it does so by more standard deviations.
+        start: the search result.
+        recording: the recording as it is, with any drift of its clock.
+        focal: whether the focal length is fitted.
+        offset_joints: joints whose offsets are fitted.
+        most_fits: maximum number of fits of the drift. A fit is repeated if the estimated drift
+            changed by more than its standard deviation and more than `min_drift`.
+        min_drift: minimum change of the offset over the recording [s].
+        drift_sds: a drift is significant beyond this many standard deviations.
 
     Raises RegistrationError: no pose explains the pictures.
     """
-    at_rate = start.clock.drift
+    scanned_drift = start.clock.drift
     without = start._replace(clock=replace(start.clock, drift=0.0))
     steady = best, as_now, start, assumed = _fit_until_stable(
-        body, without, recording, focal, zeros
+        body, without, recording, focal, offset_joints
     )
     if recording.times is None:
         return _describe(*steady, focal)
-    if at_rate:
-        clock = replace(without.clock, drift=at_rate)
+    if scanned_drift:
+        clock = replace(without.clock, drift=scanned_drift)
         start = without._replace(clock=clock)
-        best, as_now, start, assumed = _fit_until_stable(body, start, recording, focal, zeros)
+        best, as_now, start, assumed = _fit_until_stable(
+            body, start, recording, focal, offset_joints
+        )
     since, span = _mean_time(recording, start.rows), float(np.ptp(recording.times))
     for left in range(most_fits, -1, -1):
         rows = [recording.names.index(frame.name) for frame in best.fit.views[0].frames]
@@ -269,9 +280,11 @@ def fit_pictures(
         if abs(more) < max(deviation, min_drift / span) or not left:
             break
         start = start._replace(clock=replace(clock, drift=clock.drift + more))
-        best, as_now, start, assumed = _fit_until_stable(body, start, recording, focal, zeros)
-    told = abs(start.clock.drift) > drift_sds * start.clock.drift_deviation
-    return _describe(*((best, as_now, start, assumed) if told else steady), focal)
+        best, as_now, start, assumed = _fit_until_stable(
+            body, start, recording, focal, offset_joints
+        )
+    drifts = abs(start.clock.drift) > drift_sds * start.clock.drift_deviation
+    return _describe(*((best, as_now, start, assumed) if drifts else steady), focal)
 
 
 def _fit_until_stable(
@@ -279,37 +292,39 @@ def _fit_until_stable(
     start: PictureStart,
     recording: Recording,
     focal: bool,
-    zeros: Sequence[str],
+    offset_joints: Sequence[str],
 ) -> tuple[PictureFit, Recording, PictureStart, Array]:
-    """A fit with the drift of the clock that has begun.
+    """Fit a camera with a known drift, and repeat with new masks until offsets settle.
 
-    It is fitted again, so often at most, where an offset moved by 20 ms or a zero by 0.3 degrees.
+    A fit is repeated, at most three times, if the time offset changed by 20 ms or more or a joint
+    offset by 0.3 degrees or more; without joint offsets at most once.
 
     Returns:
-        the fit; the recording, whose joints' clock drifts no more; the camera and the clock that
-        were found, but for the offset's deviation; (m,) what was added to the frames' values.
+        the fit; the recording without drift; the camera and time offset, without the latter's
+        standard deviation; and the joint offsets (m,) that the frames were segmented with.
     """
     camera, offset, names = start.camera, start.clock.value, body.kinematics.names
-    constants = ((TIME_OFFSET,) if recording.times is not None else ()) + tuple(zeros)
-    turned, left = np.zeros(len(names)), 4 if zeros else 2
+    constants = ((TIME_OFFSET,) if recording.times is not None else ()) + tuple(offset_joints)
+    joint_offsets, left = np.zeros(len(names)), 4 if offset_joints else 2
     as_now = recording.with_drift(start.clock.drift, _mean_time(recording, start.rows))
     while True:
-        frames, left = posed_pictures(as_now.with_offsets(turned), start.rows, offset), left - 1
+        left -= 1
+        frames = posed_pictures(as_now.with_offsets(joint_offsets), start.rows, offset)
         best = PictureSearch(body, camera, frames).fit(camera, constants, focal)
         if best is None:
             raise _unexplained(camera, "the body leaves the pictures")
         found = dict(zip(best.fit.names, best.found.shared.tolist(), strict=True))
         camera, by = best.camera, found.get(TIME_OFFSET, 0.0)
-        assumed, turn = turned, np.array([found.get(name, 0.0) for name in names])
+        assumed, turn = joint_offsets, np.array([found.get(name, 0.0) for name in names])
         most = SHARED.max_constant
-        offset, turned = offset + by, np.clip(turned + turn, -most, most)
+        offset, joint_offsets = offset + by, np.clip(joint_offsets + turn, -most, most)
         if not left or (abs(by) < 0.02 and np.abs(turn).max() < np.radians(0.3)):
             done = start._replace(camera=camera, clock=replace(start.clock, value=offset))
             return best, as_now, done, assumed
 
 
 def _mean_time(recording: Recording, rows: Sequence[int]) -> float:
-    """Of some pictures [s]."""
+    """Return the mean time of some pictures [s]."""
     return 0.0 if recording.times is None else float(recording.times[list(rows)].mean())
 
 
@@ -320,39 +335,42 @@ def choose_pictures(
     count: int = PICTURES.search_frames,
     *,
     moving: int = 8,
-    slow_share: float = 0.6,
+    slow_fraction: float = 0.6,
     min_motion: float = 0.05,
 ) -> tuple[list[int], list[int]]:
-    """The frames that carry a search, and those that move most beside them.
+    """Choose the frames of a search, and the fastest others.
 
     Args:
-        count, moving: maximum number of the former, and of the latter.
-        slow_share: the slower share of all frames carries the search, if clocks may differ.
-        min_motion: a robot whose parts move by less [m] does not tell where a camera is.
+        count, moving: maximum number of search frames, and of fast frames.
+        slow_fraction: search frames are among the slower ones, up to this quantile of the speed.
+        min_motion: minimum motion of any part [m].
 
-    Raises RegistrationError: too few pictures with joint positions, or a body that does not move.
+    Returns:
+        the indices of both, most dissimilar frames first.
+
+    Raises RegistrationError: too few pictures have joint positions, or the robot does not move.
     """
     values = recording.values_at(0.0)
     known = np.flatnonzero(np.isfinite(values).all(axis=1))
     if len(known) < 3:
         raise RegistrationError(
             f"camera '{camera.name}': {len(known)} of its {len(values)} pictures have joint "
-            "positions of their moments; three and more are needed, in which the robot stands "
-            "otherwise: are pictures and joints of one episode and of one clock?"
+            "positions at their times; three or more with different poses are needed: do pictures "
+            "and joints belong to one episode and one clock?"
         )
     places = node_places(body, values[known])
     spread = float(np.linalg.norm(np.ptp(places, axis=0), axis=1).max())
     if spread < min_motion:
         raise RegistrationError(
             f"camera '{camera.name}': the robot hardly moves, by {1e3 * spread:.0f} mm at most, so "
-            "its pictures do not tell it from what is behind it; give an episode in which it moves"
+            "pictures do not separate it from the background; give an episode in which it moves"
         )
     rates = recording.rates_at(0.0)
     if rates is None:
         return known[choose_frames(places, count)].tolist(), []
     ahead = node_places(body, values[known] + PICTURES.rate_step * rates[known])
     speed = np.linalg.norm(ahead - places, axis=2).mean(axis=1)
-    slow = np.flatnonzero(speed <= np.quantile(speed, slow_share))
+    slow = np.flatnonzero(speed <= np.quantile(speed, slow_fraction))
     if len(slow) < count:
         slow = np.arange(len(known))
     chosen = slow[choose_frames(places[slow], count)]
@@ -364,7 +382,7 @@ def choose_pictures(
 def posed_pictures(
     recording: Recording, indices: Sequence[int], offset: float
 ) -> list[PosedPicture]:
-    """Some frames with their pictures; those whose joints are not logged are left out."""
+    """Return some frames with their pictures; frames without logged joints are left out."""
     values, rates = recording.values_at(offset), recording.rates_at(offset)
     return [
         PosedPicture(
@@ -385,14 +403,15 @@ def scan_time_offsets(
     start_within: float = 0.3,
     much_better: float = 1.01,
 ) -> TimeOffset:
-    """The offset at which a camera explains its pictures best, and what all that were tried do.
+    """Scan the time offset of a camera at a known pose.
 
-    Tried are offsets from -1 to 1 s; then rates at which the joints' clock runs faster.
+    Offsets from -1 to 1 s are scanned, then drifts of the log's clock.
 
     Args:
-        rates: [s/s].
-        start_within: at these both clocks start together but for this time [s].
-        much_better: a rate explains this many times as much as the best offset does.
+        indices: the frames that are used.
+        rates: scanned drifts [s/s].
+        start_within: for a drift both clocks start together within this time [s].
+        much_better: minimum ratio of a drift's score to that of the best constant offset.
     """
     offsets = np.linspace(-1.0, 1.0, 81)
     frames = posed_pictures(recording, indices, 0.0)
@@ -400,16 +419,16 @@ def scan_time_offsets(
     names = [one.name for one in frames]
     rows = [recording.names.index(name) for name in names]
 
-    def told(clock: Recording, tried: Array) -> Array:
+    def gains_at(clock: Recording, tried: Array) -> Array:
         found = np.full(len(tried), np.nan)
         for k, offset in enumerate(tried):
             values = clock.values_at(float(offset))[rows]
             if np.isfinite(values).all():
                 X_WN = np.array([body.kinematics.poses(one) for one in values])
-                found[k] = level.told(camera.X_CW, X_WN)[Explained.GAIN]
+                found[k] = level.statistics(camera.X_CW, X_WN)[Explained.GAIN]
         return found
 
-    scores = told(recording, offsets)
+    scores = gains_at(recording, offsets)
     k = int(np.nanargmax(scores))
     offset, drift = float(offsets[k]), 0.0
     if 0 < k < len(scores) - 1 and np.isfinite(scores[k - 1 : k + 2]).all():
@@ -422,7 +441,7 @@ def scan_time_offsets(
         first, mean = float(recording.times[0]), _mean_time(recording, rows)
         starts = np.linspace(-start_within, start_within, 13)
         for rate in rates:
-            gains = told(recording.with_drift(rate, first), starts)
+            gains = gains_at(recording.with_drift(rate, first), starts)
             if np.isfinite(gains).any() and (gain := float(np.nanmax(gains))) > most:
                 most, drift = gain, rate
                 offset = float(starts[int(np.nanargmax(gains))]) + rate * (mean - first)
@@ -435,7 +454,7 @@ def _describe(
     best: PictureFit,
     recording: Recording,
     start: PictureStart,
-    zeros: Array,
+    joint_offsets: Array,
     focal: bool,
     *,
     min_explained: float = 0.12,
@@ -445,47 +464,46 @@ def _describe(
     max_sd: float = 0.04,
     max_clock_sd: float = 0.1,
 ) -> PictureRegistration:
-    """What was found.
+    """Return the registration, if it explains the pictures.
 
     Args:
-        min_explained: share of what changes that is explained: right poses .2 and more, one that
-            few frames bore out .09.
-        min_ratio: of the contours, what fits: right poses .5 and more, the best wrong ones .3, one
-            with a free focal length .6.
-        min_contour: by how much edges along contours are stronger than by chance: right poses .17
-            and more, the best wrong ones .13, one with a free focal length .17.
-        min_evidence: of both: right poses 1.2 and more, the best wrong ones .9.
-        max_sd: of a pose [its distance from the body; rad]: right ones are known to a hundredth;
-            mirrored pictures are explained about as well from behind, known to a twentieth.
-        max_clock_sd: an offset is not told whose standard deviation is larger [s].
+        min_explained: minimum explained fraction; correct poses have 0.2 or more, a wrong one that
+            few frames supported 0.09.
+        min_ratio: minimum mean inlier ratio; correct poses have 0.5 or more, the best wrong ones
+            0.3, one with a fitted focal length 0.6.
+        min_contour: minimum strength of edges along contours beyond chance; correct poses have 0.17
+            or more, the best wrong ones 0.13, one with a fitted focal length 0.17.
+        min_evidence: minimum of both together; correct poses have 1.2 or more, wrong ones 0.9.
+        max_sd: maximum standard deviation of the pose [distance from the body; rad]. Correct poses
+            have 0.01; mirrored pictures fit a pose from behind, with 0.05.
+        max_clock_sd: a time offset with a larger standard deviation is not determined [s].
 
-    Raises RegistrationError: it does not explain the pictures.
+    Raises RegistrationError: a criterion is not met.
     """
-    fit, (seen,) = best.fit, best.fit.views
+    fit, (posed,) = best.fit, best.fit.views
     ratio = float(best.ratios[best.inliers].mean())
-    told = evidence(best.explained, best.contour)
+    score = evidence(best.explained, best.contour)
     if (
         best.explained < min_explained
         or ratio < min_ratio
         or best.contour < min_contour
-        or told < min_evidence
+        or score < min_evidence
     ):
         raise _unexplained(
             start.camera,
-            f"at best {max(best.explained, 0.0):.0%} of what changes is explained "
-            f"({min_explained:.0%} at least), {ratio:.0%} of the contours fit "
-            f"({min_ratio:.0%} at least), and edges along them are stronger than elsewhere by "
-            f"{best.contour:.2f} ({min_contour} at least); the first, and "
-            f"{PICTURES.contour_weight:g} times the last, are {told:.2f} together "
-            f"({min_evidence} at least)",
+            f"the best one explains {max(best.explained, 0.0):.0%} of all changes (minimum "
+            f"{min_explained:.0%}), {ratio:.0%} of the contours fit (minimum {min_ratio:.0%}), and "
+            f"edges along them are stronger than elsewhere by {best.contour:.2f} (minimum "
+            f"{min_contour}); the first plus {PICTURES.contour_weight:g} times the last is "
+            f"{score:.2f} (minimum {min_evidence})",
         )
     deviations = np.sqrt(np.diag(best.covariance))
     pose = fit.camera_covariances(best.found, best.covariance)[0]
     found = RegisteredCamera(
-        best.camera, pose, frame_misfits(seen, best.camera.X_CW, best.ratios, best.inliers),
+        best.camera, pose, frame_misfits(posed, best.camera.X_CW, best.ratios, best.inliers),
         np.array([np.linalg.inv(X) for X in start.alternatives]).reshape(-1, 4, 4),
     )  # fmt: skip
-    distance = float(np.linalg.norm(best.camera.X_WC[:3, 3] - seen.middle))
+    distance = float(np.linalg.norm(best.camera.X_WC[:3, 3] - posed.middle))
     if found.translation_sd > max_sd * distance or found.rotation_sd > max_sd:
         raise _unexplained(
             start.camera,
@@ -498,23 +516,23 @@ def _describe(
         clock = replace(start.clock, deviation=deviation if deviation < max_clock_sd else np.inf)
     return PictureRegistration(
         found,
-        tuple(replace(frame, values=frame.values - zeros) for frame in seen.frames),
-        {one.name: recording.picture(one.name) for one in seen.frames},
+        tuple(replace(frame, values=frame.values - joint_offsets) for frame in posed.frames),
+        {one.name: recording.picture(one.name) for one in posed.frames},
         best,
         clock,
         float(deviations[fit.per_camera - 1]) if focal else 0.0,
         recording,
-        zeros,
+        joint_offsets,
     )
 
 
 def _unexplained(camera: PinholeCamera, why: str) -> RegistrationError:
-    """That no pose explains a camera's pictures."""
+    """Return the error for pictures that no pose explains."""
     return RegistrationError(
         f"camera '{camera.name}': no pose explains its pictures: {why}. Does the camera stand "
-        "still, does the robot move much in view of it, are the joint positions of these "
-        "pictures' moments (none dropped, none repeated), in the model's zeros and signs, and "
-        "is the focal length about right? Nothing was written"
+        "still, does the robot move much in its view, are the joint positions those at the "
+        "pictures' times (no picture dropped or repeated), in the model's zeros and signs, and is "
+        "the focal length about right? Nothing was written"
     )
 
 
@@ -528,19 +546,19 @@ def evaluate_pictures(
     shown: float = 0.01,
     min_overlap: float = 0.9,
 ) -> tuple[tuple[PosedFrame, ...], tuple[FrameMisfit, ...], tuple[str, ...]]:
-    """Which of a recording's pictures contradict the others; of many, some spread over all.
+    """Evaluate all pictures of a recording with a registered camera.
 
     Args:
-        one: what was found in some of them.
-        found: the camera, where it is known to be by now.
-        most, at_once: maximum number of pictures, and of those in memory together.
-        shown: a picture shows the body where it should cover this share of it.
-        min_overlap: dark and blurred contours fit badly where the body is right, too: a frame
-            agrees, too, that overlaps this fraction of what those of the fit do in the median.
+        one: the registration from some of them.
+        found: the camera at its final pose.
+        most, at_once: maximum number of pictures, evenly spaced, and of those in memory together.
+        shown: minimum fraction of the picture that the body covers; other pictures are skipped.
+        min_overlap: a frame is an inlier, too, if its intersection over union is at least this
+            fraction of the fit's median: dark and blurred contours fit badly even in correct poses.
 
     Returns:
-        the frames that show it, with masks; their misfits; names of frames in which nothing is seen
-        of a body that should be.
+        the frames that show the body, with masks; their misfits; and the names of frames in which
+        nothing of the body is visible although it should be.
     """
     count = len(one.recording.names)
     rows = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
@@ -549,34 +567,34 @@ def evaluate_pictures(
     least = inlier_threshold(one.fit.ratios)
     known, camera = one.fit.background, found.camera
     outlines = simplify_or_hull(body.coarse, PICTURES.triangles[-1])
-    offset = 0.0 if one.offset is None else one.offset.value
+    offset = 0.0 if one.time_offset is None else one.time_offset.value
 
-    def see(posed: PosedPicture) -> tuple[str, PosedFrame | None] | None:
+    def segment(posed: PosedPicture) -> tuple[str, PosedFrame | None] | None:
         covered = draw_mask(outlines, camera.X_CW @ body.kinematics.poses(posed.values), camera)
         if covered.mean() < shown:
             return None
-        light = estimate_gain(posed.picture, known.colours)
-        return posed.name, segment_picture(posed, known, light, covered)
+        gain = estimate_gain(posed.picture, known.colours)
+        return posed.name, segment_picture(posed, known, gain, covered)
 
     frames, misfits, lost = list[PosedFrame](), list[FrameMisfit](), list[str]()
     for k in range(0, len(rows), at_once):
         pictures = posed_pictures(
-            one.recording.with_offsets(one.zeros), rows[k : k + at_once], offset
+            one.recording.with_offsets(one.joint_offsets), rows[k : k + at_once], offset
         )
-        told = [each for each in map_ordered(see, pictures) if each is not None]
-        lost += [name for name, frame in told if frame is None]
-        seen = [frame for _, frame in told if frame is not None]
+        named = [each for each in map_ordered(segment, pictures) if each is not None]
+        lost += [name for name, frame in named if frame is None]
+        seen = [frame for _, frame in named if frame is not None]
         if seen:
-            whole = PosedFrames(body.kinematics, body.full, camera, seen)
-            fit = SharedFit([whole], [camera.X_CW], fit_biases=False)
+            full = PosedFrames(body.kinematics, body.full, camera, seen)
+            fit = SharedFit([full], [camera.X_CW], fit_biases=False)
             ratios = fit.inlier_ratios(fit.start)
             misfits += [
                 replace(each, is_inlier=each.is_inlier or each.iou >= min_iou)
-                for each in frame_misfits(whole, camera.X_CW, ratios, ratios >= least)
+                for each in frame_misfits(full, camera.X_CW, ratios, ratios >= least)
             ]
-            # Odds fill the memory.
+            # Log-odds are dropped to save memory.
             frames += [
-                replace(frame, values=frame.values - one.zeros, foreground=None, rates=None)
+                replace(frame, values=frame.values - one.joint_offsets, foreground=None, rates=None)
                 for frame in seen
             ]
     return tuple(frames), tuple(misfits), tuple(lost)

@@ -1,10 +1,10 @@
-"""Where a camera stands, told by its pictures alone: no masks, no guess.
+"""Search a camera's pose in its pictures alone, without masks and without an initial guess.
 
-The body's positions are known in each picture, and the camera stands still: so a pose of the camera
-says in which frames the body covers each pixel, and the pixels' colours say how well that fits
-(``fit.background``). Rotations spread over all, and more of them near upright, are tried with the
-bodies where pictures change; the best are improved step by step, in larger and larger pictures, and
-in the end by the one fit, on lines across the contour in the log-odds of pixels to show the body.
+The camera is static and the body's joint positions are known in each picture. A hypothesis X_CW
+therefore implies in which frames the body covers each pixel, and the pixels' colours score it
+(``fit.background``). Starts are rotations over the whole sphere, and more near upright, with the
+body where pictures change. The best are improved coarse-to-fine on an image pyramid, and finally
+fitted on search lines across the contour in the pixels' foreground log-odds.
 """
 
 import math
@@ -39,13 +39,13 @@ from drake_pose.workers import map_ordered
 
 
 class PictureSettings(NamedTuple):
-    """Numbers of a search in pictures.
+    """Parameters of a search in pictures.
 
-    searched: number of pictures that carry a search. triangles: of a node, in levels of pictures up
-    to 64 and up to 120 pixels wide, and beyond; the last ones also show where a body is about.
-    compared, learned: width of the pictures in which poses are compared, and in which backgrounds
-    are learned [pixel]. contours: weight of contours' edges beside the share that is explained.
-    rate_step: rates are differences of positions this long before and after [s].
+    search_frames: number of frames in a search. triangles: number of triangles of a node in pyramid
+    levels up to 64 and up to 120 pixels wide, and in wider ones. compare_width, background_width:
+    width of the pictures in which poses are compared, and backgrounds are estimated [pixel].
+    contour_weight: weight of edges along the contours beside the explained fraction. rate_step:
+    half the interval of the differences that estimate joint velocities [s].
     """
 
     search_frames: int = 12
@@ -64,9 +64,10 @@ class PosedPicture:
     """One picture of a body at known joint positions.
 
     Args:
-        values: (m,) of the body's pose tree [rad or m].
+        name: of the frame.
+        values: (m,) values of the body's pose tree [rad or m].
         picture: (H, W, 3) red, green, blue.
-        rates: (m,) how fast the values change [rad/s or m/s]; None: unknown.
+        rates: (m,) velocities of the values [rad/s or m/s]; None: unknown.
     """
 
     name: str
@@ -77,14 +78,14 @@ class PosedPicture:
 
 @dataclass(frozen=True, eq=False)
 class PictureFit:
-    """A camera that was fitted to pictures.
+    """A camera fitted to pictures.
 
     Args:
-        fit: the fit of its frames, which have foreground probabilities, and masks of these.
-        found: by it.
-        background: what is behind the body; it gives foreground probabilities of other pictures.
-        explained: share of what could be explained at most, that the pose explains.
-        contour: how strong edges are along the outlines, beyond chance.
+        fit: the fit of frames with foreground log-odds, and masks derived from these.
+        found: its result.
+        background: the estimated background, which segments further pictures.
+        explained: explained fraction of the log-likelihood gain that is possible at most.
+        contour: mean strength of edges along the outlines, beyond that of random lines.
     """
 
     fit: SharedFit
@@ -95,27 +96,27 @@ class PictureFit:
 
     @property
     def camera(self) -> PinholeCamera:
-        """Where it was found."""
+        """The camera at its fitted pose."""
         return self.fit.cameras(self.found)[0]
 
     @cached_property
     def ratios(self) -> Array:
-        """(frames,) of the contours, what fits."""
+        """Inlier ratios (frames,)."""
         return self.fit.inlier_ratios(self.found)
 
     @cached_property
     def inliers(self) -> Mask:
-        """(frames,) which frames fit nearly as well as the best."""
+        """Which frames (frames,) are inliers."""
         return self.fit.inliers(self.ratios)
 
     @cached_property
     def covariance(self) -> Array:
-        """(u, u) of the errors of all that the frames share."""
+        """Covariance (u, u) of the shared unknowns."""
         return np.asarray(np.sum(self.fit.covariances(self.found, self.inliers), axis=0))
 
 
 def node_places(body: RegistrationBody, values: Array) -> Array:
-    """(f, n, 3) the middles of the nodes that show, in frames with values (f, m) [m]."""
+    """Return the centres (f, n, 3) of the n visible nodes at values (f, m), in the world [m]."""
     shown = [k for k, one in enumerate(body.coarse) if len(one.vertices)]
     X_WN = np.array([body.kinematics.poses(one)[shown] for one in values])
     middles = np.array([body.coarse[k].ball[:3] for k in shown])
@@ -123,10 +124,9 @@ def node_places(body: RegistrationBody, values: Array) -> Array:
 
 
 def choose_frames(places: Array, count: int) -> list[int]:
-    """Which of frames differ most, best first (farthest point sampling).
+    """Return the indices of the most dissimilar frames, by farthest point sampling.
 
-    Args:
-        places: (f, n, 3) as of ``node_places``.
+    places: (f, n, 3), see ``node_places``. count: number of frames.
     """
 
     def off(other: Array) -> Array:
@@ -141,11 +141,12 @@ def choose_frames(places: Array, count: int) -> list[int]:
 
 
 class PictureSearch:
-    """Finds where a camera stands in some of its pictures.
+    """Searches a camera's pose in some of its pictures.
 
     Args:
-        camera: its pose is not used.
-        frames: those that tell most first.
+        body: the robot's surfaces.
+        camera: the camera; its pose is not used.
+        frames: the pictures, the most informative first.
     """
 
     def __init__(
@@ -153,7 +154,7 @@ class PictureSearch:
     ) -> None:
         self._body, self._camera, self.frames = body, camera, tuple(frames)
         coarse, *finer = (simplify_or_hull(body.coarse, count) for count in PICTURES.triangles)
-        # Smaller parts do not show in the smallest pictures.
+        # Small parts are invisible at the coarsest level.
         least = 0.25 * max(one.ball[3] for one in coarse)
         coarse = tuple(one if one.ball[3] >= least else EMPTY_OUTLINE for one in coarse)
         self._outlines = (coarse, *finer)
@@ -162,7 +163,7 @@ class PictureSearch:
 
     @property
     def compared(self) -> "PyramidLevel":
-        """In which poses are compared."""
+        """The pyramid level in which poses are compared."""
         return self._level(PICTURES.compare_width)
 
     def search(
@@ -175,18 +176,18 @@ class PictureSearch:
         ),
         rotations: int = 1200,
     ) -> list[Array]:
-        """Poses X_CW (4, 4) near which the camera's may be, best first.
+        """Return pose hypotheses X_CW (4, 4), best first.
 
         Args:
-            rounds: width of the pictures [pixel], number of poses that are improved, evaluations of
-                each, and the first simplex's turn [rad].
-            rotations: number of rotations that are tried, over all and again near upright.
+            rounds: for each round of local search the width of the pictures [pixel], the number of
+                hypotheses, the number of evaluations for each, and the first step's rotation [rad].
+            rotations: number of rotations over the sphere, and again near upright.
         """
         level = self._level(rounds[0][0])
         found = level.starts(rotations)
-        # A few frames, those that differ most, rank all starts.
-        for frames, share in ((4, 0.25), (len(self.frames), 1.0)):
-            found = level.best(found, frames, share)
+        # The four most dissimilar frames select a quarter of the starts.
+        for frames, fraction in ((4, 0.25), (len(self.frames), 1.0)):
+            found = level.best(found, frames, fraction)
         after = (*(kept for _, kept, _, _ in rounds[1:]), rounds[-1][1])
         for (width, kept, evaluations, turn), most in zip(rounds, after, strict=True):
             level = self._level(width)
@@ -197,63 +198,66 @@ class PictureSearch:
         return found
 
     def coarse_fit(self, X_CW: Array) -> tuple[PinholeCamera, tuple[float, float]] | None:
-        """A camera fitted roughly from where it stands, and what it explains in `compared`.
+        """Fit a camera roughly from a pose X_CW (4, 4).
 
-        None where the body leaves the pictures.
+        Returns:
+            the camera, and its scores in `compared` (see ``PyramidLevel.explained``); None if the
+            body leaves the pictures.
         """
         frames, small = self._small
-        rough = ((*(12.0,) * 4, *(8.0,) * 4, *(5.0,) * 4), (*(6.0,) * 3, *(4.0,) * 3))
-        for scales in rough:
+        stages = ((*(12.0,) * 4, *(8.0,) * 4, *(5.0,) * 4), (*(6.0,) * 3, *(4.0,) * 3))
+        for scales in stages:
             camera = small.with_pose(np.linalg.inv(X_CW))
             known, covered = self._learn(camera, frames)
-            seen = self._segment(camera, frames, known, covered, self._outlines[-1])
-            if seen is None:
+            posed = self._segment(camera, frames, known, covered, self._outlines[-1])
+            if posed is None:
                 return None
-            fit = SharedFit([seen], [X_CW], fit_biases=False)
-            X_CW = fit.cameras(fit.fit(_stages(scales, seen)))[0].X_CW
+            fit = SharedFit([posed], [X_CW], fit_biases=False)
+            X_CW = fit.cameras(fit.fit(_stages(scales, posed)))[0].X_CW
         return self._camera.with_pose(np.linalg.inv(X_CW)), self.compared.explained(X_CW)
 
     def fit(
         self, camera: PinholeCamera, constants: Sequence[str] = (), focal: bool = False
     ) -> PictureFit | None:
-        """A camera fitted on lines across the contour in the frames, from near where it stands.
-
-        None where the body leaves the pictures.
+        """Fit a camera from near its pose, on search lines across the contours.
 
         Args:
-            constants: what else of all frames is fitted, as of ``SharedFit``.
-            focal: whether its focal length is, too.
+            constants: further unknowns shared by all frames, see ``SharedFit``.
+            focal: whether the focal length is fitted.
+
+        Returns:
+            the fit; None if the body leaves the pictures.
         """
-        looks, seen = len(POSE_NAMES) + focal, None
-        # Backgrounds are learned anew before each row of steps.
+        camera_unknowns, posed = len(POSE_NAMES) + focal, None
+        # The background is estimated again before each sequence of stages.
         for scales, outlines in (
             ((*(5.0,) * 4, *(3.0,) * 4), self._outlines[-1]),
             ((*(3.0,) * 2, *(2.0,) * 3, *(1.0,) * 3), self._body.medium),
         ):
             known, covered = self._learn(camera, self.frames)
-            seen = self._segment(camera, self.frames, known, covered, outlines)
-            if seen is None:
+            posed = self._segment(camera, self.frames, known, covered, outlines)
+            if posed is None:
                 return None
             fit = SharedFit(
-                [seen], [camera.X_CW], constants, camera_unknowns=looks, fit_biases=False
+                [posed], [camera.X_CW], constants, camera_unknowns=camera_unknowns, fit_biases=False
             )
             included = fit.inliers(fit.inlier_ratios(fit.start))
-            found = fit.fit(_stages(scales, seen), included=included)
+            found = fit.fit(_stages(scales, posed), included=included)
             camera = fit.cameras(found)[0]
-        assert seen is not None
-        whole = PosedFrames(self._body.kinematics, self._body.full, camera, seen.frames)
-        fit = SharedFit([whole], [camera.X_CW], constants, camera_unknowns=looks)
-        # The camera is where it was found now; the constants are not.
+        assert posed is not None
+        full = PosedFrames(self._body.kinematics, self._body.full, camera, posed.frames)
+        fit = SharedFit([full], [camera.X_CW], constants, camera_unknowns=camera_unknowns)
+        # The new fit starts at the camera's fitted pose; only the constants keep their values.
         constant = np.arange(len(fit.names)) >= fit.per_camera
         found = fit.start._replace(shared=np.where(constant, found.shared, 0.0))
         included = fit.inliers(fit.inlier_ratios(found))
-        found = fit.fit(_stages((0.75,) * 7, whole), found, included)
+        found = fit.fit(_stages((0.75,) * 7, full), found, included)
         camera = fit.cameras(found)[0]
         return PictureFit(fit, found, known, *self.compared.explained(camera.X_CW))
 
     @cached_property
     def _small(self) -> tuple[list[PosedPicture], PinholeCamera]:
-        """The frames with pictures as backgrounds are learned in, and their camera."""
+        """The frames at the size in which backgrounds are estimated, and their camera."""
         camera = self._level(PICTURES.background_width).camera
         size = camera.width, camera.height
         return [
@@ -269,7 +273,7 @@ class PictureSearch:
     def _learn(
         self, camera: PinholeCamera, frames: Sequence[PosedPicture]
     ) -> tuple[KnownBackground, Mask]:
-        """What is behind the body before a camera, and where that is (f, H, W)."""
+        """Return the background behind the body, and the pixels (f, H, W) that the body covers."""
         level = self._level(PICTURES.background_width)
         small = camera.resized(level.camera.width, level.camera.height)
         poses = camera.X_CW @ self._X_WN
@@ -289,18 +293,18 @@ class PictureSearch:
         covered: Mask,
         outlines: Sequence[Outline],
     ) -> PosedFrames | None:
-        """Frames with foreground probabilities and masks of these; None: fewer than two show it.
+        """Segment frames; None if fewer than two show the body.
 
         Args:
-            covered: (f, H, W) where the body is about; frames that do not show it tell nothing.
-            outlines: the surfaces that are compared.
+            covered: (f, H, W) the pixels that the body covers approximately.
+            outlines: the surfaces for later fits.
         """
         gains = self._level(PICTURES.background_width).backgrounds.gains
 
-        def see(k: int) -> PosedFrame | None:
+        def segment(k: int) -> PosedFrame | None:
             return segment_picture(frames[k], known, gains[k], covered[k])
 
-        posed = [one for one in map_ordered(see, range(len(frames))) if one is not None]
+        posed = [one for one in map_ordered(segment, range(len(frames))) if one is not None]
         if len(posed) < 2:
             return None
         return PosedFrames(self._body.kinematics, outlines, camera, posed)
@@ -316,25 +320,29 @@ class PictureSearch:
         return self._levels[width]
 
 
-def _stages(scales: Sequence[float], seen: PosedFrames) -> list[AnnealingStage]:
-    """Steps at some scales [pixel of a picture 320 wide]; lines are half a scale apart.
+def _stages(scales: Sequence[float], posed: PosedFrames) -> list[AnnealingStage]:
+    """Return stages of single steps at scales [pixel of a picture 320 wide].
 
-    What lines cost does not compare from place to place, so each step is taken.
+    Search lines are half a scale apart. Their costs are not comparable between poses, so each step
+    is taken untried.
     """
-    sizes = np.array(scales) * seen.camera.width / 320.0 / seen.size
+    sizes = np.array(scales) * posed.camera.width / 320.0 / posed.size
     return [AnnealingStage(one, 0.5 * one) for one in sizes.tolist()]
 
 
 def segment_picture(
-    one: PosedPicture, known: KnownBackground, light: Floats, covered: Mask
+    one: PosedPicture, known: KnownBackground, gain: Floats, covered: Mask
 ) -> PosedFrame | None:
-    """A picture with its log-odds and a mask of these; None where no body shows.
+    """Return a frame with foreground log-odds and a mask; None where no body is visible.
 
-    covered: (H, W) where the body is about.
+    Args:
+        known: the background.
+        gain: (3, 4) photometric gain of the picture.
+        covered: (H, W) the pixels that the body covers approximately.
     """
     if not covered.any():
         return None
-    foreground = known.foreground(one.picture, light)
+    foreground = known.foreground(one.picture, gain)
     mask = mask_of_foreground(foreground, covered)
     if not mask.any():
         return None
@@ -342,26 +350,26 @@ def segment_picture(
 
 
 def evidence(explained: float, contour: float) -> float:
-    """How much speaks for a pose, of the share that it explains and its contours' edges.
+    """Return the score of a pose from its explained fraction and its edges' mean strength.
 
-    Sums over contours are misled: a wrong pose that shows more of the body has longer ones.
+    The mean over the contours is used: their sum would favour poses with longer contours.
     """
     return explained + PICTURES.contour_weight * contour
 
 
 class PyramidLevel:
-    """Pictures of one size (a pyramid level), and what poses explain in them.
+    """Pictures of one size, and scores of poses in them.
 
     Attributes:
-        camera: of these pictures.
-        backgrounds: what may be behind the body in them.
+        camera: the camera of these pictures.
+        backgrounds: estimates of the background from all pictures.
 
     Args:
-        outlines: the body's surfaces.
-        camera: of the pictures that are given; its pose is not used.
-        pictures: (f, H, W, 3).
-        X_WN: (f, nodes, 4, 4) where the body is in each.
-        width: of the smaller pictures [pixel].
+        outlines: a surface for each node.
+        camera: the camera of the given pictures; its pose is not used.
+        pictures: f pictures (H, W, 3).
+        X_WN: (f, nodes, 4, 4) the nodes' poses.
+        width: width of this level's pictures [pixel].
     """
 
     def __init__(
@@ -385,7 +393,7 @@ class PyramidLevel:
         owners = np.repeat(np.arange(len(outlines)), [len(one.vertices) for one in outlines])
         most = np.zeros(len(outlines))
         np.maximum.at(most, owners, moves)
-        # What hardly moves beside the body's size stands still.
+        # A node is static if its points move by less than 0.06 of the body's size.
         self._static = most < 0.06 * size
         moving = points[:, ~self._static[owners]]
         self._points = (moving if moving.size else points).reshape(-1, 3)
@@ -393,58 +401,61 @@ class PyramidLevel:
         off = self._points - self._middle
         self._size = float(np.sqrt((off**2).sum(axis=1).mean()))
 
-    def told(self, X_CW: Array, X_WN: Array | None = None) -> Array:
-        """(4,) what a pose (4, 4) explains, as of `explain`.
+    def statistics(self, X_CW: Array, X_WN: Array | None = None) -> Array:
+        """Return the sums (4,) of ``fit.background.explain`` for a pose (4, 4).
 
-        X_WN: (f, nodes, 4, 4) where the body is, if it is elsewhere than it was said to be.
+        X_WN: (f, nodes, 4, 4) other poses of the nodes.
         """
         X_CN = X_CW[:3] @ (self._X_WN if X_WN is None else X_WN)
         sums = self.backgrounds.sums
         return explain(self._packed, X_CN, self._static, self._parameters, sums, 1.0, 0)[0]
 
     def explained(self, X_CW: Array) -> tuple[float, float]:
-        """Of a pose (4, 4) the share of all that could be explained, and edges beyond chance."""
-        told = self.told(X_CW)
-        share = float(told[Explained.GAIN]) / max(self.backgrounds.max_gain, 1e-9)
-        return share, float(told[Explained.CONTOUR]) / max(float(told[Explained.OUTLINE]), 1.0)
+        """Return a pose's explained fraction and the mean strength of edges along its outlines."""
+        sums = self.statistics(X_CW)
+        fraction = float(sums[Explained.GAIN]) / max(self.backgrounds.max_gain, 1e-9)
+        return fraction, float(sums[Explained.CONTOUR]) / max(float(sums[Explained.OUTLINE]), 1.0)
 
     def score(self, X_CW: Array, frames: int | None = None) -> float:
-        """How much speaks for a pose; short outlines, which say little by chance, count as longer.
+        """Return the score of a pose; a constant is added to the outlines' length.
 
-        frames: number of frames that count, from the first on; None: all.
+        The constant limits the score of short outlines, whose edges are strong by chance.
+
+        frames: number of frames that are used, from the first on; None: all.
         """
         X_WN = self._X_WN[:frames]
-        told = self.told(X_CW, X_WN)
-        outline = told[Explained.OUTLINE] + 0.3 * len(X_WN) * self.camera.width
+        sums = self.statistics(X_CW, X_WN)
+        outline = sums[Explained.OUTLINE] + 0.3 * len(X_WN) * self.camera.width
         possible = self.backgrounds.max_gain * len(X_WN) / len(self._X_WN)
         return evidence(
-            float(told[Explained.GAIN]) / max(possible, 1e-9),
-            float(told[Explained.CONTOUR] / outline),
+            float(sums[Explained.GAIN]) / max(possible, 1e-9),
+            float(sums[Explained.CONTOUR] / outline),
         )
 
-    def best(self, X_CW: Sequence[Array], frames: int, share: float) -> list[Array]:
-        """A share of some poses (4, 4): those with the best scores, best first."""
+    def best(self, X_CW: Sequence[Array], frames: int, fraction: float) -> list[Array]:
+        """Return the fraction of the poses (4, 4) with the best scores, best first."""
 
         def scores(some: Sequence[Array]) -> list[float]:
             return [self.score(X, frames) for X in some]
 
         some = [X_CW[k : k + 200] for k in range(0, len(X_CW), 200)]
         order = np.argsort(-np.concatenate(map_ordered(scores, some)), kind="stable")
-        return [X_CW[k] for k in order[: math.ceil(share * len(order))]]
+        return [X_CW[k] for k in order[: math.ceil(fraction * len(order))]]
 
-    def pieces(self, X_CW: Array, squares: int = 16) -> Array:
-        """(k, k) what a pose (4, 4) explains, by squares, `squares` along its longer side."""
+    def tile_gains(self, X_CW: Array, squares: int = 16) -> Array:
+        """Return a pose's log-likelihood gain (k, k) by square tiles, 16 along the longer side."""
         side = max(self.camera.width, self.camera.height) / squares
-        pieces = explain(
+        _, gains = explain(
             self._packed, X_CW[:3] @ self._X_WN, self._static, self._parameters,
             self.backgrounds.sums, side, squares,
         )  # fmt: skip
-        return pieces[1]
+        return gains
 
     def starts(self, rotations: int = 1200) -> list[Array]:
-        """Poses X_CW (4, 4) that show the body where pictures change, and about as large.
+        """Return poses X_CW (4, 4) that show the body where pictures change.
 
-        Each rotation comes at three distances, in the middle of the changes and beside it.
+        Each rotation is combined with three depths about that at which the body is as large as the
+        changes, and with two positions in the picture: the changes' centre, and a random one.
         """
         changes = self.backgrounds.changed_frames()
         v, u = np.mgrid[: changes.shape[0], : changes.shape[1]]
@@ -474,16 +485,19 @@ class PyramidLevel:
     def improve(
         self, numbered: tuple[int, Array], evaluations: int, turn: float
     ) -> tuple[float, Array]:
-        """The best score near a pose (4, 4), and that pose (Nelder and Mead's simplex).
+        """Improve a pose by Nelder and Mead's simplex search.
 
         Args:
-            numbered: a number that says which way the simplex begins, and the pose.
+            numbered: a seed for the signs of the first simplex, and the pose (4, 4).
             evaluations: maximum number of scores.
-            turn: of the first simplex [rad]; its other steps follow.
+            turn: rotation of the first simplex [rad]; its other steps are proportional.
+
+        Returns:
+            the best score and its pose.
         """
         key, X_CW = numbered
         signs = np.random.default_rng(key).choice([-1.0, 1.0], 6)
-        # Turns [rad], shifts of the middle in the picture [focal lengths], log depth.
+        # Rotation [rad], shift in the picture [focal lengths], logarithm of the depth.
         steps = turn * signs * np.array([1.0, 1.0, 1.0, 0.4, 0.4, 0.6])
         simplex = np.vstack([np.zeros(6), np.diag(steps)])
         options = {"maxfev": evaluations, "initial_simplex": simplex, "xatol": 0.0, "fatol": 0.0}
@@ -495,7 +509,7 @@ class PyramidLevel:
         return -float(found.fun), self._moved(X_CW, found.x)
 
     def distinct(self, X_CW: Sequence[Array], most: int | None = None) -> list[Array]:
-        """Those of some poses that show the body elsewhere than all before; `most` at most."""
+        """Return at most `most` poses that place the body apart from every pose kept before."""
         some = self._points[:: max(1, len(self._points) // 50)]
         kept, places = list[Array](), np.zeros((0, *some.shape))
         for X in X_CW:
@@ -509,7 +523,7 @@ class PyramidLevel:
         return kept
 
     def _moved(self, X_CW: Array, x: Array) -> Array:
-        """A pose (4, 4) by a turn about the body's middle, its shift in the picture, log depth."""
+        """Return a pose moved by x (6,): rotation about the body's middle, shift, log depth."""
         p_CM = X_CW[:3, :3] @ self._middle + X_CW[:3, 3]
         depth = p_CM[2] * np.exp(x[5])
         place = np.array([p_CM[0] / p_CM[2] + x[3], p_CM[1] / p_CM[2] + x[4], 1.0])
@@ -520,9 +534,9 @@ class PyramidLevel:
 
 
 def upright_rotations(count: int) -> Array:
-    """(count, 3, 3) rotations R_CW of cameras about upright in a world whose z is up.
+    """Return rotations R_CW (count, 3, 3) of nearly upright cameras in a world with z up.
 
-    They look up by 30 degrees and down by 79 at most, and are rolled by about 0.15 rad.
+    They look up by 30 degrees and down by 79 at most, with a roll of 0.15 rad standard deviation.
     """
     k = np.arange(count) + 0.5
     rng = np.random.default_rng(1)

@@ -117,15 +117,15 @@ def test_poses_that_improve_explain_more_and_the_true_one_most(
     share, contour = level.explained(true)
     assert 0.5 < share < 1.0
     assert contour > level.explained(aside)[1]
-    told = level.told(true)
+    told = level.statistics(true)
     assert share == pytest.approx(told[Explained.GAIN] / level.backgrounds.max_gain)
     assert contour == pytest.approx(told[Explained.CONTOUR] / told[Explained.OUTLINE])
 
 
 def test_what_a_pose_explains_is_told_apart_by_squares(level: PyramidLevel, episode) -> None:
     X_CW = episode.camera.X_CW
-    pieces = level.pieces(X_CW)
-    assert pieces.sum() == pytest.approx(level.told(X_CW)[Explained.GAIN])
+    pieces = level.tile_gains(X_CW)
+    assert pieces.sum() == pytest.approx(level.statistics(X_CW)[Explained.GAIN])
     # 80 by 60 pixels, in squares of 5.
     assert pieces.shape == (16, 16)
     assert (pieces[12:] == 0.0).all()
@@ -296,7 +296,7 @@ def test_a_clock_is_fitted_with_a_camera_and_told_as_surely_as_it_is(registered,
     shift, turn = errors(registered.found.camera.X_WC, episode.camera.X_WC)
     assert shift < 0.008
     assert turn < np.radians(0.3)
-    clock = registered.offset
+    clock = registered.time_offset
     assert clock.determined
     assert abs(clock.value - LATE) < 4.0 * clock.deviation
     assert clock.deviation < 0.003
@@ -319,7 +319,7 @@ def test_pictures_are_judged_by_where_the_others_show_a_body(registered, episode
         read=lambda k: pictures[k],
         values_at=lambda offset: registered.recording.values_at(offset) - zeros,
     )
-    one = replace(registered, recording=shown, zeros=zeros)
+    one = replace(registered, recording=shown, joint_offsets=zeros)
     frames, misfits, lost = evaluate_pictures(episode.body, one, registered.found)
     told = {one.frame: one for one in misfits}
     assert {name for name, one in told.items() if not one.is_inlier} | {*lost} == {
@@ -409,10 +409,12 @@ def test_a_camera_is_found_without_a_guess_and_as_sure_as_it_is(episode, recordi
     deviations = np.sqrt(np.diag(found.found.covariance))
     assert (np.abs(error) < 3.0 * deviations).all()
     assert np.linalg.norm(error[3:]) < 0.012
-    assert found.offset.value == pytest.approx(LATE, abs=4.0 * found.offset.deviation + 1e-3)
-    assert found.offset.deviation < 0.02
+    assert found.time_offset.value == pytest.approx(
+        LATE, abs=4.0 * found.time_offset.deviation + 1e-3
+    )
+    assert found.time_offset.deviation < 0.02
     # The best of all that were tried is next to what was fitted.
-    offsets, scores = found.offset.scores.T
+    offsets, scores = found.time_offset.scores.T
     assert offsets[scores.argmax()] == pytest.approx(LATE, abs=0.03)
 
 
@@ -421,8 +423,8 @@ def test_a_clock_that_drifts_is_put_right(episode, recording):
     faster = recording(values_at=lambda offset: episode.values_at(0.97 * episode.times + offset))
     found = register_pictures(episode.body, episode.camera, faster)
     # Pictures show later moments, and later ones the later they are.
-    assert found.offset.drift == pytest.approx(0.03 / 0.97, abs=0.003)
-    assert found.offset.drift_deviation < 0.003
+    assert found.time_offset.drift == pytest.approx(0.03 / 0.97, abs=0.003)
+    assert found.time_offset.drift_deviation < 0.003
     assert np.linalg.norm(pose_error(found.found.camera.X_WC, episode.camera.X_WC)[3:]) < 0.012
 
 

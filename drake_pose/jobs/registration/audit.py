@@ -209,11 +209,13 @@ def _find_cameras(
     for given in inputs.given_cameras:
         name, recording = given.name, inputs.recordings[given.name]
         if before is None:
-            one = register_pictures(body, given, recording, zeros=zeros)
+            one = register_pictures(body, given, recording, offset_joints=zeros)
         else:
-            one = fit_pictures(body, PictureStart.of(before.found[name]), recording, zeros=zeros)
+            one = fit_pictures(
+                body, PictureStart.of(before.found[name]), recording, offset_joints=zeros
+            )
         pictures[name] = one
-        values = np.array([frame.values + one.zeros for frame in one.frames])
+        values = np.array([frame.values + one.joint_offsets for frame in one.frames])
         off = compare_camera(body, given, one.found, values, alone)
         is_near = off.pixels < near * one.fit.fit.views[0].size
         held.append(given if is_near else one.found.camera)

@@ -279,7 +279,7 @@ def compare_clock(
         recording: as it is.
         clock_sd: standard deviation of clocks that are as good as right [s].
     """
-    clock, camera = one.offset, one.found.camera
+    clock, camera = one.time_offset, one.found.camera
     if clock is None or not clock.determined:
         return []
     rows = [recording.names.index(frame.name) for frame in one.frames]

@@ -317,7 +317,9 @@ class _Registration:
         # All pictures of cameras that were found in some of them.
         for name, one in self.pictures.items():
             recording, found = one.recording, self.registered[name]
-            seen, misfits, lost = evaluate_pictures(body, replace(one, zeros=self._zeros), found)
+            seen, misfits, lost = evaluate_pictures(
+                body, replace(one, joint_offsets=self._zeros), found
+            )
             frames += [MultiViewFrame(k.name, k.values + self._zeros, {name: k.mask}) for k in seen]
             found = self.registered[name] = replace(found, frames=misfits)
             errors = {k.frame: k.E_total for k in found.frames}
@@ -447,7 +449,7 @@ class _Registration:
         """Mean joint offsets that cameras were found with in their pictures [rad or m]."""
         if not self.pictures:
             return {}
-        found = np.mean([one.zeros for one in self.pictures.values()], axis=0)
+        found = np.mean([one.joint_offsets for one in self.pictures.values()], axis=0)
         return dict(zip(self.body.kinematics.names, found.tolist(), strict=True))
 
     def _found_again(

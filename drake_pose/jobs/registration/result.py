@@ -100,7 +100,7 @@ def describe_pictures(one: PictureRegistration | None, found: bool = False) -> d
     if one is None:
         masks = "found" if found else "given"
         return {"masks": masks, "time_offset_s": None, "time_offset_sd_s": None}
-    offset, focal = one.offset, one.found.camera.focal_x
+    offset, focal = one.time_offset, one.found.camera.focal_x
     told = offset if offset is not None and offset.determined else None
     drifting = offset if offset is not None and offset.drift else None
     return {
@@ -125,9 +125,9 @@ def say_pictures(one: PictureRegistration, assumed: bool) -> list[str]:
             f"camera '{name}': no focal length is given: {one.found.camera.focal_x:.0f} pixels "
             f"were found (standard deviation {one.focal_deviation * one.found.camera.focal_x:.0f})"
         )
-    if one.offset is not None and one.offset.drift:
-        texts.append(say_drift(name, one.offset.drift, one.offset.drift_deviation))
-    if one.offset is not None and not one.offset.determined:
+    if one.time_offset is not None and one.time_offset.drift:
+        texts.append(say_drift(name, one.time_offset.drift, one.time_offset.drift_deviation))
+    if one.time_offset is not None and not one.time_offset.determined:
         texts.append(
             f"camera '{name}': its pictures do not tell by how much its clock is off the joints', "
             "as the robot moves too little or too slowly"

@@ -95,7 +95,7 @@ def test_what_is_written_of_clocks_and_focal_lengths():
     camera, scores = arm_cameras()[0], np.array([[0.0, 0.5], [0.1, 1.0]])
     clock = TimeOffset(0.1, 0.02, scores, drift=1e-3, drift_deviation=1e-4)
     one = SimpleNamespace(
-        found=SimpleNamespace(camera=camera), offset=clock, focal_deviation=0.01,
+        found=SimpleNamespace(camera=camera), time_offset=clock, focal_deviation=0.01,
         fit=SimpleNamespace(explained=0.3, contour=0.2),
     )  # fmt: skip
     told = describe_pictures(one)
@@ -103,7 +103,7 @@ def test_what_is_written_of_clocks_and_focal_lengths():
     assert (told["time_drift"], told["time_drift_sd"]) == (1e-3, 1e-4)
     assert told["focal_sd_px"] == pytest.approx(0.01 * camera.focal_x)
     assert told["time_offset_scores"] == scores.tolist()
-    untold = SimpleNamespace(**{**vars(one), "focal_deviation": 0.0, "offset": None})
+    untold = SimpleNamespace(**{**vars(one), "focal_deviation": 0.0, "time_offset": None})
     told = describe_pictures(untold)
     for name in ("time_offset_s", "time_offset_sd_s", "time_drift", "time_drift_sd", "focal_sd_px"):
         assert told[name] is None

@@ -1,1 +1,1 @@
-"""A scene in, a pose a frame out."""
+"""Estimates of the poses of a scene: inputs, search or tracking, comparison, and records."""

@@ -1,7 +1,8 @@
-"""The body in a sequence of one unknown camera: which of its parts, how long, how tilted.
+"""Fit of a body's shape to a sequence of one uncalibrated camera.
 
-The first frame leaves out parts that explain it no better; its poses that look alike are
-followed; lengths, widths and all poses are fitted together, to a model, its poses and a start.
+Links that are missing in the first frame are left out. The modes of the first frame's pose are
+tracked as alternative starts; then lengths, widths and the poses of all frames are fitted together.
+The result is a model, its poses, and a start for the rest of the sequence.
 """
 
 import time
@@ -37,13 +38,13 @@ from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ
 from drake_pose.silhouette.scoring import draw_mask
 
 FittedBody = tuple[EstimateInputs, dict[str, Any], np.ndarray | None]
-"""What is found out about a body: inputs with the fitted model and a search that knows the first
-frame's pose; what the summary says of it; and a picture (h, w, 3) uint8 of the corrected shape over
-the file's (Shimada's figure 18), or None."""
+"""Inputs with the fitted model and a search that knows the pose of the last fitted frame; entries
+for the summary; and a picture (h, w, 3) uint8 of the fitted shape over the file's (figure 18 of
+Shimada et al.), or None."""
 
 
 class _Fitted(NamedTuple):
-    """A body and its first state, and the answers that are known by frame number."""
+    """A model, its search and observation, first state x, and known estimates by frame index."""
 
     model: ArticulatedModel
     search: RootPlacementSearch
@@ -53,12 +54,12 @@ class _Fitted(NamedTuple):
 
 
 class _StartedSearch(RootPlacementSearch):
-    """A search whose first answer is known: that of the frame in which the track goes on."""
+    """A search whose first estimate is given: that of the frame from which the track continues."""
 
     first: PoseEstimate | None = None
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
-        """As RootPlacementSearch."""
+        """Return the given estimate once, then search as RootPlacementSearch does."""
         known, self.first = self.first, None
         return super().match(views, root_position) if known is None else known
 
@@ -66,9 +67,10 @@ class _StartedSearch(RootPlacementSearch):
 def fit_body(
     inputs: EstimateInputs, settings: EstimateSettings, on_stage: OnStage | None
 ) -> FittedBody:
-    """Find out about the body, where it is followed through a sequence of an uncalibrated camera.
+    """Fit the body to a tracked sequence of one uncalibrated camera; other inputs stay unchanged.
 
-    Raises DrakePoseError as for an estimate.
+    Raises:
+        DrakePoseError: as for an estimate.
     """
     search, tracking = inputs.search, inputs.tracking()
     if (
@@ -85,7 +87,7 @@ def fit_body(
 
 
 class _BodyFit:
-    """One fit of a body, found by the first of a sequence's masks."""
+    """Fit of a body's shape to the first masks of a sequence."""
 
     def __init__(
         self, inputs: EstimateInputs, settings: EstimateSettings, tracking: TrackingSettings
@@ -98,9 +100,11 @@ class _BodyFit:
         self._period = 1.0 / (inputs.scene.frame_rate_hz or USUAL_RATE_HZ)
 
     def run(self, search: RootPlacementSearch, min_frames: int = 3) -> FittedBody:
-        """All of it.
+        """Search the first frame, leave out hidden links, and fit the sequence.
 
-        ``min_frames``: a shorter sequence is not fitted as a whole.
+        Args:
+            search: search for the pose in the first frame.
+            min_frames: minimum length of a sequence to which the shape is fitted.
         """
         begin = time.perf_counter()
         first = search.match([View(self._camera, self._masks[0])])
@@ -123,13 +127,13 @@ class _BodyFit:
                 surfaces = TreeSurfaces(one.search.tree).at(one.observation.node_values(one.x))
                 X_CN = self._camera.X_CW @ one.observation.node_poses(one.x)
                 outlines.append(draw_mask(surfaces, X_CN, self._camera))
-            title = f"frame {frames[0]}: the shape that explains the sequence"
+            title = f"frame {frames[0]}: the shape fitted to the sequence"
             shapes = draw_shapes(self._masks[0], outlines, ("the file's", "corrected"), title)
-            # As measured (tutorials/figures.md): what the model's flesh lacks is not in them.
+            # See tutorials/figures.md. Intervals do not include errors of the model's surface.
             text = (
-                "the body, its lengths and all poses were fitted to the sequence together: of four "
-                "hands that were measured, 90 to 100 % of the joints lay in these 95 % intervals, "
-                "and lengths were off by a fifth to a quarter"
+                "the body's lengths and all poses were fitted to the sequence together; do not "
+                "rely on the lengths: for four measured hands 90 to 100 % of the joints were "
+                "inside these 95 % intervals, but lengths were off by a fifth to a quarter"
             )
             body, warnings = fitted, (*warnings, text)
         seconds = time.perf_counter() - begin
@@ -145,7 +149,7 @@ class _BodyFit:
         return inputs, self._more, shapes
 
     def _fit(self, tracker: ContourTracker, starts: Sequence[TrackedStart]) -> _Fitted | None:
-        """The sequence fitted as a whole; None where that explains it no better."""
+        """Fit shape and poses to the sequence; return None if that does not reduce E_total."""
         explanations = fit_sequence(
             tracker, self._masks, [start.states for start in starts], self._period
         )
@@ -169,7 +173,7 @@ class _BodyFit:
         for k, answer in best.known.items():
             poses = [(one.known[k].q, one.known[k].X_WB, one.known[k].J) for one in found]
             best.known[k] = replace(answer, pose_set=pose_set(explanations, poses, k))
-        # What the summary says of the fitted body, and of explanations that look alike.
+        # Entries for the summary: the fitted shape, and the costs of alternatives.
         body, theta = explanations[0].body, explanations[0].fitted.parameters[0]
         nodes, X_WN = body.kinematics.tree.nodes, body.place(theta).X_WN
         apart = np.linalg.norm(X_WN[:, :3, 3] - X_WN[[n.parent for n in nodes], :3, 3], axis=1)
@@ -191,12 +195,14 @@ class _BodyFit:
         shown: float = 0.1,
         better_by: float = 0.9,
     ) -> tuple[RootPlacementSearch, PoseEstimate]:
-        """The search and its answer, without parts that are not there where that is better.
+        """Return search and estimate without links that are missing in the first frame.
 
         Args:
-            shown: a part that ends at the root may not be there if a smaller fraction of its own
-                area shows by itself.
-            better_by: it is left out if that multiplies E_total by less than this factor.
+            search: search for all links.
+            first: its estimate in the first frame.
+            shown: a leaf at the root may be missing if a smaller fraction of its area is in the
+                mask and outside of all other links.
+            better_by: it is left out if that reduces E_total below this multiple.
         """
         if self._settings.unseen:
             return search, first
@@ -212,7 +218,7 @@ class _BodyFit:
             others = [k for k in range(len(outlines)) if k != i]
             own = draw_mask([outlines[i]], X_CN[[i]], self._camera)
             rest = draw_mask([outlines[k] for k in others], X_CN[others], self._camera)
-            # As large as it is, turned to the viewer, it has this area at least.
+            # The two longest sides of its bounding box approximate its area.
             _, *sides = np.sort(np.ptp(outlines[i].vertices, axis=0))
             if np.sum(own & ~rest & self._masks[0]) < shown * np.prod(sides) * pixels**2:
                 hidden.append(node.name)
@@ -225,9 +231,10 @@ class _BodyFit:
         if not better.found or better.E_total >= better_by * first.E_total:
             return search, first
         warning = (
-            f"{', '.join(hidden)}: not in the pictures, it seems, and left out, its joints held: "
-            f"E_total of frame '{self._inputs.frames[0]}' is {better.E_total:.1%} without and "
-            f"{first.E_total:.1%} with it; unseen (--unseen) names links that are not seen"
+            f"{', '.join(hidden)}: seems to be missing in the pictures and is left out, its joints "
+            f"held: E_total of frame '{self._inputs.frames[0]}' is {better.E_total:.1%} without "
+            f"and {first.E_total:.1%} with it; if it is visible, name other links in unseen "
+            "(--unseen)"
         )
         warnings = (*self._inputs.warnings, warning)
         self._inputs = replace(self._inputs, model=model, warnings=warnings)
@@ -239,7 +246,7 @@ class _BodyFit:
         return make_tracker(search.tree, [self._camera], self._period, self._tracking)
 
     def _answer(self, observation: ContourObservation, x: np.ndarray, frame: int) -> PoseEstimate:
-        """A state in a frame, by its number, as a search would give it."""
+        """Return the state x in the frame of this index as a PoseEstimate."""
         q, X_WB = observation.positions(x)
         wrong, area = observation.difference(x, [(self._camera, self._masks[frame])])
         return PoseEstimate(

@@ -1,6 +1,7 @@
-"""A second process that compiles a search's last kernels: on two cores a third less waiting.
+"""A second process that compiles the kernels that a search needs last.
 
-``python -m drake_pose.jobs.estimate.compile_ahead``; what is compiled is shared.
+On two cores the first start takes a third less time. The process runs
+``python -m drake_pose.jobs.estimate.compile_ahead``; compiled kernels are cached on disk.
 """
 
 import subprocess
@@ -23,7 +24,7 @@ from drake_pose.silhouette.outline import TreeSurfaces, pack
 
 @contextmanager
 def compiling_ahead() -> Iterator[None]:
-    """Lets a second process compile as long as the kernels are not stored and the block runs."""
+    """Run the second process during the block, unless the kernels are cached already."""
     if is_stored(assemble_normal_equations):
         yield
         return
@@ -38,10 +39,10 @@ def compiling_ahead() -> Iterator[None]:
 
 
 def main() -> None:
-    """Goes through a search from its end to its beginning, with a small body and picture."""
+    """Compile the kernels of a search from its end to its start, with a small body and picture."""
     tree, view = small_match()
     surfaces = simplify_surfaces(TreeSurfaces(tree))
-    # The kernel that takes longest, by itself: the first process compiles what comes before it.
+    # The kernel that takes longest comes first; the first process compiles earlier steps meanwhile.
     views = pack_views([view.camera], [find_edge_points(view.mask, 1.0)])
     X_WN = tree.node_poses(tree.default_values())
     compare_contours(pack(surfaces), X_WN, *views, np.ones((1, 4)), 0, 1.0, False)

@@ -1,4 +1,4 @@
-"""The pose tree and the search for it that settings ask for."""
+"""Inputs of an estimate: scene, model, pose tree, search and measured positions."""
 
 import math
 import os
@@ -29,13 +29,13 @@ from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.writer import Drawn
 from drake_pose.filtering.contour_tracker import TrackingSettings
 from drake_pose.jobs.estimate.measurements import (
-    TrueAngles,
+    MeasuredPositions,
     check_units,
     is_episode,
     logged_positions,
     read_episode_scene,
     read_joint_centres,
-    read_true_angles,
+    read_measured_positions,
 )
 from drake_pose.person.search import PERSON_LANDMARKS
 from drake_pose.search import (
@@ -66,9 +66,13 @@ def make_search(
     position: np.ndarray | None,
     interval_deg: float = 10.0,
 ) -> PoseSearch:
-    """The search for a root at its own place, or at a position (3,) in the world [m].
+    """Return the search for a body with a known root position.
 
-    ``interval_deg``: sampling interval of the paper's search [deg].
+    Args:
+        model: the body's model.
+        settings: method, root, held positions and time limit.
+        position: (3,) position of the root in the world [m]; None: as the model has it.
+        interval_deg: sampling interval of the published search [deg].
     """
     tree = make_tree(model, settings, position)
     if settings.method == "paper":
@@ -84,20 +88,25 @@ def make_placement_search(
     interval_deg: float = 10.0,
     free_interval_deg: float = 30.0,
 ) -> RootPlacementSearch:
-    """The search for a root that can be anywhere.
+    """Return the search for a body with an unknown root position.
 
-    Where joints turn the root freely, the tree begins at the node of most neighbours.
+    If joints turn the model's root freely, the pose tree starts at the node with most neighbours.
 
     Args:
-        interval_deg: sampling interval of all angles [deg].
-        free_interval_deg: that of a root that can be turned in all ways [deg].
+        model: the body's model.
+        settings: root, held positions and time limit.
+        position: (3,) start of the root position in the world [m]; None: the origin.
+        scale_unknown: whether the scale of a parallel camera is searched as well.
+        interval_deg: sampling interval of joint angles [deg].
+        free_interval_deg: sampling interval of a freely turning root [deg].
 
-    Raises SettingsError: the method is the paper's.
+    Raises:
+        SettingsError: the method is "paper".
     """
     if settings.method == "paper":
         raise SettingsError(
-            "the paper's search must know where the root is and how large it looks; where the "
-            "scene has no cameras.yaml or the root position is unknown, use --method beam"
+            "the method paper needs a known root position and calibrated cameras; without "
+            "cameras.yaml or with an unknown root position use --method beam"
         )
     first = np.zeros(3) if position is None else position
     tree = make_tree(model, settings, None if settings.root is None else first)
@@ -112,7 +121,11 @@ def make_placement_search(
 def make_tree(
     model: ArticulatedModel, settings: EstimateSettings, position: np.ndarray | None = None
 ) -> PoseTree:
-    """The pose tree, its root placed as the settings say."""
+    """Return the pose tree with the root position (3,) [m] and the root rotation of the settings.
+
+    Raises:
+        SettingsError: the root cannot be rotated.
+    """
     held = _in_plant_units(model, settings.hold)
     root, turns = settings.root, settings.root_rotation
     own = model.pose_tree(root_position=position, held=held)
@@ -121,10 +134,10 @@ def make_tree(
     root = root or own.root
     if root == "world":
         raise SettingsError(
-            f"{model.path}: its own joints hold it in the world; a root rotation needs the name of "
-            f"a root; links that can be one: {', '.join(model.link_meshes)}"
+            f"{model.path}: is held in the world by its joints; a root rotation needs a root "
+            f"(--root); links that can be the root: {', '.join(model.link_meshes)}"
         )
-    # From how it stands in the world at the model's defaults.
+    # The rotation is relative to the root's rotation at the model's default positions.
     context = model.plant.CreateDefaultContext()
     model.plant.SetPositions(context, model.default_positions)
     body = model.plant.get_body(BodyIndex(model.link_index(root)))
@@ -142,16 +155,16 @@ def make_tree(
 def leave_out_links(
     model: ArticulatedModel, settings: EstimateSettings
 ) -> tuple[ArticulatedModel, EstimateSettings]:
-    """The model without the links that are not in the pictures, their joints held.
+    """Return model and settings without ``settings.unseen``; the joints of these links are held.
 
     Raises:
-        ModelError: the model is no URDF, or nothing would be seen.
-        UnknownNameError: there is no such link.
+        ModelError: the model is not a URDF, or no link would be left.
+        UnknownNameError: a link does not exist.
     """
     centre = model.pose_tree(
         hub(model.pose_tree()), root_position=np.zeros(3), root_rotation=RootRotation.free()
     )
-    # What a link that is seen follows is not held.
+    # A joint that a remaining link mimics is not held.
     led = {
         centre.source(i) for i, one in enumerate(centre.nodes) if one.name not in settings.unseen
     }
@@ -165,7 +178,7 @@ def leave_out_links(
 
 
 def _in_plant_units(model: ArticulatedModel, values: Mapping[str, float]) -> dict[str, float]:
-    """Degrees become radians; lengths stay metres. Names that are no positions are angles."""
+    """Return values [deg or m] in [rad or m]; unknown names count as angles."""
     kinds = dict(zip(model.position_names, model.position_kinds, strict=True))
     is_angle = {name: kinds.get(name, "angle") == "angle" for name in values}
     return {name: math.radians(one) if is_angle[name] else one for name, one in values.items()}
@@ -173,17 +186,19 @@ def _in_plant_units(model: ArticulatedModel, values: Mapping[str, float]) -> dic
 
 @dataclass(frozen=True)
 class EstimateInputs:
-    """What is estimated, from what, and how.
+    """Inputs of an estimate.
 
     Args:
-        scene: what those cameras see that are matched together.
-        frames: those that are asked for.
-        tracked: whether they follow each other, and the body is followed.
-        search: made for the body's pose tree; None where a person is followed by all silhouettes.
-        truth: measured joint positions, where there are some.
-        root_positions: the root's position (3,) by frame [m], where it differs.
-        starts: the plant's positions (nq,) by frame where it is known where the body is.
-        known: answers of the first frames that are known before the search is asked, by frame.
+        scene: the scene with the cameras that are used.
+        model: the body's model.
+        frames: frames to be estimated.
+        tracked: whether the body is tracked from frame to frame.
+        search: search for the body's pose; None for the method person.
+        truth: measured joint positions to compare with; None if there are none.
+        warnings: messages for the user.
+        root_positions: position (3,) of the root by frame [m]; None if it is the same in all.
+        starts: known positions (nq,) by frame at which a track starts [rad or m].
+        known: estimates by frame that were made before, of the first frames.
     """
 
     scene: Scene
@@ -191,14 +206,14 @@ class EstimateInputs:
     frames: tuple[str, ...]
     tracked: bool
     search: PoseSearch | None
-    truth: TrueAngles | None
+    truth: MeasuredPositions | None
     warnings: tuple[str, ...] = ()
     root_positions: Mapping[str, np.ndarray] | None = None
     starts: Mapping[str, np.ndarray] = field(default_factory=dict)
     known: Mapping[str, PoseEstimate] = field(default_factory=dict)
 
     def joint_errors(self, frame: str, q: np.ndarray) -> dict[str, float]:
-        """Estimate q (nq,) minus truth by position [deg or m], where the truth is known."""
+        """Return q (nq,) minus measured positions by name [deg or m]; empty if not measured."""
         if self.truth is None or (values := self.truth.of(frame)) is None:
             return {}
         places = [self.model.position_index(name) for name in self.truth.names]
@@ -209,7 +224,7 @@ class EstimateInputs:
         return dict(zip(self.truth.names, errors.tolist(), strict=True))
 
     def pictures(self, frame: str) -> dict[str, np.ndarray]:
-        """The pictures (H, W, 3) of a frame by camera."""
+        """Return the pictures (H, W, 3) of a frame by camera."""
         names = [name for name in self.scene.cameras if (name, frame) in self.scene.images]
         return {name: self.scene.read_image(name, frame) for name in names}
 
@@ -222,15 +237,16 @@ class EstimateInputs:
         shown: Mapping[str, np.ndarray],
         **more: Any,
     ) -> tuple[FrameRecord, Drawn]:
-        """A frame as written, its masks compared with the body.
+        """Return the record and overlays of a frame, with its masks compared with the body.
 
         Args:
-            pose: one without a J is judged by the masks.
-            masks: by camera, of those that the pose was found by.
-            parts: by camera (H, W), which part of the body is seen, -1 where none is; none where
-                no pose was found.
-            shown: the masks and pictures over which the body is drawn.
-            more: fields of FrameRecord.
+            frame: the frame's name.
+            pose: the estimate; if its J is not finite, E_total is computed from the masks.
+            masks: masks by camera, of the cameras used.
+            parts: index (H, W) of the visible part of the body by camera, -1 outside the body;
+                empty if no pose was found.
+            shown: masks or pictures by camera over which the body is drawn.
+            more: other fields of FrameRecord.
         """
         q, base, E_total = np.full(len(pose.q), np.nan), None, None
         if pose.found:
@@ -246,12 +262,13 @@ class EstimateInputs:
         return record, {name: (seen, parts.get(name)) for name, seen in shown.items()}
 
     def tracking(self, rest_time: float = 1.0) -> TrackingSettings | None:
-        """How the body is tracked; None where every frame is matched on its own.
+        """Return the settings of the tracker; None if frames are not tracked.
 
-        A searched root position or scale is tracked, too.
+        A searched root position or scale is tracked as well.
 
-        ``rest_time``: of the tracker where a single parallel view, which is the same for poses
-        mirrored in depth, is all there is [s].
+        Args:
+            rest_time: ``TrackingSettings.rest_time`` [s] for a single parallel camera, whose view
+                does not distinguish poses mirrored in depth.
         """
         if not self.tracked:
             return None
@@ -264,7 +281,7 @@ class EstimateInputs:
 
     @property
     def base_moves(self) -> bool:
-        """Whether the root's rotation or position moves the plant's whole world in the scene's."""
+        """Whether the estimate moves the plant's world in the scene's world (X_WB)."""
         if self.search is None:
             return False
         values, positions_from = self.search.sampled.values, self.search.tree.positions_from
@@ -279,15 +296,20 @@ def read_inputs(
     truth_path: Path | None,
     camera_path: Path | None = None,
 ) -> EstimateInputs:
-    """Read and check everything; without a truth path the scene's own joint_angles.csv is taken.
+    """Read and check all inputs of an estimate.
 
     Args:
-        camera_path: a camera file in place of the scene's own.
+        scene_path: the scene's folder, or an episode.
+        model_path: the model file.
+        settings: the settings.
+        truth_path: measured joint positions; None: the scene's joint_angles.csv, if it exists.
+        camera_path: camera file used instead of the scene's own.
 
-    Raises DrakePoseError naming the file, camera, frame, link or joint at fault.
+    Raises:
+        DrakePoseError: the message names the file, camera, frame, link or joint at fault.
     """
     model = load_model(model_path, package_paths=settings.packages)
-    # A sequence of pictures alone begins at a mask or a start, or where its joint log says.
+    # A sequence of pictures starts at a mask, at settings.start, or at its logged positions.
     has_log = settings.start is None and (truth_path or scene_path / JOINT_TABLE).is_file()
     if is_episode(scene_path, settings) and (
         has_log or not read_sequence(scene_path / SCENE_FILE)[0]
@@ -298,7 +320,7 @@ def read_inputs(
             model, settings = leave_out_links(model, settings)
         truth, starts, of_truth = logged_positions(scene, make_tree(model, settings), settings)
     else:
-        # Who is captured moves.
+        # Frames of a captured person are a sequence.
         is_person = settings.method == "person"
         scene, frames = read_scene(
             scene_path, settings.cameras, settings.frames,
@@ -342,38 +364,38 @@ def read_inputs(
 def draw_parts(
     outlines: Sequence[Outline], X_WN: np.ndarray, cameras: Iterable[Camera]
 ) -> dict[str, np.ndarray]:
-    """By camera (H, W), which of a body's parts at X_WN (parts, 4, 4) is seen, -1 where none is."""
+    """Return the index (H, W) of the visible part by camera, -1 outside; X_WN is (parts, 4, 4)."""
     labels = range(1, 1 + len(outlines))
     return {one.name: draw_labels(outlines, labels, one.X_CW @ X_WN, one) - 1 for one in cameras}
 
 
 def _read_truth(
     scene: Path, given: Path | None, model: ArticulatedModel, frames: Sequence[str]
-) -> tuple[TrueAngles | None, tuple[str, ...]]:
-    """Measured positions, and what the user should know of them."""
+) -> tuple[MeasuredPositions | None, tuple[str, ...]]:
+    """Return the measured positions, None if there are none, and warnings."""
     path = given or scene / JOINT_TABLE
     if given is None and not os.path.lexists(path):
         return None, ()
     try:
-        truth = read_true_angles(path, model.position_names)
+        truth = read_measured_positions(path, model.position_names)
     except UnknownNameError:
         if given is not None:
             raise
-        # The scene's truth is that of another model: nothing to compare with.
+        # The scene's table belongs to another model.
         return None, ()
     warnings = check_units(path, model, truth.names, truth.values)
     if all(truth.of(frame) is None for frame in frames):
-        warnings += (f"{path}: has no row of any frame that is estimated: nothing is compared",)
+        warnings += (f"{path}: has no row of an estimated frame, so that nothing is compared",)
     return truth, warnings
 
 
 def _read_starts(
     file: Path | None, frames: Sequence[str], model: ArticulatedModel
 ) -> dict[str, np.ndarray]:
-    """The plant's positions (nq,) by frame, of ``settings.start``."""
+    """Return the positions (nq,) by frame of ``settings.start`` [rad or m]; empty for None."""
     if file is None:
         return {}
-    known = read_true_angles(file, model.position_names)
+    known = read_measured_positions(file, model.position_names)
     check_units(file, model, known.names, known.values)
     places = [model.position_index(name) for name in known.names]
     starts = {}
@@ -384,7 +406,7 @@ def _read_starts(
             starts[frame][places] = values
     if frames[0] not in starts:
         raise SceneError(
-            f"{file}: has no row of the first frame, '{frames[0]}', in which the track is to begin"
+            f"{file}: has no row of the first frame, '{frames[0]}', at which the track starts"
         )
     return starts
 
@@ -392,10 +414,14 @@ def _read_starts(
 def _check_start(
     scene: Scene, frames: Sequence[str], starts: Mapping[str, np.ndarray], track: bool
 ) -> None:
-    """Refuses a track without a beginning, a start where nothing is tracked, and bad pictures."""
+    """Check that a track has a start, that a start is tracked, and that pictures can be read.
+
+    Raises:
+        SettingsError, SceneError: a check fails.
+    """
     if starts and not (scene.sequence and track):
         raise SettingsError(
-            f"{scene.path}: --start is where a track begins, but the frames are not tracked: "
+            f"{scene.path}: --start is the start of a track, but the frames are not tracked; "
             "scene.yaml needs sequence: true"
         )
     bare = [frame for frame in frames if not scene.cameras_of(frame)]
@@ -410,8 +436,8 @@ def _check_start(
     if first in bare and first not in starts:
         where = f"masks/{next(iter(scene.cameras))}/{first}.png"
         raise SceneError(
-            f"{scene.path}: nothing says where the body is in the first frame, '{first}': add its "
-            f"mask {where} (drake-pose masks makes one), or its joint positions (--start FILE.csv)"
+            f"{scene.path}: the pose in the first frame, '{first}', is unknown; add its mask "
+            f"{where} (drake-pose masks makes one), or its joint positions (--start FILE.csv)"
         )
     wanted = set(frames)
     for name, frame in scene.images:
@@ -420,14 +446,15 @@ def _check_start(
 
 
 def bundled_person() -> Path:
-    """The bundled person whose lengths are found with the pose."""
+    """Return the model file of the bundled person, whose link lengths are estimated."""
     return bundled_model("person").with_name("person_shape.urdf")
 
 
 def follows_person(scene: Scene, model: ArticulatedModel, settings: EstimateSettings) -> bool:
-    """Whether the method is ``person``, by name or because ``auto`` chooses it.
+    """Return whether the method is ``person``, by name or as the choice of ``auto``.
 
-    Raises SceneError, ModelError: the method is asked for, but scene or model does not allow it.
+    Raises:
+        SceneError, ModelError: the method is given by name, but scene or model does not allow it.
     """
     wanted = settings.method == "person"
     if not wanted and (settings.method != "auto" or settings.search_settings):
@@ -436,19 +463,19 @@ def follows_person(scene: Scene, model: ArticulatedModel, settings: EstimateSett
         if wanted:
             unknown_folders = ", ".join(scene.unknown_folders)
             raise SceneError(
-                f"{scene.path}: a person is captured by two calibrated cameras or more, but masks "
-                f"are there of {', '.join(scene.cameras)} alone"
+                f"{scene.path}: the method person needs two or more calibrated cameras, but masks "
+                f"exist only for {', '.join(scene.cameras)}"
                 + (f"; cameras.yaml lacks {unknown_folders}" if unknown_folders else "")
             )
         return False
     missing = missing_for_person(model)
     if missing and wanted:
-        raise ModelError(f"{model.path}: a person is captured with a model that has {missing}")
+        raise ModelError(f"{model.path}: the method person needs a model with {missing}")
     return not missing
 
 
 def missing_for_person(model: ArticulatedModel) -> str:
-    """What a model lacks to be a person who can be anywhere; "" where nothing."""
+    """Return what a model lacks for the method person; "" if nothing."""
     names = set(load_landmarks(model.path)) if landmarks_file(model.path).is_file() else set()
     if absent := sorted(set(PERSON_LANDMARKS) - names):
         return f"the landmarks {', '.join(absent)} in {landmarks_file(model.path).name} beside it"
@@ -457,5 +484,5 @@ def missing_for_person(model: ArticulatedModel) -> str:
     kinds = [model.position_kinds[position] for node in roots for position in node.positions]
     by_joints = all(node.value_names == node.position_names for node in nodes)
     if len(roots) != 1 or kinds.count("length") < 3 or not by_joints:
-        return "one root that joints of its own move to any place"
+        return "one root that its own joints can move to any position"
     return ""

@@ -1,4 +1,4 @@
-"""Files of measured values: joint centres, angles to compare with or to start from, by frame."""
+"""Measured joint positions and joint centres by frame, from tables and from logs of episodes."""
 
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -25,13 +25,15 @@ from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, Scene, select_fra
 
 
 @dataclass(frozen=True)
-class TrueAngles:
-    """Joint positions of a file that were measured by other means.
+class MeasuredPositions:
+    """Joint positions of a table.
 
     Args:
-        values: (len(names),) [rad or m] by frame: its number, or its name if that is none.
-        bases: (7,) BASE_COLUMNS by frame, of an estimate whose base moved.
-        is_estimate: whether they are the poses.csv of an estimate.
+        path: the table.
+        names: names of the positions.
+        values: (len(names),) positions [rad or m] by frame, see `frame_key`.
+        bases: (7,) BASE_COLUMNS by frame, from an estimate whose base moved.
+        is_estimate: whether the table is the poses.csv of an estimate.
     """
 
     path: Path
@@ -41,18 +43,18 @@ class TrueAngles:
     is_estimate: bool = False
 
     def of(self, frame: str) -> np.ndarray | None:
-        """Returns the values of a frame, or None where nothing was measured."""
+        """Return the values (len(names),) of a frame; None if it has no row."""
         return self.values.get(frame_key(frame))
 
 
 def read_joint_centres(path: Path, joint: str, frames: Sequence[str]) -> dict[str, np.ndarray]:
-    """Where a joint is in each frame (3,) [m], from a file of `frame,joint,x,y,z` rows.
+    """Return a joint's position (3,) [m] in each frame, from a table ``frame,joint,x,y,z``.
 
-    Frames are compared as numbers: the row of frame 3 is that of ``0003.png``.
+    Frames are compared as numbers: frame 3 is ``0003.png``.
 
     Raises:
-        SceneError: if the file cannot be read, or a frame has no row.
-        UnknownNameError: if no row is of that joint.
+        SceneError: the table cannot be read, or a frame has no row.
+        UnknownNameError: the table does not have the joint.
     """
     header, rows = read_csv(path, SceneError)
     if header != ["frame", "joint", "x", "y", "z"]:
@@ -70,24 +72,24 @@ def read_joint_centres(path: Path, joint: str, frames: Sequence[str]) -> dict[st
         if frame_key(frame) not in known:
             raise SceneError(
                 f"{path}: has no row of joint '{joint}' in frame '{frame}'; leave that frame out "
-                "(--frame), or take another joint that is known there"
+                "(--frame), or choose a joint that is known there"
             )
     return {frame: known[frame_key(frame)] for frame in frames}
 
 
-def read_true_angles(path: Path, position_names: Sequence[str]) -> TrueAngles:
-    """Measured joint positions [rad or m] of a file with columns `frame` and positions' names.
+def read_measured_positions(path: Path, position_names: Sequence[str]) -> MeasuredPositions:
+    """Read joint positions [rad or m] from a table with the column ``frame`` and one a position.
 
-    Frames are compared as numbers where they are numbers: the row of frame 3 is that of
-    ``0003.png``. Of an estimate's poses.csv rows without a pose are left out.
+    Frames are compared as numbers if they are numbers: frame 3 is ``0003.png``. Rows of poses.csv
+    without a pose are skipped.
 
     Raises:
-        SceneError: if the file cannot be read, or gives a column or a frame twice.
-        UnknownNameError: if the model has no position of a column's name.
+        SceneError: the table cannot be read, or has a column or frame twice.
+        UnknownNameError: the model does not have the position of a column.
     """
     header, rows = read_csv(path, SceneError)
     if len(header) < 2 or header[0] != "frame":
-        raise SceneError(f"{path}: the first line must be frame, then names of positions")
+        raise SceneError(f"{path}: the first line must be frame and the names of positions")
     is_estimate = tuple(header[-2:]) == FIT_COLUMNS
     last = len(header) - len(FIT_COLUMNS) if is_estimate else len(header)
     with_base = is_estimate and tuple(header[last - len(BASE_COLUMNS) : last]) == BASE_COLUMNS
@@ -95,7 +97,7 @@ def read_true_angles(path: Path, position_names: Sequence[str]) -> TrueAngles:
     for name in header[1:end]:
         if name not in position_names:
             raise UnknownNameError(
-                "position", name, position_names, f"{path} has a column that the model lacks; it"
+                "position", name, position_names, f"{path} has an unknown column; the model"
             )
         if header.count(name) > 1:
             raise SceneError(f"{path}: has the column '{name}' twice")
@@ -110,7 +112,7 @@ def read_true_angles(path: Path, position_names: Sequence[str]) -> TrueAngles:
         values[frame] = _numbers(row[1:end], path, line)
         if with_base:
             bases[frame] = _numbers(row[end:last], path, line)
-    return TrueAngles(path, tuple(header[1:end]), values, bases, is_estimate)
+    return MeasuredPositions(path, tuple(header[1:end]), values, bases, is_estimate)
 
 
 def check_units(
@@ -119,32 +121,33 @@ def check_units(
     names: Sequence[str],
     known: Mapping[int | str, np.ndarray],
     slack_angle: float = 0.1,
-    slack_share: float = 0.1,
+    slack_fraction: float = 0.1,
     millimetres_from: float = 20.0,
     largest: float = 1e6,
 ) -> tuple[str, ...]:
-    """Warnings of measured positions outside their limits.
+    """Return warnings of measured positions outside their limits.
 
     Args:
-        path: of the table.
-        names: of the model's positions.
+        path: the table.
+        model: the model with the limits.
+        names: names of the positions.
         known: (len(names),) values by frame [rad or m].
-        slack_angle: an angle may be this far outside its limits [rad].
-        slack_share: a length may be this far outside, as a fraction of its range.
-        millimetres_from: a length beyond this multiple of its limits is in millimetres; an angle
-            more than a full turn beyond its limits is in degrees.
-        largest: no joint's position is larger [rad or m].
+        slack_angle: tolerance of an angle beyond its limits [rad].
+        slack_fraction: tolerance of a length beyond its limits, as a fraction of its range.
+        millimetres_from: multiple of its limits beyond which a length may be in millimetres; an
+            angle may be in degrees if it is more than a full turn beyond its limits.
+        largest: largest absolute value of any position [rad or m].
 
     Raises:
-        SceneError: values are in degrees or millimetres, or no joint's positions at all.
+        SceneError: values are in degrees or millimetres, or too large for positions.
     """
     warnings = []
     for frame, row in known.items():
         for name, value in zip(names, row, strict=True):
             if abs(value) > largest:
                 raise SceneError(
-                    f"{path}: column '{name}', frame {frame}: {value:g} is no joint's position; "
-                    "give it in rad or m"
+                    f"{path}: column '{name}', frame {frame}: {value:g} is too large for a "
+                    "joint position; give it in rad or m"
                 )
     for k, name in enumerate(names if known else ()):
         place = model.position_index(name)
@@ -153,7 +156,10 @@ def check_units(
             continue
         values = np.array([row[k] for row in known.values()])
         what, unit, other, scale = "length", "m", "metres", 1e-3
-        slack, most = slack_share * (upper - lower), millimetres_from * max(abs(lower), abs(upper))
+        slack, most = (
+            slack_fraction * (upper - lower),
+            millimetres_from * max(abs(lower), abs(upper)),
+        )
         if is_angle := model.position_kinds[place] == "angle":
             what, unit, other, scale = "angle", "rad", "radians", math.pi / 180.0
             slack = slack_angle
@@ -174,12 +180,12 @@ def check_units(
                 f"{text}, but not in {wrong}: the file seems to be in {wrong}; write every {what} "
                 f"in {other}"
             )
-        why = ": is its column another joint's, its zero or sign another, its unit another?"
+        why = "; check the column's joint, its offset, sign and unit"
         turn = math.copysign(2.0 * math.pi, values[worst])
         if is_angle and lower - slack <= values[worst] - turn <= upper + slack:
             why = (
-                f"; a full turn off, {values[worst] - turn:.4g} rad, it would not: did the encoder "
-                "count a turn too many, or are the column's angles in degrees?"
+                f"; a full turn off, {values[worst] - turn:.4g} rad, it would not; check whether "
+                "the encoder counts a turn too many, or whether the angles are in degrees"
             )
         warnings.append(f"{text}{why}")
     return tuple(warnings)
@@ -196,29 +202,34 @@ def _numbers(cells: Sequence[str], path: Path, line: int) -> np.ndarray:
 
 
 class PlacedCameras(NamedTuple):
-    """Cameras of an episode that are looked at, and the names of those whose pose somebody says."""
+    """Cameras of an episode that are used, and the names of those with a known pose."""
 
     cameras: list[EpisodeCamera]
     placed: frozenset[str]
 
 
 class TreeLog(NamedTuple):
-    """A joint log in a pose tree's terms.
+    """A joint log in the values of a pose tree.
 
-    log: of the values ``asked`` of the tree; names: of all that are logged; unseen: nodes that
-    joints move which are not logged, seen: the others.
+    Args:
+        log: positions of the tree's values ``asked``.
+        asked: indices of the tree's values that are not held.
+        names: names of the logged values.
+        posed: nodes that only logged or held joints move.
+        unposed: all other nodes.
+        warnings: messages for the user.
     """
 
     log: JointLog
     asked: Indices
     names: tuple[str, ...]
-    seen: tuple[str, ...]
-    unseen: tuple[str, ...]
+    posed: tuple[str, ...]
+    unposed: tuple[str, ...]
     warnings: list[str]
 
 
 def is_episode(path: Path, settings: EpisodeSettings) -> bool:
-    """Whether a path is one of pictures and joints, and no scene of masks."""
+    """Return whether a path is an episode (pictures and joint log), not a scene of masks."""
     if path.is_file() or settings.episode is not None:
         return True
     return not (path / "masks").is_dir() and recording_format(path) != ""
@@ -227,14 +238,16 @@ def is_episode(path: Path, settings: EpisodeSettings) -> bool:
 def cameras_of(
     episode: Episode, camera_path: Path | None, settings: EpisodeSettings
 ) -> PlacedCameras:
-    """The cameras that are asked for, or all, as their file has them.
+    """Return the chosen cameras of an episode with the calibration of their camera file.
 
     Args:
-        camera_path: in place of the episode's own.
+        episode: the episode.
+        camera_path: camera file used instead of the episode's own.
+        settings: names of the cameras; all if none are given.
 
     Raises:
-        UnknownNameError: there is no such camera.
-        CameraError: the file cannot be used, or is of other pictures.
+        UnknownNameError: a camera does not exist.
+        CameraError: the file cannot be used, or is for pictures of another size.
     """
     for name in settings.cameras:
         if name not in episode.cameras:
@@ -250,16 +263,25 @@ def cameras_of(
 
 
 def say_left_out(names: Iterable[str], placed: Collection[str]) -> list[str]:
-    """Warnings of cameras that are not used because their pose is not known."""
-    return [f"camera '{name}' has no X_WC: it is left out" for name in names if name not in placed]
+    """Return a warning for each camera that is not used because its pose is unknown."""
+    return [
+        f"camera '{name}' has no X_WC and is left out; drake-pose register finds its pose"
+        for name in names
+        if name not in placed
+    ]
 
 
 def map_log(path: Path, joints: JointLog, tree: PoseTree, settings: EpisodeSettings) -> TreeLog:
-    """The joint log in the tree's terms: which of its values it has, and the nodes that it tells.
+    """Return a joint log in the values of a pose tree; values not logged are the model's defaults.
 
-    Values that are not logged are the model's defaults.
+    Args:
+        path: the episode, for messages.
+        joints: the joint log.
+        tree: the pose tree.
+        settings: joint map and units.
 
-    Raises DrakePoseError: names columns, joints or units at fault.
+    Raises:
+        DrakePoseError: the message names columns, joints or units at fault.
     """
     kinematics = TreeKinematics(tree)
     held = {tree.model.position_names[index] for index in tree.held}
@@ -270,46 +292,49 @@ def map_log(path: Path, joints: JointLog, tree: PoseTree, settings: EpisodeSetti
         joints, names, kinematics.lower[asked], kinematics.upper[asked],
         kinematics.is_angle[asked], units=settings.units, table=table,
     )  # fmt: skip
-    # The nodes that only logged joints move, and the others.
-    told: list[bool] = []
+    # A node is posed if its parent is, and its own joints are logged or held.
+    is_posed: list[bool] = []
     for k, node in enumerate(tree.nodes):
-        above = node.parent < 0 or told[node.parent]
+        above = node.parent < 0 or is_posed[node.parent]
         own = tree.nodes[tree.source(k)].value_names
-        told.append(above and set(own).isdisjoint(mapped.not_logged))
-    nodes = list(zip(tree.nodes, told, strict=True))
-    seen = tuple(node.name for node, is_told in nodes if is_told)
-    unseen = tuple(node.name for node, is_told in nodes if not is_told)
+        is_posed.append(above and set(own).isdisjoint(mapped.not_logged))
+    nodes = list(zip(tree.nodes, is_posed, strict=True))
+    posed = tuple(node.name for node, known in nodes if known)
+    unposed = tuple(node.name for node, known in nodes if not known)
     warnings, positions = list(mapped.warnings), mapped.log.positions
-    if not seen:
+    if not posed:
         raise SceneError(
-            f"{path}: no part of {tree.model.path.name} is moved by joints that are logged alone; "
-            "give a joint map (--joint-map FILE), or hold the others (--hold NAME=VALUE)"
+            f"{path}: every part of {tree.model.path.name} is moved by a joint that is not logged; "
+            "give a joint map (--joint-map FILE), or hold these joints (--hold NAME=VALUE)"
         )
     clipped = int(mapped.clipped.any(axis=1).sum())
     if clipped:
-        # There, or beyond.
+        # Such a reading only bounds the position.
         positions = np.where(mapped.clipped, np.nan, positions)
         warnings.append(
-            f"{clipped} of {len(positions)} rows have a reading at an end of its range, where a "
-            "joint may be beyond it: they are not used"
+            f"{clipped} of {len(positions)} rows are not used: a reading is at an end of its "
+            "range, and the joint may be beyond it"
         )
     default = kinematics.flatten(tree.default_values())[asked]
     missing = np.array([name in mapped.not_logged for name in names])
     log = replace(mapped.log, positions=np.where(missing, default, positions))
     logged = tuple(name for name in names if name not in mapped.not_logged)
-    return TreeLog(log, asked, logged, seen, unseen, warnings)
+    return TreeLog(log, asked, logged, posed, unposed, warnings)
 
 
 def frames_of(camera: EpisodeCamera) -> tuple[str, ...]:
-    """The names of a camera's pictures: their own, or their numbers."""
+    """Return the names of a camera's pictures, six-digit numbers if they have none."""
     return camera.frames or tuple(f"{k:06d}" for k in range(len(camera.times)))
 
 
 def rows_of(log: JointLog, camera: EpisodeCamera, kept: Indices, later: Array) -> Array:
-    """(k, m) a log's positions at some of a camera's pictures, by time or by name.
+    """Return a log's positions (k, m) at pictures of a camera, by time or by name.
 
     Args:
-        later: () or (k,) added to the pictures' times [s]; not used where names are compared.
+        log: the joint log.
+        camera: the camera.
+        kept: (k,) indices of pictures.
+        later: () or (k,) time offset added to the pictures' times [s]; unused without times.
     """
     if is_timed(log, camera):
         return log.at(camera.times[kept] + later)
@@ -318,12 +343,16 @@ def rows_of(log: JointLog, camera: EpisodeCamera, kept: Indices, later: Array) -
 
 
 def is_timed(log: JointLog, camera: EpisodeCamera) -> bool:
-    """Whether times tell which rows are of which pictures."""
+    """Return whether rows of the log belong to pictures by time; else by name."""
     return log.times is not None and bool(np.isfinite(camera.times).any())
 
 
 def kept_pictures(camera: EpisodeCamera, settings: EpisodeSettings) -> Indices:
-    """Which of a camera's pictures are asked for; UnknownNameError: there is no such."""
+    """Return the indices of the chosen pictures of a camera.
+
+    Raises:
+        UnknownNameError: a frame does not exist.
+    """
     if settings.every < 1:
         raise SettingsError(f"every must be 1 or more, not {settings.every}")
     every = frames_of(camera)
@@ -334,21 +363,25 @@ def kept_pictures(camera: EpisodeCamera, settings: EpisodeSettings) -> Indices:
 def read_episode_scene(
     path: Path, settings: EpisodeSettings, joints: Path | None, cameras: Path | None
 ) -> Scene:
-    """An episode's pictures of cameras whose pose is known: a sequence without masks.
+    """Return an episode's cameras with known poses as a scene: a sequence without masks.
 
-    Its frames are some of the first camera's pictures.
+    The frames are the chosen pictures of the first camera; other cameras are synchronised with it.
 
     Args:
-        joints: a table of joint positions, in place of the episode's own.
-        cameras: a camera file, in place of the episode's own.
+        path: the episode.
+        settings: cameras, frames and joint log.
+        joints: table of joint positions used instead of the episode's own.
+        cameras: camera file used instead of the episode's own.
 
-    Raises DrakePoseError: names the file, camera or frame at fault; no camera's pose is known.
+    Raises:
+        DrakePoseError: the message names the file, camera or frame at fault; or no camera's pose is
+            known.
     """
     episode = open_episode(path, joints=joints, episode=settings.episode)
     chosen, placed = cameras_of(episode, cameras, settings)
     if not placed.intersection(one.name for one in chosen):
         raise SceneError(
-            f"{path}: nobody says where a camera stands; find out (drake-pose register), and give "
+            f"{path}: no camera has a pose X_WC; find the poses (drake-pose register), and give "
             "the cameras.yaml that it writes (--cameras FILE)"
         )
     known = {one.name: one for one in chosen if one.name in placed and one.camera is not None}
@@ -359,7 +392,7 @@ def read_episode_scene(
     rate = None if not len(steps) or np.isnan(steps).any() else 1.0 / float(np.median(steps))
     images, readers = dict[tuple[str, str], Path](), dict[str, Callable[[str], Picture]]()
     for name, camera in known.items():
-        numbers = _same_moments(first, kept, camera)
+        numbers = _synchronised_pictures(first, kept, camera)
         images |= {(name, frames[k]): path for k in numbers}
         of_frame = {frames[k]: number for k, number in numbers.items()}
         readers[name] = partial(_read_frame, camera, of_frame)
@@ -371,16 +404,22 @@ def read_episode_scene(
 
 
 def _read_frame(camera: EpisodeCamera, numbers: Mapping[str, int], frame: str) -> Picture:
-    """A camera's picture (H, W, 3) of a frame, by its number."""
+    """Return a camera's picture (H, W, 3) of a frame; ``numbers`` are picture indices by frame."""
     return camera.read(numbers[frame])
 
 
-def _same_moments(
+def _synchronised_pictures(
     first: EpisodeCamera, kept: Indices, other: EpisodeCamera, tolerance: float = 0.5
 ) -> dict[int, int]:
-    """By index into kept, the other camera's picture of the same moment, where it has one.
+    """Return the index of another camera's synchronised picture by index into ``kept``.
 
-    ``tolerance``: largest difference of times, as a fraction of a period.
+    Without times pictures of the same name are synchronised.
+
+    Args:
+        first: the first camera.
+        kept: (k,) indices of its pictures.
+        other: the other camera.
+        tolerance: maximum difference of times, as a fraction of the first camera's period.
     """
     if np.isnan(first.times).any() or np.isnan(other.times).any():
         own = {frame_key(name): k for k, name in enumerate(frames_of(other))}
@@ -394,12 +433,13 @@ def _same_moments(
 
 def logged_positions(
     scene: Scene, tree: PoseTree, settings: EpisodeSettings
-) -> tuple[TrueAngles | None, dict[str, Array], tuple[str, ...]]:
-    """What a scene's joint log says: where joints are in frames, and the plant's positions (nq,).
+) -> tuple[MeasuredPositions | None, dict[str, Array], tuple[str, ...]]:
+    """Return a scene's logged positions, the plant's positions (nq,) by frame, and warnings.
 
-    None and nothing where it has no log; then what a user should know.
+    Without a log the first is None and the others are empty.
 
-    Raises DrakePoseError: names columns, joints or units at fault.
+    Raises:
+        DrakePoseError: the message names columns, joints or units at fault.
     """
     if scene.joints is None:
         return None, {}, ()
@@ -416,4 +456,4 @@ def logged_positions(
     }
     places = [tree.model.position_index(name) for name in mapped.names]
     known = {frame_key(frame): q[places] for frame, q in starts.items()}
-    return TrueAngles(scene.path, mapped.names, known), starts, tuple(mapped.warnings)
+    return MeasuredPositions(scene.path, mapped.names, known), starts, tuple(mapped.warnings)

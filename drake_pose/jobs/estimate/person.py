@@ -1,4 +1,4 @@
-"""One person before several cameras: followed by silhouettes or colours, compared, warned of."""
+"""Estimates of one person with several cameras, by silhouettes or colours, and their warnings."""
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,22 +31,28 @@ from drake_pose.silhouette.pictures.scene_checks import (
 )
 
 FOLLOWED = "followed"
-"""FrameRecord.stopped_by of a frame in which a person was followed."""
+"""FrameRecord.stopped_by of the frames of the method person."""
 
 
 def follow_person(
     inputs: EstimateInputs, result: ResultWriter, overlay: bool, on_stage: OnStage | None
 ) -> tuple[EstimateInputs, Iterator[tuple[FrameRecord, Drawn]]]:
-    """Follows the person through all frames, which are compared with their masks and drawn then.
+    """Estimate a person in all frames.
 
-    A resumed recording is followed as a whole again, if frames are missing.
+    A resumed recording with missing frames is estimated again as a whole.
+
+    Args:
+        inputs: the inputs.
+        result: writer of the result; gets lengths, radius scales, and finally warnings.
+        overlay: whether overlays are drawn.
+        on_stage: called with the progress of each stage.
 
     Returns:
-        What is estimated then, and its frames; once they are written, warnings stand in the result.
+        The inputs with all frames to be written, and an iterator of their records and overlays.
 
     Raises:
         ModelError: the model has no landmarks of a person.
-        SceneError: none of the masks can be read, or fewer than two are there of the first picture.
+        SceneError: no mask can be read, or the first frame of pictures has fewer than two masks.
         SettingsError: in no frame two cameras see a person.
     """
     if result.records.keys() >= set(inputs.frames):
@@ -89,13 +95,18 @@ def follow_person(
 def _follow_colours(
     inputs: EstimateInputs, reader: "_Reader"
 ) -> tuple[PersonCapture, ReadFrame, tuple[str, ...], Array]:
-    """A sequence of pictures of which few have masks: distances (frames,) of contours [pixel]."""
+    """Track a person by colour through pictures with few masks.
+
+    Returns:
+        The capture, a reader of masks, warnings, and the mean distance (frames,) of the contours
+        [pixel].
+    """
     scene, frames = inputs.scene, inputs.frames
     masked = [k for k, frame in enumerate(frames) if len(scene.cameras_of(frame)) > 1]
     if frames[0] not in inputs.starts and 0 not in masked:
         raise SceneError(
-            f"{scene.path}: a person is found by the masks of two cameras or more, but the first "
-            f"frame, '{frames[0]}', has fewer: add them (drake-pose masks), or --start FILE.csv"
+            f"{scene.path}: the first frame, '{frames[0]}', has masks of fewer than two cameras, "
+            "by which the person is found; add masks (drake-pose masks), or --start FILE.csv"
         )
     tree = inputs.model.pose_tree()
     masked = [k for k in masked if len(reader(k)) > 1]
@@ -113,16 +124,16 @@ def _follow_colours(
     lost = [frame for frame, q in zip(frames, captured.q, strict=True) if np.isnan(q).any()]
     if lost:
         text = (
-            f"frame {frame_ranges(lost, frames)}: the person is lost, too little of the contour "
-            "fits the colours; masks of two cameras in such a frame, or its row in --start "
-            "FILE.csv, say where the person is"
+            f"frame {frame_ranges(lost, frames)}: the person is lost: too little of the contour "
+            "fits the colours; add masks of two cameras in the first of these frames, or its row "
+            "in --start FILE.csv"
         )
         faults += (text,)
     return captured, reader, faults, distances
 
 
 class _Reader:
-    """Reads the masks of a frame by camera; one that cannot be read is left out, and said once."""
+    """Reads the masks of frames; masks that cannot be read are left out and recorded."""
 
     def __init__(self, inputs: EstimateInputs, on_stage: OnStage | None) -> None:
         self._scene, self._frames = inputs.scene, inputs.frames
@@ -131,7 +142,7 @@ class _Reader:
         self._read_count = self._followed = 0
 
     def __call__(self, index: int) -> dict[str, Mask]:
-        """The masks of a frame, counted from 0, by camera."""
+        """Return the masks of the frame of this index by camera."""
         frame, masks = self._frames[index], {}
         for camera in self._scene.cameras_of(frame):
             if (camera, frame) not in self.refused:
@@ -141,7 +152,7 @@ class _Reader:
                     self.refused[camera, frame] = str(error)
         require_readable(self.refused, self._scene)
         self._read_count += 1
-        # All masks are read once before anything else is done.
+        # The first pass over all frames reads the masks; later calls belong to later stages.
         count, again = len(self._frames), self._read_count - len(self._frames)
         if again <= 0:
             self._tell("reading", self._read_count, count)
@@ -152,9 +163,9 @@ class _Reader:
         return masks
 
     def count_followed(self, _: int) -> None:
-        """Called after each frame in which the person was followed."""
+        """Count a frame in which the person was tracked."""
         self._followed += 1
-        self._tell("following", self._followed, len(self._frames))
+        self._tell("tracking", self._followed, len(self._frames))
 
     def _tell(self, what: str, done: int, of: int | None) -> None:
         if self.on_stage is not None:
@@ -172,15 +183,22 @@ def _finish(
     seconds: float,
     overlay: bool,
 ) -> tuple[FrameRecord, Drawn]:
-    """A frame with the captured person, of the radius scale that was found, the nodes at X_WN.
+    """Return the record and overlays of a frame of a captured person.
 
     Args:
-        X_WN: (nodes, 4, 4).
-        distance: see above.
+        inputs: the inputs.
+        captured: the capture, with poses of all frames.
+        index: index of the frame.
+        X_WN: (nodes, 4, 4) poses of the body's nodes in the world [m].
+        masks: masks by camera, of the cameras used.
+        reader: reads all masks of the frame.
+        distance: mean distance of the contours [pixel], if the frame was tracked by colour.
+        seconds: time per frame [s].
+        overlay: whether overlays are drawn.
     """
     scene, frame, q = inputs.scene, inputs.frames[index], captured.q[index]
     shown: dict[str, NDArray[np.generic]] = inputs.pictures(frame) if overlay else {}
-    # A camera that was left out is shown, too, so that one sees why.
+    # Overlays show cameras that were left out as well.
     if overlay and len(masks) < len(scene.cameras_of(frame)):
         shown |= reader(index)
     if overlay:
@@ -190,7 +208,7 @@ def _finish(
     parts = draw_parts(captured.outlines, X_WN, [scene.cameras[name] for name in names])
     wrong, area = np.nan, 1.0
     if found and by_colour:
-        # Without masks, E_total is the strip between both contours over the body's area.
+        # Without masks, E_total is the area between both contours divided by the body's area.
         bodies = [own >= 0 for own in parts.values()]
         area = float(sum(map(np.count_nonzero, bodies))) or 1.0
         wrong = sum(map(count_edge_pixels, bodies)) * distance
@@ -203,7 +221,7 @@ def _finish(
 
 
 def describe_faults(checked: CheckedCapture, frames: Sequence[str]) -> tuple[str, ...]:
-    """All that was wrong with a recording whose frames have these names."""
+    """Return all warnings of a checked capture with these names of frames."""
     return (
         *describe_views(checked.views, frames),
         *describe_fit(checked.captured.inlier_ratios.tolist()),
@@ -213,7 +231,7 @@ def describe_faults(checked: CheckedCapture, frames: Sequence[str]) -> tuple[str
 
 
 def describe_views(views: ViewFaults, frames: Sequence[str]) -> tuple[str, ...]:
-    """Warnings of who was in view or was not; one of others, who walk through all views at once."""
+    """Return warnings of frames without the person or with other people in view."""
 
     def listed(*several: Sequence[int]) -> str:
         return frame_ranges({frames[k] for own in several for k in own}, frames)
@@ -221,44 +239,47 @@ def describe_views(views: ViewFaults, frames: Sequence[str]) -> tuple[str, ...]:
     found = []
     if views.nobody:
         found.append(
-            f"frame {listed(views.nobody)}: fewer than two cameras see the person; no pose"
+            f"frame {listed(views.nobody)}: fewer than two cameras see the person, so there is no "
+            "pose; add a camera, or check the masks"
         )
     found += [
-        f"camera '{camera}' sees nobody in frame {listed(indices)}, where others see the person: "
-        "left out there"
+        f"camera '{camera}' sees nobody in frame {listed(indices)}, where others see the person, "
+        "and is left out there; check its masks"
         for camera, indices in views.blind.items()
     ]
     if views.others:
         text = (
             f"frame {listed(*views.others.values())}: somebody else is in view of "
-            f"{_cameras(list(views.others))}; the one who is seen longest and largest is followed"
+            f"{_cameras(list(views.others))}; the person in view longest and largest is tracked"
         )
         if views.merged:
             text += (
-                f"; in {_cameras(list(views.merged))} both are one silhouette (frame "
+                f"; in {_cameras(list(views.merged))} both share a silhouette (frame "
                 f"{listed(*views.merged.values())})"
             )
         found.append(text)
     return tuple(found)
 
 
-def describe_fit(shares: Sequence[float], usual_from: float = 0.6) -> tuple[str, ...]:
-    """A warning of a person of whose contours too little fits in the frames with a pose.
+def describe_fit(inlier_ratios: Sequence[float], usual_from: float = 0.6) -> tuple[str, ...]:
+    """Return a warning if the contours fit badly in the frames with a pose.
 
-    ``usual_from``: the least fraction of the contours that fits where the person is in the masks.
+    Args:
+        inlier_ratios: (frames,) inlier ratio of the contours; 0 without a pose.
+        usual_from: minimum inlier ratio if the masks show the person.
     """
-    usual = float(np.median([share for share in shares if share > 0.0] or [1.0]))
+    usual = float(np.median([ratio for ratio in inlier_ratios if ratio > 0.0] or [1.0]))
     if usual > usual_from:
         return ()
     text = (
         f"only {100.0 * usual:.0f} % of the contours fit in the median frame, where 90 % are "
-        "usual: do the masks show one person, and are cameras.yaml and the folders' names right?"
+        "usual; check that the masks show one person, cameras.yaml, and the folders' names"
     )
     return (text,)
 
 
 def describe_alternatives(captured: PersonCapture, frames: Sequence[str]) -> tuple[str, ...]:
-    """Warnings of frames that another pose explains as well, and where it differs."""
+    """Return warnings of frames that another pose fits equally well, with the parts that differ."""
     model, found = captured.tree.model, []
     marks = load_landmarks(model.path)
     for k, alternatives in sorted(captured.alternatives.items()):
@@ -269,59 +290,59 @@ def describe_alternatives(captured: PersonCapture, frames: Sequence[str]) -> tup
             off = np.linalg.norm(np.subtract(here, there), axis=1)
             far = [name for name, one in zip(marks, off, strict=True) if one > 0.5 * off.max()]
             found.append(
-                f"frame {frames[k]}: another pose explains the silhouettes as well (mode "
-                f"{number} in modes.csv): {', '.join(far)} up to {1e3 * off.max():.0f} mm "
-                "elsewhere; look at the overlays, or add a camera"
+                f"frame {frames[k]}: another pose fits the silhouettes equally well (mode {number} "
+                f"in modes.csv), with {', '.join(far)} up to {1e3 * off.max():.0f} mm elsewhere; "
+                "check the overlays, or add a camera"
             )
     return tuple(found)
 
 
 def describe_rig(rig: RigFault | None) -> tuple[str, ...]:
-    """Warnings of a calibration that the silhouettes contradict as a whole."""
+    """Return a warning of a calibration with which no body fits all silhouettes; empty for None."""
     if rig is None:
         return ()
     worst = min(rig.filled, key=lambda name: rig.filled[name])
-    what = ": are cameras.yaml, the folders' names or the masks wrong?"
+    what = "; check cameras.yaml, the folders' names and the masks"
     if rig.exchanged:
         what = (
-            f" until the masks of {_cameras(rig.exchanged)} are exchanged: done for this result; "
-            "correct the folders' names, or those in cameras.yaml"
+            f" unless the masks of {_cameras(rig.exchanged)} are exchanged, which was done for "
+            "this result; correct the folders' names, or those in cameras.yaml"
         )
     elif rig.mirrored:
         what = (
-            f" until the masks of {_cameras(rig.mirrored)} are mirrored, left for right: done for "
-            "this result, as cameras.yaml is taken for right; if the cameras were calibrated from "
-            "mirrored pictures, left and right are exchanged in it: calibrate again"
+            f" unless the masks of {_cameras(rig.mirrored)} are mirrored left to right, which was "
+            "done for this result; mirror the masks, or, if the cameras were calibrated from "
+            "mirrored pictures, calibrate again"
         )
     filled = f"{100.0 * rig.filled[worst]:.0f} % of camera '{worst}'"
     return (f"no body fills all silhouettes ({filled}){what}",)
 
 
 def describe_camera(fault: CameraFault, frames: Sequence[str]) -> str:
-    """What is said of a camera that contradicts the others."""
+    """Return the warning of a camera that is inconsistent with the others."""
     motion = fault.motion
     since = "" if fault.first == 0 else f" since frame {frames[fault.first]}"
-    action = f"left out{since}" if fault.is_left_out else "used all the same"
+    action = f"left out{since}" if fault.is_left_out else "still used"
     whose = _cameras([fault.name, *fault.alternatives], "or")
     if not fault.is_explained:
         return (
-            f"{whose} contradicts the others{since}: {100.0 * motion.inlier_ratio_before:.0f} % of "
-            "its contours fit what they see, "
-            f"{100.0 * fault.others_inlier_ratio:.0f} % of theirs do; "
-            f"{action}. Are its masks poor, mirrored or another camera's, or has it moved far?"
+            f"{whose} is inconsistent with the others{since}: "
+            f"{100.0 * motion.inlier_ratio_before:.0f} % of its contours fit the body, "
+            f"{100.0 * fault.others_inlier_ratio:.0f} % of theirs; it is {action}. Check whether "
+            "its masks are poor, mirrored or another camera's, and whether it has moved"
         )
     right, down = motion.shift
     return (
-        f"{whose} has moved{since} after it was calibrated: what the others see lies "
-        f"{motion.pixels:.1f} pixels off in its pictures ({abs(right):.1f} to the "
+        f"{whose} has moved{since} after its calibration: the body that the others see is off by "
+        f"{motion.pixels:.1f} pixels in its pictures ({abs(right):.1f} to the "
         f"{'right' if right > 0 else 'left'}, {abs(down):.1f} {'down' if down > 0 else 'up'}, "
-        f"turned by {np.degrees(motion.turn):.1f} degrees), {100.0 * motion.metres:.0f} cm at "
-        f"the person; {action}: calibrate it again"
+        f"rotated by {np.degrees(motion.turn):.1f} degrees), {100.0 * motion.metres:.0f} cm at "
+        f"the person; it is {action}; calibrate it again"
     )
 
 
 def _cameras(names: Sequence[str], word: str = "and") -> str:
-    """Cameras as text."""
+    """Return a text such as ``cameras 'a', 'b' and 'c'``."""
     *most, last = [f"'{name}'" for name in names]
     if not most:
         return f"camera {last}"

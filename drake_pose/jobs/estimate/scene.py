@@ -61,19 +61,23 @@ def estimate_scene(
 ) -> SceneEstimate:
     """Estimate the positions of a body in every frame of a scene.
 
+    If interrupted (KeyboardInterrupt), the finished frames are kept in ``out``.
+
     Args:
-        scene: cameras.yaml and masks/<camera>/<frame>.png; or masks/<frame>.png alone, of a camera
-            is not calibrated; or an episode (``open_episode``), followed from where its log begins.
-        out, resume: folder for the result, None writes nothing; to go on with an interrupted one.
-        settings: which cameras and frames, the root, the sampling.
-        truth: measured joint positions to compare with; None: joint_angles.csv, the episode's log.
-        cameras: a camera file in place of the scene's own.
+        scene: folder with cameras.yaml and masks/<camera>/<frame>.png, or with masks/<frame>.png of
+            an uncalibrated camera; or an episode (``open_episode``), tracked from its first pose.
+        model: the model file.
+        out: folder for the result; None writes nothing.
+        settings: cameras, frames, root and method; None: defaults.
+        truth: measured joint positions to compare with; None: joint_angles.csv or joint log.
+        cameras: camera file used instead of the scene's own.
+        resume: continue the interrupted result in ``out``.
         replay, overlay: whether replay.html and overlays are written.
-        on_frame, on_stage: called after each frame; with what is done before the first one.
+        on_frame: called after each frame.
+        on_stage: called with the progress of stages before the first frame.
 
-    Returns the estimate. Interrupted (KeyboardInterrupt), the finished frames are in ``out``.
-
-    Raises DrakePoseError: names the file, camera, frame, link or joint at fault.
+    Raises:
+        DrakePoseError: the message names the file, camera, frame, link or joint at fault.
     """
     settings, folder = settings or EstimateSettings(), None if out is None else Path(out)
     known, own = (None if one is None else Path(one) for one in (truth, cameras))
@@ -110,9 +114,10 @@ def estimate_scene(
 def estimate_frames(
     inputs: EstimateInputs, search: PoseSearch, missing: Sequence[str]
 ) -> Iterator[tuple[str, PoseEstimate]]:
-    """The missing frames' poses: those that are known, then those of the matching diagram.
+    """Yield name and pose of each missing frame: known estimates, then those of a Drake diagram.
 
-    Raises SettingsError where a frame has no picture.
+    Raises:
+        SettingsError: a frame has no picture.
     """
     begun: PoseEstimate | None = None
     for frame, begun in inputs.known.items():
@@ -121,8 +126,8 @@ def estimate_frames(
     left = [frame for frame in missing if frame not in inputs.known]
     if not left:
         return
-    # What colours and starts say of a frame depends on those before: they are followed again. So
-    # is a track from the last frame that is known.
+    # A track by colour, from a start, or from the last known frame depends on all frames before the
+    # missing ones, which are therefore played again.
     follows = bool(inputs.scene.images or inputs.starts or inputs.known)
     played = inputs.frames[max(len(inputs.known) - 1, 0) :] if follows else left
     rate_hz = inputs.scene.frame_rate_hz or USUAL_RATE_HZ
@@ -132,7 +137,7 @@ def estimate_frames(
     )  # fmt: skip
     simulator = Simulator(matching.diagram)
     for index, frame in enumerate(played):
-        # The frame is matched at index periods; half a period later the answer surely stands.
+        # The frame is matched at index / rate_hz; half a period later its output is up to date.
         simulator.AdvanceTo((index + 0.5) / rate_hz)
         if frame in left:
             context = simulator.get_context()
@@ -146,7 +151,7 @@ def estimate_frames(
                     place = (inputs.root_positions or {}).get(frame)
                     pose = search.with_intervals(pose, views, place, before)
                 else:
-                    # What has no mask is as sure as its contours said.
+                    # Without masks, the intervals come from the fitted contours.
                     own = matching.with_intervals(context) if was_tracked else pose
                     pose = own.widened(before)
             begun = begun if was_tracked else pose
@@ -154,14 +159,14 @@ def estimate_frames(
 
 
 def _views(scene: Scene, frame: str) -> list[View]:
-    """A frame's masks, each with its camera."""
+    """Return the masks of a frame with their cameras."""
     return [View(scene.cameras[name], scene.read(name, frame)) for name in scene.cameras_of(frame)]
 
 
 def match_frames(
     inputs: EstimateInputs, search: PoseSearch, overlay: bool, missing: Sequence[str]
 ) -> Iterator[tuple[FrameRecord, Drawn]]:
-    """The missing frames, matched or tracked, compared with their masks and drawn."""
+    """Yield record and overlays of each missing frame."""
     scene, model = inputs.scene, inputs.model
     tree = model.pose_tree()
     surfaces = TreeSurfaces(tree)
@@ -179,7 +184,7 @@ def match_frames(
             values = tree.values_from_positions(pose.q)
             parts = draw_parts(surfaces.at(values), pose.X_WB @ tree.node_poses(values), cameras)
             more["first_E_total"] = pose.first_E_total
-        # A search that does not say how sure it is knows nothing of any joint.
+        # Without a pose set no joint has an interval.
         nothing = np.full(len(pose.q), np.nan)
         known = record_pose_set(pose.pose_set, search.tree) or {
             "joints": record_deviations(model, pose.q, nothing)
@@ -196,22 +201,26 @@ def compare_cameras(
     records: Mapping[str, FrameRecord],
     on_stage: OnStage | None,
     doubtful: float = 0.12,
-    left_share: float = 0.5,
+    inconsistent_below: float = 0.5,
     frame_count: int = 2,
     pair_count: int = 3,
 ) -> list[str]:
-    """A warning of cameras that contradict each other; few frames are matched again for it.
+    """Return a warning of cameras that are exchanged or inconsistent, if the poses fit badly.
 
-    Nothing is matched where the poses fit.
+    A few frames are searched again with single cameras, and with exchanged masks.
 
     Args:
-        doubtful: median E_total from which two cameras are compared. More are compared only where
-            the pictures are explained badly: a real person in four leaves 15 to 18 %, and one of
-            several that disagrees is known by its IoU.
-        left_share: cameras contradict each other where each alone leaves less than this fraction
-            of what all together leave; and what is put right leaves as little.
-        frame_count: how many frames are compared.
-        pair_count: how many pairs of cameras are tried exchanged.
+        inputs: the inputs.
+        search: the search.
+        records: estimates by frame.
+        on_stage: called before the comparison.
+        doubtful: median E_total from which two cameras are compared. Three or more are compared
+            only from BADLY_EXPLAINED on: a real person before four cameras has an E_total of 15 to
+            18 %, and a single inconsistent camera is detected by its IoU.
+        inconsistent_below: cameras are inconsistent if the E_total of single cameras is less than
+            this fraction of that of all cameras; the same threshold confirms an exchange.
+        frame_count: number of frames that are compared.
+        pair_count: number of pairs of cameras whose masks are exchanged.
     """
     scene, cameras = inputs.scene, inputs.scene.cameras
     known = {f: one.E_total for f, one in records.items() if one.E_total is not None}
@@ -220,7 +229,7 @@ def compare_cameras(
     if scene.images or len(cameras) < 2 or usual < least:
         return []
     whole = [f for f in known if all((name, f) in scene.masks for name in cameras)]
-    # The usual ones: in the worst, there may be more that is wrong.
+    # Frames near the median error: the worst may have other faults as well.
     chosen = sorted(whole, key=lambda frame: abs(known[frame] - usual))[:frame_count]
     if not chosen:
         return []
@@ -229,7 +238,7 @@ def compare_cameras(
     masks = {frame: {name: scene.read(name, frame) for name in cameras} for frame in chosen}
 
     def error(owners: Mapping[str, str]) -> float:
-        """E_total, mean over the frames, each camera given the mask of another (or its own)."""
+        """Return the mean E_total if each camera has the mask of the camera ``owners[name]``."""
         errors = []
         for frame, own in masks.items():
             views = [View(cameras[name], own[other]) for name, other in owners.items()]
@@ -244,42 +253,42 @@ def compare_cameras(
     alike = [pair for pair in combinations(worst, 2) if sizes[pair[0]] == sizes[pair[1]]]
     for one, other in alike[:pair_count]:
         after = error({n: {one: other, other: one}.get(n, n) for n in cameras})
-        if after < left_share * together:
+        if after < inconsistent_below * together:
             return [
-                f"cameras '{one}' and '{other}' are exchanged, it seems: E_total is "
-                f"{percent(together)} together, but {percent(after)} with each other's pictures; "
-                "exchange their folders of masks, or their names in cameras.yaml"
+                f"cameras '{one}' and '{other}' seem to be exchanged: E_total is "
+                f"{percent(together)}, but {percent(after)} with each other's masks; exchange "
+                "their folders of masks, or their names in cameras.yaml"
             ]
     alone = {name: error({name: name}) for name in cameras}
     areas = [sum(float(own[name].sum()) for own in masks.values()) for name in cameras]
     bad: Sequence[str] = [name for name in cameras if alone[name] >= BADLY_EXPLAINED]
     good = [alone[name] for name in cameras if name not in bad]
-    if np.average(list(alone.values()), weights=areas) < left_share * together:
+    if np.average(list(alone.values()), weights=areas) < inconsistent_below * together:
         left = {
             n: error({m: m for m in worst if m != n}) for n in worst[:pair_count] if len(worst) > 2
         }
         first = min(left, key=lambda name: left[name], default="")
-        bad = [first] if first and left[first] < left_share * together else list(cameras)
-    # A camera whose place the model's own contradicts is not explained even alone.
-    elif not (bad and good and max(good) < left_share * min(alone[name] for name in bad)):
+        bad = [first] if first and left[first] < inconsistent_below * together else list(cameras)
+    # A single camera with a wrong pose may fit badly even alone.
+    elif not (bad and good and max(good) < inconsistent_below * min(alone[name] for name in bad)):
         return []
     names = " and ".join(f"'{name}'" for name in bad)
-    what = f"cameras {names} contradict each other"
+    what = f"cameras {names} are inconsistent"
     if len(bad) < len(alone):
         others = "the others" if len(alone) > 2 else "the other one"
-        what = f"camera {names} contradicts {others}"
+        what = f"camera {names} is inconsistent with {others}"
     each = ", ".join(f"'{name}' {percent(left)}" for name, left in alone.items())
     return [
-        f"{what}: E_total is {percent(together)} together, alone {each}; has one moved since it "
-        "was calibrated, are masks of another camera or instant, is X_WC the camera's pose in the "
-        "world, in metres?"
+        f"{what}: E_total is {percent(together)} together, alone {each}; check whether a camera "
+        "has moved since its calibration, whether masks belong to another camera or time, and "
+        "whether X_WC is the camera's pose in the world, in metres"
     ]
 
 
 def _match_again(
     inputs: EstimateInputs, search: PoseSearch, frame: str, views: Sequence[View]
 ) -> PoseEstimate:
-    """A frame's pose without what else looks the same."""
+    """Search a frame's pose again, without alternative poses."""
     if isinstance(search, (BeamSearch, MultiStartSearch)):
         search = search.without_alternatives()
     return search.match(views, (inputs.root_positions or {}).get(frame))
@@ -291,11 +300,15 @@ def check_track(
     records: Mapping[str, FrameRecord],
     elsewhere: float = 0.2,
 ) -> list[str]:
-    """A warning of a track that follows a wrong pose: its worst frame is matched by itself for it.
+    """Return a warning if the track follows a wrong pose.
 
-    Nothing is matched where all frames fit nearly as well as those in which a pose was searched.
+    If the worst tracked frame fits clearly worse than the searched frames, it is searched as well.
 
-    ``elsewhere``: a joint that is off by more is named [rad or m].
+    Args:
+        inputs: the inputs.
+        search: the search.
+        records: estimates by frame.
+        elsewhere: minimum difference of a joint to be named in the warning [rad or m].
     """
     searched, tracked = list[float](), dict[str, float]()
     for frame, one in records.items():
@@ -316,15 +329,14 @@ def check_track(
     model, q = inputs.model, records[worst].q
     off = nearest_turn(found.q, q, model.periodic) - q
     joints = [model.position_names[k] for k in np.flatnonzero(np.abs(off) > elsewhere)]
-    where = f", with {listed(joints)} elsewhere" if joints else ""
+    where = f", with other positions of {listed(joints)}" if joints else ""
     return [
-        f"frame '{worst}': tracked it leaves {percent(tracked[worst])} of the silhouettes' area, "
-        f"matched by itself {percent(found.E_total)}{where}: its pose is wrong, and so may be the "
-        "others, if the track began with a wrong one; match all by themselves (--no-track) and "
-        "compare"
+        f"frame '{worst}': E_total is {percent(tracked[worst])} by tracking, but "
+        f"{percent(found.E_total)} by a search{where}: its pose is wrong, and those of other "
+        "frames may be; search every frame (--no-track) and compare"
     ]
 
 
 def _is_worse(error: float, other: float) -> bool:
-    """Whether a pose that leaves one E_total fits clearly worse than one that leaves another."""
+    """Return whether an E_total is clearly larger than another."""
     return error > max(1.2 * other, other + 0.01)

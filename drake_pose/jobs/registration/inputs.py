@@ -26,7 +26,7 @@ from drake_pose.jobs.estimate.measurements import (
     is_timed,
     kept_pictures,
     map_log,
-    read_true_angles,
+    read_measured_positions,
     rows_of,
 )
 from drake_pose.jobs.registration.positions import (
@@ -213,7 +213,7 @@ def _own_joints(scene: Path, robot: ArticulatedModel, settings: AuditSettings) -
     if not path.is_file():
         return None
     try:
-        known = {*read_true_angles(path, robot.position_names).names}
+        known = {*read_measured_positions(path, robot.position_names).names}
     except UnknownNameError:  # It is another model's.
         return None
     tree = make_tree(robot, EstimateSettings(hold=settings.hold))
@@ -239,11 +239,11 @@ def _read_episode(
         tree = target.tree(np.eye(4))
     mapped = map_log(path, episode.joints, tree, settings)
     warnings = [*episode.warnings, *robot.warnings, *mapped.warnings]
-    if mapped.unseen:
+    if mapped.unposed:
         warnings.append(
-            "parts that joints move which are not logged are not looked at: "
-            f"{', '.join(mapped.unseen)}; where these joints stand still say so: --hold NAME=VALUE "
-            "[deg or m]"
+            f"these parts are not used, as a joint that moves them is not logged: "
+            f"{', '.join(mapped.unposed)}; hold joints that do not move (--hold NAME=VALUE, [deg "
+            "or m])"
         )
     chosen, placed = cameras_of(episode, cameras, settings)
     known = {one.name: _known_camera(one) for one in chosen}
@@ -255,7 +255,7 @@ def _read_episode(
         given_cameras=tuple(one for name, one in known.items() if name in placed),
         assumed_focal=frozenset(one.name for one in chosen if one.camera is None),
         recordings={one.name: _recording(one, mapped, default, settings) for one in chosen},
-        visible_nodes=(TARGET,) if target else mapped.seen if mapped.unseen else None,
+        visible_nodes=(TARGET,) if target else mapped.posed if mapped.unposed else None,
         target=target,
     )  # fmt: skip
     if not isinstance(settings, RegistrationSettings):
@@ -336,7 +336,7 @@ def _read_masks(
     searched, held = _select_cameras(scene, file, settings)
     table, target = None, _read_target(robot, settings)
     if joints is not None and target is None:
-        table = read_true_angles(joints, robot.position_names)
+        table = read_measured_positions(joints, robot.position_names)
     if joints is None or (table is not None and table.is_estimate):
         # Only measured joint positions tell these.
         for name in ("zeros", "lengths", "focal", "on", "suggest"):

@@ -18,7 +18,11 @@ from drake_pose.errors import SceneError
 from drake_pose.files.records import base_pose
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.inputs import missing_for_person
-from drake_pose.jobs.estimate.measurements import TrueAngles, check_units, read_true_angles
+from drake_pose.jobs.estimate.measurements import (
+    MeasuredPositions,
+    check_units,
+    read_measured_positions,
+)
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.person.shape import shape_parts
 
@@ -64,7 +68,9 @@ class KnownPositions:
         return bool((np.ptp(np.array(list(rows)), axis=0) < same).all())
 
 
-def put_on_base(model: ArticulatedModel, table: TrueAngles) -> tuple[ArticulatedModel, TrueAngles]:
+def put_on_base(
+    model: ArticulatedModel, table: MeasuredPositions
+) -> tuple[ArticulatedModel, MeasuredPositions]:
     """A model and its positions on BASE_JOINTS that move all of it as the table's bases say.
 
     Raises ModelError: the file is no URDF.
@@ -79,14 +85,14 @@ def put_on_base(model: ArticulatedModel, table: TrueAngles) -> tuple[Articulated
         place = X[:3, 3] - first[:3, 3]
         values[frame] = np.concatenate([table.values[frame][kept], place, turns])
     names = (*(table.names[k] for k in kept), *BASE_JOINTS)
-    return moved, TrueAngles(table.path, names, values, is_estimate=table.is_estimate)
+    return moved, MeasuredPositions(table.path, names, values, is_estimate=table.is_estimate)
 
 
 def read_known_positions(
     path: Path,
     kinematics: TreeKinematics,
     unobserved: bool = False,
-    table: TrueAngles | None = None,
+    table: MeasuredPositions | None = None,
 ) -> KnownPositions:
     """Reads a table with the column frame and one for each joint that is not held.
 
@@ -101,7 +107,7 @@ def read_known_positions(
         UnknownNameError: the model has no joint of a column's name.
     """
     model = kinematics.tree.model
-    table = table or read_true_angles(path, model.position_names)
+    table = table or read_measured_positions(path, model.position_names)
     held = {model.position_names[index] for index in kinematics.tree.held}
     asked = [name for name in kinematics.names if name not in held]
     missing = [name for name in asked if name not in table.names]

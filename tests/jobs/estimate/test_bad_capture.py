@@ -192,8 +192,8 @@ def test_who_was_in_view():
 @pytest.mark.parametrize(
     ("mirrored", "exchanged", "what"),
     [
-        (("a",), (), "until the masks of camera 'a' are mirrored"),
-        ((), ("a", "b"), "until the masks of cameras 'a' and 'b' are exchanged"),
+        (("a",), (), "unless the masks of camera 'a' are mirrored"),
+        ((), ("a", "b"), "unless the masks of cameras 'a' and 'b' are exchanged"),
         ((), (), "are cameras.yaml, the folders' names or the masks wrong?"),
     ],
 )
@@ -208,11 +208,11 @@ def test_a_camera_that_moved_or_contradicts():
     moved = CameraFault("a", motion, True, (), 0.95, 2, True)
     unclear = CameraFault("a", motion, False, ("b",), 0.95)
     first, second = (describe_camera(one, NAMED) for one in (moved, unclear))
-    assert first.startswith("camera 'a' has moved since frame 2 after it was calibrated")
+    assert first.startswith("camera 'a' has moved since frame 2 after its calibration")
     assert "5.0 pixels off in its pictures (3.0 to the right, 4.0 up" in first
     assert "left out since frame 2" in first
-    assert second.startswith("camera 'a' or 'b' contradicts the others: 50 % of its")
-    assert "used all the same" in second
+    assert second.startswith("camera 'a' or 'b' is inconsistent with the others: 50 % of its")
+    assert "still used" in second
 
 
 def test_who_fits_badly():

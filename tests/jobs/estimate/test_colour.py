@@ -239,7 +239,7 @@ def test_frames_are_chosen_and_truth_is_of_the_same_moments(episode):
 def test_cameras_of_another_file_are_taken(episode, tmp_path):
     scene, painted = episode
     nowhere = edit_camera(scene / "cameras.yaml", "camera", tmp_path / "nowhere.yaml", X_WC=None)
-    with pytest.raises(SceneError, match="nobody says where a camera stands; find out"):
+    with pytest.raises(SceneError, match="no camera has a pose X_WC; find"):
         estimate_scene(scene, painted.path, cameras=nowhere)
     save_cameras(tmp_path / "small.yaml", [painted.camera.resized(160, 120)])
     with pytest.raises(CameraError, match="has 160 x 120 pixels"):

@@ -4,7 +4,7 @@ import pytest
 
 from drake_pose.csv_files import read_csv
 from drake_pose.errors import SceneError, UnknownNameError
-from drake_pose.jobs.estimate.measurements import read_joint_centres, read_true_angles
+from drake_pose.jobs.estimate.measurements import read_joint_centres, read_measured_positions
 
 CENTRES = "frame,joint,x,y,z\n0,ankle,1,2,3\n0,knee,4,5,6\n7,ankle,-1,-2,-3\n"
 
@@ -52,7 +52,7 @@ def test_joint_centres_that_are_not_there_are_named(tmp_path: Path) -> None:
 
 def test_true_angles(tmp_path: Path) -> None:
     path = written(tmp_path / "angles.csv", "frame,b,a\n3,0.5,-1\n")
-    truth = read_true_angles(path, ["a", "b", "c"])
+    truth = read_measured_positions(path, ["a", "b", "c"])
     assert truth.names == ("b", "a")
     values = truth.of("0003")
     assert values is not None
@@ -60,10 +60,12 @@ def test_true_angles(tmp_path: Path) -> None:
     assert truth.of("0004") is None
     assert truth.of("still") is None
     # A number of so many digits is one to nobody.
-    assert read_true_angles(written(path, f"frame,b\n{'9' * 5000},0\n"), ["b"]).of("9") is None
+    assert (
+        read_measured_positions(written(path, f"frame,b\n{'9' * 5000},0\n"), ["b"]).of("9") is None
+    )
     path = written(tmp_path / "angles.csv", "frame,b,d\n3,0.5,-1\n")
     with pytest.raises(UnknownNameError, match=r"angles.csv.*'d'.*a, b, c"):
-        read_true_angles(path, ["a", "b", "c"])
+        read_measured_positions(path, ["a", "b", "c"])
 
 
 @pytest.mark.parametrize(("sign", "name"), [(";", "semicolons"), ("\t", "tabs")])

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from drake_pose.body import load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.errors import SceneError
-from drake_pose.jobs.estimate.measurements import read_true_angles
+from drake_pose.jobs.estimate.measurements import read_measured_positions
 from drake_pose.jobs.registration.positions import (
     KnownPositions,
     put_on_base,
@@ -74,7 +74,7 @@ def test_a_base_that_moves_becomes_joints(tmp_path: Path) -> None:
     ends = ["error,seconds", *["0.1,1"] * 3]
     text = "\n".join(f"{line},{end}" for line, end in zip(lines, ends, strict=True))
     (tmp_path / "poses.csv").write_text(text)
-    table = read_true_angles(tmp_path / "poses.csv", model.position_names)
+    table = read_measured_positions(tmp_path / "poses.csv", model.position_names)
     moved, table = put_on_base(model, table)
     kinematics = TreeKinematics(moved.pose_tree())
     found = read_known_positions(table.path, kinematics, table=table)

@@ -77,8 +77,8 @@ def grow(
     pairs = pairs[ordered]
     # The unreachable area is known only after placing the node: place more, and rank again.
     grown = width if limit < np.inf else 2 * width
-    chosen, made, looked_at = store.choose(partial, made, node, pairs, grown, limit)
-    lost = lost or len(looked_at) < len(pairs)
+    chosen, made, examined = store.choose(partial, made, node, pairs, grown, limit)
+    lost = lost or len(examined) < len(pairs)
     if limit == np.inf:
         best = np.argsort(made.costs(outside_weight), kind="stable")[:width]
         lost = lost or len(best) < len(made)

@@ -139,11 +139,11 @@ def _project_ball(
         nearness = one / max(depth, least)
         column = focal_x * (xx * p + xy * q + xz * r + x0) * nearness + center_x
         row = focal_y * (yx * p + yy * q + yz * r + y0) * nearness + center_y
-        seen = (depth >= least) & (column > low_x) & (column < high_x)
-        seen = seen & (row > low_y) & (row < high_y)
+        visible = (depth >= least) & (column > low_x) & (column < high_x)
+        visible = visible & (row > low_y) & (row < high_y)
         columns[k] = column
         rows[k] = row
-        scales[k] = pixels * nearness if seen else np.float32(0.0)
+        scales[k] = pixels * nearness if visible else np.float32(0.0)
 
 
 @compiled
@@ -316,23 +316,23 @@ class CoarseSearch:
 
     def _prepare(self, view: View, levels: int = 10) -> CoarseView:
         """Return a silhouette with its lookup tables; ``levels``: number of tabulated radii."""
-        own, body = self._settings, self.body
+        settings, body = self._settings, self.body
         points = spread_points(view.mask)
-        slack, least_cell = own.slack * self._size, max(1.0, self._size / own.cells)
+        slack, least_cell = settings.slack * self._size, max(1.0, self._size / settings.cells)
         largest = max(max((float(r.max(initial=0.0)) for r in body.ball_radii), default=0.0), 1e-6)
         # Balls with their centre outside the image do not count, and a ball as large as the image
         # covers all points, so larger radii are not needed.
         scale = float(view.camera.kernel_parameters()[1])
         if not isinstance(view.camera, ParallelCamera):
             nearest = float(body.root_distances(view.camera).min())
-            scale /= max(1e-6, own.nearest * nearest)
+            scale /= max(1e-6, settings.nearest * nearest)
         reach = min(largest * scale, math.hypot(*view.mask.shape)) + slack
         radii = np.linspace(0.15, 1.0, levels) * reach
         origin = np.maximum(points.min(axis=0) - reach, -1.0)
         end = np.minimum(points.max(axis=0) + reach, np.add(view.mask.shape, 1.0))
-        cell = max(least_cell, float((end - origin).max()) / own.most_cells)
+        cell = max(least_cell, float((end - origin).max()) / settings.most_cells)
         rows, columns = np.ceil((end - origin) / cell).astype(int)
-        parts = max(1, min(own.parts, round(cell)))
+        parts = max(1, min(settings.parts, round(cell)))
         cover = np.zeros((levels, rows, columns, 4), dtype=np.uint64)
         fill_cover(cover, points, origin, cell, radii)
         # Signed distances at the centres of the cells' parts.
@@ -441,20 +441,20 @@ class CoarseSearch:
         Returns:
             The new hypotheses, and the points that they cover.
         """
-        own, balls, X_PN = self._settings, self.balls[node], self.body.sampled.X_PN[node]
+        settings, balls, X_PN = self._settings, self.balls[node], self.body.sampled.X_PN[node]
         parent = self._nodes[node].parent
         X_WP = np.tile(np.eye(4), (len(poses), 1, 1)) if parent < 0 else poses.X_WN[:, parent]
         X_CPs = [np.ascontiguousarray(view.X_CW @ X_WP) for view in self.views]
         added = np.zeros((len(poses), len(X_PN)))
 
         def score(part: slice) -> list[np.ndarray]:
-            weight = own.outside_weight
+            weight = settings.outside_weight
             return [
                 score_samples(view, X_CP[part], balls, mask[part], weight, added[part])
                 for view, X_CP, mask in zip(self.views, X_CPs, masks, strict=True)
             ]
 
-        step = max(1, own.batch // len(X_PN))
+        step = max(1, settings.batch // len(X_PN))
         parts = [slice(k, k + step) for k in range(0, len(poses), step)]
         united = [np.concatenate(one) for one in zip(*map_ordered(score, parts), strict=True)]
         costs = (poses.costs[:, None] + added).ravel()
@@ -463,9 +463,9 @@ class CoarseSearch:
             costs[(np.arange(len(X_PN)) != poses.samples[:, parent, None]).ravel()] = np.inf
         following = [i for i in self.body.limb_order if i not in placed]
         widest = len(self.body.sampled.X_PN[following[0]]) if following else 1
-        width = min(hypotheses, max(own.least_hypotheses, own.evaluations // widest))
+        width = min(hypotheses, max(settings.least_hypotheses, settings.evaluations // widest))
         possible = int(np.count_nonzero(costs < np.inf))
-        for spare in own.spares:
+        for spare in settings.spares:
             pool = min(possible, spare * width)
             best = np.argpartition(costs, pool - 1)[:pool]
             best = best[np.lexsort((best, costs[best]))]
@@ -494,11 +494,11 @@ class CoarseSearch:
             own: (n, 4, 4) poses of the node that was placed.
             placed: the nodes that are placed, this one included.
         """
-        is_open = [i for i in sorted(placed) if not placed.issuperset(self._nodes[i].children)]
-        if not is_open:
+        open_nodes = [i for i in sorted(placed) if not placed.issuperset(self._nodes[i].children)]
+        if not open_nodes:
             return np.arange(len(of))
         lever, points = 0.15 * self._reach, []
-        for i in is_open:
+        for i in open_nodes:
             X = own if i == node else X_WN[of, i]
             p = X[:, :3, 3]
             points += [p, p + lever * X[:, :3, 0], p + lever * X[:, :3, 2]]

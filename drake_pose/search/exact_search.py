@@ -67,23 +67,23 @@ class ExactSearch:
             deadline: time.perf_counter() at which the search ends [s].
 
         Returns:
-            The pose; None if J of all poses is hopelessly large, or the time is up.
+            The pose; None if J of all poses of some grid is hopelessly large, or the time is up.
         """
-        own, length, reached = self._settings, problem.border_length, None
+        settings, length, reached = self._settings, problem.border_length, None
         for grid in self._grids:
             left = deadline - time.perf_counter()
             if left <= 0.0:
                 return None
             views = problem.views
-            starts = grid.best_poses(views, root_position, own.starts, own.overlap, left)
+            starts = grid.best_poses(views, root_position, settings.starts, settings.overlap, left)
             poses = [self.body.parameters(start, root_position) for start in starts]
             found = self._descend(problem, poses, deadline)
             if found is None:
                 return None
             pair = [*([reached] if reached else []), found]
             reached, worse = min(pair, key=lambda one: one.J), max(one.J for one in pair)
-            agree = len(pair) > 1 and worse <= own.agreement * reached.J
-            if reached.J <= own.exact * length or agree:
+            agree = len(pair) > 1 and worse <= settings.agreement * reached.J
+            if reached.J <= settings.exact * length or agree:
                 break
         if reached is None:
             return None
@@ -140,14 +140,14 @@ class ExactSearch:
 
         ``tree``: the pose tree, with its root where the body is.
         """
-        own, others = self._settings, []
-        for _ in range(own.replacements):
-            limit = reached.J + own.tolerance * problem.border_length
-            others = reached.neighbourhood.others(reached.parameters, limit, own.same)
+        settings, others = self._settings, []
+        for _ in range(settings.replacements):
+            limit = reached.J + settings.tolerance * problem.border_length
+            others = reached.neighbourhood.others(reached.parameters, limit, settings.same)
             if not others or problem.J(others[0]) >= reached.J:
                 break
             reached = self._end(problem, reached, others[0])
-        return reached, find_intervals(problem, others, reached.parameters, tree, own)
+        return reached, find_intervals(problem, others, reached.parameters, tree, settings)
 
 
 def find_intervals(
@@ -175,28 +175,28 @@ def find_intervals(
     Returns:
         The set, with the best pose as the representative of the first mode.
     """
-    own = settings or ExactSearchSettings()
+    settings = settings or ExactSearchSettings()
     body, kinematics = problem.body, problem.body.kinematics
     count = len(kinematics.names)
     free = body.freedom()
     equations, squares = problem.equations(parameters, free, PASSES.fine[-1])
     # The variance [pixel^2] is at least that of a border distributed uniformly between two pixel
     # centres. The factor accounts for the correlation of neighbouring distances.
-    variance = own.noise_factor**2 * max(1.0 / 12.0, squares)
+    variance = settings.noise_factor**2 * max(1.0 / 12.0, squares)
     # The limits are a prior with the variance of a uniform distribution between them.
     spans = np.clip(body.upper[free.columns] - body.lower[free.columns], 1e-6, 2.0 * np.pi)
     information = equations.H[0] / variance + np.diag(12.0 / spans**2)
     covariance = np.zeros((count, count))
     covariance[np.ix_(free.columns, free.columns)] = np.linalg.inv(information)
-    margins = float(ndtri(0.5 + 0.5 * own.confidence)) * np.sqrt(np.diag(covariance))
-    fits = problem.J(parameters) <= own.misfit * problem.border_length
-    near = np.maximum(margins, own.same)
+    margins = float(ndtri(0.5 + 0.5 * settings.confidence)) * np.sqrt(np.diag(covariance))
+    fits = problem.J(parameters) <= settings.misfit * problem.border_length
+    near = np.maximum(margins, settings.same)
     groups = [[parameters]]
     for other in others:
         # Poses that differ by full turns are equal.
         pose = body.nearest_turns(other, parameters)
         # A pose this near is the same optimum, not fully converged.
-        if np.abs(pose - parameters).max() <= own.same:
+        if np.abs(pose - parameters).max() <= settings.same:
             continue
         of_group = (g for g in groups if np.all(np.abs(pose - g[0])[:count] <= near))
         group = next(of_group, None)
@@ -213,5 +213,5 @@ def find_intervals(
             ends = np.full(count, -np.inf), np.full(count, np.inf)
         modes.append(FittedPose(poses[0], 0.0, *ends, len(poses)))
         Js.append(float(problem.J(first)))
-    tolerance = own.tolerance * problem.border_length
+    tolerance = settings.tolerance * problem.border_length
     return describe_modes(kinematics, tree or body.tree, modes, Js, tolerance, fits)

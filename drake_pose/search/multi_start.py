@@ -180,8 +180,8 @@ class _MultiStartRun:
         if any(one.mask is not view.mask for one, view in zip(clean, views, strict=True)):
             self._clean = RefinementProblem(search.exact.body, clean)
         self._several = len(clean) > 1
-        own = self._settings = search.settings
-        self._passes = own.passes[self._several]
+        settings = self._settings = search.settings
+        self._passes = settings.passes[self._several]
         self._survivors = self._passes[-1][1]
         self._done: list[np.ndarray] = []
 
@@ -192,9 +192,13 @@ class _MultiStartRun:
             rounds: number of rounds of the search for alternative poses.
             with_set: whether the pose set is computed.
         """
-        tree, exact, own = self._kinematics.tree, self._search.exact, self._search.exact_settings
+        tree, exact, settings = (
+            self._kinematics.tree,
+            self._search.exact,
+            self._search.exact_settings,
+        )
         problem, found, poses = self._problem, None, list[FittedPose]()
-        exactly = own.exact * problem.border_length
+        exactly = settings.exact * problem.border_length
         pool = self._begin()
         first_J = self._J(pool[0].values)
         searched = self._looks_exact(pool[0].values)
@@ -240,19 +244,21 @@ class _MultiStartRun:
 
         None if neither explains the masks, or if J at the values as they are is smaller.
         """
-        exact, own, J = self._search.exact, self._search.exact_settings, self._J(values)
+        exact, settings, J = self._search.exact, self._search.exact_settings, self._J(values)
         length = self._problem.border_length
         if self._proceed():
             other = exact.refine(self._problem, self._parameters(values), self._deadline)
             found = min((one for one in (found, other) if one), key=lambda one: one.J)
-        explained = found is not None and found.J < min(J, own.plausible * length)
+        explained = found is not None and found.J < min(J, settings.plausible * length)
         return found if explained else None
 
     def _begin(self) -> list[FittedPose]:
         """Return the poses of the coarse search, refined but for the final stage, best first."""
-        own = self._settings
+        settings = self._settings
         self._coarse = CoarseSearch(self._body, self._clean.views, None if self._proceed() else 1)
-        starts = self._coarse.choose_distinct(self._coarse.find(), own.starts, own.separation)
+        starts = self._coarse.choose_distinct(
+            self._coarse.find(), settings.starts, settings.separation
+        )
         return refine_best(self._fit, self._values(starts), self._passes, self._proceed)
 
     def _looks_exact(self, values: np.ndarray) -> bool:
@@ -278,47 +284,49 @@ class _MultiStartRun:
 
         ``pool``: poses refined by all stages but the final; ``rounds``: as in ``search``.
         """
-        own, turns = self._settings, self._kinematics.turns_around
+        settings, turns = self._settings, self._kinematics.turns_around
         pool = self._explore(pool, rounds)
         refined = self._finish(pool)
         unexplained = self._unexplained_views(refined[0].values)
         if unexplained and self._proceed():
             left = max(0.0, self._deadline - time.perf_counter())
-            views = [coarsen(view, own.beam_pixels) for view in unexplained[: own.beam_views]]
+            views = [
+                coarsen(view, settings.beam_pixels) for view in unexplained[: settings.beam_views]
+            ]
             by_areas = self._search.beam.best_poses(
-                views, self._root_position, own.beam_starts, time_limit=left
+                views, self._root_position, settings.beam_starts, time_limit=left
             )
             values = [self._kinematics.flatten(one) for one in by_areas]
             others = refine_best(self._fit, values, self._passes, self._proceed)
             pool = distinct([*pool, *others], self._survivors, turns)
             refined += self._finish(self._explore(pool, min(1, rounds)))
-            refined = distinct(refined, own.finalists, turns)
+            refined = distinct(refined, settings.finalists, turns)
         return [
             pose._replace(values=self._kinematics.nearest_turns(pose.values)) for pose in refined
         ]
 
     def _explore(self, pool: list[FittedPose], rounds: int) -> list[FittedPose]:
         """Return the best poses after rounds of the search for alternatives around them."""
-        own = self._settings
+        settings = self._settings
         for _ in range(rounds):
             found = []
-            for pose in pool[: own.explored]:
+            for pose in pool[: settings.explored]:
                 if any(pose.values is values for values in self._done) or not self._proceed():
                     continue
                 self._done.append(pose.values)
                 others = self._alternatives_to(pose.values)
                 found += others
                 least = min((one.cost for one in others), default=math.inf)
-                if self._several and least > own.improvement * pool[0].cost:
+                if self._several and least > settings.improvement * pool[0].cost:
                     break
             pool = distinct([*pool, *found], self._survivors, self._kinematics.turns_around)
         return pool
 
     def _finish(self, pool: Sequence[FittedPose]) -> list[FittedPose]:
         """Return the best poses, refined by the final stage."""
-        own = self._settings
-        values = [pose.values for pose in pool[: own.finalists]]
-        return refine_best(self._fit, values, [(own.final, own.finalists)], self._proceed)
+        settings = self._settings
+        values = [pose.values for pose in pool[: settings.finalists]]
+        return refine_best(self._fit, values, [(settings.final, settings.finalists)], self._proceed)
 
     def _unexplained_views(self, values: np.ndarray) -> list[View]:
         """Return all views, worst first, if a limb seems misplaced at values (m,), else none.
@@ -349,9 +357,9 @@ class _MultiStartRun:
 
     def _alternatives_to(self, values: np.ndarray) -> list[FittedPose]:
         """Return refined alternatives to a pose (m,): flips, counter-turns, limbs placed anew."""
-        kinematics, own = self._kinematics, self._settings
+        kinematics, settings = self._kinematics, self._settings
         flipped = [flip.values for flip in flips(kinematics, values)]
-        tried = counter_turns(kinematics, values, own.interval)
+        tried = counter_turns(kinematics, values, settings.interval)
         X_WN = kinematics.poses(values)
         # Limbs are subtrees of at most half of the nodes whose joint does not mimic another.
         tree = kinematics.tree
@@ -360,23 +368,24 @@ class _MultiStartRun:
         def search_again(nodes: tuple[int, ...]) -> list[np.ndarray]:
             again = self._coarse.find_again(X_WN, nodes)
             return self._values(
-                self._coarse.choose_distinct(again, own.alternatives, own.separation), values
+                self._coarse.choose_distinct(again, settings.alternatives, settings.separation),
+                values,
             )
 
         limbs = [one for one in below if 2 * len(one) <= len(X_WN)]
         tried += itertools.chain.from_iterable(map_ordered(search_again, limbs))
-        stage = AnnealingStage(own.medium[0].scale, own.coarse[0].spacing)
+        stage = AnnealingStage(settings.medium[0].scale, settings.coarse[0].spacing)
         best: list[FittedPose] = []
-        for group, count in ((flipped, own.flipped), (tried, own.alternatives)):
+        for group, count in ((flipped, settings.flipped), (tried, settings.alternatives)):
             costs = map_ordered(lambda one: self._fit.cost(one, stage), group)
             scored = [FittedPose(*pair) for pair in zip(group, costs, strict=True)]
-            best += distinct(scored, count, kinematics.turns_around, 0.5 * own.interval)
+            best += distinct(scored, count, kinematics.turns_around, 0.5 * settings.interval)
         starts = [one.values for one in best]
         if self._several:
-            return refine_best(self._fit, starts, own.alternative_passes, self._proceed)
+            return refine_best(self._fit, starts, settings.alternative_passes, self._proceed)
 
         def refine(one: np.ndarray) -> FittedPose | None:
-            return self._fit.refine(one, own.medium) if self._proceed() else None
+            return self._fit.refine(one, settings.medium) if self._proceed() else None
 
         return [one for one in map_ordered(refine, starts) if one is not None]
 

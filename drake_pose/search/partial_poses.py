@@ -505,8 +505,8 @@ class PoseStore:
             examined pair its index among the chosen ones, -1 if it was dropped.
         """
         placed = np.flatnonzero(partial.poses[0] >= 0).tolist() if len(partial) else ()
-        is_open, waiting = self.body.frontier(frozenset((*placed, node)))
-        frontier_hashes = made.poses[:, is_open].astype(np.uint64) @ self._node_keys[is_open]
+        open_nodes, waiting = self.body.frontier(frozenset((*placed, node)))
+        frontier_hashes = made.poses[:, open_nodes].astype(np.uint64) @ self._node_keys[open_nodes]
         state_hashes = made.hashes + frontier_hashes
         if keep_beyond:
             state_hashes += made.beyond.astype(np.uint64) @ self._beyond_keys

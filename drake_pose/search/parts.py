@@ -451,16 +451,18 @@ class NeighbourhoodSearch:
         Returns:
             Parameters (m + 4,) of the best pose, and its J [pixel].
         """
-        J, own = float(self.problem.J(parameters)), self._settings
-        rounds = own.rounds * (2 if everywhere else 1)
-        same = own.least_decrease * self.problem.border_length
-        least = own.least_error * self.problem.area
+        J, settings = float(self.problem.J(parameters)), self._settings
+        rounds = settings.rounds * (2 if everywhere else 1)
+        same = settings.least_decrease * self.problem.border_length
+        least = settings.least_error * self.problem.area
         last = np.inf if tries is None else int(self._tried.sum()) + tries
         while J > enough and self._tried.sum() < last and time.perf_counter() < deadline:
             errors = self._errors_near(parameters, J)
             # A part is tried again only if the error near it has changed since its last try.
             due = ((errors >= least) | everywhere) & (self._tried < rounds)
-            due &= np.abs(errors - self._left_error) > np.maximum(own.same_error * errors, same)
+            due &= np.abs(errors - self._left_error) > np.maximum(
+                settings.same_error * errors, same
+            )
             if not due.any():
                 break
             # Half of the body is mirrored only after single parts.
@@ -484,12 +486,12 @@ class NeighbourhoodSearch:
             limit: greatest J [pixel].
             same: poses are equal if no parameter differs by more [rad or m].
         """
-        problem, own, J = self.problem, self._settings, float(self.problem.J(parameters))
+        problem, settings, J = self.problem, self._settings, float(self.problem.J(parameters))
         # Until now reflections were tried at other poses, or not at all.
         for k in range(len(self.search.parts), len(self._parts)):
             self._try(parameters, J, k, False)
         known, kept = [parameters], []
-        spare = own.alternative_excess * problem.border_length
+        spare = settings.alternative_excess * problem.border_length
         everything = problem.body.freedom()
 
         def is_known(pose: np.ndarray, poses: Sequence[np.ndarray]) -> bool:
@@ -502,10 +504,10 @@ class NeighbourhoodSearch:
             start[freedom.columns] = values
             if is_known(start, known):
                 continue
-            refined, _, _ = descend(problem, start, freedom, own.final)
+            refined, _, _ = descend(problem, start, freedom, settings.final)
             J = float(problem.J(refined))
             if limit < J <= limit + spare and not is_known(refined, known):
-                refined, _, _ = descend(problem, refined, everything, own.final)
+                refined, _, _ = descend(problem, refined, everything, settings.final)
                 J = float(problem.J(refined))
             if J <= limit and not is_known(refined, known):
                 kept.append((J, refined))
@@ -534,46 +536,46 @@ class NeighbourhoodSearch:
             The parameters of the best pose and its J [pixel]; the given parameters and infinity if
             J does not decrease.
         """
-        problem, length, own = self.problem, self.problem.border_length, self._settings
+        problem, length, settings = self.problem, self.problem.border_length, self._settings
         part, freedom = self._parts[chosen], self._freedoms[chosen]
         fixed_borders = problem.fixed_borders(parameters, freedom.moved)
         starts = [self.search.mirror(parameters, part, view) for view in problem.views]
         if erring and not part.exchanged:
             starts += self.search.propose(problem, parameters, part)
-        rough, near = [], J + own.second_excess * length
+        rough, near = [], J + settings.second_excess * length
         for start in starts:
             if part.exchanged:
-                refined, cost, _ = descend(problem, start, freedom, own.mirrored)
-                if near < cost <= J + own.repaired_excess * length:
+                refined, cost, _ = descend(problem, start, freedom, settings.mirrored)
+                if near < cost <= J + settings.repaired_excess * length:
                     # Joint limits may prevent some nodes from being mirrored. They are placed anew,
                     # so that the mirrored body is not rejected because of them.
-                    refined, _, _ = descend(problem, refined, freedom, own.whole)
+                    refined, _, _ = descend(problem, refined, freedom, settings.whole)
                     repair = NeighbourhoodSearch(problem, self.search, reflections=False)
-                    refined, cost = repair.improve(refined, near, tries=own.repair_tries)
+                    refined, cost = repair.improve(refined, near, tries=settings.repair_tries)
             else:
-                refined, cost, _ = descend(problem, start, freedom, own.placed, fixed_borders)
-            if cost <= J + own.first_excess * length:
+                refined, cost, _ = descend(problem, start, freedom, settings.placed, fixed_borders)
+            if cost <= J + settings.first_excess * length:
                 rough.append((cost, refined))
         rough.sort(key=lambda pair: pair[0])
         found: list[tuple[float, np.ndarray]] = []
-        for _, start in rough[: own.refined]:
-            refined, cost, _ = descend(problem, start, freedom, own.second, fixed_borders)
+        for _, start in rough[: settings.refined]:
+            refined, cost, _ = descend(problem, start, freedom, settings.second, fixed_borders)
             if cost <= near:
-                refined, _, _ = descend(problem, refined, freedom, own.fine, fixed_borders)
+                refined, _, _ = descend(problem, refined, freedom, settings.fine, fixed_borders)
                 found.append((float(problem.J(refined)), refined))
         columns = freedom.columns
         self._others += [
             (other_J, freedom, other[columns])
             for other_J, other in found
-            if other_J <= J + own.stored_excess * length
+            if other_J <= J + settings.stored_excess * length
         ]
         least, best = min(found, key=lambda pair: pair[0], default=(np.inf, parameters))
-        if least > J + own.whole_excess * length:
+        if least > J + settings.whole_excess * length:
             return parameters, np.inf
-        whole, _, _ = descend(problem, best, problem.body.freedom(), own.whole)
+        whole, _, _ = descend(problem, best, problem.body.freedom(), settings.whole)
         whole_J = float(problem.J(whole))
         best, least = (whole, whole_J) if whole_J < least else (best, least)
-        if least > J - own.least_decrease * length:
+        if least > J - settings.least_decrease * length:
             return parameters, np.inf
         self._others.append((J, freedom, parameters[columns]))
         return best, least

@@ -193,23 +193,25 @@ class PoseAndMask:
         """
         values = [np.clip(one, self._kinematics.lower, self._kinematics.upper) for one in starts]
         whole = PictureLevel(self._cameras, pictures)
-        own = self._settings
+        settings = self._settings
         drawn = [self._draw(one, camera, few=True) for one in values for camera in self._cameras]
         size = math.sqrt(float(np.mean([np.count_nonzero(one) for one in drawn])))
-        factor = own.coarse_side / max(1.0, size)
+        factor = settings.coarse_side / max(1.0, size)
         level = whole if factor >= 1.0 else whole.downscaled(factor)
         # Each frame has its own generator, so results do not depend on the order of parallel tasks.
         rngs = np.random.default_rng(self._seed).spawn(len(values))
         frames = [_Progress(*one) for one in zip(values, starts, rngs, strict=True)]
-        for k in range(own.rounds):
-            if k == min(own.coarse_rounds, own.rounds - 1):
+        for k in range(settings.rounds):
+            if k == min(settings.coarse_rounds, settings.rounds - 1):
                 level = whole
                 for one in frames:
                     one.drawn = [self._draw(one.values, camera) for camera in self._cameras]
-            self._round(level, frames, searches=k < own.searched_rounds)
+            self._round(level, frames, searches=k < settings.searched_rounds)
             on_round(k + 1)
             for one in frames:
-                one.settled = level is whole and one.unchanged and one.error <= own.finest_error
+                one.settled = (
+                    level is whole and one.unchanged and one.error <= settings.finest_error
+                )
             if all(one.settled for one in frames):
                 break
         spread = np.where(self._spread > 0.0, self._spread, np.inf)
@@ -237,10 +239,10 @@ class PoseAndMask:
         log_ratios = self._log_ratios(level, frames)
 
         def improve(k: int) -> None:
-            frame, own = frames[k], self._settings
+            frame, settings = frames[k], self._settings
             if searches:
                 frame.values = self._search(level, frame, log_ratios[k])
-                frame.error = min(frame.error, own.searched_error)
+                frame.error = min(frame.error, settings.searched_error)
                 frame.probabilities = self._probabilities(level, frame)
             frame.cuts = [
                 None if picture is None else cut_by_foreground(picture, probability, log_ratio)
@@ -251,14 +253,14 @@ class PoseAndMask:
             before, frame.values = frame.drawn, self._refine(level, frame)
             frame.drawn = [self._draw(frame.values, camera) for camera in level.cameras]
             frame.unchanged = bool(before) and all(
-                intersection_over_union(*pair) > own.settled
+                intersection_over_union(*pair) > settings.settled
                 for pair in zip(frame.drawn, before, strict=True)
             )
             frame.agreements = tuple(
                 math.nan if mask is None else intersection_over_union(silhouette, mask)
                 for silhouette, mask in zip(frame.drawn, frame.cuts, strict=True)
             )
-            frame.error = next_error(frame.error, frame.agreements, own)
+            frame.error = next_error(frame.error, frame.agreements, settings)
 
         map_ordered(improve, moving)
 
@@ -310,7 +312,7 @@ class PoseAndMask:
     def _search(self, level: PictureLevel, frame: _Progress, log_ratios: Sequence[Floats]) -> Array:
         """Return values (m,) near a frame's whose silhouette has the greatest sum of log ratios."""
         # Log ratios are summed as integers, in units of 1/64.
-        parts, own = 64.0, self._settings
+        parts, settings = 64.0, self._settings
         shown = [
             (camera, prefix_sums(np.rint(parts * one).astype(np.int32))[None])
             for camera, one in zip(level.cameras, log_ratios, strict=True)
@@ -320,34 +322,34 @@ class PoseAndMask:
             return frame.values
         first = frame.error * self._spread
         mean, spread, best, most = frame.values, first, frame.values, -math.inf
-        for _ in range(own.iterations):
-            poses = self._sample(frame.rng, mean, spread, own.iteration_poses)
+        for _ in range(settings.iterations):
+            poses = self._sample(frame.rng, mean, spread, settings.iteration_poses)
             poses[0] = mean
             X_WN = np.array([self._kinematics.poses(pose) for pose in poses])
             scores = np.zeros(len(poses))
             for camera, sums in shown:
                 scores += score_bodies(self._few, camera.X_CW @ X_WN, camera, sums)[:, 1]
-            order = np.argsort(-scores, kind="stable")[: own.elite_poses]
+            order = np.argsort(-scores, kind="stable")[: settings.elite_poses]
             if scores[order[0]] > most:
                 best, most = poses[order[0]], scores[order[0]]
             mean = poses[order].mean(axis=0)
-            wider = own.spread_factor * poses[order].std(axis=0)
-            spread = np.maximum(wider, own.least_spread * first)
+            wider = settings.spread_factor * poses[order].std(axis=0)
+            spread = np.maximum(wider, settings.least_spread * first)
         return best
 
     def _refine(self, level: PictureLevel, frame: _Progress) -> Array:
         """Return values (m,) fitted to the edges of a frame's masks by colours."""
-        masks, own = frame.cuts, self._settings
+        masks, settings = frame.cuts, self._settings
         areas = [np.count_nonzero(mask) for mask in masks if mask is not None and mask.any()]
         if not areas:
             return frame.values
         size = math.sqrt(float(np.mean(areas)))
         edges = [NO_EDGE if mask is None else find_edge_points(mask, 2.0) for mask in masks]
         # The fit's unit of length is 100 pixels.
-        first = max(own.spacing, own.first_scale * frame.error)
+        first = max(settings.spacing, settings.first_scale * frame.error)
         stages = [
-            AnnealingStage(one * size / 200.0, own.spacing, 8)
-            for one in np.geomspace(first, own.last_scale, 4)
+            AnnealingStage(one * size / 200.0, settings.spacing, 8)
+            for one in np.geomspace(first, settings.last_scale, 4)
         ]
         held = self._spread <= 0.0
         prior = Prior(frame.start, np.where(held, 0.0, 1.0 / np.maximum(self._spread, 1e-9) ** 2))
@@ -392,9 +394,9 @@ def follow_colours(silhouette: Mask, mask: Mask, band: float = 0.01) -> Mask:
     size = math.sqrt(max(1, int(np.count_nonzero(silhouette))))
     reach = max(1, round(band * size))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-    own = silhouette.astype(np.uint8)
-    inner = cv2.erode(own, disc, borderType=cv2.BORDER_REPLICATE) > 0
-    outer = cv2.dilate(own, disc) > 0
+    inside = silhouette.astype(np.uint8)
+    inner = cv2.erode(inside, disc, borderType=cv2.BORDER_REPLICATE) > 0
+    outer = cv2.dilate(inside, disc) > 0
     return np.asarray(inner | (outer & mask))
 
 

@@ -109,8 +109,8 @@ def cluster_samples(sampled: SampledTree, node: int, samples: np.ndarray) -> np.
     near = tree.query_pairs(1.01, p=np.inf, output_type="ndarray")
     # Different values give the same pose where two axes coincide.
     X_PN = sampled.X_PN[node][samples, :3].reshape(len(samples), -1)
-    alike = cKDTree(X_PN).query_pairs(1e-6, output_type="ndarray")
-    links = np.vstack([near, alike])
+    same_pose = cKDTree(X_PN).query_pairs(1e-6, output_type="ndarray")
+    links = np.vstack([near, same_pose])
     ones = np.ones(len(links))
     graph = coo_array((ones, (links[:, 0], links[:, 1])), shape=(len(samples), len(samples)))
     labels[samples] = connected_components(graph, directed=False)[1]
@@ -219,8 +219,8 @@ def find_modes(
     if graph.size == 0.0:
         graph, complete = PartialPoseGraph.of_pose(samples, J), False
     sampled, described = body.sampled, []
-    seen = graph.samples_used()
-    labels = [cluster_samples(sampled, node, own) for node, own in enumerate(seen)]
+    used = graph.samples_used()
+    labels = [cluster_samples(sampled, node, own) for node, own in enumerate(used)]
     modes = split_into_modes(graph, labels)
     for mode_J, size, clusters in modes[:most]:
         own = graph.restricted(
@@ -233,7 +233,7 @@ def find_modes(
         described.append(PoseMode.of_values(sampled.tree, values, mode_J, joints, size))
     return GridPoseSet(
         modes=tuple(described),
-        joints=estimate_joints(sampled, seen, described[0].node_values, complete=complete),
+        joints=estimate_joints(sampled, used, described[0].node_values, complete=complete),
         tolerance=tolerance,
         complete=complete,
         mode_count=len(modes),

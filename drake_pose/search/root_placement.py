@@ -227,7 +227,7 @@ class RootPlacementSearch:
         deadline = math.inf if limit is None else begin + limit
         layers = find_root_places(self.body, views, self.scale_unknown, root_position)
         placed: list[_PlacedPose] = []
-        own, width = self._placement, math.ceil(self._placement.hypotheses / len(layers))
+        settings, width = self._placement, math.ceil(self._placement.hypotheses / len(layers))
         # Number of poses found by each search of a layer.
         counts: list[int] = []
 
@@ -238,7 +238,7 @@ class RootPlacementSearch:
             counts.append(len(found))
             return found
 
-        for outside_fraction in (own.outside_fraction, math.inf):
+        for outside_fraction in (settings.outside_fraction, math.inf):
             if not placed:
                 searched = map_ordered(partial(search, outside_fraction), layers)
                 placed += itertools.chain.from_iterable(searched)
@@ -247,7 +247,7 @@ class RootPlacementSearch:
             found = PoseEstimate.nothing(self.tree, stopped_by="end", runs=runs)
             return replace(found, seconds=time.perf_counter() - begin)
         placed.sort(key=attrgetter("J"))
-        best = self._improve(placed[: own.starts], root_position is None, deadline)
+        best = self._improve(placed[: settings.starts], root_position is None, deadline)
         first_J = placed[0].J / _area(views) * _area(best.views)
         p_WR = self._root_of(best)
         tree = self.tree.with_root_position(p_WR)
@@ -285,21 +285,25 @@ class RootPlacementSearch:
         """
         if len(layer.positions) == 0:
             return []
-        own, views = (
+        settings, views = (
             self._placement,
             [coarsen(view, self._placement.coarse_pixels) for view in layer.views],
         )
-        quota, factor = math.ceil(own.quota * width), own.root_factor
+        quota, factor = math.ceil(settings.quota * width), settings.root_factor
         chosen = choose_root_samples(
-            self.body, views, layer.positions, own.root_spare * factor * quota, own.outside_weight
+            self.body,
+            views,
+            layer.positions,
+            settings.root_spare * factor * quota,
+            settings.outside_weight,
         )
         body = place_body(self.body, layer.positions, chosen)
         store = PoseStore(body, SilhouetteBits(body, views), outside_fraction)
         # Index of the position of each of the root's samples, for the quota.
         places, hypotheses = chosen // len(self.sampled.X_PN[0]), store.start()
         for node in self.body.order:
-            spare = own.spare * factor * width
-            grown, _ = grow(store, hypotheses, node, spare, own.outside_weight)
+            spare = settings.spare * factor * width
+            grown, _ = grow(store, hypotheses, node, spare, settings.outside_weight)
             if grown is None:
                 return []
             groups = places[store.nodes[0].samples[grown.poses[:, 0]]]
@@ -313,7 +317,7 @@ class RootPlacementSearch:
         Js = _area(layer.views) / store.bits.area * store.objectives(hypotheses)
         samples = store.samples(hypotheses.poses)
         order = np.argsort(Js, kind="stable")
-        firsts = np.sort(np.unique(samples[order, 0], return_index=True)[1])[: own.starts]
+        firsts = np.sort(np.unique(samples[order, 0], return_index=True)[1])[: settings.starts]
         found = []
         for i in order[firsts]:
             p_WR = body.sampled.X_PN[0][samples[i, 0], :3, 3]
@@ -336,10 +340,12 @@ class RootPlacementSearch:
 
         def search_again(one: _PlacedPose) -> list[_PlacedPose]:
             # The beam search with the root where it is.
-            p_WR, own = self._root_of(one), self._placement
+            p_WR, settings = self._root_of(one), self._placement
             starts = (
                 replace(one, parameters=self._refined.parameters(values, p_WR))
-                for values in self._grid.best_poses(one.views, p_WR, own.poses_again, own.overlap)
+                for values in self._grid.best_poses(
+                    one.views, p_WR, settings.poses_again, settings.overlap
+                )
             )
             return [self._settle(start, PASSES.coarse, moves) for start in starts]
 

@@ -53,7 +53,7 @@ def find_root_places(
     Raises:
         SettingsError: if the scale is unknown, but the views are not one parallel view.
     """
-    main, own = max(views, key=lambda view: int(view.mask.sum())), RootPlacementSettings()
+    main, settings = max(views, key=lambda view: int(view.mask.sum())), RootPlacementSettings()
     camera = main.camera
     if scale_unknown and (len(views) > 1 or not isinstance(camera, ParallelCamera)):
         raise SettingsError(
@@ -82,8 +82,8 @@ def find_root_places(
     p_CR = in_camera(camera, body.sampled.X_PN[0][0, :3, 3])
     # Places (n, 2) of the root in the image, or beyond its border if the mask touches that [pixel].
     low, high = _box(main.mask)
-    spacing = _extent(main.mask) / own.positions_across
-    beyond = (own.cut_off - 1.0) * _extent(main.mask)
+    spacing = _extent(main.mask) / settings.positions_across
+    beyond = (settings.cut_off - 1.0) * _extent(main.mask)
     size = np.array([camera.width, camera.height])
     low = np.where(low < 1, -beyond, low - 0.5 * spacing)
     high = np.where(high > size - 2, size - 1 + beyond, high + 0.5 * spacing)
@@ -127,7 +127,7 @@ def root_steps(views: Sequence[View], p_WR: np.ndarray) -> np.ndarray:
     For each view: u and v in units of the spacing of positions, and the logarithm of pixels per
     metre in units of that of the ratio of scales. ``p_WR``: (3,) the root's position [m].
     """
-    here, own = list[float](), RootPlacementSettings()
+    here, settings = list[float](), RootPlacementSettings()
     for view in views:
         camera = view.camera
         place, depth = camera.project(p_WR[None])
@@ -135,8 +135,8 @@ def root_steps(views: Sequence[View], p_WR: np.ndarray) -> np.ndarray:
             size = camera.pixels_per_metre
         else:
             size = 1.0 / max(float(depth[0]), camera.near)
-        spacing = _extent(view.mask) / own.positions_across
-        here += [*(place[0] / spacing), np.log(size) / np.log(own.scale_ratio)]
+        spacing = _extent(view.mask) / settings.positions_across
+        here += [*(place[0] / spacing), np.log(size) / np.log(settings.scale_ratio)]
     return np.array(here)
 
 
@@ -153,7 +153,7 @@ def _pixel_sizes(
         side: side of the image in which they are drawn [pixel].
         rare: fraction of the smallest, and of the largest, areas that are disregarded.
     """
-    generator, sampled, own = np.random.default_rng(1), body.sampled, RootPlacementSettings()
+    generator, sampled, settings = np.random.default_rng(1), body.sampled, RootPlacementSettings()
     samples = np.column_stack([generator.integers(len(X_PN), size=poses) for X_PN in sampled.X_PN])
     balls = np.array([outline.ball for outline in sampled.outlines])
     X_CN = view.camera.X_CW @ sampled.poses(samples)
@@ -168,13 +168,13 @@ def _pixel_sizes(
     low, middle, high = np.quantile(areas, [rare, 0.5, 1.0 - rare])
     smallest, likely, largest = np.sqrt(float(view.mask.sum()) / np.array([high, middle, low]))
     if _touches_edge(view.mask):
-        largest *= own.cut_off
-    step = np.log(own.scale_ratio)
+        largest *= settings.cut_off
+    step = np.log(settings.scale_ratio)
     steps = np.arange(
         np.floor(np.log(smallest / likely) / step), np.ceil(np.log(largest / likely) / step) + 1
     )
     steps = steps[np.argsort(np.abs(steps), kind="stable")]
-    return np.asarray(likely * own.scale_ratio**steps)
+    return np.asarray(likely * settings.scale_ratio**steps)
 
 
 def _touches_edge(mask: np.ndarray) -> bool:
@@ -201,13 +201,13 @@ def _near(view: View, places: np.ndarray) -> np.ndarray:
     A place must be near the silhouette; or, if it is outside the image, within the distance that a
     cut-off body may extend, and nearest to a border pixel that is near the silhouette.
     """
-    extent, own = _extent(view.mask), RootPlacementSettings()
+    extent, settings = _extent(view.mask), RootPlacementSettings()
     distances = distance_transform_edt(~view.mask)
     inside = np.clip(places, 0, np.array(view.mask.shape)[::-1] - 1)
     column, row = np.rint(inside).astype(np.int64).T
-    near = distances[row, column] <= 0.75 * extent / own.positions_across
+    near = distances[row, column] <= 0.75 * extent / settings.positions_across
     over = np.linalg.norm(places - inside, axis=1)
-    return np.asarray(near & (over <= (own.cut_off - 1.0) * extent))
+    return np.asarray(near & (over <= (settings.cut_off - 1.0) * extent))
 
 
 def _lift(camera: Camera, places: np.ndarray, depth: float) -> np.ndarray:
@@ -237,16 +237,16 @@ def _places_in_space(
         middle: (3,) centre of the grid [m].
         size: likeliest number of pixels per metre at the body in ``main``.
     """
-    own, extent = RootPlacementSettings(), _extent(main.mask) / size
-    half = 0.75 * extent * (own.cut_off if _touches_edge(main.mask) else 1.0)
-    spacing = extent / own.positions_across
+    settings, extent = RootPlacementSettings(), _extent(main.mask) / size
+    half = 0.75 * extent * (settings.cut_off if _touches_edge(main.mask) else 1.0)
+    spacing = extent / settings.positions_across
     steps = spacing * np.arange(-np.ceil(half / spacing), np.ceil(half / spacing) + 1)
     points = middle + np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
     for view in views:
         places, depth = view.camera.project(points)
-        seen = np.ones(len(points), dtype=np.bool_)
+        visible = np.ones(len(points), dtype=np.bool_)
         if not isinstance(view.camera, ParallelCamera):
-            seen = depth > view.camera.near
-        seen[seen] = _near(view, places[seen])
-        points = points[seen]
+            visible = depth > view.camera.near
+        visible[visible] = _near(view, places[visible])
+        points = points[visible]
     return RootPlaces(tuple(views), points)

@@ -324,13 +324,13 @@ class SampledBody:
         """
         if placed not in self._frontiers:
             nodes = self.sampled.tree.nodes
-            is_open = [i for i in sorted(placed) if not placed.issuperset(nodes[i].children)]
+            open_nodes = [i for i in sorted(placed) if not placed.issuperset(nodes[i].children)]
             waiting = [
                 i
                 for i, node in enumerate(nodes)
                 if i not in placed and (node.parent < 0 or node.parent in placed)
             ]
-            self._frontiers[placed] = np.array(is_open, dtype=np.int64), waiting
+            self._frontiers[placed] = np.array(open_nodes, dtype=np.int64), waiting
         return self._frontiers[placed]
 
     def celled_outline(self, node: int, camera: Camera, coarse: bool) -> CelledOutline:

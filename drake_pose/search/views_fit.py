@@ -395,18 +395,18 @@ class RobustModes:
         ``moves``: whether values with a wide interval are moved; else the intervals follow from the
         covariance alone.
         """
-        kinematics, own = self._kinematics, self._settings
+        kinematics, settings = self._kinematics, self._settings
         lower, upper = kinematics.reach(values)
         free = np.flatnonzero(upper > lower)
-        residuals = self._fit.distances(values, own.measure)
+        residuals = self._fit.distances(values, settings.measure)
         if self._sizes is None:
             self._sizes = estimate_sizes(residuals, kinematics.is_angle)
         covariance = values_covariance(residuals, self._sizes, free, kinematics.is_angle)
         low, high = values.copy(), values.copy()
-        degrees_of_freedom = own.camera_freedom * self._fit.camera_count
-        widths = stdtrit(degrees_of_freedom, own.one_sided) * np.sqrt(np.diag(covariance))
+        degrees_of_freedom = settings.camera_freedom * self._fit.camera_count
+        widths = stdtrit(degrees_of_freedom, settings.one_sided) * np.sqrt(np.diag(covariance))
         low[free], high[free] = values[free] - widths, values[free] + widths
-        wide = widths > np.where(kinematics.is_angle[free], *own.moved)
+        wide = widths > np.where(kinematics.is_angle[free], *settings.moved)
 
         def move(direction: tuple[int, float]) -> list[np.ndarray]:
             column, sign = direction
@@ -443,22 +443,22 @@ class RobustModes:
             Values (m,) of the poses, the first the given one. The last is interpolated to where the
             increase of the cost becomes significant.
         """
-        own = self._settings
-        longest = own.longest_steps[0 if self._kinematics.is_angle[index] else 1]
+        settings = self._settings
+        longest = settings.longest_steps[0 if self._kinematics.is_angle[index] else 1]
         lower, upper = self._kinematics.lower.copy(), self._kinematics.upper.copy()
         # An angle that turns around is moved by at most half a turn.
         lower[index], upper[index] = (ends[index] for ends in self._kinematics.reach(values))
         step, found, worse = width, [values], 0.0
         while lower[index] < found[-1][index] < upper[index] and self._proceed():
             trial = np.clip(found[-1] + min(step, longest) * along, lower, upper)
-            fitted = self._fit.refine(trial, own.follow, held=(index,)).values
-            costs = self._fit.tile_costs(fitted, own.comparison)
+            fitted = self._fit.refine(trial, settings.follow, held=(index,)).values
+            costs = self._fit.tile_costs(fitted, settings.comparison)
             before, worse = worse, vuong_statistic(costs, self._best_costs)
-            if worse > own.significance:
+            if worse > settings.significance:
                 # The cost is roughly a parabola and the standard deviation of a difference grows
                 # linearly, so the statistic is interpolated linearly.
-                fraction = (own.significance - before) / (worse - before)
+                fraction = (settings.significance - before) / (worse - before)
                 return [*found, found[-1] + fraction * (fitted - found[-1])]
             found.append(fitted)
-            step *= own.step_factor
+            step *= settings.step_factor
         return found

@@ -26,7 +26,7 @@ from drake_pose.errors import OutputError, SettingsError
 from drake_pose.files.folder import POSES, cannot_write, read_summary, write_file
 from drake_pose.files.settings import SceneSettings, percent
 from drake_pose.regular_files import digest, read_regular
-from drake_pose.search import JointEstimate, PoseSet, following_joints
+from drake_pose.search import JointEstimate, PoseSet, mimic_joints
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.version import VERSION
@@ -236,7 +236,7 @@ def record_pose_set(pose_set: PoseSet | None, tree: PoseTree) -> dict[str, Any]:
 
     def record(joints: Sequence[JointEstimate], values: Sequence[float | None]) -> Joints:
         told = {}
-        for joint, value in zip((*joints, *following_joints(tree, joints)), values, strict=True):
+        for joint, value in zip((*joints, *mimic_joints(tree, joints)), values, strict=True):
             unit = 1.0 if kinds.get(joint.name) == "length" else math.degrees(1.0)
             told[joint.name] = {
                 "determined": joint.determined,

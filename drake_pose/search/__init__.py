@@ -17,8 +17,8 @@ from drake_pose.search.estimates import (
     PoseMode,
     PoseSet,
     View,
-    following_joints,
     joint_estimates,
+    mimic_joints,
 )
 from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.multi_start import MultiStartSearch
@@ -30,7 +30,11 @@ from drake_pose.search.pose_modes import (
     renderer_tolerance,
     samples_at,
 )
-from drake_pose.search.root_placement import RootPlacementSearch, hub, turns_freely
+from drake_pose.search.root_placement import (
+    RootPlacementSearch,
+    most_connected_node,
+    root_rotates_freely,
+)
 from drake_pose.search.root_places import scale_camera, slide_root
 from drake_pose.search.sampled_body import PoseSearch, SampledTree, Scoring
 from drake_pose.search.settings import BeamSearchSettings, ExactSearchSettings, PaperSearchSettings
@@ -62,12 +66,12 @@ __all__ = [
     "ViewsFit",
     "covariance_pose_set",
     "examine",
-    "following_joints",
-    "hub",
     "joint_estimates",
+    "mimic_joints",
+    "most_connected_node",
     "renderer_tolerance",
+    "root_rotates_freely",
     "samples_at",
     "scale_camera",
     "slide_root",
-    "turns_freely",
 ]

@@ -137,7 +137,7 @@ def joint_estimates(
     )
 
 
-def following_joints(tree: PoseTree, joints: Sequence[JointEstimate]) -> tuple[JointEstimate, ...]:
+def mimic_joints(tree: PoseTree, joints: Sequence[JointEstimate]) -> tuple[JointEstimate, ...]:
     """Return the estimates of mimic joints, computed from those of the joints they follow.
 
     ``joints``: estimates of the pose tree's values.
@@ -213,7 +213,7 @@ class PoseSet:
 
         Columns of positions that are not in the tree are NaN. Mimic joints are included.
         """
-        joints = (*self.joints, *following_joints(tree, self.joints))
+        joints = (*self.joints, *mimic_joints(tree, self.joints))
         known = {joint.name: (joint.determined, joint.low, joint.high) for joint in joints}
         names = tree.model.position_names
         return np.array([known.get(name, (np.nan,) * 3) for name in names], dtype=float).T

@@ -42,7 +42,7 @@ from drake_pose.search.settings import PASSES, BeamSearchSettings, RootPlacement
 from drake_pose.workers import map_ordered
 
 
-def hub(tree: PoseTree) -> str:
+def most_connected_node(tree: PoseTree) -> str:
     """Return the name of the node with geometry that has the most neighbours, the first if tied."""
     counts = [
         len(node.children) + (node.parent >= 0) if len(node.mesh.triangles) else -1
@@ -51,7 +51,7 @@ def hub(tree: PoseTree) -> str:
     return tree.nodes[int(np.argmax(counts))].name
 
 
-def turns_freely(tree: PoseTree) -> bool:
+def root_rotates_freely(tree: PoseTree) -> bool:
     """Return whether the plant's joints at the tree's only root can give it every rotation.
 
     They must be three angles, besides fixed ones, with ranges of at least pi, 2 pi and 2 pi.

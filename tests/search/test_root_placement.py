@@ -7,7 +7,13 @@ import pytest
 from drake_pose.body import RootRotation, bundled_model, load_model
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.errors import SettingsError
-from drake_pose.search import BeamSearchSettings, RootPlacementSearch, View, hub, turns_freely
+from drake_pose.search import (
+    BeamSearchSettings,
+    RootPlacementSearch,
+    View,
+    most_connected_node,
+    root_rotates_freely,
+)
 from drake_pose.search.root_placement import choose_root_samples
 from drake_pose.search.root_places import find_root_places, root_steps
 from drake_pose.search.sampled_body import SampledBody
@@ -84,8 +90,8 @@ def test_three_angles_at_the_root_give_every_rotation(tmp_path, ranges, free):
     arms += [joint(f"swing_{k}", "revolute", "ball", f"arm_{k}", (-1.0, 1.0)) for k in range(3)]
     arms += [box_link("finger", 2, 2), joint("bend", "revolute", "arm_0", "finger", (0.0, 1.0))]
     tree = load_body(tmp_path, *parts, box_link("ball", 10, 10), *arms).pose_tree()
-    assert turns_freely(tree) == free
-    assert hub(tree) == "ball"
+    assert root_rotates_freely(tree) == free
+    assert most_connected_node(tree) == "ball"
 
 
 @pytest.fixture(scope="module")

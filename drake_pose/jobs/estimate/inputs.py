@@ -46,8 +46,8 @@ from drake_pose.search import (
     PoseEstimate,
     PoseSearch,
     RootPlacementSearch,
-    hub,
-    turns_freely,
+    most_connected_node,
+    root_rotates_freely,
 )
 from drake_pose.silhouette.outline import Outline
 from drake_pose.silhouette.pictures.masks import compare_masks
@@ -110,10 +110,12 @@ def make_placement_search(
         )
     first = np.zeros(3) if position is None else position
     tree = make_tree(model, settings, None if settings.root is None else first)
-    if settings.root is None and settings.root_rotation is None and turns_freely(tree):
+    if settings.root is None and settings.root_rotation is None and root_rotates_freely(tree):
         rotation = RootRotation.free(interval_deg=free_interval_deg)
         held = _in_plant_units(model, settings.hold)
-        tree = model.pose_tree(hub(tree), root_position=first, root_rotation=rotation, held=held)
+        tree = model.pose_tree(
+            most_connected_node(tree), root_position=first, root_rotation=rotation, held=held
+        )
     sampling = BeamSearchSettings(math.radians(interval_deg), time_limit=settings.time_limit)
     return RootPlacementSearch(tree, sampling, scale_unknown)
 
@@ -162,7 +164,9 @@ def leave_out_links(
         UnknownNameError: a link does not exist.
     """
     centre = model.pose_tree(
-        hub(model.pose_tree()), root_position=np.zeros(3), root_rotation=RootRotation.free()
+        most_connected_node(model.pose_tree()),
+        root_position=np.zeros(3),
+        root_rotation=RootRotation.free(),
     )
     # A joint that a remaining link mimics is not held.
     led = {

@@ -156,7 +156,7 @@ def _ordered_times(rows: Sequence[_Row], what: str, warnings: list[str]) -> tupl
     stamps = np.array([row[:2] for row in rows])
     clock = 0 if stamps[:, 0].any() else 1
     if clock:
-        warnings.append(f"{what}: headers without time stamps: the times of recording are used")
+        warnings.append(f"{what}: headers without time stamps: using the times of recording")
     times = 1e-9 * stamps[:, clock]
     kept, late = ascending_indices(times, what)
     warnings += late
@@ -181,8 +181,8 @@ def _merge_joints(
         assert base.times is not None
         if again := [name for name in names if owners.setdefault(name, topic) != topic]:
             warnings.append(
-                f"{topic}: has joint {', '.join(again)} of {owners[again[0]]} again, which has "
-                "more rows and is used"
+                f"{topic}: also has joint {', '.join(again)} of {owners[again[0]]}, which is used "
+                "because it has more rows"
             )
         columns = dict(zip(names, log.at(base.times).T, strict=True)) | columns
     assert base is not None
@@ -205,7 +205,7 @@ def _read_camera(
         warnings.append(f"{topic}: no calibration in {beside}: its lens is unknown")
     elif (info.width, info.height) != (width, height):
         warnings.append(
-            f"{topic}: its calibration is of {info.width} x {info.height} pixels, but its pictures "
+            f"{topic}: its calibration is for {info.width} x {info.height} pixels, but its images "
             f"have {width} x {height}: its lens is unknown"
         )
     else:

@@ -145,7 +145,7 @@ def lens_of(size: Any, matrix: Any, distortion: Any, model: str, where: str) -> 
     kinds |= {"equidistant": True, "fisheye": True}  # OpenCV's fisheye.
     if model not in kinds:
         raise CameraError(
-            f"{where}: distortion_model '{model}' is not known; it may be {', '.join(kinds)}"
+            f"{where}: distortion_model '{model}' is unknown; known are {', '.join(kinds)}"
         )
     return _lens(size, matrix, distortion, kinds[model], where)
 
@@ -160,8 +160,8 @@ def _kalibr(
         where, numbers = f"{path}: camera '{name}'", _numbers(entry["intrinsics"])
         if entry["camera_model"] != "pinhole":
             raise CameraError(
-                f"{where}: Kalibr's '{entry['camera_model']}' camera is not read, but pinhole with "
-                "radtan, equidistant or none; calibrate it as one of these"
+                f"{where}: Kalibr's '{entry['camera_model']}' camera is not supported: calibrate "
+                "it as a pinhole with radtan, equidistant or none"
             )
         if numbers is None or numbers.size != 4:
             raise CameraError(f"{where}: intrinsics must be [f_x, f_y, c_x, c_y]")
@@ -205,10 +205,10 @@ def _lens(
     if abs(K[1]) > largest_skew * K[0]:
         raise CameraError(
             f"{where}: its camera matrix has a skew of {K[1]:g} pixels, which is not modelled: "
-            "calibrate without skew, or set it to 0 if it is none"
+            "calibrate without skew, or set it to 0 if it is negligible"
         )
     if D is None:
-        raise CameraError(f"{where}: its distortion coefficients are no list of finite numbers")
+        raise CameraError(f"{where}: its distortion coefficients must be a list of finite numbers")
     D = D if D.size else np.zeros(4)
     counts = (4,) if fisheye else (4, 5, 8, 12, 14)
     D = D[:4] if fisheye and not D[4:].any() else D

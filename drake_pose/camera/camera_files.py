@@ -123,7 +123,9 @@ def load_camera_file(path: str | Path, *, distorted: bool = False) -> CameraFile
     entries = [entry for entry in content.values() if isinstance(entry, dict)]
     if not (calibrated or any(ours & {*entry} for entry in entries)):
         found = ", ".join(map(str, content))
-        raise CameraError(f"{path}: is no camera file: it has {found[:200]}; read are {FORMATS}")
+        raise CameraError(
+            f"{path}: is not a camera file: it has {found[:200]}; supported are {FORMATS}"
+        )
     cameras, lenses = dict[str, Camera](), dict[str, Lens]()
     links, unplaced = dict[str, str](), list[str]()
     for key in calibrated or content:

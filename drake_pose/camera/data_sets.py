@@ -70,7 +70,7 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
                 continue
             video = _file(path, info, rows, number, key)
             if not video.is_file():
-                warnings.append(f"camera '{name}' is left out: {video} is not here")
+                warnings.append(f"camera '{name}' is left out: {video} is missing")
                 continue
             span = np.array([0.0, np.inf])
             if rows is not None:
@@ -102,8 +102,8 @@ def _episode_rows(path: Path, info: Mapping[str, Any], parquet: Any) -> _Rows:
     version = str(info["codebase_version"])
     if not version.startswith(("v2.", "v3.")):
         raise SceneError(
-            f"{path / INFO}: a LeRobot data set of version {version}, but 2.0, 2.1 and 3.0 are "
-            "read: convert it by LeRobot's own scripts"
+            f"{path / INFO}: a LeRobot data set of version {version}, but only 2.0, 2.1 and 3.0 "
+            "are supported: convert it with LeRobot's scripts"
         )
     if version.startswith("v2."):
         return None
@@ -140,7 +140,7 @@ def _choose_episode(path: Path, info: Mapping[str, Any], rows: _Rows, wanted: in
     if wanted is not None:
         raise UnknownNameError("episode", str(wanted), [names] if names else [], str(path))
     raise SceneError(
-        f"{path}: say which episode (--episode N): of {len(numbers)} these are here: "
+        f"{path}: choose an episode (--episode N); of {len(numbers)} these are present: "
         f"{names or 'none'}"
     )
 
@@ -185,8 +185,8 @@ def _video_camera(
     warnings += video.warnings
     if last - first != count:
         warnings.append(
-            f"camera '{name}': has {last - first} pictures of {count} rows: some were dropped or "
-            "repeated, so that they may drift apart"
+            f"camera '{name}': has {last - first} pictures for {count} rows: pictures were dropped "
+            "or repeated, so times may drift"
         )
 
     def recorded(k: int) -> Picture:
@@ -231,11 +231,11 @@ def open_droid(path: Path, joints: JointLog | None) -> Episode:
             for video in sorted(folder.glob("*.mp4")):
                 cameras += _zed_cameras(file, video, warnings)
     except (OSError, ValueError, LookupError, RuntimeError) as error:
-        raise SceneError(f"{where}: cut short or damaged: {error}") from error
+        raise SceneError(f"{where}: truncated or damaged: {error}") from error
     if not cameras:
         raise SceneError(
-            f"{folder}: holds no <serial>.mp4; a recordings/SVO of the cameras' own format has to "
-            "be exported as MP4 first (svo_to_mp4.py of DROID)"
+            f"{folder}: has no <serial>.mp4; export files of recordings/SVO as MP4 first "
+            "(svo_to_mp4.py of DROID)"
         )
     return Episode.checked(path, cameras, joints or own, warnings)
 
@@ -272,7 +272,7 @@ def _zed_cameras(
     kept, late = ascending_indices(times, f"{path}: pictures")
     hand = file.get(f"observation/camera_type/{serial}")
     if hand is not None and not np.any(hand[()]):
-        late.append(f"camera '{serial}' is the hand's (camera_type 0): it rides on the arm")
+        late.append(f"camera '{serial}' is on the hand (camera_type 0): it moves with the arm")
     warnings += [*video.warnings, *late]
     sides = ("_left", "_right") if video.width > stereo * video.height else ("",)
     width, cameras = video.width // len(sides), []
@@ -307,7 +307,7 @@ def _picture_times(file: Any, path: Path, serial: str, count: int, warnings: lis
         times, source = np.array(json.loads(read_regular(beside))) - delay, beside.name
     if len(times) != count:
         warnings.append(
-            f"{path}: has {count} pictures, but {source} {len(times)} times: they are taken one by "
-            "one from the first on, which may be off by as many, and the rest is left out"
+            f"{path}: has {count} pictures, but {source} has {len(times)} times: they are paired "
+            "from the first on and the rest is left out, so pairs may be shifted by the difference"
         )
     return 1e-3 * times[:count]  # Stamps are milliseconds.

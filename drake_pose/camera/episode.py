@@ -140,18 +140,18 @@ class Episode:
         """
         found, warnings = {camera.name: camera for camera in cameras}, list(reader_warnings)
         if not found:
-            raise SceneError(f"{path}: holds no camera's pictures {'; '.join(warnings)}".rstrip())
+            raise SceneError(f"{path}: has no camera's pictures {'; '.join(warnings)}".rstrip())
         for name, camera in found.items():
             warnings += _gap_warnings(camera.times, f"camera '{name}'", "picture")
         if joints is None:
-            return cls(path, found, None, (*warnings, f"{path}: holds no joint positions"))
+            return cls(path, found, None, (*warnings, f"{path}: has no joint positions"))
         if not joints.positions.size:
-            raise SceneError(f"{path}: the joint log holds no row, or no joint")
+            raise SceneError(f"{path}: the joint log has no row, or no joint")
         is_number = np.isfinite(joints.positions)
         joints = replace(joints, positions=np.where(is_number, joints.positions, np.nan))
         warnings += [
-            f"the joint log: '{name}' is no number in {(~column).sum()} of {len(column)} rows, the "
-            f"first of which is {np.argmin(column)} (counted from 0)"
+            f"the joint log: '{name}' is not a number in {(~column).sum()} of {len(column)} rows, "
+            f"first in row {np.argmin(column)} (counted from 0)"
             for name, column in zip(joints.names, is_number.T, strict=True)
             if not column.all()
         ]
@@ -190,7 +190,7 @@ def ascending_indices(
     is_later = stamps > before
     late = np.flatnonzero(~is_later)
     if not len(stamps):
-        raise SceneError(f"{what}: holds nothing")
+        raise SceneError(f"{what}: is empty")
     if not len(late):
         return np.arange(len(stamps)), []
     text = (
@@ -202,7 +202,7 @@ def ascending_indices(
             f"{text}, nor do {len(late)} of {len(stamps)} in all: the clock runs backwards or "
             "stands still; correct the times, or split the recording where the clock was set"
         )
-    return np.flatnonzero(is_later), [f"{text}; {len(late)} of {len(stamps)} such are left out"]
+    return np.flatnonzero(is_later), [f"{text}; {len(late)} of {len(stamps)} are left out"]
 
 
 def _gap_warnings(times: Array, what: str, one: str, gap: float = 1.5) -> list[str]:
@@ -215,8 +215,8 @@ def _gap_warnings(times: Array, what: str, one: str, gap: float = 1.5) -> list[s
         return []
     return [
         f"{what}: {(steps > gap * usual).sum()} of {len(steps)} steps are longer than {gap:g} "
-        f"times the usual {usual:.4g} s, the longest {steps[k]:.4g} s after {one} {k}: {one}s were "
-        "dropped, or their rate varies"
+        f"times the median {usual:.4g} s, the longest {steps[k]:.4g} s after {one} {k}: {one}s "
+        "were dropped, or their rate varies"
     ]
 
 
@@ -230,20 +230,20 @@ def _comparison_warnings(path: Path, camera: EpisodeCamera, joints: JointLog) ->
             f"{len(known - seen)} of {len(known)} rows no picture"
         )
         if not known & seen:
-            raise SceneError(f"{path}: {text}: frames must be called alike in both")
+            raise SceneError(f"{path}: {text}: frames must have the same names in both")
         return [text] if known != seen else []
     if joints.times is None or np.isnan(camera.times).all():
         raise SceneError(
-            f"{path}: nothing tells which of the joint log's rows belong to the pictures of {where}"
-            ": rows and pictures both need times [s] (a folder of images its timestamps.csv, or "
-            "frame_rate_hz in scene.yaml), or the log a column 'frame'"
+            f"{path}: cannot match the joint log's rows to the pictures of {where}: either rows "
+            "and pictures both need times [s] (for a folder of images: timestamps.csv, or "
+            "frame_rate_hz in scene.yaml), or the log needs a column 'frame'"
         )
     outside = int(np.isnan(joints.at(camera.times)).all(axis=1).sum())
     (first, last), (begin, end) = camera.times[[0, -1]], joints.times[[0, -1]]
     span = f"({first:.3f} to {last:.3f} s; the log's are {begin:.3f} to {end:.3f} s)"
     if outside == count:
-        return [f"{where}: its clock is not the joint log's: no picture is of its time {span}"]
+        return [f"{where}: its clock differs from the joint log's: no picture is within it {span}"]
     is_short = last - first < 0.75 * (end - begin)
     text = f"{where}: {outside} of {count} pictures are before or after the log {span}"
-    short = f"{where}: its pictures end, or begin, while the log goes on {span}"
+    short = f"{where}: its pictures cover only a part of the log {span}"
     return [text] if outside else [short] if is_short else []

@@ -59,7 +59,7 @@ def read_joint_table(path: Path) -> tuple[JointLog, list[str]]:
                 values[name][k] = read_number(cell)
             except ValueError:
                 raise SceneError(
-                    f"{path}: line {rows[k][0]}, column '{name}': '{cell[:40]}' is no number"
+                    f"{path}: line {rows[k][0]}, column '{name}': '{cell[:40]}' is not a number"
                 ) from None
     positions = np.column_stack([values[name] for name in names])
     if "time" not in values:
@@ -183,11 +183,11 @@ def add_calibration(camera: EpisodeCamera, known: CameraFile, path: Path) -> Epi
     if found is None:
         return camera
     if not isinstance(found, PinholeCamera):
-        raise CameraError(f"{where}: is parallel, but pictures are taken by pinholes")
+        raise CameraError(f"{where}: is parallel, but pictures need a pinhole camera")
     if (found.width, found.height) != (camera.width, camera.height):
         raise CameraError(
             f"{where}: has {found.width} x {found.height} pixels (width x height), but its "
-            f"pictures {camera.width} x {camera.height}: give the numbers of these pictures"
+            f"pictures {camera.width} x {camera.height}: give the calibration of these pictures"
         )
     link, lens = known.links.get(camera.name), known.lenses.get(camera.name)
     return replace(camera, camera=found, link=link, lens=lens)
@@ -216,7 +216,7 @@ def require_recording(path: Path) -> None:
     if not found or found[0] != path.name:
         raise SceneError(
             f"{path}: has no folder masks/<camera>/<frame>.png, and no pictures, videos, data set "
-            "or bag" + (f"; give one of its folders: {listed(found)}" if found else "")
+            "or bag" + (f"; give one of its subfolders: {listed(found)}" if found else "")
         )
 
 
@@ -248,7 +248,9 @@ def open_episode(
     log, warnings = (None, []) if joints is None else read_joint_table(Path(joints))
     kind = recording_format(path)
     if episode is not None and kind != "lerobot":
-        raise SettingsError(f"--episode {episode}: {path} is no LeRobot data set, but one episode")
+        raise SettingsError(
+            f"--episode {episode}: {path} is a single episode, not a LeRobot data set"
+        )
     inside = sorted(one.name for one in path.iterdir()) if path.is_dir() else []
     bags = [path / name for name in inside if name.endswith(BAGS)]
     if kind == "lerobot":
@@ -261,5 +263,5 @@ def open_episode(
         found = open_bag(path if path.is_file() or "metadata.yaml" in inside else bags[0], log)
     else:
         what = ", ".join(inside[:8]) if path.is_dir() else "a file of another kind"
-        raise SceneError(f"{path}: is no episode: {what or 'empty'}; {expected}")
+        raise SceneError(f"{path}: is not an episode: {what or 'empty'}; {expected}")
     return replace(found, warnings=(*warnings, *found.warnings))

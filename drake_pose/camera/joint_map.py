@@ -105,7 +105,7 @@ def map_joints(
         angles, rows = {column: readings_of[column] for column in turning}, [*turning.values()]
         others = np.array([one for name, one in readings_of.items() if name not in used])
         units, why = _find_unit(angles, others, lower[rows], upper[rows])
-        warnings.append(f"angles of the joint log are read in {units} (units): {why}")
+        warnings.append(f"angles of the joint log are assumed to be in {units} (units): {why}")
     scale = UNITS[units or "rad"]
     columns |= {j: Column(c, scale if c in turning else 1.0) for c, j in matched.items()}
     positions = np.full((len(log.positions), len(names)), np.nan)
@@ -123,7 +123,7 @@ def map_joints(
     if missing:
         warnings.append(f"joints that are not logged: {', '.join(missing)}")
     if unused:
-        warnings.append(f"columns of the joint log that are no joint: {', '.join(unused)}")
+        warnings.append(f"columns of the joint log that are not joints: {', '.join(unused)}")
     mapped = JointLog(tuple(names), log.times, positions, log.frames)
     return MappedJoints(mapped, clipped, missing, unused, tuple(warnings))
 
@@ -163,7 +163,7 @@ def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str,
     if not guesses:
         return matched, []
     taken = ", ".join(f"{a} for {b}" for a, b in guesses.items())
-    return matched, [f"columns of the joint log are taken by what their names are like: {taken}"]
+    return matched, [f"columns of the joint log are matched by similar names: {taken}"]
 
 
 def _words(name: str) -> list[str]:
@@ -216,20 +216,20 @@ def _find_unit(
     column = list(readings)[k]
     reason = (
         f"are not all within the joints' limits as radians ('{column}' is {least[k]:.4g} to "
-        f"{most[k]:.4g}), nor surely degrees"
+        f"{most[k]:.4g}), and not clearly degrees"
     )
     is_named = any(name.endswith(".pos") for name in readings)
     if is_named or normalised[0] <= reach <= normalised[1]:
-        reason = "look as if they were normalised to -100 ... 100, as LeRobot's are"
+        reason = "seem to be normalised to -100 ... 100, as in LeRobot"
     elif worst["rad"] <= slack and worst["deg"] <= 0.0:
-        return "rad", "they would lie within the limits as degrees, too"
+        return "rad", "but as degrees they would be within the limits, too"
     elif worst["rad"] <= slack:
-        return "rad", "only as these all lie within the limits"
+        return "rad", "only as radians all are within the limits"
     elif worst["deg"] <= slack and worst["rad"] > full_turn:
-        return "deg", "only as these all lie within the limits"
+        return "deg", "only as degrees all are within the limits"
     raise SceneError(
-        f"the readings of the joint log ({', '.join(readings)}) {reason}: say units: rad or deg, "
-        "or give a joint map with the range of each: JOINT: {column: COLUMN, from: [-100, 100], "
+        f"the readings of the joint log ({', '.join(readings)}) {reason}: give units: rad or deg, "
+        "or a joint map with the range of each: JOINT: {column: COLUMN, from: [-100, 100], "
         "to: [LOWEST, HIGHEST]} in radians"
     )
 
@@ -261,8 +261,8 @@ def _positions(
         clipped = (np.abs(readings - low) <= near) | (np.abs(readings - high) <= near)
         if beyond := int(((readings < low - near) | (readings > high + near)).sum()):
             said.append(
-                f"has {beyond} of {len(readings)} readings beyond {low:g} ... {high:g}, between "
-                "which the joint map says that they are"
+                f"has {beyond} of {len(readings)} readings outside the joint map's range {low:g} "
+                f"... {high:g}"
             )
     lower, upper = limits
     if not math.isfinite(upper - lower):
@@ -274,8 +274,8 @@ def _positions(
     row = int(np.argmax(off))
     if off[row] > (slack if is_angle else slack * (upper - lower)):
         said.append(
-            f"puts it at {found[row]:.4g} in row {row}, outside its limits {lower:.4g} to "
-            f"{upper:.4g}: is it another joint's, its zero or sign another, its unit another?"
+            f"gives {found[row]:.4g} in row {row}, outside the joint's limits {lower:.4g} to "
+            f"{upper:.4g}: is it the wrong column, offset, sign or unit?"
         )
     return found, clipped, said
 

@@ -262,7 +262,7 @@ def camera_tuple(cameras: Mapping[str, Camera] | Iterable[Camera]) -> tuple[Came
     """
     if isinstance(cameras, Camera):
         raise CameraError(
-            f"one camera, '{cameras.name}', where several are expected: give [camera], or "
+            f"got one camera, '{cameras.name}', but several are expected: give [camera], or "
             "{name: camera}"
         )
     several = isinstance(cameras, Mapping | Iterable) and not isinstance(cameras, str | bytes)
@@ -270,8 +270,8 @@ def camera_tuple(cameras: Mapping[str, Camera] | Iterable[Camera]) -> tuple[Came
     for one in found if several else [cameras]:
         if not isinstance(one, Camera):
             raise CameraError(
-                f"{type(one).__name__} where a camera is expected: give a PinholeCamera or a "
-                "ParallelCamera, as load_cameras does"
+                f"got {type(one).__name__} where a camera is expected: give a PinholeCamera or a "
+                "ParallelCamera, as from load_cameras"
             )
     return found
 
@@ -415,7 +415,7 @@ class Lens:
         """Return an image (H, W) or (H, W, 3) without distortion; CameraError for another size."""
         if picture.shape[:2] != (self.height, self.width):
             raise CameraError(
-                f"a picture of {picture.shape[1]} x {picture.shape[0]} pixels (width x height) is "
-                f"not of the lens of {self.width} x {self.height}"
+                f"a picture of {picture.shape[1]} x {picture.shape[0]} pixels (width x height) "
+                f"does not fit the lens, which is for {self.width} x {self.height}"
             )
         return np.asarray(cv2.remap(picture, *self._maps, cv2.INTER_LINEAR), dtype=np.uint8)

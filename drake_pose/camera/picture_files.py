@@ -110,14 +110,14 @@ def read_binary_mask(
         same = cv2.countNonZero(cv2.inRange(layers, colour, colour))
         is_one_colour = not mask.any() or same == np.count_nonzero(mask)
     if mask.all():
-        raise error_type(f"{path}: the mask is full (no black pixel): no background to be seen")
+        raise error_type(f"{path}: the mask is full (no black pixel): it shows no background")
     if not (may_be_empty or mask.any()):
-        raise error_type(f"{path}: the mask is empty (all black): no object to be seen")
+        raise error_type(f"{path}: the mask is empty (all black): it shows no object")
     if not is_one_colour:
         values = len(np.unique(layers.reshape(-1, layers.shape[2]), axis=0))
         raise error_type(
-            f"{path}: the mask has {values} values, but must have two: black, and one other on the "
-            "object; threshold it first (or give the camera's source a background instead of masks)"
+            f"{path}: the mask has {values} values, but must have two, black and one other on the "
+            "object: threshold it (or give the camera's source a background instead of masks)"
         )
     return np.asarray(mask, dtype=np.bool_)
 
@@ -140,7 +140,7 @@ def find_pictures(folder: Path, camera: str) -> dict[str, Path]:
         raise SceneError(f"{folder}: no such folder of camera '{camera}'s pictures")
     files = list_pictures(folder, SceneError)
     if not files:
-        raise SceneError(f"{folder}: holds no picture <frame>.png or .jpg of camera '{camera}'")
+        raise SceneError(f"{folder}: has no picture <frame>.png or .jpg of camera '{camera}'")
     return files
 
 
@@ -206,7 +206,7 @@ def _decode(
     """
     is_jpeg = data.startswith(b"\xff\xd8") and not only_png
     if is_jpeg and not data.rstrip(b"\0").endswith(b"\xff\xd9"):
-        raise error_type(f"{path}: the JPEG picture is cut short")
+        raise error_type(f"{path}: the JPEG picture is truncated")
     # Check completeness here, because OpenCV's versions differ in decoding truncated images.
     if not (is_jpeg or data.startswith(b"\x89PNG\r\n\x1a\n")):
         raise error_type(f"{path}: not a PNG picture")
@@ -223,7 +223,7 @@ def _decode(
     ) as error:  # fmt: skip
         # Pillow's message for an unidentified image only has a memory address.
         why = "" if isinstance(error, UnidentifiedImageError) else f": {error}"
-        raise error_type(f"{path}: the picture is cut short, damaged or too large{why}") from error
+        raise error_type(f"{path}: the picture is truncated, damaged or too large{why}") from error
     if max(width, height) > LARGEST_SIDE:
         raise error_type(
             f"{path}: {width} x {height} pixels are too many: at most {LARGEST_SIDE} a side"
@@ -240,8 +240,8 @@ def _decode(
         brightest = 0 if deep is None else int(deep.max())
         if 0 < brightest < 1 << 12:
             raise error_type(
-                f"{path}: 16 bits a pixel, but no value above {brightest} of 65535: its values "
-                "have fewer bits; scale them to the whole range, or save the picture in 8 bits"
+                f"{path}: has 16 bits per pixel, but no value above {brightest} of 65535: scale "
+                "its values to the whole range, or save the picture with 8 bits"
             )
     return np.asarray(decoded)
 
@@ -253,7 +253,7 @@ def import_reader(library: str, path: Path) -> Any:
     except ImportError as error:
         package = library.partition(".")[0]
         raise SceneError(
-            f"{path}: is read by {package}: pip install 'drake_pose[episodes]' ({error})"
+            f"{path}: needs {package} to be read: pip install 'drake_pose[episodes]' ({error})"
         ) from error
 
 
@@ -302,7 +302,7 @@ class VideoPictures:
             self._next += 1
         found, picture = self._capture.read()
         if self._next < number or not found:
-            what = f"is cut short: it ends after {self._next} pictures, but says {self.count}"
+            what = f"is truncated: it ends after {self._next} of {self.count} pictures"
             what = what if number < self.count else f"has no picture {number}"
             raise SceneError(
                 f"{self._path}: {what}; leave the rest out (--frame), or repair it: ffmpeg -i "
@@ -337,7 +337,7 @@ class TimedVideo:
             self._stream = self._container.streams.video[0]
         except (*self._errors, IndexError) as error:
             raise SceneError(
-                f"{path}: not a video that PyAV can read, or its index is cut off ({error}); copy "
+                f"{path}: not a video that PyAV can read, or its index is missing ({error}); copy "
                 "or record it again"
             ) from error
         self._packets = list(self._scan())
@@ -351,7 +351,7 @@ class TimedVideo:
         self.warnings: list[str] = []
         if self._promised > len(self.times):
             text = f"it ends after {len(self.times)} of {self._promised} pictures"
-            self.warnings.append(f"{path}: is cut short: {text}")
+            self.warnings.append(f"{path}: is truncated: {text}")
         self._frames: Iterator[Any] = iter(())
         self._last: int | None = None
         self.height, self.width = self.read(0).shape[:2]
@@ -374,7 +374,7 @@ class TimedVideo:
     def read(self, number: int) -> Picture:
         """Return an image (H, W, 3), red, green, blue; SceneError if it is missing or damaged."""
         if not 0 <= number < len(self._stamps):
-            cut = "is cut short: it " if self._promised > len(self._stamps) else ""
+            cut = "is truncated: it " if self._promised > len(self._stamps) else ""
             raise SceneError(f"{self._path}: {cut}has pictures 0 to {len(self._stamps) - 1} only")
         wanted = int(self._stamps[number])
         key = int(self._keys[max(0, int(np.searchsorted(self._keys, wanted, side="right")) - 1)])

@@ -228,9 +228,7 @@ class DeviceSource(FrameSource):
                 return
             if not self._failed:
                 what = "stopped" if count else "cannot be opened"
-                self.report(
-                    f"'{self.specification.location}' {what}; it is tried again until it answers"
-                )
+                self.report(f"'{self.specification.location}' {what}; retrying until it answers")
                 self._failed = True
             pause = first if count > before else pause
             self._stop.wait(pause)
@@ -401,7 +399,7 @@ def _times_from_rate(given: SourceSpecification, files: Mapping[str, Path]) -> d
     if given.rate_hz is None:
         raise SceneError(
             f"{folder}: has no {TIME_STAMPS} (frame,time), so the source of camera "
-            f"'{given.camera}' needs rate_hz, its pictures a second"
+            f"'{given.camera}' needs rate_hz, its pictures per second"
         )
     names = set(files)
     for other in given.beside:

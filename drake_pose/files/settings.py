@@ -274,8 +274,8 @@ class CaptureSettings(SceneSettings):
     """Settings that estimates and the capture of a person share."""
 
     track: Annotated[bool, Parameter(negative="--no-track")] = True
-    """--track: track the body through a sequence, and search only in the first frame and after a
-    loss. --no-track: search in every frame."""
+    """Track the body through a sequence, and search only in the first frame and after a loss;
+    --no-track: search in every frame."""
     start: Path | None = None
     """Joint positions in the first frame of a sequence [rad or m]: CSV file with the column frame
     and one for each joint. Rows of other frames are used after a loss."""

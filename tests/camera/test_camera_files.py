@@ -68,7 +68,7 @@ def test_principal_points_may_be_counted_as_drake_does(tmp_path):
         (f"cam: {{{GOOD[1:-1]}, pixel_centers: middle}}", "'cam'.*integers.*drake.*'middle'"),
         ("", "mapping from camera names"),
         ("[1, 2]", "mapping from camera names"),
-        ("cam: 3", "is no camera file: it has cam; read are this program's"),
+        ("cam: 3", "is not a camera file: it has cam; supported are this program's"),
         ("cam: [", "not a YAML file"),
         ("cam: !!python/object/apply:os.system [ls]", "not a YAML file"),
         (f"cam: {GOOD}\ncam: {GOOD}", "given twice"),

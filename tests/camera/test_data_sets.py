@@ -93,7 +93,7 @@ def test_each_episode_has_its_own_pictures_and_rows(tmp_path, write):
         assert (joints.positions[:, 2] == 10.0 * n).all()
     with pytest.raises(UnknownNameError, match="has no episode '3'; it has: 0, 1, 2"):
         open_episode(tmp_path, episode=3)
-    with pytest.raises(SceneError, match=r"--episode N\): of 3 these are here: 0, 1, 2"):
+    with pytest.raises(SceneError, match=r"--episode N\); of 3 these are present: 0, 1, 2"):
         open_episode(tmp_path)
 
 
@@ -105,7 +105,7 @@ def test_a_part_of_a_data_set_and_what_is_wrong_in_it(tmp_path):
         open_episode(tmp_path, episode=1)
     assert open_episode(tmp_path).joints.names == ("joint_0", "joint_1", "joint_2")
     video = write_video(tmp_path / f"videos/chunk-001/{TOP}/episode_000002.mp4", range(7))
-    assert "camera 'top': has 7 pictures of 9 rows" in open_episode(tmp_path).warnings[0]
+    assert "camera 'top': has 7 pictures for 9 rows" in open_episode(tmp_path).warnings[0]
     video.unlink()
     assert "camera 'top' is left out" in open_episode(tmp_path).warnings[0]
     table, info = tmp_path / "data/chunk-001//episode_000002.parquet", tmp_path / "meta/info.json"
@@ -113,10 +113,12 @@ def test_a_part_of_a_data_set_and_what_is_wrong_in_it(tmp_path):
     with pytest.raises(SceneError, match="a file of it is damaged"):
         open_episode(tmp_path)
     table.unlink()
-    with pytest.raises(SceneError, match="of 3 these are here: none"):
+    with pytest.raises(SceneError, match="of 3 these are present: none"):
         open_episode(tmp_path)
     info.write_text(info.read_text().replace("v2.1", "v1.6"))
-    with pytest.raises(SceneError, match=r"version v1\.6, but 2\.0, 2\.1 and 3\.0 are read"):
+    with pytest.raises(
+        SceneError, match=r"version v1\.6, but only 2\.0, 2\.1 and 3\.0 are supported"
+    ):
         open_episode(tmp_path)
 
 
@@ -129,7 +131,7 @@ def test_a_recorded_data_set(shared_data):
         assert (len(joints.names), joints.names[3]) == (26, "kLeftElbow")
         assert np.abs(joints.times - one.times).max() < 1e-5
         np.testing.assert_array_equal(one.read(200), [one.read(k) for k in (199, 200)][1])
-    with pytest.raises(SceneError, match="of 100 these are here: 10, 20"):
+    with pytest.raises(SceneError, match="of 100 these are present: 10, 20"):
         open_episode(folder)
 
 
@@ -182,14 +184,14 @@ def test_cameras_and_joints_are_on_the_recorders_clock(tmp_path):
     assert (whole.shape, number_of(whole), right.camera) == ((64, 256, 3), 6, None)
     assert (left.camera.width, left.camera.height, left.camera.focal_x) == (128, 64, 52.0)
     assert left.camera.focal_y == pytest.approx(522 * 64 / 720)
-    assert "camera '111' is the hand's" in "\n".join(episode.warnings)
+    assert "camera '111' is on the hand" in "\n".join(episode.warnings)
 
 
 def test_videos_that_are_longer_than_their_time_stamps(tmp_path):
     video = write_video(write_episode(tmp_path), range(COUNT + 2))
     episode = open_episode(tmp_path)
     assert len(episode.camera("111").times) == COUNT
-    text = f"111.mp4: has {COUNT + 2} pictures, but trajectory.h5 {COUNT} times"
+    text = f"111.mp4: has {COUNT + 2} pictures, but trajectory.h5 has {COUNT} times"
     assert text in "\n".join(episode.warnings)
     received = START + 50 + 66.7 * np.arange(COUNT + 2)
     video.with_name("111_timestamps.json").write_text(json.dumps(received.tolist()))
@@ -203,7 +205,7 @@ def test_what_is_missing_or_damaged_is_named(tmp_path):
     for changed, message in (
         (none | {"111_frame_received": None}, r"111\.mp4: has no .*cameras/111_est.* has: 222_est"),
         ({"gripper_position": None}, r"has no .*/gripper_position; /obs.*state has: joint_pos"),
-        ({"joint_positions": np.zeros((COUNT - 1, 7))}, "h5: cut short or damaged"),
+        ({"joint_positions": np.zeros((COUNT - 1, 7))}, "h5: truncated or damaged"),
         ({"read_end": START + 4 - EACH, "read_start": START - 4 - EACH}, "rows: .* backwards"),
     ):
         write_episode(tmp_path, **changed)
@@ -211,10 +213,10 @@ def test_what_is_missing_or_damaged_is_named(tmp_path):
             open_episode(tmp_path)
     write_episode(tmp_path)
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    with pytest.raises(SceneError, match=r"trajectory\.h5: cut short or damaged"):
+    with pytest.raises(SceneError, match=r"trajectory\.h5: truncated or damaged"):
         open_episode(tmp_path)
     write_episode(tmp_path)
     for video in (tmp_path / "recordings" / "MP4").iterdir():
         video.unlink()
-    with pytest.raises(SceneError, match=r"MP4: holds no <serial>\.mp4"):
+    with pytest.raises(SceneError, match=r"MP4: has no <serial>\.mp4"):
         open_episode(tmp_path)

@@ -46,9 +46,11 @@ def test_videos_beside_a_faster_log(tmp_path):
     said = "\n".join(episode.warnings)
     assert "camera 'lost' of cameras.yaml has no pictures" in said
     assert "camera 'right' has no entry in cameras.yaml" in said
-    with pytest.raises(SettingsError, match=r"--episode 3: .* is no LeRobot data set"):
+    with pytest.raises(SettingsError, match=r"--episode 3: .* is a single episode"):
         open_episode(tmp_path, episode=3)
-    with pytest.raises(SceneError, match=r"joint_angles\.csv: is no episode: a file of another"):
+    with pytest.raises(
+        SceneError, match=r"joint_angles\.csv: is not an episode: a file of another"
+    ):
         open_episode(tmp_path / "joint_angles.csv")
 
 
@@ -120,11 +122,11 @@ def test_distortion_is_taken_out_as_the_formula_says(tmp_path):
         ("q,r\n1,2\n", "expected one column 'time'.* has 1 rows of: q, r"),
         ("time,q,q\n1,2,3\n", "expected one column 'time'"),
         ("time,q\n", "has 0 rows of: time, q"),
-        ("time,q\n0,1\n1,two\n", "line 3, column 'q': 'two' is no number"),
-        ("time,q\n0,1\n1,1_8\n", "line 3, column 'q': '1_8' is no number"),
+        ("time,q\n0,1\n1,two\n", "line 3, column 'q': 'two' is not a number"),
+        ("time,q\n0,1\n1,1_8\n", "line 3, column 'q': '1_8' is not a number"),
         ("frame,q\n1,0\n01,0\n", "has frame 1 more than once"),
         ("time,q\n3,1\n2,1\n1,1\n", "rows: number 1 .* runs backwards"),
-        ("frame,q\n5,1\n", "camera 'a': 1 of 1 pictures have no row .* called alike in both"),
+        ("frame,q\n5,1\n", "camera 'a': 1 of 1 pictures have no row .* the same names in both"),
     ],
 )
 def test_tables_that_cannot_be_used(tmp_path, table, message):
@@ -202,11 +204,11 @@ def test_clocks_that_run_backwards():
     kept, said = ascending_indices(times, "the log")
     np.testing.assert_array_equal(kept, np.delete(np.arange(20), [5, 7]))
     assert "number 5" in said[0]
-    assert "2 of 20 such are left out" in said[0]
+    assert "2 of 20 are left out" in said[0]
     times[8:] -= 0.6
     with pytest.raises(SceneError, match=r"the log: number 5 .* runs backwards or stands still"):
         ascending_indices(times, "the log")
-    with pytest.raises(SceneError, match="the log: holds nothing"):
+    with pytest.raises(SceneError, match="the log: is empty"):
         ascending_indices(np.zeros(0), "the log")
 
 
@@ -216,24 +218,28 @@ def test_what_is_odd_is_named():
     for times, joints, expected in (
         (TIMES[2:-2] + 0.013, log(TIMES), None),
         (TIMES + 1.71, log(TIMES), "17 of 20 pictures are before or after the log (1.710 to"),
-        (TIMES[:14], log(TIMES), "camera 'a': its pictures end, or begin, while the log goes on"),
-        (TIMES + 1.7e9, log(TIMES), "camera 'a': its clock is not the joint log's: no picture"),
+        (TIMES[:14], log(TIMES), "camera 'a': its pictures cover only a part of the log"),
+        (
+            TIMES + 1.7e9,
+            log(TIMES),
+            "camera 'a': its clock differs from the joint log's: no picture",
+        ),
         (np.delete(TIMES, [4, 5, 11]), log(TIMES), "camera 'a': 2 of 16 steps are longer than 1.5"),
         (TIMES, log(np.delete(TIMES, [4, 5])), "the joint log: 1 of 17 steps"),
         (TIMES[:1], log(TIMES), "camera 'a': has one picture only"),
-        (TIMES, broken, "'y' is no number in 2 of 20 rows, the first of which is 3"),
-        (TIMES, None, "here: holds no joint positions"),
+        (TIMES, broken, "'y' is not a number in 2 of 20 rows, first in row 3"),
+        (TIMES, None, "here: has no joint positions"),
     ):
         said = episode(times, joints).warnings
         assert expected in said[0] if expected else said == ()
 
 
 def test_what_cannot_be_used_is_refused():
-    with pytest.raises(SceneError, match="here: holds no camera's pictures because"):
+    with pytest.raises(SceneError, match="here: has no camera's pictures because"):
         Episode.checked(Path("here"), [], log(TIMES), ["because"])
-    with pytest.raises(SceneError, match="holds no row"):
+    with pytest.raises(SceneError, match="has no row"):
         episode(TIMES, JointLog((), TIMES, np.zeros((20, 0))))
-    with pytest.raises(SceneError, match=r"nothing tells which .* of camera 'a'.*timestamps\.csv"):
+    with pytest.raises(SceneError, match=r"cannot match .* of camera 'a'.*timestamps\.csv"):
         episode(np.full(3, np.nan), log(TIMES))
     with pytest.raises(UnknownNameError, match="here has no camera 'c'; it has: a"):
         episode(TIMES, None).camera("c")

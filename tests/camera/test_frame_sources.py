@@ -87,7 +87,7 @@ class TestFolder:
         source = open_source(specify(folder))
         assert [one.frame for one in read_all(source)] == ["0", "3"]
         assert source.dropped == 2
-        what = "the JPEG picture is cut short" if suffix == ".jpg" else "is cut short, damaged"
+        what = "the JPEG picture is truncated" if suffix == ".jpg" else "is truncated, damaged"
         assert what in source.problems[0]
         assert "7 x 5" in source.problems[1]
 

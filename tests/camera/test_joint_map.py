@@ -67,7 +67,7 @@ def test_positions_are_in_the_models_order_and_what_is_missing_is_named():
     assert (found.not_logged, found.unused) == (("panda_joint5",), ("gripper",))
     assert found.warnings[-2:] == (
         "joints that are not logged: panda_joint5",
-        "columns of the joint log that are no joint: gripper",
+        "columns of the joint log that are not joints: gripper",
     )
     with pytest.raises(SceneError, match=r"its columns are x, y, the joints panda_joint1,"):
         mapped(("x", "y"), np.zeros((2, 2)), ARM)
@@ -78,10 +78,10 @@ def test_units_are_told_or_follow_from_the_limits():
     wide = ARM | {"lower": np.full(7, -3.0), "upper": np.full(7, 3.0)}
     holes = np.where(np.eye(2, 7, dtype=bool), np.nan, POSES)
     for readings, model, units, words in (
-        (POSES, ARM, None, "read in rad (units): only as these"),
-        (holes, ARM, None, "read in rad (units): only as these"),
-        (degrees, ARM, None, "read in deg (units): only as these"),
-        (POSES, wide, None, "read in rad (units): they would lie within the limits as degrees"),
+        (POSES, ARM, None, "in rad (units): only as radians"),
+        (holes, ARM, None, "in rad (units): only as radians"),
+        (degrees, ARM, None, "in deg (units): only as degrees"),
+        (POSES, wide, None, "in rad (units): but as degrees they would be within"),
         (POSES, ARM, "rad", None),
         (degrees, ARM, "deg", None),
     ):
@@ -91,10 +91,12 @@ def test_units_are_told_or_follow_from_the_limits():
         assert words in found.warnings[0] if words else found.warnings == ()
     # 0.3 rad beyond a limit is no reason to take radians for degrees.
     beyond = [[3.3, *np.zeros(6)]]
-    with pytest.raises(SceneError, match=r"'panda_joint1' is 3\.3 to 3\.3.*nor surely degrees"):
+    with pytest.raises(
+        SceneError, match=r"'panda_joint1' is 3\.3 to 3\.3.*and not clearly degrees"
+    ):
         mapped(names, beyond, wide)
     told = mapped(names, beyond, wide, units="rad").warnings[0]
-    assert "joint 'panda_joint1': column 'panda_joint1' puts it at 3.3 in row 0" in told
+    assert "joint 'panda_joint1': column 'panda_joint1' gives 3.3 in row 0" in told
     with pytest.raises(SettingsError, match="units must be rad or deg, not 'turns'"):
         mapped(names, POSES, ARM, units="turns")
 
@@ -108,7 +110,7 @@ def test_normalised_readings_ask_for_their_ranges():
         (names, [[-60.0, 3.0, 1.0], [40.0, 9.0, 100.0]]),
         (("pan.pos", "lift.pos"), [[-40.0, 3.0], [40.0, 9.5]]),
     ):
-        with pytest.raises(SceneError, match=r"normalised.*say units.*from: \[-100, 100\]"):
+        with pytest.raises(SceneError, match=r"normalised.*give units.*from: \[-100, 100\]"):
             mapped(columns, readings, model)
     pan = Column("main_pan", 0.0192, 0.0, (-100.0, 100.0))
     table = {"pan": pan, "lift": Column("main_lift", 0.01)}
@@ -117,9 +119,12 @@ def test_normalised_readings_ask_for_their_ranges():
     np.testing.assert_array_equal(found.clipped, [[True, False], [False, False], [True, False]])
     beside = mapped(names[:2], [[-100.0, 1.0]], {**model, "names": ("pan", "main_lift")},
                     table={"pan": pan}).warnings[0]  # fmt: skip
-    assert "read in rad" in beside
+    assert "to be in rad" in beside
     said = mapped(names, [[-101.0, 3.0, 0.0]], model, table=table).warnings[0]
-    assert "joint 'pan': column 'main_pan' has 1 of 1 readings beyond -100 ... 100" in said
+    assert (
+        "joint 'pan': column 'main_pan' has 1 of 1 readings outside the joint map's range -100 ... 100"
+        in said
+    )
 
 
 def test_a_joint_without_limits_counts_on_over_a_turn():

@@ -54,9 +54,9 @@ def test_videos_that_are_cut_short(tmp_path):
     video = TimedVideo(tmp_path / "a.mp4")
     last = len(video.times) - 1
     assert 10 < last < 59
-    assert video.warnings[0].endswith(f"is cut short: it ends after {last + 1} of 60 pictures")
+    assert video.warnings[0].endswith(f"is truncated: it ends after {last + 1} of 60 pictures")
     assert number_of(video.read(last)) == last
-    with pytest.raises(SceneError, match=f"is cut short: it has pictures 0 to {last} only"):
+    with pytest.raises(SceneError, match=f"is truncated: it has pictures 0 to {last} only"):
         video.read(last + 1)
     # Where the index is at the end, nothing is left.
     for name in ("b.mp4", "none.mp4"):

@@ -33,7 +33,9 @@ def test_twelve_bit_values_in_sixteen_bit_files_are_refused(tmp_path):
     ramp = np.linspace(0, 4095, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH).astype(np.uint16)
     for name, values in (("twelve", ramp), ("sixteen", ramp * 16), ("black", ramp * 0)):
         cv2.imwrite(str(tmp_path / f"{name}.png"), values)
-    with pytest.raises(SceneError, match=r"twelve\.png: 16 bits a pixel.*above 4095 of 65535"):
+    with pytest.raises(
+        SceneError, match=r"twelve\.png: has 16 bits per pixel.*above 4095 of 65535"
+    ):
         read_picture(tmp_path / "twelve.png", SceneError)
     assert read_picture(tmp_path / "sixteen.png", SceneError).max() == 255
     assert read_picture(tmp_path / "black.png", SceneError).max() == 0

@@ -287,7 +287,7 @@ def test_masks_in_a_video_become_a_sequence(tmp_path, out, two_views):
 
 def test_an_episode_of_a_data_set_is_a_source(tmp_path, out):
     write_v21(tmp_path)
-    with pytest.raises(SceneError, match="say which episode"):
+    with pytest.raises(SceneError, match="choose an episode"):
         make_masks(tmp_path, out, MaskSettings(box=(8, 8, 40, 40)))
     result = make_masks(tmp_path, out, MaskSettings(box=(8, 8, 40, 40), episode=1))
     frames = [f"{k:06d}" for k in range(LENGTHS[1])]

@@ -87,7 +87,7 @@ def test_a_folder_of_recordings_names_them(episode, tmp_path, command):
     model = [] if command == "capture" else ["--model", str(painted.path)]
     result = run_command([command, str(scene.parent), *model, "--out", str(tmp_path / "out")])
     assert result.exit_code == 1
-    assert "give one of its folders: scene" in " ".join(result.output.split())
+    assert "give one of its subfolders: scene" in " ".join(result.output.split())
 
 
 def test_joints_are_where_their_log_says_at_the_pictures_times(episode):

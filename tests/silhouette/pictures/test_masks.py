@@ -78,7 +78,7 @@ def test_damaged_files_are_refused(tmp_path):
     data = path.read_bytes()
     for end in (0, 5, 8, 20, 40, len(data) - 13, len(data) - 8):
         path.write_bytes(data[:end])
-        with pytest.raises(MaskError, match=r"0007\.png: .*(not a PNG|cut short|damaged)"):
+        with pytest.raises(MaskError, match=r"0007\.png: .*(not a PNG|truncated|damaged)"):
             read_mask(path)
     for place in (9, 14, 18, 30, len(data) - 20):
         path.write_bytes(data[:place] + bytes([data[place] ^ 0x55]) + data[place + 1 :])

@@ -70,7 +70,7 @@ def test_videos_of_different_rates_or_lengths_are_reported(tmp_path):
     assert "'middle' has 45 of 60 frames; it lacks 000045-000059" in text
     video = tmp_path / "videos" / "left.avi"
     video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
-    with pytest.raises(SceneError, match=r"cut short: it ends after \d+ .* says 60; .*--frame"):
+    with pytest.raises(SceneError, match=r"truncated: it ends after \d+ of 60 .*--frame"):
         load_scene(tmp_path).read_image("left", "000059")
 
 

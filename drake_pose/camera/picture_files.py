@@ -117,7 +117,7 @@ def read_binary_mask(
         values = len(np.unique(layers.reshape(-1, layers.shape[2]), axis=0))
         raise error_type(
             f"{path}: the mask has {values} values, but must have two, black and one other on the "
-            "object: threshold it (or give the camera's source a background instead of masks)"
+            "object: threshold it first (or give the camera's source a background instead of masks)"
         )
     return np.asarray(mask, dtype=np.bool_)
 

@@ -189,7 +189,7 @@ def _draw_points(result: DateResult, sample: MotionSample) -> Figure:
         origins, directions = viewing_rays(result.studio.cameras[name], view.blobs.centroids)
         for origin, direction in zip(origins, directions, strict=True):
             # Draw rays from 0.1 m before the features to 0.1 m behind them.
-            along = (found.places - origin) @ direction
+            along = (found.positions - origin) @ direction
             ends = origin + np.outer([along.min() - 0.1, along.max() + 0.1], direction)
             axes.plot(*ends.T, color="0.85", linewidth=0.5, zorder=0)
     colours = ("tab:red", "tab:blue", "tab:green", "tab:orange", "tab:purple")
@@ -197,7 +197,7 @@ def _draw_points(result: DateResult, sample: MotionSample) -> Figure:
         points = found.points[found.owners == k]
         axes.plot(*points.T, ".", color=colour, markersize=3)
         label = f"{name.replace('_', ' ')}: {found.support[k]} of {len(points)}"
-        axes.plot(*found.places[k : k + 1].T, "x", color=colour, markersize=9, label=label)
+        axes.plot(*found.positions[k : k + 1].T, "x", color=colour, markersize=9, label=label)
     axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", aspect="equal")
     axes.legend(title="points in the dense part, of all", fontsize="small")
     return figure

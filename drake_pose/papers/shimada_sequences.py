@@ -442,7 +442,7 @@ def run_sequence(
 
 
 def _truth(folder: Path, inputs: EstimateInputs, hand: HandModel) -> dict[str, Array]:
-    """Return the true angles (frames,) [deg] of which the sequence's file has columns."""
+    """Return the true angles (frames,) [deg] that the sequence's file contains."""
     file = folder / JOINT_TABLE
     if not file.is_file():
         return {}

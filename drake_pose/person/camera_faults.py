@@ -25,7 +25,7 @@ class FaultSettings(NamedTuple):
     """Thresholds for a camera to be at fault.
 
     Args:
-        rounds: scales at which a camera's motion is fitted [m].
+        scales: at which a camera's motion is fitted [m].
         max_misfit: leaving the camera out must lower the others' misfit to this fraction.
         similar_misfit: cameras are suspected, too, whose misfit is at most this factor above the
             lowest.
@@ -35,7 +35,7 @@ class FaultSettings(NamedTuple):
             this fraction of the others'.
     """
 
-    rounds: tuple[float, ...] = (0.4, 0.3, 0.2, 0.15, 0.1, 0.07, 0.05, 0.05)
+    scales: tuple[float, ...] = (0.4, 0.3, 0.2, 0.15, 0.1, 0.07, 0.05, 0.05)
     max_misfit: float = 0.8
     similar_misfit: float = 1.1
     min_metres: float = 0.035
@@ -128,8 +128,8 @@ class CameraComparison:
         is_angle = self._fit.kinematics.is_angle
         prior = Prior(frame.values, np.where(is_angle, 1.0, 4.0) / 0.5**2)
         scales = (0.15, 0.12, 0.10, 0.08, 0.06, 0.05, 0.04)
-        rounds = [AnnealingStage(scale, 0.05) for scale in scales]
-        found = self._fit.fit(views, frame.values, rounds, prior, self._held)
+        stages = [AnnealingStage(scale, 0.05) for scale in scales]
+        found = self._fit.fit(views, frame.values, stages, prior, self._held)
         self._without[frame, left_out] = found.values, found.inlier_ratio
         return found.values, found.inlier_ratio
 
@@ -144,7 +144,7 @@ class CameraComparison:
         name: str,
         edges: Sequence[EdgePoints],
         poses: Sequence[Array],
-        scales: Sequence[float] = FAULT.rounds,
+        scales: Sequence[float] = FAULT.scales,
     ) -> CameraMotion:
         """Fit the motion of a camera to its edges, for poses (m,) found without this camera.
 
@@ -167,11 +167,11 @@ class CameraComparison:
             noise=fit.noise, steps=StepSettings(max_step=2.0, damping=1e-6, uniform_damping=1e-9),
         )  # fmt: skip
         seen = [Observation(pack_evidence([edge]), values) for edge, values in pairs]
-        rounds = [AnnealingStage(scale, 0.05) for scale in scales]
+        stages = [AnnealingStage(scale, 0.05) for scale in scales]
         nothing, solutions = np.zeros((len(pairs), 0)), []
         for start in (np.zeros(3), _shift_to_regions(camera, edges, places)):
             shift = np.concatenate([np.zeros(3), camera.X_CW[:3, :3] @ start])
-            solved = problem.solve(seen, rounds, (nothing, shift), expected=(nothing, np.zeros(6)))
+            solved = problem.solve(seen, stages, (nothing, shift), expected=(nothing, np.zeros(6)))
             X_CW = problem.place_cameras(solved.parameters[0])[0][0]
             moved = camera.with_pose(np.linalg.inv(X_CW))
             solutions.append(self._describe(camera, moved, pairs, points))

@@ -208,7 +208,7 @@ class _Capture:
         return shape, PersonPoseTracker(shaped, LENIENT, shape_values(fit.tree), shape.values, plan)
 
     def find_explanations(self, frame: int, start: PoseFit | None = None) -> list["_Explanation"]:
-        """Return the distinct poses that explain a frame, best first; empty where nobody is seen.
+        """Return the distinct poses that explain a frame, best first; empty if nobody is visible.
 
         Where the shape is unknown, the shape of a first fit is used in the search, and each
         explanation gets its own shape before they are compared: in a body of other proportions a
@@ -337,7 +337,7 @@ def capture_by_colour(
     known: PersonCapture | None,
     on_frame: Callable[[int], None] | None = None,
 ) -> tuple[PersonCapture, Array]:
-    """Capture a recording of which few frames have masks, by the person's colours.
+    """Capture a recording with masks in few frames only, by the person's colours.
 
     Masks or given positions start the track, and start it again after a loss.
 

@@ -50,12 +50,12 @@ class Person:
     """A person seen by two or more cameras.
 
     Args:
-        place: (3,) middle of the body [m].
+        position: (3,) middle of the body [m].
         figures: index of the person's figure, by index of the camera.
         area: median area of these figures, the smaller one of two [pixel^2].
     """
 
-    place: Array
+    position: Array
     figures: dict[int, int] = field(default_factory=dict)
     area: float = 0.0
 
@@ -124,16 +124,16 @@ def find_persons(
 
     Args:
         figures: of each camera's mask.
-        examined: number of places with the best support that are examined in each round.
+        examined: number of best supported positions that are examined in each round.
     """
     if all(len(own) <= 1 for own in figures):
         taken = {k: 0 for k, own in enumerate(figures) if own}
         if len(taken) < 2:
             return ()
         person = _person(cameras, figures, taken)
-        place = person.place[None]
+        position = person.position[None]
         if (
-            max(ray_distances(cameras[k], figures[k][0].middle, place)[0] for k in taken)
+            max(ray_distances(cameras[k], figures[k][0].middle, position)[0] for k in taken)
             < _MAX_RAY_DISTANCE
         ):
             return (person,)
@@ -145,16 +145,16 @@ def find_persons(
             np.isin(np.arange(len(own)), list(rest))
             for own, rest in zip(figures, free, strict=True)
         ]
-        places = meeting_points(cameras, middles, 2.0 * _MAX_RAY_DISTANCE, is_candidate)
+        positions = meeting_points(cameras, middles, 2.0 * _MAX_RAY_DISTANCE, is_candidate)
         best: tuple[float, float, Person] | None = None
-        scores, nearest = _support(cameras, figures, free, places)
+        scores, nearest = _support(cameras, figures, free, positions)
         # Places with the same nearest figures belong to one person.
         for chosen in dict.fromkeys(map(tuple, nearest[np.argsort(-scores)[:examined]].tolist())):
             taken = {k: i for k, i in enumerate(chosen) if i >= 0}
             if len(taken) < 2:
                 continue
-            place = _person(cameras, figures, taken).place
-            score, confirmed = _support(cameras, figures, free, place[None])
+            position = _person(cameras, figures, taken).position
+            score, confirmed = _support(cameras, figures, free, position[None])
             taken = {k: i for k, i in enumerate(confirmed[0].tolist()) if i >= 0}
             if len(taken) < 2:
                 continue
@@ -174,42 +174,42 @@ def _person(
     """Return the person with these figures, by index of the camera."""
     chosen = [figures[k][i] for k, i in taken.items()]
     areas = sorted(figure.area for figure in chosen)
-    place = triangulate([cameras[k] for k in taken], [figure.middle for figure in chosen])
-    return Person(place, taken, areas[(len(areas) - 1) // 2])
+    position = triangulate([cameras[k] for k in taken], [figure.middle for figure in chosen])
+    return Person(position, taken, areas[(len(areas) - 1) // 2])
 
 
 def _support(
     cameras: Sequence[Camera],
     figures: Sequence[Sequence[Figure]],
     free: Sequence[set[int]],
-    places: Array,
+    positions: Array,
     *,
     covers: float = 0.4,
     misses: float = -1.0,
 ) -> tuple[Array, Indices]:
-    """Score places (n, 3) by the figures that support a person there.
+    """Score positions (n, 3) by the figures that support a person there.
 
     A figure adds 0.5 to 1 if its ray passes within 0.35 m.
 
     Args:
-        free: indices of the figures of each camera that belong to nobody yet.
-        covers: score of a figure whose box only covers the place.
-        misses: score of a camera that sees the place, but no figure there.
+        free: indices of the figures of each camera that belong to no person yet.
+        covers: score of a figure whose box only covers the position.
+        misses: score of a camera that sees the position, but no figure there.
 
     Returns:
         (n,) sums of the scores over cameras, and (n, cameras) index of the figure, or -1.
     """
-    scores = np.zeros(len(places))
-    taken = np.full((len(places), len(cameras)), -1)
+    scores = np.zeros(len(positions))
+    taken = np.full((len(positions), len(cameras)), -1)
     for k, (camera, own) in enumerate(zip(cameras, figures, strict=True)):
-        uv, depth = camera.project(places)
+        uv, depth = camera.project(positions)
         with np.errstate(invalid="ignore"):
             is_visible = (depth > 0.0) & (uv >= 0.0).all(axis=1)
             is_visible &= (uv < [camera.width, camera.height]).all(axis=1)
         if not own:
             scores += misses * is_visible
             continue
-        distances = np.array([ray_distances(camera, figure.middle, places) for figure in own])
+        distances = np.array([ray_distances(camera, figure.middle, positions) for figure in own])
         distances[[i for i in range(len(own)) if i not in free[k]]] = np.inf
         nearest = distances.argmin(axis=0)
         distance = distances.min(axis=0)
@@ -236,18 +236,18 @@ def is_separate(
     """
     if person.area < least_area * max(one.area for one in persons):
         return False
-    return all(np.linalg.norm((person.place - one.place)[:2]) > apart for one in persons)
+    return all(np.linalg.norm((person.position - one.position)[:2]) > apart for one in persons)
 
 
-def pixels_per_metre(camera: Camera, place: Array) -> float:
-    """Return the size of a metre at the depth of a place (3,) in a picture [pixel/m]."""
-    return float(contour_fit.pixels_per_metre(contour_fit.pack_cameras([camera]), place)[0])
+def pixels_per_metre(camera: Camera, position: Array) -> float:
+    """Return the size of a metre at the depth of a position (3,) in a picture [pixel/m]."""
+    return float(contour_fit.pixels_per_metre(contour_fit.pack_cameras([camera]), position)[0])
 
 
-def ray_distances(camera: Camera, uv: Array, places: Array) -> Array:
-    """Return the distances (n,) of places (n, 3) from the ray of a pixel (2,) [m]."""
+def ray_distances(camera: Camera, uv: Array, positions: Array) -> Array:
+    """Return the distances (n,) of positions (n, 3) from the ray of a pixel (2,) [m]."""
     origin, direction = viewing_rays(camera, uv[None])
-    across = places - origin
+    across = positions - origin
     along = across @ direction[0]
     return np.asarray(np.linalg.norm(across - along[:, None] * direction, axis=1))
 
@@ -281,12 +281,12 @@ def sort_figures(
     """
 
     def covers(camera: Camera, figure: Figure, one: Person) -> bool:
-        uv, depth = camera.project(one.place[None])
+        uv, depth = camera.project(one.position[None])
         left, top, right, bottom = figure.box
         return bool(depth[0] > 0.0 and left <= uv[0, 0] <= right and top <= uv[0, 1] <= bottom)
 
     others = [one for one in persons if one is not person]
-    places = np.array([one.place for one in others]).reshape(-1, 3)
+    positions = np.array([one.position for one in others]).reshape(-1, 3)
     found = {}
     for k, (name, own) in enumerate(figures.items()):
         if person is None:
@@ -296,7 +296,7 @@ def sort_figures(
         taken = {one.figures[k] for one in others if k in one.figures}
         away: list[Figure] = []
         for i, figure in enumerate(own):
-            off = ray_distances(camera, figure.middle, person.place[None])[0]
+            off = ray_distances(camera, figure.middle, person.position[None])[0]
             if person.figures.get(k) == i:
                 hidden = [one for one in others if k not in one.figures]
                 merged |= any(covers(camera, figure, one) for one in hidden)
@@ -304,7 +304,7 @@ def sort_figures(
                 merged = True
             elif (
                 i in taken
-                or ray_distances(camera, figure.middle, places).min(initial=np.inf) < off
+                or ray_distances(camera, figure.middle, positions).min(initial=np.inf) < off
                 or (
                     k in person.figures
                     and off >= far
@@ -317,12 +317,12 @@ def sort_figures(
 
 
 def keep_person(
-    cameras: Mapping[str, Camera], masks: Mapping[str, Mask], place: Array | None = None
+    cameras: Mapping[str, Camera], masks: Mapping[str, Mask], position: Array | None = None
 ) -> tuple[dict[str, Mask], Person | None, tuple[str, ...], tuple[str, ...]]:
     """Keep one person in the masks of a frame, and cut out all others.
 
     Args:
-        place: (3,) where the person was in the last frame [m]. None: the person with the largest
+        position: (3,) where the person was in the last frame [m]. None: the person with the largest
             figures is kept, of equal ones the nearer one to the middle of the cameras' view.
 
     Returns:
@@ -335,11 +335,11 @@ def keep_person(
     persons = find_persons(list(used.values()), list(figures.values()))
     if not persons:
         return dict(masks), None, (), ()
-    if place is None:
+    if position is None:
         middle = middle_of_view(list(used.values()))
         person = max(persons, key=lambda one: _prominence(one, middle))
     else:
-        person = min(persons, key=lambda one: float(np.linalg.norm(one.place - place)))
+        person = min(persons, key=lambda one: float(np.linalg.norm(one.position - position)))
     found = sort_figures(cameras, figures, persons, person)
     return (
         {name: cut_figures(mask, found[name][0]) for name, mask in masks.items()},
@@ -350,12 +350,12 @@ def keep_person(
 
 
 def keep_views(
-    frame: FrameViews, place: Array | None = None
+    frame: FrameViews, position: Array | None = None
 ) -> tuple[FrameViews, tuple[str, ...], tuple[str, ...]]:
     """Keep one person in a frame's views; return them, and the cut and merged cameras' names."""
     cameras = {camera.name: camera for camera in frame.cameras}
     regions = {one.name: view.region for one, view in frame.pairs}
-    masks, _, cut, merged = keep_person(cameras, regions, place)
+    masks, _, cut, merged = keep_person(cameras, regions, position)
     alone = [
         see_silhouette(masks[one.name], edge_spacing(one)) if one.name in cut else view
         for one, view in frame.pairs
@@ -387,11 +387,11 @@ def follow_one(
         if not set(range(min(track), max(track) + 1)) & set(main):
             main = main | track
     known = sorted(main)
-    places = np.array([main[k].place for k in known])
+    positions = np.array([main[k].position for k in known])
     found: list[Person | None] = [None] * len(frames)
     for k in range(known[0], known[-1] + 1):
-        place = np.array([np.interp(k, known, places[:, axis]) for axis in range(3)])
-        found[k] = main.get(k, Person(place))
+        position = np.array([np.interp(k, known, positions[:, axis]) for axis in range(3)])
+        found[k] = main.get(k, Person(position))
     return found
 
 
@@ -409,7 +409,7 @@ def find_tracks(
         for t, track in enumerate(tracks):
             last = max(track)
             for p, person in enumerate(persons):
-                distance = float(np.linalg.norm(person.place - track[last].place))
+                distance = float(np.linalg.norm(person.position - track[last].position))
                 if distance < step + more * (k - last - 1):
                     pairs.append((distance, t, p))
         free_tracks, free = set(range(len(tracks))), set(range(len(persons)))
@@ -424,7 +424,7 @@ def find_tracks(
 
 def _prominence(person: Person, middle: Array) -> tuple[float, float]:
     """Return the sort key of the most prominent person: area first, then nearness to the middle."""
-    return person.area, -float(np.linalg.norm(person.place - middle))
+    return person.area, -float(np.linalg.norm(person.position - middle))
 
 
 @dataclass(frozen=True, eq=False)
@@ -485,10 +485,10 @@ class PersonRecording:
                 )
             if frame % max(1, count // measured) == 0 and len(seen) >= 2:
                 used = [cameras[name] for name in seen]
-                place = triangulate(used, [figure.middle for figure in seen.values()])
+                position = triangulate(used, [figure.middle for figure in seen.values()])
                 for camera, figure in zip(used, seen.values(), strict=True):
                     height = float(figure.box[3] - figure.box[1])
-                    heights.append(height / pixels_per_metre(camera, place))
+                    heights.append(height / pixels_per_metre(camera, position))
         self.height = float(np.median(heights)) if heights else float("nan")
         self.covering = float(np.mean(covering)) if covering else 0.0
         middle = middle_of_view(list(cameras.values()))

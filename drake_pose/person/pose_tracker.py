@@ -45,7 +45,7 @@ def pose_uncertainty(
     held: Mask | None = None,
     held_covariance: Array | None = None,
     *,
-    place: float = 10.0,
+    extent: float = 10.0,
 ) -> PoseUncertainty:
     """Return the uncertainty of a fitted pose, given the pictures and the limits alone.
 
@@ -53,61 +53,63 @@ def pose_uncertainty(
         compared: comparison of the pose with the cameras at the scale of the last step.
         held: (m,) values that were held, for instance lengths.
         held_covariance: (h, h) covariance of the held values; None: they are exact.
-        place: extent of the region in which the person is [m].
+        extent: of the region in which the person is [m].
     """
     size = len(fit.lower)
     held = np.zeros(size, dtype=np.bool_) if held is None else held
     free = np.flatnonzero(~held)
     A, X_WN = symmetric(compared.A), compared.placement.X_WN
-    whole, b = A.sum(axis=0), compared.b.sum(axis=0)
+    A_sum, b = A.sum(axis=0), compared.b.sum(axis=0)
     # (nodes, m, 12): affine motion of each node per unit of each value.
-    moves = compared.placement.dense(size)
-    # The variance of a uniform distribution between two limits is their distance squared over 12.
-    span = np.minimum(fit.upper - fit.lower, np.where(fit.kinematics.is_angle, 2.0 * np.pi, place))
-    apriori = 12.0 / np.maximum(span, 1e-6) ** 2
+    jacobians = compared.placement.dense(size)
+    # A uniform distribution between two limits has the variance (upper - lower)^2 / 12.
+    span = np.minimum(fit.upper - fit.lower, np.where(fit.kinematics.is_angle, 2.0 * np.pi, extent))
+    prior_information = 12.0 / np.maximum(span, 1e-6) ** 2
     # Candidate standard deviations of the parts' surfaces [m].
-    surfaces = 0.0005 * np.sqrt(2.0) ** np.arange(13)
+    surface_deviations = 0.0005 * np.sqrt(2.0) ** np.arange(13)
     # Each part by itself, free to shift, turn and stretch, along independent directions
     # (nodes, 12, 12), each a motion of the surface by about a metre.
     K = surface_deformations(fit.outlines, X_WN)
-    information, turns = np.linalg.eigh(np.swapaxes(K, 1, 2) @ whole @ K)
+    information, turns = np.linalg.eigh(np.swapaxes(K, 1, 2) @ A_sum @ K)
     information, K = np.maximum(information, 0.0), K @ turns
-    alone = (K / (information + surfaces[-1] ** -2)[:, None]) @ np.swapaxes(K, 1, 2)
-    residual = compared.b - (A @ (alone @ b[..., None]))[..., 0]
-    between = _noise(A, residual, alone)
+    part_covariance = (K / (information + surface_deviations[-1] ** -2)[:, None]) @ np.swapaxes(
+        K, 1, 2
+    )
+    residual = compared.b - (A @ (part_covariance @ b[..., None]))[..., 0]
+    part_noise = _noise(A, residual, part_covariance)
 
-    def with_surfaces(variance: float, surfaces: Array) -> tuple[Array, Array]:
-        """Log-likelihoods (k,) and informations (k, m, m) for surface deviations (k,) [m].
+    def with_surfaces(variance: float, surface_deviations: Array) -> tuple[Array, Array]:
+        """Return restricted log-likelihoods (k,) and informations (k, m, m) by deviation (k,) [m].
 
         `variance` is that of the contours' distances.
         """
-        H = (moves @ whole @ np.swapaxes(moves, 1, 2)).sum(axis=0) / variance
+        H = (jacobians @ A_sum @ np.swapaxes(jacobians, 1, 2)).sum(axis=0) / variance
         # (m, k): information that couples each value with each direction of the parts.
-        along = np.swapaxes(moves @ whole @ K, 0, 1) / variance
-        along = along.reshape(size, -1)
+        coupling = np.swapaxes(jacobians @ A_sum @ K, 0, 1) / variance
+        coupling = coupling.reshape(size, -1)
         pulls = (np.einsum("nij,ni->nj", K, b) / variance).ravel()
         observed = information.ravel() / variance
-        shrinkage = 1.0 / (observed + surfaces[:, None] ** -2)
-        H = H - (along * shrinkage[:, None]) @ along.T
-        g = np.einsum("njk,nk->j", moves, b) / variance
-        g = (g - (shrinkage * pulls) @ along.T)[:, free]
-        H_free = H[:, free[:, None], free] + np.diag(apriori[free])
+        shrinkage = 1.0 / (observed + surface_deviations[:, None] ** -2)
+        H = H - (coupling * shrinkage[:, None]) @ coupling.T
+        g = np.einsum("njk,nk->j", jacobians, b) / variance
+        g = (g - (shrinkage * pulls) @ coupling.T)[:, free]
+        H_free = H[:, free[:, None], free] + np.diag(prior_information[free])
         explained = (shrinkage * pulls**2).sum(axis=1)
         explained += (g * np.linalg.solve(H_free, g[..., None])[..., 0]).sum(axis=1)
-        freedom = np.log1p(surfaces[:, None] ** 2 * observed).sum(axis=1)
+        freedom = np.log1p(surface_deviations[:, None] ** 2 * observed).sum(axis=1)
         return 0.5 * (explained - freedom - np.linalg.slogdet(H_free)[1]), H
 
-    likeliest = int(np.argmax(with_surfaces(between, surfaces)[0]))
-    surface = surfaces[likeliest : likeliest + 1]
+    best = int(np.argmax(with_surfaces(part_noise, surface_deviations)[0]))
+    surface = surface_deviations[best : best + 1]
     # Nearest points of two contours are nearer than corresponding points. So the larger of two
     # estimates is used: the second is over the whole body and includes the surface's error.
-    H_free = (moves @ whole @ np.swapaxes(moves, 1, 2)).sum(axis=0)[np.ix_(free, free)]
-    V = np.linalg.inv(H_free + np.diag(apriori[free]))
-    Q = np.swapaxes(moves[:, free], 1, 2) @ V @ moves[:, free]
-    noise = max(between, _noise(A, compared.b, Q))
+    H_free = (jacobians @ A_sum @ np.swapaxes(jacobians, 1, 2)).sum(axis=0)[np.ix_(free, free)]
+    V = np.linalg.inv(H_free + np.diag(prior_information[free]))
+    Q = np.swapaxes(jacobians[:, free], 1, 2) @ V @ jacobians[:, free]
+    noise = max(part_noise, _noise(A, compared.b, Q))
     H = with_surfaces(noise, surface)[1][0]
     covariance = np.zeros((size, size))
-    V_free = np.linalg.inv(H[np.ix_(free, free)] + np.diag(apriori[free]))
+    V_free = np.linalg.inv(H[np.ix_(free, free)] + np.diag(prior_information[free]))
     covariance[np.ix_(free, free)] = V_free
     if held_covariance is not None and held.any():
         follow = np.eye(size)[:, held]
@@ -124,7 +126,7 @@ def _noise(A: Array, b: Array, Q: Array, assumed: float = 4.0) -> float:
         assumed: weight of the fit's own noise in the estimate [number of distances].
     """
     gain = Q @ A
-    # Each fitted degree of freedom lowers the sum of squares by one variance.
+    # Expected value of `pulls` at unit variance, less the part that the fit has absorbed.
     freedom = np.einsum("cnii->", gain) - np.einsum("cnij,cnji->", gain, gain)
     pulls = np.einsum("cni,nij,cnj->", b, Q, b)
     return float((pulls + assumed) / (max(freedom, 0.0) + assumed))
@@ -254,7 +256,7 @@ class PersonPoseTracker:
         is_due = 0 <= last.troubled_frames < 4 or last.troubled_frames % 8 == 0
         due = fitted.inlier_ratio < enough and is_due
         if due and not lost:
-            first, limbs = last.troubled_frames * settings.limbs_a_frame, settings.limbs_a_frame
+            first, limbs = last.troubled_frames * settings.limbs_per_frame, settings.limbs_per_frame
             fitted = self.search.improve_limbs(fitted, frame, enough, first, limbs)
         ratio, is_unconfirmed = fitted.inlier_ratio, last.troubled_frames < 0
         state = TrackState(

@@ -73,7 +73,7 @@ def find_rig_fault(
     if not frames:
         return None
     first: dict[tuple[str, tuple[int, ...]], Indices] = {}
-    filled = _filled(cameras, frames, RigFault((), (), {}), first)
+    filled = _filled_fractions(cameras, frames, RigFault((), (), {}), first)
     unfilled = 1.0 - float(np.mean(list(filled.values())))
     if unfilled < sound_below:
         return None
@@ -85,7 +85,7 @@ def find_rig_fault(
         *(RigFault(names, (), filled) for names in mirrored),
         *(RigFault((), pair, filled) for pair in pairs),
     ):
-        filled_so = _filled(cameras, frames, guess, first)
+        filled_so = _filled_fractions(cameras, frames, guess, first)
         remains = 1.0 - float(np.mean(list(filled_so.values())))
         if remains < least:
             best, least = guess, remains
@@ -94,7 +94,7 @@ def find_rig_fault(
     return RigFault((), (), filled) if unfilled > faulty_above else None
 
 
-def _filled(
+def _filled_fractions(
     cameras: Mapping[str, Camera],
     frames: Sequence[Mapping[str, Mask]],
     guess: RigFault,
@@ -138,20 +138,20 @@ def _filled(
         for camera, size, own in zip(used, sizes, touched, strict=True):
             key = camera.name, cell
             known = None if cells else first.get(key)
-            seen = _cells(camera, points, size, own.shape) if known is None else known
+            seen = _cell_indices(camera, points, size, own.shape) if known is None else known
             if not cells:
                 first[key] = seen
-            inside = (seen < 0) | _grown(own).ravel()[seen]
+            inside = (seen < 0) | _dilated(own).ravel()[seen]
             points, cells = points[inside], [one[inside] for one in (*cells, seen)]
         for name, chosen, own in zip(masks, cells, touched, strict=True):
             hull = np.zeros(own.size, dtype=np.bool_)
             hull[chosen[chosen >= 0]] = True
-            fills = _grown(hull.reshape(own.shape)) & own
+            fills = _dilated(hull.reshape(own.shape)) & own
             shares.setdefault(name, []).append(fills.sum() / own.sum() if own.any() else 1.0)
     return {name: float(np.mean(own)) for name, own in shares.items()}
 
 
-def _cells(camera: Camera, points: Array, size: float, shape: tuple[int, ...]) -> Indices:
+def _cell_indices(camera: Camera, points: Array, size: float, shape: tuple[int, ...]) -> Indices:
     """Return the index (n,) of the cell, `size` pixels wide, that shows each point; -1: none."""
     uv, depth = camera.project(points)
     with np.errstate(invalid="ignore"):
@@ -161,6 +161,6 @@ def _cells(camera: Camera, points: Array, size: float, shape: tuple[int, ...]) -
     return np.where(seen, row * shape[1] + column, -1.0).astype(np.int64)
 
 
-def _grown(cells: Mask) -> Mask:
+def _dilated(cells: Mask) -> Mask:
     """Return cells grown by one to all eight sides."""
     return np.asarray(cv2.dilate(cells.view(np.uint8), np.ones((3, 3), np.uint8)) > 0)

@@ -1,4 +1,4 @@
-"""Search for a lost limb or a lost person: coarse guesses, of which the best are fitted.
+"""Search for a lost limb or a lost person: the best of many coarse guesses are fitted.
 
 Guesses are ranked in subsampled silhouettes of at most five cameras; only the most promising ones
 are fitted to all cameras.
@@ -49,8 +49,8 @@ class PersonSettings:
         usual_ratio: usual inlier ratio at the start.
         min_contour: least contour of a part in all cameras for the part's ratio to count [m].
         headings: number of headings, evenly spread, in which a lost person is searched.
-        headings_a_frame: number of them in each frame of a sequence.
-        limbs_a_frame: number of doubtful limbs searched in each frame of a sequence.
+        headings_per_frame: number of them in each frame of a sequence.
+        limbs_per_frame: number of doubtful limbs searched in each frame of a sequence.
         min_limb_ratio: a limb is doubtful below this inlier ratio of its contour.
         limb_gain: a limb is doubtful if the score of another of its poses is higher by this: the
             fraction of the limb that covers unexplained silhouette.
@@ -81,8 +81,8 @@ class PersonSettings:
     usual_ratio: float = 0.95
     min_contour: float = 0.3
     headings: int = 12
-    headings_a_frame: int = 3
-    limbs_a_frame: int = 2
+    headings_per_frame: int = 3
+    limbs_per_frame: int = 2
     min_limb_ratio: float = 0.8
     limb_gain: float = 0.15
     min_limb_contour: float = 0.5
@@ -103,7 +103,7 @@ class PersonSettings:
     @property
     def cycle(self) -> int:
         """Number of frames in which all headings are tried."""
-        return self.headings // self.headings_a_frame
+        return self.headings // self.headings_per_frame
 
     def headings_of(self, frame: int) -> list[int]:
         """Return the indices of the headings tried in a troubled frame, spread all around."""
@@ -355,7 +355,7 @@ class PersonSearch:
         if len(headings) == self._settings.headings:
             return next(iter(self.find_explanations(frame, known)), None)
         starts = self._fresh_starts(frame, headings, known)
-        limbs = self._settings.limbs_a_frame
+        limbs = self._settings.limbs_per_frame
         return self.improve_limbs(starts[0], frame, enough, limbs=limbs) if starts else None
 
     def find_explanations(self, frame: FrameViews, known: Array | None = None) -> list[PoseFit]:
@@ -424,16 +424,16 @@ class PersonSearch:
     def _fit_coarsely(self, values: Array, frame: FrameViews) -> PoseFit:
         """Fit by a few stages to the scoring cameras."""
         prior, coarser = Prior(values, 0.1 * self._information), self._settings.ranking_spacing
-        rounds = [
+        stages = [
             replace(one, spacing=coarser * one.spacing)
             for one in self._settings.search[: self._settings.ranking_stages]
         ]
-        return self._fit.fit(frame.scoring_edges, values, rounds, prior, self._held)
+        return self._fit.fit(frame.scoring_edges, values, stages, prior, self._held)
 
     def refine(self, values: Array, frame: FrameViews | ColourViews) -> PoseFit:
         """Fit from a coarse guess, with a weak prior."""
-        prior, rounds = Prior(values, 0.1 * self._information), self._settings.search
-        return self._fit.fit(partial(frame.compare, self._fit), values, rounds, prior, self._held)
+        prior, stages = Prior(values, 0.1 * self._information), self._settings.search
+        return self._fit.fit(partial(frame.compare, self._fit), values, stages, prior, self._held)
 
     def _doubtful_limbs(self, fitted: PoseFit, frame: FrameViews) -> list[PlannedLimb]:
         """Return the limbs that fit badly, hardly show or would cover more elsewhere, worst first.

@@ -29,7 +29,7 @@ Frames = Sequence[tuple[Sequence[Camera], Sequence[EdgePoints]]]
 # log radius scales, and of angles from the start [rad]; and the largest log radius scale.
 _LENGTH_DEVIATION, _SIDE_DEVIATION, _SCALE_DEVIATION = 0.03, 0.005, 0.15
 _ANGLE_DEVIATION, _MAX_LOG_SCALE = 0.5, 0.5
-_ROUNDS = tuple(
+_STAGES = tuple(
     AnnealingStage(scale, 0.04) for scale in (0.10, 0.08, 0.06, 0.05, 0.04, 0.04, 0.03, 0.03)
 )
 NOISE = Noise(deviation=0.02, correlation=0.15)
@@ -134,10 +134,10 @@ def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
     body = BodyParameters(fit.kinematics, fit.outlines, groups, parts)
     count = int(is_shape.sum())
     names = [name for name, wanted in zip(body.names, is_shape, strict=False) if wanted]
-    cameras = {camera.name: camera for seers, _ in frames for camera in seers}
+    cameras = {camera.name: camera for own_cameras, _ in frames for camera in own_cameras}
     observations = []
-    for seers, edges in frames:
-        seen = {camera.name: edge for camera, edge in zip(seers, edges, strict=True)}
+    for own_cameras, edges in frames:
+        seen = {camera.name: edge for camera, edge in zip(own_cameras, edges, strict=True)}
         packed = pack_evidence([seen.get(name, NO_EDGE) for name in cameras])
         observations.append(Observation(packed))
     poses = np.array(poses, dtype=np.float64)
@@ -155,7 +155,7 @@ def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
     problem = Problem(body, list(cameras.values()), [pose, shape, radius_scale], noise=fit.noise)
     found = problem.solve(
         observations,
-        _ROUNDS,
+        _STAGES,
         (poses[:, ~is_shape], np.zeros(count + len(parts))),
         shared_information=_sides_information(names, len(parts)),
     )
@@ -167,8 +167,8 @@ def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
     prior = np.eye(count) / _LENGTH_DEVIATION**2 + _sides_information(names, 0)
     # The information of all frames is averaged, not added: a surface's error is the same in all.
     own, total = np.flatnonzero(~is_shape), np.zeros((count, count))
-    for (seers, edges), values_then in zip(frames, poses, strict=True):
-        compared = shaped.compare(pack_views(seers, edges), values_then, _ROUNDS[-1])
+    for (own_cameras, edges), values_then in zip(frames, poses, strict=True):
+        compared = shaped.compare(pack_views(own_cameras, edges), values_then, _STAGES[-1])
         H = pose_uncertainty(shaped, compared).information
         cross = H[np.ix_(own, is_shape)]
         follow = np.linalg.solve(

@@ -254,7 +254,7 @@ class FrameViews:
 
 
 def _coarser(camera: Camera, stride: int) -> Camera:
-    """Return the camera of a picture of which every stride-th row and column is kept."""
+    """Return the camera of a picture reduced to every stride-th row and column."""
     smaller = replace(
         camera,
         width=-(-camera.width // stride),

@@ -130,7 +130,7 @@ def prepare_paper_capture(
         see_person(pictures[n], person_region(pictures[n], backgrounds[n]), skin) for n in ring
     ]
     seen = find_features(list(ring.values()), views, own.features(q))
-    places = np.where(seen.support[:, None] > 0, seen.places, np.nan)
+    places = np.where(seen.support[:, None] > 0, seen.positions, np.nan)
     skeleton = own.with_features(q, places)
     registered = render_registered_pose(skeleton, q, ring)
     if face_camera is not None and faces is None:
@@ -276,7 +276,7 @@ class FeatureFinder(PortedSystem):
 
         def places(context: Context) -> Array:
             what = found.Eval(context)
-            return np.full(size, np.nan) if what is None else what.places.ravel()
+            return np.full(size, np.nan) if what is None else what.positions.ravel()
 
         def support(context: Context) -> Array:
             what = found.Eval(context)

@@ -78,7 +78,7 @@ class Studio:
             self.skeleton.features(self.registered.q),
         )
         assert (found.support > 10).all()
-        return self.skeleton.with_features(self.registered.q, found.places)
+        return self.skeleton.with_features(self.registered.q, found.positions)
 
     @cached_property
     def templates(self):

@@ -104,7 +104,7 @@ class Core:
             self.q, _ = found
             self.features = setup.skeleton.features(self.q)
             return self.q
-        self.features = find_features(cameras, seen, self.features).places
+        self.features = find_features(cameras, seen, self.features).positions
         angles = None
         if FACE_CAMERA in views:
             blobs = views[FACE_CAMERA].blobs

@@ -33,8 +33,8 @@ from drake_pose.person.capture import capture_person
 from drake_pose.person.date.features import (
     RegisteredPose,
     learn_recorded_faces,
+    place_registered,
     recognise,
-    stand_registered,
 )
 from drake_pose.person.date.skeleton import FEATURES, load_skeleton
 from drake_pose.person.figures import PersonRecording, keep_person
@@ -287,7 +287,7 @@ def _best_moment(
             cameras, seen = [ring[name] for name in contours], list(contours.values())
             if len(seen) >= 2:
                 if registered is None:
-                    q = stand_registered(setup.skeleton, cameras, [middle for _, middle in seen])
+                    q = place_registered(setup.skeleton, cameras, [middle for _, middle in seen])
                     registered = render_registered_pose(setup.skeleton, q, ring)
                 found = recognise(setup.skeleton, registered, cameras, seen, threshold=0.0)
                 if found is not None and (best is None or found[1] > best[1]):

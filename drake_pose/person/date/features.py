@@ -157,13 +157,13 @@ class Features:
     """Positions of the features in a frame.
 
     Args:
-        places: (k, 3) positions [m]; the last frame's where nothing was measured.
+        positions: (k, 3) positions [m]; the last frame's where nothing was measured.
         support: (k,) number of 3-D points that each is the mean of; 0: not measured.
         points: (m, 3) all 3-D points inside every silhouette [m].
         owners: (m,) index of the feature that each point belongs to.
     """
 
-    places: Array
+    positions: Array
     support: Indices
     points: Array
     owners: Indices
@@ -211,7 +211,7 @@ def find_features(
         kept[visible] &= is_near
     points = points[kept]
     owners = np.linalg.norm(points[:, None] - last[None], axis=2).argmin(axis=1)
-    places, support = np.array(last, dtype=np.float64), np.zeros(len(last), dtype=np.int64)
+    positions, support = np.array(last, dtype=np.float64), np.zeros(len(last), dtype=np.int64)
     for k in range(len(last)):
         owned = points[owners == k]
         if len(owned):
@@ -220,8 +220,8 @@ def find_features(
             around = distances <= dense
             spread = np.where(around, distances, 0.0).sum(axis=1)
             part = owned[around[np.lexsort((spread, -around.sum(axis=1)))[0]]]
-            places[k], support[k] = part.mean(axis=0), len(part)
-    return Features(places, support, points, owners)
+            positions[k], support[k] = part.mean(axis=0), len(part)
+    return Features(positions, support, points, owners)
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,7 +243,7 @@ class RegisteredPose:
     middles: Mapping[str, Array]
 
 
-def stand_registered(
+def place_registered(
     skeleton: Skeleton, cameras: Sequence[Camera], middles: Sequence[Array]
 ) -> Array:
     """Return the registered pose (nq,) in the place of boxes' middles (2,) in cameras [pixel]."""
@@ -294,14 +294,14 @@ def recognise(
     Returns:
         (nq,) positions and the mean similarity, 0 to 1; None if the pose is not recognised.
     """
-    scores, seers, middles = [], [], []
+    scores, used, middles = [], [], []
     for camera, contour in zip(cameras, contours, strict=True):
         if contour is not None and camera.name in registered.shapes:
             templates = registered.shapes[camera.name]
             scores.append([similarity(contour[0], template) for template in templates])
-            seers.append(camera)
+            used.append(camera)
             middles.append(contour[1])
-    if len(seers) < 2:
+    if len(used) < 2:
         return None
     means = np.nan_to_num(np.array(scores)).mean(axis=0)
     best = int(np.argmax(means))
@@ -314,10 +314,8 @@ def recognise(
     shift = 0.5 * (before - after) / curvature if curvature < 0.0 else 0.0
     heading = registered.headings[best] + shift * (2.0 * np.pi / len(means))
     q[registered.heading_position] = math.remainder(heading, 2.0 * math.pi)
-    templates_middles = [registered.middles[camera.name][best] for camera in seers]
-    q[skeleton.head_positions] += triangulate(seers, middles) - triangulate(
-        seers, templates_middles
-    )
+    templates_middles = [registered.middles[camera.name][best] for camera in used]
+    q[skeleton.head_positions] += triangulate(used, middles) - triangulate(used, templates_middles)
     return skeleton.clip(q), float(means[best])
 
 

@@ -21,10 +21,10 @@ from drake_pose.person.date.features import (
     learn_recorded_faces,
     measure_contour,
     nearest_template,
+    place_registered,
     recognise,
     similarity,
     skin_blobs,
-    stand_registered,
 )
 from drake_pose.person.date.skeleton import registered_positions
 from drake_pose.person.views import meeting_points, viewing_rays
@@ -129,7 +129,7 @@ class TestFeatures:
         cameras, views = self.seen(self.places)
         last = self.places + np.random.default_rng(3).normal(0, 0.03, self.places.shape)
         found = find_features(cameras, views, last)
-        assert np.linalg.norm(found.places - self.places, axis=1).max() < 0.01
+        assert np.linalg.norm(found.positions - self.places, axis=1).max() < 0.01
         assert (found.support >= 20).all()
 
     def test_rays_that_meet_by_chance_are_dropped(self):
@@ -140,7 +140,7 @@ class TestFeatures:
             away = np.linalg.norm(some[:, None] - self.places[None], axis=2).min(axis=1)
             assert (away > 0.15).any() == wrong
         # A place is the mean of the dense part of its points alone.
-        for k, place in enumerate(found.places):
+        for k, place in enumerate(found.positions):
             mine = found.points[found.owners == k]
             near = np.linalg.norm(mine[:, None] - mine[None], axis=2) <= 0.08
             assert found.support[k] == near.sum(axis=1).max()
@@ -153,10 +153,10 @@ class TestFeatures:
         last = self.places + 0.01
         found = find_features(cameras, views, last)
         assert found.support[2] == 0
-        assert np.array_equal(found.places[2], last[2])
+        assert np.array_equal(found.positions[2], last[2])
         others = np.delete(np.arange(5), 2)
         assert (found.support[others] > 0).all()
-        off = np.linalg.norm(found.places - self.places, axis=1)[others]
+        off = np.linalg.norm(found.positions - self.places, axis=1)[others]
         assert off.max() < 0.01
 
 
@@ -213,7 +213,7 @@ class TestRecognition:
         reach = np.linalg.norm(raised - hanging) / (2.0 * np.sin(np.radians(15.0)))
         assert reach == pytest.approx(sum(skeleton.limbs["left_arm"].lengths), rel=0.15)
         middle = np.array([0.2, -0.1, 0.8])
-        q = stand_registered(
+        q = place_registered(
             skeleton, cameras, [one.project(middle[None])[0][0] for one in cameras]
         )
         head, _, _, *feet = skeleton.features(q)

@@ -111,7 +111,9 @@ def test_a_limb_without_its_own_colours_is_searched_again_or_said_to_be_lost(
     assert not state.is_lost
     assert joint_errors(person, tracker.positions(state.values), q).max() < 60.0
     other = own.is_own & ~np.isin(np.arange(len(own.is_own)), limb.nodes)[:, None]
-    assert tracker.follow_by_colour(tracker.start(values), views, replace(own, known=other)).is_lost
+    assert tracker.follow_by_colour(
+        tracker.start(values), views, replace(own, is_own=other)
+    ).is_lost
 
 
 class TestLearning:

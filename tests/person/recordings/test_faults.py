@@ -208,7 +208,7 @@ class TestOthers:
         masks = [one | other for one, other in zip(*(own.values() for own in both), strict=True)]
         persons = find_persons(list(nine.cameras.values()), [find_figures(m) for m in masks])
         assert len(persons) == 2
-        places = sorted((one.place for one in persons), key=lambda place: place[1])
+        places = sorted((one.position for one in persons), key=lambda place: place[1])
         np.testing.assert_allclose(places[0][:2], poses[0][:2], atol=0.2)
         np.testing.assert_allclose(places[1][:2], [0.5, 1.2], atol=0.2)
 
@@ -292,11 +292,11 @@ class TestOthers:
         camera = circle_of_cameras(2, size=(160, 120), face_camera=False)["camera_0"]
         me = Person(np.array([0.0, 0.0, 1.0]), {0: 0}, 100.0)
         hidden = Person(np.array([-0.4, 0.0, 1.1]), {}, 90.0)
-        uv = camera.project(hidden.place[None])[0][0]
+        uv = camera.project(hidden.position[None])[0][0]
         box = np.array([*(uv - 9.0), *(uv + 9.0)])
         if side is not None:
             box[side] = np.tile(uv, 2)[side] + (1.0 if side < 2 else -1.0)
-        figure = Figure(camera.project(me.place[None])[0][0], 100.0, box)
+        figure = Figure(camera.project(me.position[None])[0][0], 100.0, box)
         found = sort_figures({"0": camera}, {"0": (figure,)}, [me, hidden], me)
         assert found == {"0": ((), side is None)}
 
@@ -319,7 +319,9 @@ class TestOthers:
         found = follow_one(frames, np.zeros(3), True)
         assert [found[k] for k in (0, 1, 4, 5, 6)] == [me[0], me[1], me[2], me[3], None]
         # Where one is hidden one is on a straight way, without figures.
-        np.testing.assert_allclose(found[2].place, me[1].place + (me[2].place - me[1].place) / 3)
+        np.testing.assert_allclose(
+            found[2].position, me[1].position + (me[2].position - me[1].position) / 3
+        )
         assert found[2].figures == {}
         # Who is there at the same time, if only in a frame, is somebody else.
         found = follow_one([[him[0]], [him[1], me[0]], [me[1]], [me[1]]], np.zeros(3), True)

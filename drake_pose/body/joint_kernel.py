@@ -48,17 +48,17 @@ class PackedBands(NamedTuple):
 def join_bands(bands: Sequence[PackedBands]) -> PackedBands:
     """Return several packed bands as one."""
     steps = [band.steps for band in bands]
-    rows = np.cumsum([0, *(len(one.coefficients) for one in steps)])
+    rows = np.cumsum([0, *(len(chain.coefficients) for chain in steps)])
     counts = [np.diff(band.starts, axis=0) for band in bands]
     return PackedBands(
         starts=np.cumsum(np.vstack([np.zeros((1, 3), dtype=np.int64), *counts]), axis=0),
         steps=PackedSteps(
-            sizes=np.concatenate([one.sizes for one in steps]),
-            inverted=np.concatenate([one.inverted for one in steps]),
+            sizes=np.concatenate([chain.sizes for chain in steps]),
+            inverted=np.concatenate([chain.inverted for chain in steps]),
             starts=np.concatenate(
-                [one.starts + row for one, row in zip(steps, rows, strict=False)]
+                [chain.starts + row for chain, row in zip(steps, rows, strict=False)]
             ),
-            coefficients=np.vstack([one.coefficients for one in steps]),
+            coefficients=np.vstack([chain.coefficients for chain in steps]),
         ),
         weights=np.concatenate([band.weights for band in bands]),
         weight_index=np.concatenate([band.weight_index for band in bands]),

@@ -114,8 +114,8 @@ def sanitise_urdf(path: Path, finder: FileFinder, warn: Warn) -> str:
         for visual in link.iterfind("visual"):
             _check_urdf_visual(visual, f"link '{link.get('name')}'", path, finder)
     open_loops(root, joints, ends, warn)
-    followed = root.findall("joint")
-    leaders = [one.get("name", "") for one in followed if one.get("type") in FOLLOWING]
+    kept_joints = root.findall("joint")
+    leaders = [joint.get("name", "") for joint in kept_joints if joint.get("type") in FOLLOWING]
     for joint in _joints(root):
         _check_urdf_joint(joint)
         name = joint.get("name", "")
@@ -196,9 +196,9 @@ def _check_urdf_joint(joint: ElementTree.Element) -> None:
 def _inline_colours(root: ElementTree.Element) -> None:
     """Replace each visual's material by an unnamed colour, because Drake needs unique names."""
     shared = root.findall("material")
-    own = [one for visual in root.iterfind("link/visual") for one in visual.iterfind("material")]
+    per_visual = root.findall("link/visual/material")
     colours: dict[str, str] = {}
-    for material in [*shared, *own]:
+    for material in [*shared, *per_visual]:
         colour = _colour(material)
         if colour is not None:
             colours.setdefault(material.get("name", ""), colour)
@@ -236,7 +236,7 @@ def _checked_shape(shape: ElementTree.Element, where: str, *, is_urdf: bool) -> 
         raise ModelError(f"{where}: there is no shape <{kind}>; use one of {', '.join(known)}")
     for name, count in known[kind].items():
         # SDFormat's own reader replaces an invalid size by 1 m.
-        texts = [shape.get(name)] if is_urdf else [one.text for one in shape.iterfind(name)]
+        texts = [shape.get(name)] if is_urdf else [size.text for size in shape.iterfind(name)]
         for text in texts:
             zero = is_urdf and kind == "sphere"
             require_size(text, count, f"{where}: {name} of its {kind}", zero=zero)
@@ -286,11 +286,11 @@ def sanitise_sdf(
                 warn(f"joint '{joint.get('name')}' is a gearbox: not enforced, it is left out")
         joints = model.findall("joint")
         ends = [
-            [(one.findtext(end) or "").strip() for end in ("parent", "child")] for one in joints
+            [(joint.findtext(end) or "").strip() for end in ("parent", "child")] for joint in joints
         ]
         open_loops(model, joints, ends, warn)
         joints = model.findall("joint")
-        leaders = [one.get("name", "") for one in joints if one.get("type") in FOLLOWING]
+        leaders = [joint.get("name", "") for joint in joints if joint.get("type") in FOLLOWING]
         for joint in joints:
             name = joint.get("name", "")
             for axis in [*joint.findall("axis"), *joint.findall("axis2")]:
@@ -316,10 +316,10 @@ def _model_of_folder(folder: Path, name: str) -> Path:
     config = folder / "model.config"
     if not config.is_file():
         raise ModelError(f"included model '{name}': {config} does not exist")
-    files = [one for one in read_xml(config).iterfind("sdf") if (one.text or "").strip()]
+    files = [file for file in read_xml(config).iterfind("sdf") if (file.text or "").strip()]
     if not files:
         raise ModelError(f"included model '{name}': {config} names no <sdf> file")
-    newest = max(files, key=lambda one: [int(p) for p in one.get("version", "0").split(".")])
+    newest = max(files, key=lambda file: [int(p) for p in file.get("version", "0").split(".")])
     return folder / (newest.text or "").strip()
 
 

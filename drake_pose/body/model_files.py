@@ -232,16 +232,16 @@ def take_mimic(
 
 def refuse_macros(root: ElementTree.Element) -> None:
     """Raise ModelError for a file with unexpanded xacro macros."""
-    left = [f"<{child.tag}>" for child in root if child.tag in OLD_XACRO_ELEMENTS]
+    macros = [f"<{child.tag}>" for child in root if child.tag in OLD_XACRO_ELEMENTS]
     for element in root.iter():
         if element.tag.startswith("xacro:"):
-            left.append(f"<{element.tag}>")
+            macros.append(f"<{element.tag}>")
         for value in [*element.attrib.values(), element.text or ""]:
             if "${" in value or "$(" in value:
-                left.append(f"'{value.strip()[:60]}' in <{element.tag}>")
-    if left:
+                macros.append(f"'{value.strip()[:60]}' in <{element.tag}>")
+    if macros:
         raise ModelError(
-            f"it has unexpanded xacro macros, such as {left[0]}: links and joints would be "
+            f"it has unexpanded xacro macros, such as {macros[0]}: links and joints would be "
             "missing; expand it first: xacro robot.urdf.xacro > robot.urdf (PyPI: xacro)"
         )
 
@@ -340,8 +340,8 @@ class FileFinder:
             # Packages in repositories of a ROS workspace.
             packages = PackageMap.MakeEmpty()
             packages.PopulateFromRosPackagePath()
-            known = [one for one in packages.GetPackageNames() if one.strip() == name]
-            found = [Path(packages.GetPath(one)) for one in known]
+            known = [package for package in packages.GetPackageNames() if package.strip() == name]
+            found = [Path(packages.GetPath(package)) for package in known]
         return found
 
 

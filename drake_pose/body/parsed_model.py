@@ -249,21 +249,21 @@ def _resolve_chains(found: Sequence[Coupling], names: Sequence[str]) -> tuple[Co
 
     Raises ModelError: two positions are coupled in two ways.
     """
-    of = {k: Coupling(k, k, 1.0, 0.0) for one in found for k in one[:2]}
-    for one in found:
-        own, other = of[one.follower], of[one.leader]
-        scale = one.multiplier * other.multiplier / own.multiplier
-        shift = (one.multiplier * other.offset + one.offset - own.offset) / own.multiplier
-        if own.leader == other.leader:
+    of = {k: Coupling(k, k, 1.0, 0.0) for coupling in found for k in coupling[:2]}
+    for i, j, multiplier, offset in found:
+        follower, leader = of[i], of[j]
+        scale = multiplier * leader.multiplier / follower.multiplier
+        shift = (multiplier * leader.offset + offset - follower.offset) / follower.multiplier
+        if follower.leader == leader.leader:
             raise ModelError(
-                f"joints '{names[one.follower]}' and '{names[one.leader]}' are coupled in two ways "
-                "(<mimic>): remove one of them"
+                f"joints '{names[i]}' and '{names[j]}' are coupled in two ways (<mimic>): remove "
+                "one of them"
             )
         for k, known in of.items():
-            if known.leader == own.leader:
+            if known.leader == follower.leader:
                 m = known.multiplier
-                of[k] = Coupling(k, other.leader, m * scale, m * shift + known.offset)
-    return tuple(one for k, one in sorted(of.items()) if one.leader != k)
+                of[k] = Coupling(k, leader.leader, m * scale, m * shift + known.offset)
+    return tuple(coupling for k, coupling in sorted(of.items()) if coupling.leader != k)
 
 
 def _intersect_limits(

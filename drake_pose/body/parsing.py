@@ -236,20 +236,20 @@ def _sanitise_directives(
     if node is None:
         raise ModelError("it is empty; expected 'directives:'")
     # Visit each YAML node once, together with the directive that it belongs to.
-    waiting, seen = [("", node)], set()
-    while waiting:
-        directive, node = waiting.pop()
-        if id(node) in seen or isinstance(node, yaml.ScalarNode):
+    stack, visited = [("", node)], set()
+    while stack:
+        directive, node = stack.pop()
+        if id(node) in visited or isinstance(node, yaml.ScalarNode):
             continue
-        seen.add(id(node))
+        visited.add(id(node))
         if isinstance(node, yaml.SequenceNode):
-            waiting += [(directive, item) for item in reversed(node.value)]
+            stack += [(directive, item) for item in reversed(node.value)]
             continue
         for key, value in node.value:
             if key.value != "file" or not isinstance(value, yaml.ScalarNode):
-                waiting.append((directive if key.value == "<<" else key.value, value))
-            elif id(value) not in seen:
-                seen.add(id(value))
+                stack.append((directive if key.value == "<<" else key.value, value))
+            elif id(value) not in visited:
+                visited.add(id(value))
                 found = finder.resolve(value.value, path, directive)
                 value.value = f"file://{sanitise_file(found)}"
     return yaml.serialize(top, Dumper=yaml.SafeDumper, allow_unicode=True)
@@ -329,8 +329,8 @@ def why_unusable(read: Reader, path: str, packages: str, limits: str) -> str:
 
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         pages = int(Path("/proc/self/statm").read_text().split()[0])
-        most = pages * resource.getpagesize() + MEMORY_LIMIT_BYTES
-        resource.setrlimit(resource.RLIMIT_AS, (most, most))
+        limit = pages * resource.getpagesize() + MEMORY_LIMIT_BYTES
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     try:
         model = read(Path(path), json.loads(packages), json.loads(limits))
         scene_graph = SceneGraph()

@@ -177,10 +177,10 @@ class PlantSource:
                 copy.set_position_limits(*limits)
                 copy.set_default_positions(joint.default_positions())
         moving = {joint.position_start(): joint for joint in joints if joint.num_positions()}
-        for one in read_couplings(old):
+        for coupling in read_couplings(old):
             follower, leader = (
                 plant.GetJointByName(moving[k].name(), instances[moving[k].model_instance()])
-                for k in (one.follower, one.leader)
+                for k in (coupling.follower, coupling.leader)
             )
-            add_coupler(plant, follower, leader, one.multiplier, one.offset)
+            add_coupler(plant, follower, leader, coupling.multiplier, coupling.offset)
         return list(instances.values()), []

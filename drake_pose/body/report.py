@@ -63,11 +63,11 @@ def describe_model(
 def _describe_node(tree: PoseTree, index: int) -> dict[str, Any]:
     """Return the dictionary of one node for ``ModelReport.nodes``."""
     model, node = tree.model, tree.nodes[index]
-    followers = {one.follower for one in tree.placements[index].follows}
+    followers = {coupling.follower for coupling in tree.placements[index].follows}
     follows = {
-        one.follower: f"{one.multiplier:g} {model.position_names[one.leader]} {one.offset:+g}"
-        for one in tree.followers
-        if one.follower in followers
+        follower: f"{multiplier:g} {model.position_names[leader]} {offset:+g}"
+        for follower, leader, multiplier, offset in tree.followers
+        if follower in followers
     }
     joints = []
     for position in (*node.positions, *follows):
@@ -106,10 +106,10 @@ def model_warnings(
     searched = {position for node in tree.nodes for position in node.positions} - {*tree.held}
     for follower, leader, *_ in model.couplings:
         if {follower, leader} <= searched:
-            one, other = (model.position_names[k] for k in (follower, leader))
+            first, second = (model.position_names[k] for k in (follower, leader))
             warnings.append(
-                f"joint '{one}' is written to follow joint '{other}' (<mimic>): not enforced, the "
-                "joint is searched independently, because other joints move their links, too"
+                f"joint '{first}' is written to follow joint '{second}' (<mimic>): not enforced, "
+                "the joint is searched independently, because other joints move their links, too"
             )
     if tree.unobserved_positions and tree.root == "world":
         warnings.append(

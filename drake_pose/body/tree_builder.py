@@ -64,12 +64,12 @@ def build_pose_tree(
             held_values.setdefault(leader, (held_values[follower] - offset) / multiplier)
     for follower, leader, multiplier, offset in model.couplings:
         if leader in held_values:
-            wanted = multiplier * held_values[leader] + offset
-            if abs(held_values.setdefault(follower, wanted) - wanted) > rounding:
-                one, other = (model.position_names[k] for k in (follower, leader))
+            implied = multiplier * held_values[leader] + offset
+            if abs(held_values.setdefault(follower, implied) - implied) > rounding:
+                first, second = (model.position_names[k] for k in (follower, leader))
                 raise SettingsError(
-                    f"joint '{one}' is held at {held_values[follower]:g}, but it follows joint "
-                    f"'{other}' (<mimic>): {wanted:g} [rad or m]; hold only one of them"
+                    f"joint '{first}' is held at {held_values[follower]:g}, but it follows joint "
+                    f"'{second}' (<mimic>): {implied:g} [rad or m]; hold only one of them"
                 )
     for name, value in held.items():
         if not np.isfinite(value):
@@ -225,39 +225,40 @@ def _attach_followers(
     for i, branch in enumerate(branches):
         known = [couplings.get(p) if p not in held else None for p in branch.positions]
         candidates = {
-            leaders[one.leader][0] if one and one.leader in leaders else -1 for one in known
+            leaders[coupling.leader][0] if coupling and coupling.leader in leaders else -1
+            for coupling in known
         }
         parent, leader = branch.parent, min(candidates, default=-1)
         parent_branch = found[parent] if parent >= 0 else branch
         beside = leader >= 0 and parent == branches[leader].parent
         below = parent == leader or (parent_branch.parent == leader and parent_branch.follows)
         if leader < 0 or len(candidates) > 1 or branch.group in skinned or not (beside or below):
-            for one, position in zip(known, branch.positions, strict=True):
-                if one:
-                    leaders.setdefault(one.leader, (i, position))
+            for coupling, position in zip(known, branch.positions, strict=True):
+                if coupling:
+                    leaders.setdefault(coupling.leader, (i, position))
             found.append(replace(branch, depth=parent_branch.depth + (parent >= 0)))
             continue
-        first, steps, follows = found[leader], branch.steps, list[Coupling]()
+        leading, steps, follows = found[leader], branch.steps, list[Coupling]()
         if beside:
-            last = len(first.positions)
-            for step in first.steps[::-1]:
+            last = len(leading.positions)
+            for step in leading.steps[::-1]:
                 last -= step.position_count
-                own = first.positions[last : last + step.position_count]
+                own = leading.positions[last : last + step.position_count]
                 follows += [Coupling(p, last + k, 1.0, 0.0) for k, p in enumerate(own)]
-            steps = *(replace(s, inverted=not s.inverted) for s in first.steps[::-1]), *steps
+            steps = *(replace(s, inverted=not s.inverted) for s in leading.steps[::-1]), *steps
         elif parent != leader:
             steps, follows = parent_branch.steps + steps, list(parent_branch.follows)
-        for one in (one for one in known if one):
-            relation = _relative_coupling(couplings, one.follower, leaders[one.leader][1])
-            follows.append(relation._replace(leader=first.positions.index(relation.leader)))
-        found.append(Branch(branch.group, leader, first.depth + 1, steps, (), tuple(follows)))
+        for coupling in (coupling for coupling in known if coupling):
+            relation = _relative_coupling(couplings, coupling.follower, leaders[coupling.leader][1])
+            follows.append(relation._replace(leader=leading.positions.index(relation.leader)))
+        found.append(Branch(branch.group, leader, leading.depth + 1, steps, (), tuple(follows)))
     return _ordered(graph, found)
 
 
 def _couplings_by_position(model: ParsedModel) -> dict[int, Coupling]:
     """Return the coupling of each follower and leader; a leader follows itself."""
-    own = {one.leader: Coupling(one.leader, one.leader, 1.0, 0.0) for one in model.couplings}
-    return own | {one.follower: one for one in model.couplings}
+    leaders = {leader: Coupling(leader, leader, 1.0, 0.0) for _, leader, *_ in model.couplings}
+    return leaders | {coupling.follower: coupling for coupling in model.couplings}
 
 
 def _relative_coupling(couplings: Mapping[int, Coupling], follower: int, leader: int) -> Coupling:
@@ -272,8 +273,8 @@ def _followers(
 ) -> tuple[Coupling, ...]:
     """Return the couplings of positions that follow searched ones and are not known already."""
     couplings, found = _couplings_by_position(model), []
-    for follower, one in couplings.items():
-        own = [p for p in searched if p in couplings and couplings[p].leader == one.leader]
+    for follower, coupling in couplings.items():
+        own = [p for p in searched if p in couplings and couplings[p].leader == coupling.leader]
         if own and follower not in known:
             found.append(_relative_coupling(couplings, follower, own[0]))
     return tuple(found)
@@ -441,7 +442,7 @@ def _assemble(
         model, graph, {(branches[b.parent].group, b.group) for b in branches if b.parent >= 0}
     )
     followers = _followers(model, searched, {*searched, *base.positions, *held})
-    determined = {*searched, *base.positions, *(one.follower for one in followers)}
+    determined = {*searched, *base.positions, *(coupling.follower for coupling in followers)}
     return PoseTree(
         model=model,
         nodes=tuple(nodes),

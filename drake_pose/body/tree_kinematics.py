@@ -85,9 +85,9 @@ class TreeKinematics:
         firsts = np.cumsum([0, *counts])
         self._splits = firsts.tolist()
         followers = [
-            (firsts[tree.nodes[i].parent] + one.leader, i, one.multiplier, one.offset)
+            (firsts[tree.nodes[i].parent] + leader, i, multiplier, offset)
             for i, placement in enumerate(tree.placements)
-            for one in placement.follows
+            for _, leader, multiplier, offset in placement.follows
         ]
         values, nodes, scale, offset = np.array(followers, dtype=np.float64).reshape(-1, 4).T
         self.parameters = np.append(np.arange(firsts[-1]), values.astype(np.int64))
@@ -113,9 +113,9 @@ class TreeKinematics:
     def flatten(self, node_values: Sequence[np.ndarray]) -> np.ndarray:
         """Return all values (m,), given each node's (k_i,); SettingsError for a wrong size."""
         parts = [np.asarray(values, dtype=np.float64).reshape(-1) for values in node_values]
-        wanted = [len(node.value_names) for node in self.tree.nodes]
-        if [len(part) for part in parts] != wanted:
-            raise SettingsError(f"{wanted} values of the nodes expected")
+        sizes = [len(node.value_names) for node in self.tree.nodes]
+        if [len(part) for part in parts] != sizes:
+            raise SettingsError(f"{sizes} values of the nodes expected")
         return np.concatenate(parts) if parts else np.zeros(0)
 
     def split(self, values: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -348,7 +348,7 @@ def link_vectors(tree: PoseTree, min_length: float = 1e-3) -> tuple[LinkVector, 
     for i, (node, placement) in enumerate(zip(tree.nodes, tree.placements, strict=True)):
         X_BA, offset = np.eye(4), 0
         follows = placement.follows
-        positions = [one.follower for one in follows] if follows else list(node.positions)
+        positions = [coupling.follower for coupling in follows] if follows else list(node.positions)
         values = model.default_positions[positions] if follows else placement.defaults
         if node.parent >= 0:
             parent = model.link_index(tree.nodes[node.parent].name)

@@ -260,7 +260,7 @@ def require_visible(
         if len(outline.triangles)
     ]
     where = f"camera '{camera.name}'"
-    placed = [(one, one.vertices @ X[:3, :3].T + X[:3, 3]) for one, X in solid]
+    placed = [(outline, outline.vertices @ X[:3, :3].T + X[:3, 3]) for outline, X in solid]
     if isinstance(camera, PinholeCamera):
         if all((p_C[:, 2] < camera.near).all() for _, p_C in placed):
             raise CameraError(

@@ -84,7 +84,7 @@ def background_of_recording(pictures: Sequence[Picture], min_deviation: float = 
 
 def _require_one_size(pictures: Sequence[Picture], min_count: int, message: str) -> None:
     """Raise SettingsError unless there are enough pictures, all of one size."""
-    if len(pictures) < min_count or any(one.shape != pictures[0].shape for one in pictures):
+    if len(pictures) < min_count or any(picture.shape != pictures[0].shape for picture in pictures):
         raise SettingsError(message)
 
 
@@ -113,7 +113,7 @@ def person_region(picture: Picture, background: Background, min_fraction: float 
     # Opening keeps squares of 3 x 3 pixels, so every third row suffices to locate them.
     rows = slice(int(size[0] % 3 == 0), None, 3)
     inputs = picture, background.mean, background.tolerance
-    squares = cv2.erode(_differs(*(one[rows] for one in inputs)), square[:1])
+    squares = cv2.erode(_differs(*(image[rows] for image in inputs)), square[:1])
     left, top, width, height = cv2.boundingRect(squares)
     if not width:
         return region
@@ -127,7 +127,7 @@ def person_region(picture: Picture, background: Background, min_fraction: float 
 
     # The margin covers the squares' borders, the reach of closing, and one more pixel.
     inner, middles = window(4), window(0)
-    eroded = cv2.erode(_differs(*(one[inner] for one in inputs)), square)
+    eroded = cv2.erode(_differs(*(image[inner] for image in inputs)), square)
     # Erosion counts pixels beyond the inner part as foreground: keep the squares' middles only.
     kept = np.zeros_like(eroded)
     place = tuple(
@@ -158,9 +158,9 @@ def _differs(picture: Picture, mean: Picture, tolerance: Picture) -> NDArray[Any
 
     ``picture``: (H, W, 3 or 4); a fourth channel is ignored.
     """
-    seen = cv2.cvtColor(picture, cv2.COLOR_RGBA2RGB) if picture.shape[2] == 4 else picture
-    off = cv2.compare(cv2.absdiff(seen, mean), tolerance, cv2.CMP_GT)
-    return cv2.cvtColor(off, cv2.COLOR_RGB2GRAY)
+    colours = cv2.cvtColor(picture, cv2.COLOR_RGBA2RGB) if picture.shape[2] == 4 else picture
+    exceeds = cv2.compare(cv2.absdiff(colours, mean), tolerance, cv2.CMP_GT)
+    return cv2.cvtColor(exceeds, cv2.COLOR_RGB2GRAY)
 
 
 def foreground_log_ratios(
@@ -221,7 +221,7 @@ def foreground_log_ratios(
         for picture, gain in zip(pictures, gains, strict=True)
     ]
     step = -(-len(equalised) // max_count)
-    hidden = np.stack([one[relevant] for one in probabilities[::step]]) >= max_background
+    hidden = np.stack([p[relevant] for p in probabilities[::step]]) >= max_background
     count = np.count_nonzero(~hidden, axis=0)
     stack = np.stack(equalised[::step])
     middle = _masked_median(stack, hidden, count)
@@ -298,7 +298,7 @@ def grab_cut(
         cv2.setRNGSeed(seed)
         colours, no_rectangle = (np.zeros((1, 65)), np.zeros((1, 65))), (0, 0, 0, 0)
         sampled, sampled_labels = (
-            np.ascontiguousarray(one[::stride, ::stride]) for one in (picture, found)
+            np.ascontiguousarray(image[::stride, ::stride]) for image in (picture, found)
         )
         cv2.grabCut(
             sampled, sampled_labels, no_rectangle, *colours, iterations, cv2.GC_INIT_WITH_MASK
@@ -360,7 +360,7 @@ def find_regions(
     lab = cv2.cvtColor(picture, cv2.COLOR_RGB2LAB).astype(np.float32)
     whole = np.moveaxis(cv2.GaussianBlur(lab, (0, 0), 1.0), -1, 0)
     by_channel = []
-    for channel in (cv2.resize(one, size, interpolation=cv2.INTER_AREA) for one in whole):
+    for channel in (cv2.resize(plane, size, interpolation=cv2.INTER_AREA) for plane in whole):
         slopes = (cv2.Sobel(channel, cv2.CV_32F, *by) for by in ((1, 0), (0, 1)))
         change = np.hypot(*slopes)
         low, high = np.quantile(channel, (0.01, 0.99)).tolist()
@@ -371,7 +371,7 @@ def find_regions(
             for mask in _components(np.asarray(sign * channel > sign * level))
         ]
         kept = list[_Region]()
-        for region in sorted(regions, key=lambda one: -one.strength):
+        for region in sorted(regions, key=lambda region: -region.strength):
             if all(
                 intersection_over_union(region.mask, other.mask) < max_overlap for other in kept
             ):
@@ -381,10 +381,10 @@ def find_regions(
         by_channel.append(kept)
     # All regions of a grey picture come from its lightness.
     rows = zip_longest(*by_channel)
-    found = [(k, one) for row in rows for k, one in enumerate(row) if one is not None]
+    found = [(k, region) for row in rows for k, region in enumerate(row) if region is not None]
     return [
-        _upscaled(one.mask, one.sign * whole[k] > one.sign * one.level)
-        for k, one in found[:max_count]
+        _upscaled(region.mask, region.sign * whole[k] > region.sign * region.level)
+        for k, region in found[:max_count]
     ]
 
 

@@ -537,10 +537,10 @@ def _draw_triangle(
         slope_long = (uc - ua) / (vc - va)
         slope_upper, slope_lower = (ub - ua) / (vb - va), (uc - ub) / (vc - vb)
         for row in range(math.ceil(top), min(math.ceil(vc), bounds[1])):
-            one = ua + (row - va) * slope_long
-            other = ua + (row - va) * slope_upper if row < vb else ub + (row - vb) * slope_lower
-            start = max(math.ceil(min(one, other)), bounds[2])
-            stop = min(math.ceil(max(one, other)), bounds[3])
+            long = ua + (row - va) * slope_long
+            short = ua + (row - va) * slope_upper if row < vb else ub + (row - vb) * slope_lower
+            start = max(math.ceil(min(long, short)), bounds[2])
+            stop = min(math.ceil(max(long, short)), bounds[3])
             at_row = at_origin + row * along_v
             i, first = row - bounds[0], bounds[2]
             for column in range(start, stop):

@@ -44,10 +44,10 @@ def check_scene(scene: Scene) -> Scene:
     """Return a scene with warnings about its files, and without masks of cameras that froze."""
     if scene.scale_unknown:
         return scene
-    warnings, known, seen = list(scene.warnings), scene.frames, {*scene.masks, *scene.images}
+    warnings, known, files = list(scene.warnings), scene.frames, {*scene.masks, *scene.images}
     several = len(scene.cameras) > 1
     for name in scene.cameras if several else ():
-        missing = [frame for frame in known if (name, frame) not in seen]
+        missing = [frame for frame in known if (name, frame) not in files]
         if count := (len(known) - len(missing)) * bool(missing):
             warnings.append(
                 f"camera '{name}' has {count} of {len(known)} frames; it lacks "
@@ -167,8 +167,8 @@ def _find_repeats(scene: Scene, min_change: float = 0.02) -> tuple[dict[str, lis
             changes = []
             for name in others:
                 with suppress(MaskError):
-                    one, other = (scene.read(name, f, may_be_empty=True) for f in (last, frame))
-                    changes.append((one != other).sum() / max(one.sum(), other.sum(), 1))
+                    a, b = (scene.read(name, f, may_be_empty=True) for f in (last, frame))
+                    changes.append((a != b).sum() / max(a.sum(), b.sum(), 1))
             if changes and float(np.median(changes)) > min_change:
                 for name in alike:
                     frozen.setdefault(name, []).append(frame)

@@ -304,12 +304,13 @@ def common_rate(
     Raises SceneError: a video cannot be read, or the rates differ.
     """
     opened = {name: VideoPictures(path) for name, path in videos.items()}
-    rates = {name: one.rate_hz for name, one in opened.items() if one.rate_hz is not None}
+    rates = {name: video.rate_hz for name, video in opened.items() if video.rate_hz is not None}
     if not rates:
         return None, ()
-    slow, fast = min(rates, key=lambda one: rates[one]), max(rates, key=lambda one: rates[one])
+    slow = min(rates, key=lambda name: rates[name])
+    fast = max(rates, key=lambda name: rates[name])
     ratio = rates[fast] / rates[slow]
-    drift = min(one.count for one in opened.values()) * (ratio - 1.0)
+    drift = min(video.count for video in opened.values()) * (ratio - 1.0)
     text = (
         f"{videos[slow]} has {rates[slow]:.5g} pictures a second, {videos[fast]} {rates[fast]:.5g}:"
         f" pictures of equal number must be synchronised, but at the end they are {drift:.0f} "
@@ -375,7 +376,9 @@ def find_masks(
     if not root.is_dir():
         raise SceneError(f"{folder}: has no folder masks/<camera>/<frame>.png")
     flat, foreign = _list_masks(root)
-    found = {one.name: _list_masks(root / one.name) for one in _visible(root) if one.is_dir()}
+    found = {
+        entry.name: _list_masks(root / entry.name) for entry in _visible(root) if entry.is_dir()
+    }
     known = {name: found[name][0] for name in names if name in found}
     unknown_folders = {name: len(files) for name, (files, _) in found.items() if name not in names}
     if flat and not any(known.values()):

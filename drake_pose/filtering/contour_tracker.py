@@ -136,9 +136,9 @@ class ContourObservation(BodyState):
             SettingsError: the number or size of masks or pictures does not fit the cameras.
         """
         pictures = [None] * len(masks) if pictures is None else pictures
-        for what, given in (("masks", masks), ("pictures", pictures)):
+        for kind, given in (("masks", masks), ("pictures", pictures)):
             if len(given) != len(self.cameras):
-                raise SettingsError(f"{len(self.cameras)} {what} expected, got {len(given)}")
+                raise SettingsError(f"{len(self.cameras)} {kind} expected, got {len(given)}")
         edges, compared = [], []
         for camera, mask, picture in zip(self.cameras, masks, pictures, strict=True):
             if mask is not None and mask.shape != (camera.height, camera.width):
@@ -250,7 +250,7 @@ class ContourObservation(BodyState):
         H, g = normal_equations(compared, len(self._body.names))
         index = self._parameter_index
         scale = max(CONTOUR.deviation, distance)
-        # The two comparisons (model to edge, edge to model) are redundant and count as one.
+        # Residuals are computed from both contours, so each gets half of the weight.
         weight = 0.5 / (scale**2 * CONTOUR.correlation)
         prior_curvature, prior_slope = self._prior_information
         slopes = weight * g[index] + prior_curvature @ x[self._state_index] - prior_slope
@@ -433,7 +433,7 @@ class ContourTracker:
         """Return the initial belief about a state (n,), before limits and measurements."""
         layout, settings = self.observation.layout, self.settings
         starts = (settings.start_log_scale, settings.start_angle, settings.start_length)
-        # Standard deviation of a rate that accelerates during ``memory``.
+        # Standard deviation of a rate [unit/step] that accelerates during ``memory``.
         picked_up = self.settings.memory * self._period
         deviations = [
             *(self._of_kind(name, *starts) for name in layout.moving),

@@ -449,7 +449,7 @@ class HandSilhouette:
             if prior is not None:
                 y[at + 1 :] = prior.mean
             if k < len(gates) - 1:
-                x = self.belief_filter.corrected(prediction, y, R, x)
+                x = self.belief_filter.estimate_roughly(prediction, y, R, x)
         wrong = np.count_nonzero(self.draw(x) != mask)
         return HandMeasurement(y, R, x, wrong / np.count_nonzero(mask))
 

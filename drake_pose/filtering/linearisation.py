@@ -60,10 +60,10 @@ def linearise_over(
         function: maps x (n,) to values (m,) and their Jacobian (m, n).
         belief: over which to linearise.
         is_angle: (m,) which values are angles [rad].
-        values: the function without its Jacobian, if that is expensive. Its values at another n (n
-            - 1) / 2 points then replace the Jacobians at the sigma points.
+        values: the function without its Jacobian, if that is expensive. Its values at n (n - 1) / 2
+            more points then replace the Jacobians at the sigma points.
     """
-    reach, root, n = np.sqrt(3.0), belief.root, len(belief.mean)
+    distance, root, n = np.sqrt(3.0), belief.root, len(belief.mean)
     value, tangent = function(belief.mean)
 
     def end_of(step: Array) -> tuple[Array, Array]:
@@ -72,26 +72,28 @@ def linearise_over(
         end, slope = function(x) if values is None else (values(x), tangent)
         return wrapped_difference(np.array(end, dtype=np.float64), value, is_angle), slope
 
-    ends = [[end_of(sign * reach * column) for column in root.T] for sign in (1.0, -1.0)]
-    far, near = (np.array([one for one, _ in side]) for side in ends)
+    ends = [[end_of(sign * distance * column) for column in root.T] for sign in (1.0, -1.0)]
+    plus, minus = (np.array([one for one, _ in side]) for side in ends)
     # Slopes (m, n) along the root's columns, shift of the mean (m,), second derivatives (m, n, n).
-    S, mean_bend = (far - near).T / (2.0 * reach), (far + near).sum(axis=0) / 6.0
+    S, mean_shift = (plus - minus).T / (2.0 * distance), (plus + minus).sum(axis=0) / 6.0
     C = np.zeros((len(value), n, n))
-    for i, ((_, far_slope), (_, near_slope)) in enumerate(zip(*ends, strict=True)):
-        C[:, i] = (far_slope - near_slope) @ root / (2.0 * reach)
+    for i, ((_, plus_slope), (_, minus_slope)) in enumerate(zip(*ends, strict=True)):
+        C[:, i] = (plus_slope - minus_slope) @ root / (2.0 * distance)
         if values is not None:
-            C[:, i, i] = (far[i] + near[i]) / 3.0
+            C[:, i, i] = (plus[i] + minus[i]) / 3.0
             for j in range(i):
-                both, _ = end_of(reach * (root[:, i] + root[:, j]))
-                C[:, i, j] = C[:, j, i] = (both - far[i] - far[j]) / 3.0
+                both, _ = end_of(distance * (root[:, i] + root[:, j]))
+                C[:, i, j] = C[:, j, i] = (both - plus[i] - plus[j]) / 3.0
     is_finite = np.isfinite(S).all(axis=1) & np.isfinite(C).all(axis=(1, 2))
-    S[~is_finite], mean_bend[~is_finite], C[~is_finite] = (tangent @ root)[~is_finite], 0.0, 0.0
+    S[~is_finite], mean_shift[~is_finite], C[~is_finite] = (tangent @ root)[~is_finite], 0.0, 0.0
     # Directions without variance keep the tangent.
     deviations = belief.deviations()
     scale = np.where(deviations > 0, deviations, 1.0)
-    turn = np.linalg.lstsq((root / scale[:, None]).T, (S - tangent @ root).T, rcond=1e-12)[0]
+    correction = np.linalg.lstsq((root / scale[:, None]).T, (S - tangent @ root).T, rcond=1e-12)[0]
     flat = (0.5 * (C + C.transpose(0, 2, 1))).reshape(len(C), -1)
-    return Linear(belief.mean, value + mean_bend, tangent + turn.T / scale, 0.5 * flat @ flat.T)
+    return Linear(
+        belief.mean, value + mean_shift, tangent + correction.T / scale, 0.5 * flat @ flat.T
+    )
 
 
 def numerical_jacobian(function: Function, x: Array, is_angle: Mask, size: float = 1.0) -> Array:
@@ -108,8 +110,8 @@ def numerical_jacobian(function: Function, x: Array, is_angle: Mask, size: float
         ends = [x.copy(), x.copy()]
         ends[0][k] += step
         ends[1][k] -= step
-        far, near = (np.array(function(end), dtype=np.float64) for end in ends)
-        columns.append(wrapped_difference(far, near, is_angle) / (2.0 * step))
+        plus, minus = (np.array(function(end), dtype=np.float64) for end in ends)
+        columns.append(wrapped_difference(plus, minus, is_angle) / (2.0 * step))
     return np.stack(columns, axis=1)
 
 
@@ -129,7 +131,7 @@ def require_jacobian(
         names: (m) names of the values.
         elements: (n) names of the state's elements.
         is_angle: (m,) which values are angles [rad].
-        subject: subject of messages.
+        subject: begins messages.
 
     Raises:
         SettingsError: a shape is wrong, or an entry of the Jacobian differs from central

@@ -166,6 +166,6 @@ def step_from(motion: MotionModel, belief: Belief, over_belief: bool) -> Linear:
         nothing = np.zeros(len(belief.mean))
         return Linear(nothing, nothing, motion.transition)
     if over_belief:
-        still = np.zeros(len(belief.mean), dtype=np.bool_)
-        return linearise_over(motion.predict, belief, still, function_without_jacobian(motion))
+        no_angles = np.zeros(len(belief.mean), dtype=np.bool_)
+        return linearise_over(motion.predict, belief, no_angles, function_without_jacobian(motion))
     return Linear(belief.mean, *motion.predict(belief.mean))

@@ -263,7 +263,7 @@ def pose_set(
     poses: Sequence[tuple[Array, Array, float]],
     frame: int,
 ) -> PoseSet:
-    """Return the pose set of a frame: one family per explanation, and the union of their intervals.
+    """Return the pose set of a frame: one mode per explanation, and joint intervals.
 
     Args:
         explanations: best first.

@@ -15,13 +15,13 @@ from drake_pose.arrays import Array
 from drake_pose.errors import SettingsError, UnknownNameError
 
 
-def factor_of(covariance: Array, names: Sequence[str] = (), what: str = "the belief") -> Array:
+def factor_of(covariance: Array, names: Sequence[str] = (), subject: str = "the belief") -> Array:
     """Return L (n, n) with L L^T = covariance; the covariance may be singular.
 
     Args:
         covariance: (n, n), symmetric and positive semidefinite.
         names: (n) names of the elements, for messages; their indices if empty.
-        what: subject of messages.
+        subject: begins messages.
 
     Raises:
         SettingsError: the covariance is indefinite; the message names the element that contributes
@@ -38,8 +38,8 @@ def factor_of(covariance: Array, names: Sequence[str] = (), what: str = "the bel
     if values[0] < -1e-8:
         k = int(np.argmax(np.abs(vectors[:, 0])))
         raise SettingsError(
-            f"{what}: the covariance is indefinite; the lowest eigenvalue of its correlations is "
-            f"{values[0]:.3g}, to which '{names[k] if names else k}' contributes most"
+            f"{subject}: the covariance is indefinite; the lowest eigenvalue of its correlations "
+            f"is {values[0]:.3g}, to which '{names[k] if names else k}' contributes most"
         )
     root = (scale[:, None] * vectors) * np.sqrt(np.maximum(values, 0.0))
     return np.ascontiguousarray(root)
@@ -169,7 +169,7 @@ def make_belief(
     mean: ArrayLike,
     covariance: ArrayLike,
     layout: StateLayout | None = None,
-    what: str = "the belief",
+    subject: str = "the belief",
 ) -> Belief:
     """Return a belief from a mean and a covariance, after checking both.
 
@@ -177,7 +177,7 @@ def make_belief(
         mean: (n,).
         covariance: (n, n); made exactly symmetric.
         layout: the state's elements, for messages; None: elements are named by their indices.
-        what: subject of messages.
+        subject: begins messages.
 
     Raises:
         SettingsError: the shapes do not fit, a number is not finite, or the covariance is not
@@ -191,7 +191,7 @@ def make_belief(
         )
     if layout is not None and q.size != len(layout):
         raise SettingsError(
-            f"{what} has a mean {q.shape} and a covariance {Q.shape}; the state has "
+            f"{subject} has a mean {q.shape} and a covariance {Q.shape}; the state has "
             f"{len(layout)} elements"
         )
     names = layout.names if layout else [str(k) for k in range(q.size)]
@@ -200,11 +200,11 @@ def make_belief(
         bad = np.flatnonzero(~np.isfinite(Q).all(axis=1))
     if bad.size:
         raise SettingsError(
-            f"{what}: the mean or the covariance of '{names[bad[0]]}' is NaN or infinity"
+            f"{subject}: the mean or the covariance of '{names[bad[0]]}' is NaN or infinity"
         )
     scale = np.sqrt(np.abs(np.diag(Q)))
     if (np.abs(Q - Q.T) > 1e-6 * np.outer(scale, scale) + 1e-300).any():
-        raise SettingsError(f"{what}: the covariance is not symmetric")
+        raise SettingsError(f"{subject}: the covariance is not symmetric")
     belief = Belief(q, 0.5 * (Q + Q.T))
-    factor_of(belief.covariance, names, what)
+    factor_of(belief.covariance, names, subject)
     return belief

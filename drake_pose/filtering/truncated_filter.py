@@ -1,7 +1,7 @@
 """A Kalman filter inside linear inequalities that keeps several weighted hypotheses.
 
 Shimada, Shirai, Kuno and Miura, sections 4 and 5: prediction, update from each hypothesis and its
-mirrored ones, truncation, rejection, and weighting of what is left.
+mirrored ones, truncation, rejection, and weighting of the remaining hypotheses.
 """
 
 import math
@@ -55,7 +55,7 @@ class Hypothesis:
         log_weight: logarithm of its weight among all hypotheses.
         log_evidence: the same without the probability of the limits in this step.
         born: step in which it was made by mirroring; 0 for the first.
-        place: index among the hypotheses made in that step; unique together with ``born``.
+        number: index among the hypotheses made in that step; unique together with ``born``.
         active: names of the inequalities that changed its belief in the last step.
         sites: of the last truncation, where the next one starts; see ``Truncated``.
         tangent: (n,) state at which the first frame of the current view was linearised.
@@ -67,7 +67,7 @@ class Hypothesis:
     log_weight: float = 0.0
     log_evidence: float = 0.0
     born: int = 0
-    place: int = 0
+    number: int = 0
     active: tuple[str, ...] = ()
     sites: Array = field(default_factory=lambda: np.zeros((0, 2)))
     tangent: Array = field(default_factory=lambda: np.zeros(0))
@@ -349,8 +349,10 @@ class TruncatedFilter:
                 model.predict, truncated.mean, model.names, names, model.wraps, "the observation"
             )
             if not isinstance(motion, LinearMotion):
-                still = np.zeros(len(names), dtype=np.bool_)
-                require_jacobian(motion.predict, truncated.mean, names, names, still, "the motion")
+                no_angles = np.zeros(len(names), dtype=np.bool_)
+                require_jacobian(
+                    motion.predict, truncated.mean, names, names, no_angles, "the motion"
+                )
             self._checked = True
         return FilterState(0, (self._finish(Hypothesis(checked, checked), checked, truncated),))
 
@@ -366,14 +368,16 @@ class TruncatedFilter:
             stepped.append(replace(h, belief=belief, free=free, repeated=repeated))
         return replace(state, hypotheses=tuple(stepped), rejections=())
 
-    def predicted(self, belief: Belief) -> Belief:
+    def predict_belief(self, belief: Belief) -> Belief:
         """Return a belief after one step of the motion: (6)."""
         return after_step(belief, self._step(belief), self._U)
 
     def _step(self, belief: Belief) -> Linear:
         return step_from(self.motion, belief, self._remainder_weight > 0)
 
-    def corrected(self, prediction: Belief, y: Array, variances: Array, start: Array) -> Array:
+    def estimate_roughly(
+        self, prediction: Belief, y: Array, variances: Array, start: Array
+    ) -> Array:
         """Return a rough state (n,): the mean after a measurement, from one hypothesis.
 
         Args:
@@ -417,9 +421,9 @@ class TruncatedFilter:
         if view.count > 1:
             branches = [self._repeat(h, measurement) for h in state.hypotheses]
         else:
-            places = count()
+            numbers = count()
             branches = [
-                b for h in state.hypotheses for b in self._branches(h, measurement, step, places)
+                b for h in state.hypotheses for b in self._branches(h, measurement, step, numbers)
             ]
         alive, rejected = self._reject(branches, step)
         finished = [
@@ -434,18 +438,18 @@ class TruncatedFilter:
         )
 
     def _branches(
-        self, hypothesis: Hypothesis, measurement: Measurement, step: int, places: Iterator[int]
+        self, hypothesis: Hypothesis, measurement: Measurement, step: int, numbers: Iterator[int]
     ) -> list[Branch]:
         """Update a hypothesis from its prediction, and from each mirrored prediction.
 
-        ``places`` numbers the mirrored hypotheses of this step.
+        ``numbers`` numbers the mirrored hypotheses of this step.
         """
         own = replace(hypothesis, repeated=None)
         iterations = self.settings.iterations
         starts = [(own, own.belief.mean)]
         if self.settings.hypothesis_cap > 1:
             for start in measurement.model.mirrors(own.belief):
-                starts.append((replace(own, born=step, place=next(places)), start))
+                starts.append((replace(own, born=step, number=next(numbers)), start))
         # A belief wide enough to include its mirrored state would mix the two, so that each is
         # linearised at its own start.
         alone = self._remainder_weight > 0 and len(starts) == 1

@@ -247,7 +247,7 @@ def _filter_sequence(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
     belief = sequence.guess
     for t, (truth, y) in enumerate(zip(sequence.states, sequence.measurements, strict=True)):
         if t:
-            belief = hand_filter.predicted(belief)
+            belief = hand_filter.predict_belief(belief)
         belief = update(belief, make_measurement(hand_filter.observation, y), 1, truth).belief
     return FilteredHand(sequence, track_of(states, times), belief.mean)
 
@@ -526,11 +526,11 @@ def _histories(run: int, truths: Array, states: Sequence[FilterState]) -> list[H
 
     for state in states:
         for end in state.rejections:
-            path = believed.pop((end.hypothesis.born, end.hypothesis.place), [])
+            path = believed.pop((end.hypothesis.born, end.hypothesis.number), [])
             path.append((state.step, end.hypothesis.belief.mean, math.nan))
             close(path, state.best.mean, end.reason, end.row, end.c)
         for one in state.hypotheses:
-            path = believed.setdefault((one.born, one.place), [])
+            path = believed.setdefault((one.born, one.number), [])
             path.append((state.step, one.belief.mean, one.weight))
     for path in believed.values():
         close(path, states[-1].best.mean)

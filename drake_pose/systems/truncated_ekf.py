@@ -361,7 +361,7 @@ class HandSensor(PortedSystem):
         else:
             mask = label_image_to_mask(image)
         if has_started:
-            return silhouette.measure(mask, silhouette.belief_filter.predicted(belief))
+            return silhouette.measure(mask, silhouette.belief_filter.predict_belief(belief))
         # Table 2 of Shimada et al. gives the scale of the first frame.
         return silhouette.measure(mask, belief, 1.0)
 

@@ -261,7 +261,7 @@ def test_a_motion_that_bends_moves_mean_and_covariance():
         return np.array([x[0] + 0.3 * x[1], x[1] - 0.3 * 9.8 * np.sin(x[0]) / x[2], x[2]])
 
     f = make(motion=FunctionMotion(swing, 1e-6 * np.eye(3), 0.3))
-    found = f.predicted(START)
+    found = f.predict_belief(START)
     draws = START.mean + np.random.default_rng(0).normal(size=(100_000, 3)) @ START.root.T
     ends = np.array([swing(x) for x in draws[:20_000]])
     scale = ends.std(axis=0)

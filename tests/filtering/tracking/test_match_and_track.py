@@ -160,14 +160,14 @@ def test_rates_fade_within_the_memory_and_change_by_the_acceleration_of_their_ki
     )
     tracker, n = ContourTracker(observation, 0.05, settings), len(observation.layout)
     moving = observation.layout.moving
-    still = tracker.filter.predicted(Belief(np.zeros(n), np.zeros((n, n))))
+    still = tracker.filter.predict_belief(Belief(np.zeros(n), np.zeros((n, n))))
     for name, deviation in zip(moving, still.deviations()[len(moving) :], strict=True):
         turn, shift = name.endswith("turn"), name.startswith("root_shift")
         of_kind = 2.0 if turn else 3.0 if shift else 5.0
         assert deviation == pytest.approx(0.05**2 * of_kind), name
     belief = Belief(np.r_[np.zeros(len(moving)), np.ones(len(moving))], np.eye(n))
     for _ in range(4):
-        belief = tracker.filter.predicted(belief)
+        belief = tracker.filter.predict_belief(belief)
     np.testing.assert_allclose(belief.mean[len(moving) :], math.exp(-1.0))
 
 

@@ -25,7 +25,7 @@ def test_the_hand_sensor_measures_the_silhouette_beside_the_prediction():
             assert sensor["difference"] == 1.0
             continue
         sensor.give(label_image=mask_to_label_image(image))
-        found = silhouette.measure(image, belief_filter.predicted(belief))
+        found = silhouette.measure(image, belief_filter.predict_belief(belief))
         np.testing.assert_array_equal(sensor["measurement"], found.y)
         np.testing.assert_array_equal(sensor["measurement_covariance"], found.covariance.ravel())
         np.testing.assert_array_equal(sensor["rough_state"], found.rough)

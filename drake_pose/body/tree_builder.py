@@ -230,16 +230,21 @@ def _attach_followers(
         }
         parent, leader = branch.parent, min(candidates, default=-1)
         parent_branch = found[parent] if parent >= 0 else branch
-        beside = leader >= 0 and parent == branches[leader].parent
-        below = parent == leader or (parent_branch.parent == leader and parent_branch.follows)
-        if leader < 0 or len(candidates) > 1 or branch.group in skinned or not (beside or below):
+        is_sibling = leader >= 0 and parent == branches[leader].parent
+        is_below = parent == leader or (parent_branch.parent == leader and parent_branch.follows)
+        if (
+            leader < 0
+            or len(candidates) > 1
+            or branch.group in skinned
+            or not (is_sibling or is_below)
+        ):
             for coupling, position in zip(known, branch.positions, strict=True):
                 if coupling:
                     leaders.setdefault(coupling.leader, (i, position))
             found.append(replace(branch, depth=parent_branch.depth + (parent >= 0)))
             continue
         leading, steps, follows = found[leader], branch.steps, list[Coupling]()
-        if beside:
+        if is_sibling:
             last = len(leading.positions)
             for step in leading.steps[::-1]:
                 last -= step.position_count

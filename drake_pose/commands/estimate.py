@@ -278,7 +278,7 @@ def capture(
             progress.show_stage("frames", count, None)
 
         result = capture_live(studio, out, model, live, warn, show, method)
-    for text in result.troubles:
+    for text in result.unreported:
         warn(text)
     if result.interrupted:
         say("drake-pose: stopped by Ctrl-C; all frames are kept")

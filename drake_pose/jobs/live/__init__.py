@@ -1,1 +1,1 @@
-"""Capture of a person frame by frame, as pictures come, and the walk through the garden."""
+"""Live capture of a person, frame by frame as pictures arrive, and the walk through a garden."""

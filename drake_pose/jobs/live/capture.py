@@ -1,4 +1,4 @@
-"""Capture frame by frame, as the pictures come from live cameras, videos or folders."""
+"""Capture of a person, frame by frame as pictures arrive from live cameras, videos or folders."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -58,11 +58,17 @@ from drake_pose.systems.ports import evaluate
 
 
 class LiveResult(NamedTuple):
-    """What came out of a live capture; troubles: what the user was not told while it ran."""
+    """Result of a live capture.
+
+    Args:
+        estimate: the estimate of all frames.
+        interrupted: whether Ctrl-C ended the capture.
+        unreported: warnings that were not passed to ``on_report`` during the capture.
+    """
 
     estimate: SceneEstimate
     interrupted: bool
-    troubles: tuple[str, ...]
+    unreported: tuple[str, ...]
 
 
 @writes_folder
@@ -75,23 +81,25 @@ def capture_live(
     on_frame: Callable[[int, bool], None] = lambda _, __: None,
     method: CaptureMethod = "person",
 ) -> LiveResult:
-    """Captures a person as the pictures come, and writes the result's folder.
+    """Capture a person as pictures arrive, and write the result folder.
 
-    Ctrl-C ends the capture, and keeps everything. The sources are opened twice if the first frames
-    give the person's shape or show the registered pose.
+    Ctrl-C ends the capture and keeps all frames. The sources are opened twice if the shape is
+    fitted to the first frames or the registered pose is searched.
 
     Args:
-        out: the result's folder, empty or not there.
-        model_path: a person with landmarks.yaml beside it; the bundled one, with shape joints
-            for the method "person", where not given.
-        on_report: called at once when cameras stop and return, and with bad pictures.
-        on_frame: called with each frame: how many there are, and whether a person was found.
-        method: "person" by all silhouettes at once; "paper" by the stages of Date et al. (skin,
+        scene: cameras, sources and backgrounds.
+        out: folder for the result; it must be new or empty.
+        model_path: model of a person with landmarks.yaml beside it; None: the bundled person, with
+            shape joints for the method "person".
+        settings: settings; None: defaults.
+        on_report: called immediately when a camera stops or returns, and for bad pictures.
+        on_frame: called after each frame with the number of frames and whether a person was found.
+        method: "person": fit to all silhouettes at once; "paper": the stages of Date et al. (skin,
             rays, inverse kinematics, search; see find_registered_pose).
 
     Raises:
-        SceneError, CameraError, ModelError, SettingsError, UnknownNameError: what was given cannot
-            be captured so.
+        SceneError, CameraError, ModelError, SettingsError, UnknownNameError: the inputs do not
+            allow a capture.
         OutputError: the result cannot be written.
     """
     settings = settings or LiveSettings()
@@ -124,29 +132,29 @@ def capture_live(
             writer.more |= {"lengths_m": shape.lengths, "radius_scales": shape.radius_scales}
         views = {name: diagram.GetOutputPort(f"{kind}_{name}") for name in cameras}
         frames = _FrameWriter(writer, scene, tracker, diagram, views, sensors.period, on_frame)
-        told: list[str] = []
+        reported: list[str] = []
 
-        def tell(text: str) -> None:
-            told.append(text)
+        def report(text: str) -> None:
+            reported.append(text)
             writer.warnings.append(text)
             on_report(text)
 
         writer.begin()
         try:
-            interrupted = run_live(diagram, sensors, settings.seconds, tell, monitor=frames.watch)
+            interrupted = run_live(diagram, sensors, settings.seconds, report, monitor=frames.watch)
             frames.finish(sensors, settings.replay)
         finally:
             writer.write_summary()
     estimate = writer.result()
-    troubles = tuple(text for text in estimate.warnings if text not in told)
-    return LiveResult(estimate, interrupted, troubles)
+    unreported = tuple(text for text in estimate.warnings if text not in reported)
+    return LiveResult(estimate, interrupted, unreported)
 
 
 def shape_of_result(result: Path) -> KnownShape:
-    """The lengths and radius scales that an earlier capture found.
+    """Return the link lengths [m] and radius scales of an earlier capture.
 
     Raises:
-        OutputError: there is no such result, or it has none.
+        OutputError: the result does not exist, or has none.
     """
     summary = read_summary(result)
     found = []
@@ -155,7 +163,7 @@ def shape_of_result(result: Path) -> KnownShape:
         if not isinstance(numbers, dict) or not all(
             isinstance(number, int | float) for number in numbers.values()
         ):
-            raise OutputError(f"{result}: its summary has no {name}; name a result of capture")
+            raise OutputError(f"{result}: its summary has no {name}; give a result of capture")
         found.append(numbers)
     return KnownShape(*found)
 
@@ -167,7 +175,10 @@ def _fit_first_frames(
     on_report: Callable[[str], None],
     count: int = 40,
 ) -> KnownShape | None:
-    """Fit lengths and radius scales to the first frames; None without shape joints."""
+    """Fit link lengths and radius scales to the first ``count`` frames that two cameras see.
+
+    Returns None for a model without shape joints.
+    """
     if not shape_values(tree).any():
         return None
     sensors = scene.open_sensors(tolerance=settings.tolerance)
@@ -187,13 +198,13 @@ def _fit_first_frames(
         return len(frames) >= count
 
     look_until(builder.Build(), sensors, look, on_report)
-    # Whoever else is in view is cut out.
+    # Other people in view are removed from the masks.
     alone = PersonRecording(scene.cameras, lambda k: frames[k], len(frames), True)
     seen = alone.seen
     if not seen:
         raise SettingsError(
-            f"{scene.path}: two cameras never saw a person at the same time: stand before them, "
-            "and compare the pictures with their backgrounds"
+            f"{scene.path}: two cameras never saw a person at the same time; stand in view of "
+            "them, and compare the pictures with their backgrounds"
         )
     found = capture_person(tree, scene.cameras, alone.read, seen)
     return None if found.shape is None else found.shape.known
@@ -205,68 +216,79 @@ def find_registered_pose(
     settings: LiveSettings,
     on_report: Callable[[str], None],
 ) -> CaptureSetup:
-    """What capture needs, from the pictures in which a person shows the registered pose.
+    """Prepare a capture by the stages of Date et al. from pictures that show the registered pose.
 
     Args:
-        model: a person of the same build as the bundled one; its measures are taken as they are.
-        settings: no shape can be given; without a camera before the face, and templates as of
-            learn_recorded_faces, its direction is found by inverse kinematics alone.
+        scene: cameras, sources and backgrounds.
+        model: model of a person with the bundled person's joints; its lengths stay as they are.
+        settings: settings without shape; without a face camera and faces, the head's direction is
+            found by inverse kinematics only.
+        on_report: called when a camera stops, returns, or is left out.
 
     Raises:
-        SceneError, CameraError, ModelError, SettingsError, UnknownNameError: what was given cannot
-            be captured so, or no picture shows the registered pose.
+        SceneError, CameraError, ModelError, SettingsError, UnknownNameError: the inputs do not
+            allow such a capture, or no picture shows the registered pose.
     """
     if settings.shape is not None:
-        raise SettingsError("the paper's stages take the model's measures: give no shape")
+        raise SettingsError("the method paper uses the model's lengths; leave shape out")
     faces = None if settings.faces is None else learn_recorded_faces(settings.faces)
     path, face = scene.path, settings.face_camera
     cameras = dict[str, PinholeCamera]()
     for name, camera in scene.cameras.items():
         if scene.specifications[name].gives_masks:
             raise SceneError(
-                f"{path}: camera '{name}' delivers masks; the paper's stages look for skin in "
-                "colour pictures: give these, and a background of the empty room"
+                f"{path}: camera '{name}' delivers masks, but the method paper detects skin in "
+                "colour pictures; give pictures, and a background of the empty room"
             )
         if not isinstance(camera, PinholeCamera):
-            raise CameraError(f"camera '{name}': the paper's stages need a pinhole camera")
+            raise CameraError(f"camera '{name}': the method paper needs a pinhole camera")
         cameras[name] = camera
     if face is not None and face not in cameras:
         raise UnknownNameError("camera", face, cameras, str(path))
     ring = {name: one for name, one in cameras.items() if name != face}
     blank = CaptureSetup(load_skeleton(model), ring, backgrounds=scene.backgrounds)
-    best, shown = _best_moment(
+    best, shown = _best_registered_frame(
         blank, ring, scene.open_sensors(tolerance=settings.tolerance), on_report
     )
     if best is None:
         raise SettingsError(
-            f"{path}: two cameras never saw a person whole at the same time: compare the "
-            "pictures with those of the empty room"
+            f"{path}: two cameras never saw a whole person at the same time; compare the pictures "
+            "with those of the empty room"
         )
     (q, similarity), needed = best, blank.recognition
     if similarity < needed:
         raise SettingsError(
-            f"{path}: nobody showed the registered pose, upright with both arms spread: the "
-            f"likest silhouettes agree with it by {similarity:.2f}, {needed:.2f} are needed; "
-            "show it once, give a model of the person's measures (urdf/person/make_person.py "
-            "makes one), or capture by all silhouettes (--method person)"
+            f"{path}: no frame shows the registered pose, upright with both arms spread: the best "
+            f"similarity is {similarity:.2f}, {needed:.2f} are needed; show the pose once, give a "
+            "model with the person's measures (urdf/person/make_person.py makes one), or use "
+            "--method person"
         )
     known = {name: one for name, one in cameras.items() if name == face or name in shown}
     for name in cameras:
         if name not in known:
-            on_report(f"camera '{name}' gave no picture of the registered pose: left out")
+            on_report(f"camera '{name}' has no picture of the registered pose and is left out")
     return prepare_paper_capture(model, known, face, q, shown, scene.backgrounds, faces=faces)
 
 
-def _best_moment(
+def _best_registered_frame(
     setup: CaptureSetup,
     ring: Mapping[str, PinholeCamera],
     sensors: PictureCapture,
     on_report: Callable[[str], None],
-    more_moments: int = 10,
+    more_frames: int = 10,
 ) -> tuple[tuple[Array, float] | None, dict[str, Picture]]:
-    """Positions and similarity of the moment most like the registered pose; its pictures.
+    """Return positions (nq,) and similarity of the frame most like the registered pose.
 
-    more_moments: number of moments after a good one that may be better: arms may still be rising.
+    Args:
+        setup: setup without registered pose.
+        ring: cameras around the person.
+        sensors: sensors of the cameras; they are closed.
+        on_report: called with messages about cameras.
+        more_frames: number of frames after a good one that may still be better.
+
+    Returns:
+        Positions and similarity, None if no frame had two whole silhouettes; and the frame's
+        pictures by camera.
     """
     diagram = build_paper_capture(setup, sensors, sensors.period).diagram
     registered: RegisteredPose | None = None
@@ -298,21 +320,23 @@ def _best_moment(
                     best, since = found, 0
                     shown = {k: colour_image_to_picture(one).copy() for k, one in images.items()}
         is_sure = best is not None and best[1] >= setup.recognition
-        return is_sure and since >= more_moments
+        return is_sure and since >= more_frames
 
     look_until(diagram, sensors, look, on_report)
     return best, shown
 
 
 class _FrameWriter:
-    """Writes the frames of a capture under way.
+    """Writes the frames of a running capture.
 
     Args:
-        tracker: made for the person's pose tree; gives its surfaces.
-        diagram: of build_silhouette_capture, or of build_paper_capture.
-        views: by camera, the diagram's port of what its picture says, None where there is none.
+        writer: writer of the result.
+        scene: the live scene.
+        tracker: tracker of the person, which has the body's surfaces.
+        diagram: diagram of build_silhouette_capture or build_paper_capture.
+        views: by camera, the diagram's port of its segmented picture, which may be None.
         period: time between two frames [s].
-        on_frame: as of capture_live.
+        on_frame: as in capture_live.
     """
 
     def __init__(
@@ -331,20 +355,20 @@ class _FrameWriter:
         self._times: dict[str, float] = {}
         self._seen: dict[tuple[str, str], Path] = {}
         self._doubts: dict[str, list[str]] = {}
-        self._index, self._moment, self._begin = -1, float("nan"), time.perf_counter()
+        self._index, self._time, self._begin = -1, float("nan"), time.perf_counter()
 
     def watch(self, context: Context) -> None:
-        """Writes a frame where there is a new moment; its name counts periods from the first."""
-        moment = float(self._value(context, "time")[0])
-        if np.isnan(moment) or moment == self._moment:
+        """Write a frame if the pictures are new; its name counts periods since the first one."""
+        now = float(self._value(context, "time")[0])
+        if np.isnan(now) or now == self._time:
             return
-        self._moment, self._index = moment, max(self._index + 1, round(moment / self._period))
+        self._time, self._index = now, max(self._index + 1, round(now / self._period))
         name, q = f"{self._index:06d}", self._value(context, "estimated_positions")
         seen = {camera: port.Eval(context) for camera, port in self._views.items()}
         masks = {camera: view.region for camera, view in seen.items() if view is not None}
         for camera in masks:
             self._seen[camera, name] = Path(self._scene.specifications[camera].location)
-        share, others = (
+        inlier_ratio, others = (
             float(self._value(context, what)[0]) for what in ("inlier_ratio", "others")
         )
         seconds = time.perf_counter() - self._begin
@@ -372,10 +396,10 @@ class _FrameWriter:
             stopped_by=FOLLOWED,
             joints=record_deviations(self._writer.model, q, deviations),
             ious=ious,
-            share=share if np.isfinite(share) else None,
+            share=inlier_ratio if np.isfinite(inlier_ratio) else None,
         )
         self._writer.add(record)
-        self._times[name] = moment
+        self._times[name] = now
         if self._writer.more["method"] != "person":
             self._doubt(context, name, q, ious)
         self._on_frame(len(self._times), record.found)
@@ -389,35 +413,43 @@ class _FrameWriter:
         ious: Mapping[str, float],
         min_iou: float = 0.6,
     ) -> None:
-        """Notes why one should not trust the paper's stages in a frame.
+        """Record doubts about the result of the paper's stages in a frame.
 
-        min_iou: of a frame in the mean; of simulated persons who are followed it is about 0.8.
+        Args:
+            context: context of the diagram.
+            frame: the frame's name.
+            q: (nq,) positions; nan before the registered pose.
+            ious: intersection over union by camera.
+            min_iou: mean IoU below which the pose is doubtful; tracked simulated persons have
+                about 0.8.
         """
         doubts = []
         if not np.isfinite(q).all():
             doubts.append("before the registered pose")
         else:
-            # Where a pose was recognised no feature need be measured.
+            # In a recognised registered pose features need not be measured.
             if np.isfinite(self._value(context, "limb_points")).all():
                 lost = np.array(FEATURES)[self._value(context, "last_support") == 0]
-                doubts += [f"{k.replace('_', ' ')} not seen; held where it was last" for k in lost]
+                doubts += [
+                    f"{k.replace('_', ' ')} not visible; held at its last position" for k in lost
+                ]
             if np.mean(list(ious.values()) or [0.0]) < min_iou:
                 doubts.append(
-                    f"the body and the silhouettes hardly agree (mean IoU below {min_iou}); the "
-                    "paper's stages do not notice when they have lost the person, until the "
-                    "registered pose is shown again"
+                    f"body and silhouettes hardly agree (mean IoU below {min_iou}); the method "
+                    "paper does not detect that it has lost the person: show the registered pose "
+                    "again"
                 )
         for text in doubts:
             self._doubts.setdefault(text, []).append(frame)
 
     def finish(self, sensors: PictureCapture, replay: bool) -> None:
-        """Writes what is made of all frames."""
+        """Write warnings, the use of pictures, and the files about all frames."""
         writer = self._writer
         writer.warnings += [
             f"frame {frame_ranges(frames, list(self._times))}: {text}"
             for text, frames in self._doubts.items()
         ]
-        # A moment that no camera saw, or that was skipped, is a frame without a pose.
+        # Periods without pictures, and skipped ones, are frames without a pose.
         names = tuple(f"{k:06d}" for k in range(self._index + 1))
         writer.scene = replace(writer.scene, frames=names, masks=self._seen)
         counts, sources = sensors.counts(), {}
@@ -430,31 +462,37 @@ class _FrameWriter:
             known = {"kind": given.kind, "location": given.location, **asdict(count)}
             sources[name] = known | {"changes": changes}
         writer.more |= {"sources": sources, "skipped_moments": sensors.skipped}
-        writer.warnings += camera_troubles(counts, sensors.skipped)
+        writer.warnings += capture_warnings(counts, sensors.skipped)
         if writer.records:
             writer.finish(replay)
             times = [(frame, f"{time:.6f}") for frame, time in self._times.items()]
             writer.write(TIME_STAMPS, csv_text([("frame", "time"), *times]))
 
     def _value(self, context: Context, name: str, size: int = 1) -> Array:
-        """An output's value; nan where the diagram has no such output."""
+        """Return the value of an output of the diagram; nan if there is no such output."""
         if not self._diagram.HasOutputPort(name):
             return np.full(size, np.nan)
         return np.array(self._diagram.GetOutputPort(name).Eval(context))
 
 
-def camera_troubles(counts: Mapping[str, CameraCount], skipped: int) -> list[str]:
-    """What the user should know at the end of a capture: pictures lost, by camera."""
-    troubles = []
+def capture_warnings(counts: Mapping[str, CameraCount], skipped: int) -> list[str]:
+    """Return warnings of lost pictures and stopped cameras at the end of a capture.
+
+    Args:
+        counts: use of pictures by camera.
+        skipped: number of skipped sets of synchronised pictures.
+    """
+    warnings = []
     for name, count in counts.items():
-        numbers = {"could not be used": count.dropped, "came after their moment": count.late}
+        numbers = {"could not be used": count.dropped, "came too late": count.late}
         lost = [f"{number} {what}" for what, number in numbers.items() if number]
         if lost:
-            troubles.append(f"camera '{name}': of its pictures {' and '.join(lost)}")
+            warnings.append(f"camera '{name}': of its pictures {' and '.join(lost)}")
         if count.changes and count.changes[-1].stopped:
-            troubles.append(f"camera '{name}' had stopped by the end")
+            warnings.append(f"camera '{name}' had stopped by the end; check its connection")
     if skipped:
-        troubles.append(
-            f"{skipped} moments were skipped: this computer could not follow the cameras"
+        warnings.append(
+            f"{skipped} frames were skipped, as this computer is too slow for the cameras; use "
+            "fewer or smaller pictures"
         )
-    return troubles
+    return warnings

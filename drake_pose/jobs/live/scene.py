@@ -1,4 +1,4 @@
-"""A folder of cameras and where their pictures come from, and the one loop of what is live."""
+"""Scenes of live cameras or recorded sources, and the loop that simulates their diagrams."""
 
 import math
 import os
@@ -32,9 +32,13 @@ from drake_pose.systems.picture_capture import PictureCapture
 
 @dataclass(frozen=True, eq=False)
 class LiveScene:
-    """Calibrated cameras, where their pictures come from, and how the empty room looks.
+    """Calibrated cameras, the sources of their pictures, and their background models.
 
-    A camera whose source delivers masks has no background.
+    Args:
+        path: the scene's folder.
+        cameras: cameras by name.
+        specifications: sources by camera.
+        backgrounds: background models by camera, without cameras whose sources deliver masks.
     """
 
     path: Path
@@ -45,15 +49,15 @@ class LiveScene:
     def open_sensors(
         self, live: bool | None = None, tolerance: float | None = None
     ) -> PictureCapture:
-        """Opens the sources of the pictures.
+        """Open the sources and return their sensor system.
 
         Args:
-            live: whether the computer's clock decides; where not given, if a camera is live.
-            tolerance: how far apart the pictures of one moment may be [s].
+            live: whether frames follow the computer's clock; None: if any source is live.
+            tolerance: maximum difference of the times of synchronised pictures [s].
 
         Raises:
-            SceneError: a source cannot be opened; what was opened is closed.
-            SettingsError: the tolerance cannot be.
+            SceneError: a source cannot be opened; sources opened before are closed.
+            SettingsError: the tolerance is out of range.
         """
         with ExitStack() as opened:
             sources = _open_sources(self.specifications, opened)
@@ -65,30 +69,36 @@ class LiveScene:
 def _open_sources(
     given: Mapping[str, SourceSpecification], opened: ExitStack
 ) -> dict[str, FrameSource]:
-    """Opens sources, which ``opened`` closes; SceneError: one cannot be."""
+    """Open sources, which ``opened`` closes.
+
+    Raises:
+        SceneError: a source cannot be opened.
+    """
     return {name: opened.enter_context(closing(open_source(one))) for name, one in given.items()}
 
 
 def hush_opencv() -> None:
-    """Keeps OpenCV from writing to the terminal whenever a camera is tried again."""
-    # FFmpeg's part reads it when the first camera or video is opened; -8: nothing at all.
+    """Silence OpenCV, which logs every attempt to open a camera."""
+    # Read when the first camera or video is opened; -8 means silent.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 
 def load_live_scene(path: Path) -> LiveScene:
-    """Reads cameras.yaml, sources.yaml and the pictures of the empty room.
+    """Read cameras.yaml, sources.yaml and background pictures.
 
     Raises:
-        SceneError, CameraError: a file is missing or wrong; names it.
+        SceneError, CameraError: the message names a missing or damaged file.
     """
     if not path.is_dir():
         raise SceneError(f"{path}: no such folder; it needs {CAMERAS} and {SOURCES}")
     if not (path / SOURCES).is_file():
-        raise SceneError(f"{path}: has no {SOURCES}, which says where its cameras' pictures are")
+        raise SceneError(
+            f"{path}: has no {SOURCES}, which names the sources of its cameras' pictures"
+        )
     cameras = load_cameras(path / CAMERAS)
     if len(cameras) < 2:
-        raise SceneError(f"{path}: a person is captured by two calibrated cameras or more")
+        raise SceneError(f"{path}: the capture of a person needs two or more calibrated cameras")
     specifications = load_sources(path / SOURCES, cameras)
     backgrounds = {
         name: learn_background(load_background_pictures(one))
@@ -99,26 +109,27 @@ def load_live_scene(path: Path) -> LiveScene:
 
 
 def take_empty_room(folder: Path, count: int, patience: float = 30.0) -> dict[str, Path]:
-    """Writes each camera's first pictures to its background folder; by camera, where that is.
+    """Write each camera's first pictures to its background folder; return the folders by camera.
 
     Args:
+        folder: folder with cameras.yaml and sources.yaml.
         count: number of pictures of each camera.
-        patience: how long to wait for them [s].
+        patience: timeout for the pictures [s].
 
     Raises:
-        SceneError: a camera gives too few pictures, or none needs a background.
-        OutputError: a background folder holds something already, or cannot be written.
+        SceneError: a camera gives too few pictures, or no camera needs a background.
+        OutputError: a background folder is not empty, or cannot be written.
     """
     specifications = {
         name: one for name, one in load_sources(folder).items() if one.background is not None
     }
     if not specifications:
-        raise SceneError(f"{folder}: all sources deliver masks, so none needs a background")
+        raise SceneError(f"{folder}: no source needs a background, as all deliver masks")
     places = {name: Path(str(one.background)) for name, one in specifications.items()}
     for name, place in places.items():
         if place.exists() and (not place.is_dir() or any(place.iterdir())):
             raise OutputError(
-                f"{place}: the background of camera '{name}' exists already; move it away first"
+                f"{place}: the background of camera '{name}' exists already; remove it first"
             )
     pictures: dict[str, list[Picture]] = {name: [] for name in places}
     with ExitStack() as opened:
@@ -151,15 +162,19 @@ def run_live(
     speed: float = 0.0,
     largest_lag: float = 0.2,
 ) -> bool:
-    """Runs a diagram until its recordings end or its time is up; True: until Ctrl-C instead.
+    """Simulate a diagram until its recordings end, the time is over, or Ctrl-C.
 
     Args:
-        sensors: those in the diagram; None: it has none.
-        seconds: how long; None: without end.
-        on_report: called with what the user should know of cameras and pictures.
+        diagram: the diagram.
+        sensors: its sensor system; None: it has none.
+        seconds: duration [s]; None: unlimited.
+        on_report: called with messages about cameras and pictures.
         monitor: called with the diagram's context after every step; may end the run.
-        speed: simulated seconds a second where no camera is live; 0: as fast as it can.
-        largest_lag: a simulation that is further behind the clock [s] skips what it has missed.
+        speed: simulated time per real time without live cameras; 0: as fast as possible.
+        largest_lag: delay to the clock beyond which a simulation skips ahead [s].
+
+    Returns:
+        Whether Ctrl-C ended the run.
     """
     simulator = Simulator(diagram)
     if monitor is not None:
@@ -196,13 +211,17 @@ def look_until(
     on_report: Callable[[str], None],
     patience: float = 60.0,
 ) -> None:
-    """Runs a diagram until ``looks`` returns True; closes the sensors.
+    """Simulate a diagram until ``looks`` returns True, then close the sensors.
 
     Args:
-        patience: how long to wait for a person before live cameras [s].
+        diagram: the diagram.
+        sensors: its sensor system.
+        looks: called with the diagram's context after every step.
+        on_report: called with messages about live cameras.
+        patience: timeout with live cameras [s].
 
     Raises:
-        KeyboardInterrupt: the user gave up.
+        KeyboardInterrupt: Ctrl-C ended the run.
     """
 
     def look(context: Context) -> EventStatus:
@@ -211,7 +230,7 @@ def look_until(
             EventStatus.ReachedTermination(diagram, "") if is_enough else EventStatus.DidNothing()
         )
 
-    # What is wrong with recorded pictures is said when they are captured.
+    # Recorded pictures are read again in the capture, which reports their problems.
     report = on_report if sensors.live else lambda _: None
     waited = patience if sensors.live else None
     try:

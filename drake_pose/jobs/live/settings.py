@@ -1,4 +1,4 @@
-"""What a live capture is made with: options, and arguments in Python."""
+"""Settings of a live capture: command line options and Python arguments."""
 
 import math
 from collections.abc import Mapping
@@ -12,15 +12,15 @@ from drake_pose.errors import SettingsError
 from drake_pose.files.settings import within
 
 CaptureMethod = Literal["person", "paper"]
-"""By all silhouettes at once, or by the stages of Date et al. as they print them."""
+"""person: a fit to all silhouettes at once; paper: the stages of Date et al. as published."""
 
 Seconds = Annotated[float | None, within(0.01)]
 Shape = Annotated[
     Path | None,
     Parameter(
         metavar="RESULT",
-        help="Take lengths and radius scales from this result of capture with the same person. "
-        "Live capture (sources.yaml) only.",
+        help="Use the link lengths and radius scales of this earlier result of capture with the "
+        "same person. Live capture (sources.yaml) only.",
     ),
 ]
 _OF_PYTHON = Parameter(parse=False)
@@ -28,35 +28,36 @@ _OF_PYTHON = Parameter(parse=False)
 
 @dataclass(frozen=True, kw_only=True)
 class LiveSettings:
-    """How a live capture is made.
+    """Settings of a live capture.
 
     Args:
         replay: whether replay.html is written.
-        packages: folders of packages that the model's ``package://`` names mean, by name.
+        packages: folders of the packages in the model's ``package://`` addresses, by name.
 
     Raises:
-        SettingsError: a time that cannot be, or options that go together are given apart.
+        SettingsError: a time is not positive, or an option lacks the other one that it needs.
     """
 
     seconds: Seconds = None
     """Stop after this time [s]. Live capture (sources.yaml) only."""
     shape: Shape = None
     fit_shape: Annotated[bool, Parameter(negative="--no-fit-shape")] = True
-    """Fit lengths and radius scales to the first frames; or keep the model's. Live capture only."""
+    """--fit-shape: fit link lengths and radius scales to the first frames. --no-fit-shape: keep the
+    model's. Live capture only."""
     tolerance: Annotated[float | None, within(0.0), Parameter(metavar="SECONDS")] = None
-    """Largest difference of time stamps of simultaneous pictures. Default: half the time between
-    two pictures of a camera, or 0.9 of it if cameras are live."""
+    """Maximum difference of the time stamps of synchronised pictures [s]. Default: half the time
+    between two pictures of a camera, or 0.9 of it for live cameras."""
     face_camera: Annotated[str | None, Parameter(metavar="NAME")] = None
-    """With --method paper: the camera before the face, which tells where the person looks; needs
+    """With --method paper: the camera before the face, for the direction of the head; needs
     --faces."""
     faces: Annotated[Path | None, Parameter(metavar="FOLDER")] = None
-    """With --method paper: pictures of the person's face, and directions.csv: picture,turn,nod
-    [deg]."""
+    """With --method paper: folder with pictures of the person's face and directions.csv, which has
+    the columns picture, turn and nod [deg]."""
     replay: Annotated[bool, _OF_PYTHON] = True
     packages: Annotated[Mapping[str, Path], _OF_PYTHON] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.seconds is not None and not 0.0 < self.seconds < math.inf:
-            raise SettingsError(f"the capture's length must be positive, not {self.seconds} s")
+            raise SettingsError(f"seconds must be positive, not {self.seconds}")
         if (self.face_camera is None) != (self.faces is None):
-            raise SettingsError("--face-camera and --faces go together")
+            raise SettingsError("--face-camera and --faces need each other")

@@ -1,4 +1,4 @@
-"""A walk through a garden in the browser: what moves the avatar, and the run."""
+"""A walk through a garden in the browser: sources of the avatar's motion, and the simulation."""
 
 import logging
 import math
@@ -20,7 +20,7 @@ from drake_pose.errors import OutputError, SettingsError
 from drake_pose.files.folder import read_summary
 from drake_pose.files.records import PoseTable
 from drake_pose.jobs.estimate.inputs import bundled_person
-from drake_pose.jobs.live.capture import camera_troubles, shape_of_result
+from drake_pose.jobs.live.capture import capture_warnings, shape_of_result
 from drake_pose.jobs.live.scene import LiveScene, run_live
 from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.date.skeleton import load_skeleton
@@ -31,24 +31,23 @@ from drake_pose.systems.picture_capture import PictureCapture
 from drake_pose.systems.ports import evaluate
 from drake_pose.systems.walk import KEYS, AddPositions, build_walk
 
-# Between two looks at browser and button [s].
+# Interval at which browser and button are polled [s].
 _POLL_PAUSE = 0.05
 
 RATE_HZ = 30.0
-"""Frames a second where a recording does not say."""
+"""Frame rate [Hz] of recordings without one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Player:
-    """What moves the avatar.
+    """Source of the avatar's motion: recorded positions, cameras, or the arrow keys if neither.
 
     Args:
-        model: the bundled person where not given.
-        q: (n, nq) positions [rad or m], nan where the person was not found.
-        period: time between two of them, or two looks at the keys or the cameras [s].
-        sensors: of the cameras that see the person, in place of q.
-        add: adds the sensors and who follows the person to a diagram. Without it and q the keys
-            alone move the avatar.
+        model: model of the avatar; default: the bundled person.
+        q: (n, nq) recorded positions [rad or m], nan where the person was not found.
+        period: time between two positions, or sampling period of keys or cameras [s].
+        sensors: sensor system of the cameras.
+        add: adds the sensors and a tracker of the person to a diagram builder.
     """
 
     model: ArticulatedModel = field(
@@ -66,21 +65,22 @@ def recorded_player(
     rate_hz: float | None,
     packages: Mapping[str, Path] | None = None,
 ) -> Player:
-    """Plays the poses of a result folder, as `drake-pose capture` writes it.
+    """Return a player of the poses of a result folder, as `drake-pose capture` writes it.
 
     Args:
-        model_path: the model it was captured with; the bundled one of its summary where not given.
-        rate_hz: its frames a second; those in its summary where not given.
-        packages: folders of packages that the model's ``package://`` names mean, by name.
+        result: the result folder.
+        model_path: model of the capture; None: the bundled model named in its summary.
+        rate_hz: frame rate [Hz]; None: that of its summary.
+        packages: folders of the packages in the model's ``package://`` addresses, by name.
 
     Raises:
-        OutputError: there is no such result, or it is one of another model.
+        OutputError: the result does not exist, or belongs to another model.
         SettingsError: the rate is not positive.
     """
     summary = read_summary(result)
     rate_hz = float(summary.get("frame_rate_hz") or RATE_HZ) if rate_hz is None else rate_hz
     if not (math.isfinite(rate_hz) and rate_hz > 0):
-        raise SettingsError(f"frames a second must be a positive number, not {rate_hz}")
+        raise SettingsError(f"the frame rate must be a positive number, not {rate_hz}")
     if model_path is None:
         name = str(summary.get("model", ""))
         model_path = bundled_model("person").with_name(Path(name).name)
@@ -89,12 +89,12 @@ def recorded_player(
     model = load_model(model_path, package_paths=packages)
     rows = PoseTable(result, model.position_names, with_base=False).read()
     if not any(row.found for row in rows):
-        raise OutputError(f"{result}: nobody was found in any frame, so nobody can walk")
+        raise OutputError(f"{result}: no person was found in any frame, so the avatar cannot walk")
     return Player(model, np.array([row.q for row in rows]), 1.0 / rate_hz)
 
 
 def simulated_player() -> Player:
-    """Plays the known motion of Date's experiment."""
+    """Return a player of the simulated motion in the experiment of Date et al."""
     model = load_model(bundled_model("person"), check=False)
     return Player(model, make_motion(load_skeleton(model), 1200, seed=0).q)
 
@@ -105,16 +105,17 @@ def live_player(
     settings: LiveSettings | None = None,
     open_sensors: Callable[[], PictureCapture] | None = None,
 ) -> Player:
-    """Walks as the person before the cameras commands; recorded sources are played as if live.
+    """Return a player that follows the person before the cameras; recordings play as if live.
 
     Args:
-        model_path: a person with landmarks.yaml beside it; the bundled one where not given.
-        settings: whose shape; the model's where not given.
-        open_sensors: opens the sensors; those of the scene in this process where not given.
+        scene: cameras, sources and backgrounds.
+        model_path: model of a person with landmarks.yaml beside it; None: the bundled person.
+        settings: shape and packages; None: the model's shape.
+        open_sensors: opens the sensor system; None: the scene's, in this process.
 
     Raises:
-        SceneError, ModelError, SettingsError: what was given cannot be walked with.
-        OutputError: the shape's result is none.
+        SceneError, ModelError, SettingsError: the inputs do not allow a walk.
+        OutputError: the result of the shape does not exist or has none.
     """
     settings = settings or LiveSettings()
     model = load_model(model_path or bundled_person(), package_paths=settings.packages)
@@ -132,7 +133,10 @@ def live_player(
 
 
 def stride_positions(model: ArticulatedModel) -> Array:
-    """(n, nq) one stride on the spot, standing at its end; joints of other names rest."""
+    """Return positions (n, nq) of one stride on the spot that ends standing.
+
+    Joints that the bundled person does not have keep their default positions.
+    """
     person = load_model(bundled_model("person"), check=False)
     motion = make_motion(load_skeleton(person), 5 * int(RATE_HZ), 0)
     walking = motion.q[[name == "walk" for name in motion.names]]
@@ -155,25 +159,26 @@ def walk(
     on_report: Callable[[str], None] = lambda _: None,
     settle: float = 1.0,
 ) -> dict[str, Any]:
-    """Lets the avatar walk until its recording, the given time, or the user (Ctrl-C) ends it.
+    """Simulate the walk until the recording or the given time ends, or Ctrl-C.
 
     Args:
-        player: its sensors are used up.
-        seconds: how long; the recording's length where not given, else without end.
-        speed: seconds walked a second; 0: as fast as the machine can; cameras: 1.
-        on_command: called when the command changes, with its words, "" for none.
-        again: asked at the end of what is not live whether to walk once more from the start.
-        on_spot: as of Walker.
-        on_report: told of cameras that stop and return, bad pictures, a person found or lost.
-        settle: whoever comes before the cameras commands after standing still for this long [s].
+        player: source of the motion; its sensors are closed at the end.
+        meshcat: the page.
+        seconds: duration [s]; None: the length of the recording, or unlimited.
+        speed: simulated time per real time; 0: as fast as possible; always 1 with cameras.
+        on_command: called with the words of the command whenever it changes, "" for none.
+        again: called at the end of a walk without cameras; True starts it again.
+        on_spot: as in Walker.
+        on_report: called with messages about cameras, pictures, and a person found or lost.
+        settle: time for which a person must stand still before commands count [s].
 
     Returns:
-        Of the last walk: seconds walked; x, y [m] and heading_deg where it ended; and by command
-            how many seconds it was followed. Live, found_share of the periods in which the person
-            was known; and warnings.
+        Of the last walk: ``seconds``; the final ``x``, ``y`` [m] and ``heading_deg``; ``commands``,
+        the time [s] of each command. With cameras also ``found_share``, the fraction of periods in
+        which the person was found, and ``warnings``.
 
     Raises:
-        SettingsError: a time or a speed that cannot be.
+        SettingsError: time or speed is out of range.
     """
     if seconds is not None and not 0.0 < seconds < math.inf:
         raise SettingsError(f"the walk's length must be a positive number, not {seconds} s")
@@ -196,16 +201,16 @@ def walk(
                 diagram, sensors, seconds, on_report, monitor=log.watch, speed=speed
             )
             if sensors is not None:
-                return log.as_json() | {"warnings": camera_troubles(sensors.counts(), 0)}
+                return log.as_json() | {"warnings": capture_warnings(sensors.counts(), 0)}
             if interrupted or not again():
                 return log.as_json()
-            # What was pressed before does not move the next walker.
+            # Adding the buttons again resets their clicks.
             for name, key in KEYS.items():
                 meshcat.AddButton(name, key)
 
 
 class _WalkLog:
-    """Which commands of a diagram of build_walk were followed for how long, and where to."""
+    """Logs the duration of each command and the final pose of a diagram of build_walk."""
 
     def __init__(
         self,
@@ -222,11 +227,11 @@ class _WalkLog:
             self._person = tracker.GetOutputPort("estimated_positions")
         self._words: tuple[str, ...] = ()
         self._time, self._last = 0.0, self._pose.Eval(diagram.CreateDefaultContext())
-        # In each period, whether the person was known.
+        # Whether the person was found in each period.
         self._known = [False]
 
     def watch(self, context: Context) -> None:
-        """Notes the command that holds from a time on, and whether the person is known."""
+        """Log the command, and whether the person is found, at the time of a context."""
         elapsed, self._time = context.get_time() - self._time, context.get_time()
         for word in self._words:
             self._seconds[word] += elapsed
@@ -242,21 +247,22 @@ class _WalkLog:
                 self._on_report(f"the person is {'found' if self._known[-1] else 'lost'}")
 
     def as_json(self) -> dict[str, Any]:
-        """How long the walk was, where it ended, what was commanded, and the person's share."""
+        """Return the entries of the result of `walk`, without warnings."""
         x, y, heading = (float(value) for value in self._last)
         place = {"x": x, "y": y, "heading_deg": math.degrees(heading)}
-        share = sum(self._known) / max(len(self._known) - 1, 1)
-        seen = {} if self._person is None else {"found_share": share}
-        return {"seconds": self._time, **place, "commands": self._seconds, **seen}
+        fraction = sum(self._known) / max(len(self._known) - 1, 1)
+        found = {} if self._person is None else {"found_share": fraction}
+        return {"seconds": self._time, **place, "commands": self._seconds, **found}
 
 
 def open_page(port: int | None = None) -> Meshcat:
-    """A Meshcat page for this machine's browsers: it listens on the loopback address alone.
+    """Return a Meshcat server that listens on the loopback address only; Drake logs no address.
 
-    Drake's own message of where it is is left out.
+    Args:
+        port: the port; None: any free one.
 
     Raises:
-        SettingsError: no page can be opened at the port.
+        SettingsError: the port cannot be used.
     """
     logger = logging.getLogger("drake")
     level = logger.level
@@ -271,7 +277,7 @@ def open_page(port: int | None = None) -> Meshcat:
 
 
 def wait_for_browser(page: Meshcat, patience: float = math.inf) -> bool:
-    """Waits until a browser shows a page, for this long at most [s]; whether one does."""
+    """Wait until a browser shows a page, at most ``patience`` [s]; return whether one does."""
     end = time.monotonic() + patience
     while page.GetNumActiveConnections() == 0 and time.monotonic() < end:
         time.sleep(_POLL_PAUSE)
@@ -279,7 +285,7 @@ def wait_for_browser(page: Meshcat, patience: float = math.inf) -> bool:
 
 
 def wait_for_replay(page: Meshcat) -> bool:
-    """Waits until the page's button to play again is pressed; False: Ctrl-C was, instead."""
+    """Wait for a click on the page's button to play again; return False for Ctrl-C."""
     name = "play again"
     page.AddButton(name, "Space")
     try:

@@ -89,7 +89,7 @@ def test_what_happened_to_cameras_is_told(captured):
     sources = summary["sources"]
     assert [one["dropped"] for one in sources.values()] == [1, 1 + len(GAP), 2]
     assert [one["what"] for one in sources["camera_1"]["changes"]] == ["stopped", "returned"]
-    assert not result.troubles or "could not be used" in result.troubles[0]
+    assert not result.unreported or "could not be used" in result.unreported[0]
 
 
 def test_ctrl_c_keeps_everything(studio, person, tmp_path):

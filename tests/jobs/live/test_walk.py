@@ -70,7 +70,7 @@ def test_results_that_cannot_be_played_say_why(tmp_path):
     record(tmp_path / "lost", [0.0, 0.0], lost=(0, 1))
     record(tmp_path / "good", [0.0])
     for name, model, rate_hz, error, words in (
-        ("lost", None, 30.0, OutputError, "nobody was found"),
+        ("lost", None, 30.0, OutputError, "no person was found"),
         ("good", None, 0.0, SettingsError, "positive"),
         ("good", bundled_model("hand"), 30.0, OutputError, "another model"),
         ("nothing", None, 30.0, OutputError, "no result"),

@@ -71,7 +71,7 @@ def test_person_is_followed_from_the_registered_pose_on(studio, person, skeleton
 @pytest.mark.slow
 def test_whoever_never_shows_the_registered_pose_is_refused(tmp_path, person):
     write_studio(tmp_path, person, [standing(person)] * 3, "videos", cameras=3)
-    with pytest.raises(SettingsError, match=r"registered pose.*likest silhouettes"):
+    with pytest.raises(SettingsError, match=r"registered pose.*best similarity"):
         capture_live(load_live_scene(tmp_path), tmp_path / "out", person.path, method="paper")
     assert not (tmp_path / "out").exists()
 
@@ -81,7 +81,7 @@ def test_what_cannot_be_captured_so_is_refused_before(tmp_path, person):
     scene, out = load_live_scene(tmp_path), tmp_path / "out"
     with pytest.raises(SceneError, match="'camera_0' delivers masks"):
         capture_live(scene, out, method="paper")
-    with pytest.raises(SettingsError, match="give no shape"):
+    with pytest.raises(SettingsError, match="leave shape out"):
         capture_live(scene, out, None, LiveSettings(shape=tmp_path), method="paper")
     words = ["capture", str(tmp_path), "--out", str(tmp_path / "out"), "--method", "paper"]
     for more in (["--no-track"], ["--face-camera", "camera_0"]):

@@ -86,18 +86,18 @@ def find_segments(
                         facings[t] = 0
         begin, end = packed.starts[node, 2], packed.starts[node + 1, 2]
         sides = packed.sides[begin:end]
-        before, behind = packed.edges[2, begin:end], packed.edges[3, begin:end]
+        owners, neighbours = packed.edges[2, begin:end], packed.edges[3, begin:end]
         found = 0
         for e in range(len(sides)):
             # Branch-free, because the branch would be unpredictable.
             chosen[found] = e
-            found += facings[before[e]] + sides[e] * facings[behind[e]] != 0
+            found += facings[owners[e]] + sides[e] * facings[neighbours[e]] != 0
         if count + found > capacity:
             capacity = 2 * (count + found)
             ends, depths = grow_rows(ends, count, capacity), grow_rows(depths, count, capacity)
             labels = grow_rows(labels, count, capacity)
         for e in chosen[:found]:
-            weight = int(facings[before[e]]) + int(sides[e]) * int(facings[behind[e]])
+            weight = int(facings[owners[e]]) + int(sides[e]) * int(facings[neighbours[e]])
             labels[count, 0], labels[count, 1] = weight, node
             for k in range(2):
                 i = np.int64(packed.edges[k, begin + e])

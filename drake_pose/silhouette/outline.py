@@ -1,4 +1,9 @@
-"""Triangle surfaces prepared for the span kernel: their edges, planes and skin bands."""
+"""Triangle surfaces prepared for the span kernel: their edges, planes and skin bands.
+
+A camera is passed to kernels as eight numbers, ``Camera.kernel_parameters()``: 1 for a parallel or
+0 for a pinhole camera, fx, fy, cx, cy [pixel, or pixel/m for parallel fx and fy], near plane [m],
+width and height [pixel].
+"""
 
 from __future__ import annotations
 

@@ -168,7 +168,7 @@ def foreground_log_ratios(
     probabilities: Sequence[Floats],
     indices: Sequence[int],
     *,
-    max_background: float = 0.1,
+    background_threshold: float = 0.1,
     min_probability: float = 0.011,
     min_count: int = 2,
     max_count: int = 40,
@@ -188,7 +188,7 @@ def foreground_log_ratios(
     Args:
         probabilities: (H, W) foreground probability at each pixel of each picture.
         indices: indices of the pictures whose ratios are returned.
-        max_background: a pixel shows the background where its foreground probability is lower.
+        background_threshold: a pixel shows the background below this foreground probability.
         min_probability: pixels with a lower foreground probability in all returned pictures are
             skipped.
         min_count: number of pictures that must show a pixel's background.
@@ -209,7 +209,7 @@ def foreground_log_ratios(
     relevant = np.max([probabilities[k] for k in indices], axis=0) >= min_probability
     # Exposure gains (n, 3) of the channels, from pixels that are background in all pictures.
     gains = np.ones((len(pictures), 3), np.float32)
-    background = np.flatnonzero(np.max(probabilities, axis=0) < 0.5 * max_background)
+    background = np.flatnonzero(np.max(probabilities, axis=0) < 0.5 * background_threshold)
     if len(background):
         background = background[:: -(-len(background) // exposure_pixels)]
         samples = np.stack([picture.reshape(-1, 3)[background] for picture in pictures]).astype(
@@ -221,7 +221,7 @@ def foreground_log_ratios(
         for picture, gain in zip(pictures, gains, strict=True)
     ]
     step = -(-len(equalised) // max_count)
-    hidden = np.stack([p[relevant] for p in probabilities[::step]]) >= max_background
+    hidden = np.stack([p[relevant] for p in probabilities[::step]]) >= background_threshold
     count = np.count_nonzero(~hidden, axis=0)
     stack = np.stack(equalised[::step])
     middle = _masked_median(stack, hidden, count)
@@ -296,24 +296,20 @@ def grab_cut(
     is_uncertain = np.isin(labels, (cv2.GC_PR_FGD, cv2.GC_PR_BGD))
     if is_uncertain.any():
         cv2.setRNGSeed(seed)
-        colours, no_rectangle = (np.zeros((1, 65)), np.zeros((1, 65))), (0, 0, 0, 0)
-        sampled, sampled_labels = (
+        colours, rectangle = (np.zeros((1, 65)), np.zeros((1, 65))), (0, 0, 0, 0)
+        pixels, pixel_labels = (
             np.ascontiguousarray(image[::stride, ::stride]) for image in (picture, found)
         )
-        cv2.grabCut(
-            sampled, sampled_labels, no_rectangle, *colours, iterations, cv2.GC_INIT_WITH_MASK
-        )
+        cv2.grabCut(pixels, pixel_labels, rectangle, *colours, iterations, cv2.GC_INIT_WITH_MASK)
         if stride == 1:
-            found = sampled_labels
+            found = pixel_labels
         else:
             x, y, w, h = cv2.boundingRect(is_uncertain.astype(np.uint8))
             box = np.s_[max(0, y - 1) : y + h + 1, max(0, x - 1) : x + w + 1]
-            sampled_labels = np.ascontiguousarray(found[box])
-            sampled = np.ascontiguousarray(picture[box])
-            cv2.grabCut(
-                sampled, sampled_labels, no_rectangle, *colours, 1, cv2.GC_EVAL_FREEZE_MODEL
-            )
-            found[box] = sampled_labels
+            pixel_labels = np.ascontiguousarray(found[box])
+            pixels = np.ascontiguousarray(picture[box])
+            cv2.grabCut(pixels, pixel_labels, rectangle, *colours, 1, cv2.GC_EVAL_FREEZE_MODEL)
+            found[box] = pixel_labels
     return np.asarray((found == cv2.GC_FGD) | (found == cv2.GC_PR_FGD))
 
 

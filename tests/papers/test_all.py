@@ -29,7 +29,7 @@ class Interrupted(Exception):
 
 @pytest.fixture
 def two_experiments(monkeypatch):
-    """Two that write down that they ran; the second is interrupted the first time."""
+    """Two experiments that record their runs; the second one is interrupted the first time."""
     ran = []
 
     def first(_short, folder, _count):
@@ -50,7 +50,7 @@ def two_experiments(monkeypatch):
     return ran
 
 
-def test_what_is_finished_is_kept_and_the_rest_made_again(two_experiments, tmp_path):
+def test_finished_experiments_are_kept_and_others_repeated(two_experiments, tmp_path):
     with pytest.raises(Interrupted):
         reproduce_all(tmp_path, True, quiet, lambda _text: None)
     assert (tmp_path / "first" / "figures.json").is_file()
@@ -76,7 +76,7 @@ def test_other_settings_are_refused(two_experiments, tmp_path):
 
 
 @pytest.mark.slow
-def test_all_of_it_short(tmp_path):
+def test_all_experiments_run_short(tmp_path):
     made = CliRunner().invoke(app, ["reproduce", "all", "--short", "--out", str(tmp_path / "all")])
     assert made.exit_code == 0, made.output
     page = (tmp_path / "all" / "report.html").read_text()
@@ -96,7 +96,7 @@ def test_all_of_it_short(tmp_path):
 RUNS = ({"seed": 3, "a": 1, "b": 0.5, "c": "x"}, {"seed": 4, "a": 4, "b": 0.25, "c": "x"})
 
 
-def test_the_spread_is_that_of_the_runs():
+def test_spread_over_seeds():
     spread = spread_over_seeds(RUNS, without=("seed",))
     assert spread == {
         "a": {"mean": 2.5, "min": 1.0, "max": 4.0},
@@ -104,7 +104,7 @@ def test_the_spread_is_that_of_the_runs():
     }
 
 
-def test_a_table_shows_one_run_or_mean_and_ends_of_several():
+def test_table_shows_one_run_or_mean_minimum_and_maximum():
     rows = {"a": ("count [mm]", "{}"), "b": ("ratio", "{:.1%}"), "none": ("nowhere", "{}")}
     table = figure_table("T", rows, {"one [deg]": {"a": None, "b": math.nan}, "several": RUNS})
     console = Console(file=io.StringIO(), width=100)
@@ -116,7 +116,7 @@ def test_a_table_shows_one_run_or_mean_and_ends_of_several():
     assert [list(column.cells) for column in table.columns][1] == ["-", "-"]
 
 
-def test_counts_and_choices_are_refused_by_name():
+def test_bad_counts_and_choices_are_named():
     require_counts(runs=1)
     with pytest.raises(SettingsError, match="images must be 1 or more, not 0"):
         require_counts(runs=1, images=0)

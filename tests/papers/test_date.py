@@ -37,7 +37,7 @@ class TestMotion:
         assert feet.max() < 0.4
         assert np.degrees(np.abs(np.diff(motion.q[:, 3:], axis=0))).max() < 25.0
 
-    def test_other_seed_other_motion(self, skeleton):
+    def test_seeds_determine_the_motion(self, skeleton):
         first, again, other = (make_motion(skeleton, 60, seed).q for seed in (1, 1, 2))
         np.testing.assert_array_equal(first, again)
         assert np.abs(first - other).max() > 0.01
@@ -56,14 +56,14 @@ class TestMotion:
 
 
 @pytest.mark.slow
-def test_all_silhouettes_are_nearer_than_the_papers_search_and_pictures_are_saved(tmp_path):
+def test_fit_to_all_silhouettes_is_more_accurate_and_pictures_are_saved(tmp_path):
     result = run_experiment(cameras=4, frames=120, seed=1, size=(480, 360))
     figures = result.as_json()
     assert figures["joint_error_mm"] < 40.0
     assert figures["face_error_deg"] < 6.0
     assert figures["paper_mm"] < figures["ik_only_mm"]
     assert figures["method"] == "silhouette"
-    # The search moves elbows and knees alone; the paper's waist holds the knees back.
+    # The search moves elbows and knees only; errors of the paper's waist limit the knees'.
     assert figures["elbows"]["paper_mm"] < 0.7 * figures["elbows"]["ik_only_mm"]
     assert figures["elbows"]["silhouette_mm"] < 0.5 * figures["elbows"]["paper_mm"]
     assert set(figures["as_found"]) == set(MOTIONS)
@@ -74,7 +74,7 @@ def test_all_silhouettes_are_nearer_than_the_papers_search_and_pictures_are_save
     motions = {f"figure_{n}_{name}.png" for n in ("02", "03", "07") for name in MOTIONS}
     assert names == {*motions, "figure_04.png", "errors.png"}
     walk = cv2.imread(str(tmp_path / "new" / "figure_07_walk.png"))
-    # The input and three estimates, all of which show a person before the same background.
+    # The input and three estimates, each a person before the same background.
     parts = np.split(walk, 4, axis=1)
     for part in parts:
         assert (np.abs(part.astype(int) - part[0, 0]).max(axis=2) > 30).mean() > 0.01
@@ -83,7 +83,7 @@ def test_all_silhouettes_are_nearer_than_the_papers_search_and_pictures_are_save
 
 class TestWalkThrough:
     def test_each_gesture_gives_its_command_and_no_other(self, skeleton):
-        """By the true poses; the walk is that of table 1's rates along the frames commanded."""
+        """With the true poses; the walk integrates the rates over the commanded frames."""
         motion = make_gestures(skeleton)
         commands, poses, _ = walk_by(skeleton.model, motion.q)
         names = np.array(motion.names)
@@ -95,8 +95,8 @@ class TestWalkThrough:
         way = poses[-1, 0] - WALK.start[0]
         np.testing.assert_allclose(way, ways * WALK.speed * PERIOD, atol=0.01)
 
-    def test_the_view_follows_the_walker(self, skeleton):
-        """The avatar is seen in the picture's middle from behind, wherever and however he walks."""
+    def test_view_follows_the_walker(self, skeleton):
+        """The avatar is in the picture's middle, seen from behind, wherever it walks."""
         q, rest = make_motion(skeleton, 40, 0).q[30], np.zeros(5)
         there, elsewhere = (
             draw_walk(skeleton.model, q, pose, rest)
@@ -107,8 +107,8 @@ class TestWalkThrough:
         assert (skin_blobs(there, np.ones(there.shape[:2], bool), SkinColour()).areas > 20).any()
 
     @pytest.mark.slow
-    def test_captured_turns_are_followed_as_the_true_ones(self, tmp_path):
-        """Five small pictures do not always tell the feet apart: who walks may not be followed."""
+    def test_captured_turns_last_as_long_as_the_true_ones(self, tmp_path):
+        """Only turns are compared: five small pictures do not always separate the feet."""
         walk = run_walk_through(5, size=(320, 240))
         figures = walk.figures
         assert figures["same_command"] > 0.7

@@ -1,4 +1,4 @@
-"""Kameda's experiments: what is drawn, counted and shown, and what the command refuses."""
+"""Kameda's experiments: drawn poses, figures, tables, pictures and the command."""
 
 import json
 import math
@@ -47,11 +47,11 @@ def beam_result():
     return run_experiment(beam_experiment_search(), images=6, seed=5)
 
 
-def test_the_camera_is_the_papers():
+def test_camera_is_the_papers():
     camera, side = experiment_camera(), experiment_camera(0.5 * np.pi)
     assert (camera.width, camera.height, camera.pixels_per_metre) == (700, 700, 226.0)
-    # The world's y is the picture's right, z its up, x comes towards the camera; from the side,
-    # what comes towards the front goes left.
+    # World y is the picture's right, z its up, and x points to the camera; seen from the side, x
+    # points left.
     axes = np.vstack([np.zeros(3), np.eye(3)])
     for one, expected in (
         (camera, [[0, 0], [226, 0], [0, -226]]),
@@ -62,7 +62,7 @@ def test_the_camera_is_the_papers():
     assert depths[2] < depths[0]
 
 
-def test_drawn_angles_are_multiples_of_20_degrees_inside_table_2_or_between(search):
+def test_drawn_angles_are_multiples_of_20_degrees_or_continuous_inside_table_2(search):
     model = search.tree.model
     on_grid, between = (
         draw_values(search, angles, np.random.default_rng(1)) for angles in ("grid", "continuous")
@@ -72,13 +72,13 @@ def test_drawn_angles_are_multiples_of_20_degrees_inside_table_2_or_between(sear
             assert model.lower[index] - 1e-9 <= value <= model.upper[index] + 1e-9
             if model.position_kinds[index] == "angle":
                 assert math.degrees(value) / 20 == pytest.approx(round(math.degrees(value) / 20))
-    # The root's place is known.
+    # The root's position is known.
     np.testing.assert_array_equal(between[0][:3], 0.0)
     off = [abs(math.degrees(v) / 20 - round(math.degrees(v) / 20)) for v in between[0][3:]]
     assert max(off) > 0.01
 
 
-def test_the_figures_are_what_drake_draws(result):
+def test_figures_match_drakes_label_images(result):
     """E_total, recomputed from Drake's own label images of the true and the found pose."""
     renderer = LabelRenderer(result.search.tree.model, result.cameras[0])
     for trial in result.trials:
@@ -90,7 +90,7 @@ def test_the_figures_are_what_drake_draws(result):
             assert trial.result.E_total == pytest.approx(expected, abs=0.004)
 
 
-def test_poses_not_found_are_counted_apart(search, result):
+def test_poses_not_found_are_counted_separately(search, result):
     nothing = PoseEstimate.nothing(search.tree, stopped_by="end")
     lost = [replace(one, result=nothing) for one in result.trials[:2]]
     figures = grid_figures(replace(result, trials=(*lost, *result.trials[2:])))
@@ -99,8 +99,8 @@ def test_poses_not_found_are_counted_apart(search, result):
     assert figures["mean_e_total"] == pytest.approx(np.mean(found))
 
 
-def test_the_beam_search_matches_every_silhouette_exactly_and_names_the_truth(beam_result):
-    """Without being told r, in one run over poses that the paper's search mostly misses."""
+def test_beam_search_matches_every_silhouette_and_its_set_has_the_true_pose(beam_result):
+    """Without a threshold r, for poses that the paper's search mostly misses."""
     figures = grid_figures(beam_result)
     assert figures["exact"] == figures["proved"] == figures["truth_in_set"] == 6
     assert figures["method"] == "beam"
@@ -111,7 +111,7 @@ def test_the_beam_search_matches_every_silhouette_exactly_and_names_the_truth(be
 
 
 def test_pictures_are_written(result, beam_result, tmp_path):
-    """Of the paper's search and of ours."""
+    """For the paper's search and the beam search."""
     files = save_pictures(replace(result, trials=result.trials[:1]), tmp_path / "paper")
     assert all(file.stat().st_size > 5000 for file in files)
     names = {file.name for file in files}
@@ -125,7 +125,7 @@ def test_pictures_are_written(result, beam_result, tmp_path):
 
 
 def at(search, **degrees):
-    """The nodes' values where all angles are 0 but those given."""
+    """Return the nodes' values with the given angles [deg], all others 0."""
     model = search.tree.model
     q = np.zeros(len(model.position_names))
     for name, value in degrees.items():
@@ -133,7 +133,7 @@ def at(search, **degrees):
     return search.tree.values_from_positions(q)
 
 
-def test_a_hand_before_the_belly_is_hidden_from_behind(search):
+def test_hand_before_the_belly_is_hidden_from_behind(search):
     camera = experiment_camera()
     behind = replace(camera, X_WC=np.diag([-1.0, -1.0, 1.0, 1.0]) @ camera.X_WC)
     arm = {"right_upper_arm_x": -15, "right_upper_arm_y": 60, "right_forearm_x": -60}
@@ -145,7 +145,7 @@ def test_a_hand_before_the_belly_is_hidden_from_behind(search):
     assert causes_of_wrong_angles(search.sampled, camera, true, true) == (False, False)
 
 
-def test_the_chests_rank_is_that_of_areas_counted_in_masks(search, result):
+def test_chest_rank_matches_areas_counted_in_masks(search, result):
     ranks, lengths = chest_ranks(replace(result, trials=result.trials[:1]))
     trial, nodes = result.trials[0], [node.name for node in search.tree.nodes]
     head, chest = nodes.index("head"), nodes.index("chest")
@@ -173,7 +173,7 @@ def test_the_chests_rank_is_that_of_areas_counted_in_masks(search, result):
     assert (ratio_within(ranks, ranks[0] - 1), ratio_within(ranks, ranks[0])) == (0.0, 1.0)
 
 
-def test_cameras_are_spread_over_half_a_turn():
+def test_cameras_are_spread_over_180_degrees():
     before, after = run_experiment(experiment_search(), 1, 7, views=2).cameras
     assert before.X_WC[:3, 2] @ after.X_WC[:3, 2] == pytest.approx(0.0)
     origins = [camera.project(np.zeros((1, 3)))[0] for camera in (before, after)]
@@ -184,7 +184,7 @@ def test_cameras_are_spread_over_half_a_turn():
 
 
 @pytest.mark.slow
-def test_figures_of_continuous_angles_come_from_the_trials():
+def test_figures_of_continuous_angles():
     result = run_experiment(MultiStartSearch(experiment_tree(), exact_masks=True), 2, 7, views=2)
     figures = continuous_figures(result)
     assert (figures["images"], figures["views"], figures["interval_confidence"]) == (2, 2, 0.95)
@@ -195,10 +195,10 @@ def test_figures_of_continuous_angles_come_from_the_trials():
     for trial in result.trials:
         true = np.concatenate(trial.true_values)
         off = np.degrees(np.abs(np.concatenate(trial.result.node_values) - true))
-        # The root's place is known, all else is searched for.
+        # The root's position is known, all other values are searched.
         errors += off[3:].tolist()
         known += off[3:][list(trial.result.pose_set.determined)[3:]].tolist()
-        # Intervals take as large a part of the processor's time as of the clock's.
+        # Intervals take the same fraction of processor time as of wall-clock time.
         part = trial.more_seconds / (trial.seconds + trial.more_seconds)
         assert part == pytest.approx(trial.result.interval_seconds / trial.result.seconds)
     assert figures["median_error_deg"] == pytest.approx(np.median(errors))
@@ -211,7 +211,7 @@ def test_figures_of_continuous_angles_come_from_the_trials():
 
 @pytest.mark.slow
 def test_both_methods_find_the_hand(tmp_path):
-    """One of two pictures; E_total is compared with Drake's label image of the pose found."""
+    """In one of two pictures; E_total is compared with Drake's label image of the found pose."""
     made = reproduce("--experiment", "C", "--images", "1", "--out", str(tmp_path / "c"), "--json")
     assert made.exit_code == 0, made.output
     ours = json.loads(made.stdout)
@@ -225,7 +225,7 @@ def test_both_methods_find_the_hand(tmp_path):
         folder = tmp_path / "c" / figures["method"]
         record = json.loads((folder / "summary.json").read_text())["frames"]["0000"]
         (iou,) = record["ious"].values()
-        # Of an area J of their difference, whichever of the two bodies it lies outside of.
+        # J is the area of the symmetric difference.
         assert 1 - iou - 0.005 <= figures["mean_e_total"] <= (1 - iou) / iou + 0.005
         assert len(list(folder.rglob("overlay/*/0000.png"))) == 1
     assert ours["mean_e_total"] < min(0.172, paper["mean_e_total"])
@@ -244,14 +244,14 @@ def test_both_methods_find_the_hand(tmp_path):
         (("--angles", "odd"), ("--angles", "grid", "continuous")),
     ],
 )
-def test_what_means_nothing_is_refused(options, words):
+def test_incompatible_options_are_refused(options, words):
     refused = reproduce("--images", "1", *options)
     assert refused.exit_code == 2
     for word in words:
         assert word in refused.stderr
 
 
-def test_a_run_for_each_seed_shows_the_spread():
+def test_runs_of_several_seeds_show_the_spread():
     made = reproduce("--images", "1", "--seeds", "2", "--method", "beam", "--json")
     assert made.exit_code == 0, made.output
     beam = json.loads(made.stdout)

@@ -1,4 +1,4 @@
-"""Shimada's synthetic hand: what is drawn, what the filters reach, and the command."""
+"""Shimada's synthetic hand: sequences, accuracy of the filters, pictures and the command."""
 
 import json
 
@@ -40,14 +40,14 @@ def hypotheses():
 
 
 def reproduce(*words, code=0):
-    """Its JSON, or what it says."""
+    """Return the command's JSON, or its error text."""
     made = run_command(["reproduce", "shimada", *words])
     assert made.exit_code == code, made.output
     return json.loads(made.stdout) if "--json" in words else made.stderr
 
 
 @pytest.mark.parametrize("yaw", [0.0, OBLIQUENESS])
-def test_the_true_motion_obeys_table_1(yaw):
+def test_true_motion_satisfies_table_1(yaw):
     rows = experiment_filter()[0].inequalities
     generator = np.random.default_rng(0)
     for r_13 in CASES.values():
@@ -59,7 +59,7 @@ def test_the_true_motion_obeys_table_1(yaw):
             assert margins[worst] <= 1e-9, rows.rows[worst[1]]
 
 
-def test_the_first_guess_is_table_2():
+def test_first_guess_is_table_2():
     generator = np.random.default_rng(0)
     for _ in range(20):
         sequence = make_sequence(35.0, "full", HandObservation(), generator)
@@ -76,7 +76,7 @@ def test_the_first_guess_is_table_2():
         np.testing.assert_allclose(variances[6:14], np.radians(40) ** 2)
 
 
-def test_the_noise_is_what_the_filter_is_told():
+def test_noise_has_the_variances_given_to_the_filter():
     observation = HandObservation()
     generator = np.random.default_rng(1)
     normalised = []
@@ -94,7 +94,7 @@ def test_the_noise_is_what_the_filter_is_told():
 
 @pytest.mark.parametrize(("observed", "more"), [("lines", {"wrist_x", "wrist_y"}),
                                                 ("lines_wrist", set())])  # fmt: skip
-def test_lines_hides_the_knuckles_and_the_wrist(observed, more):
+def test_lines_hide_the_knuckles_and_the_wrist(observed, more):
     sequence = make_sequence(35.0, observed, HandObservation(), np.random.default_rng(2))
     hidden = np.isnan(sequence.measurements).all(axis=0)
     names = {name for name, gone in zip(MEASURED, hidden, strict=True) if gone}
@@ -105,8 +105,8 @@ def test_lines_hides_the_knuckles_and_the_wrist(observed, more):
 
 
 @pytest.mark.slow
-def test_lengths_are_learned_from_drakes_pictures(tmp_path):
-    """Plant, renderer, sensor, filter; the silhouette alone, and no part of it named."""
+def test_lengths_converge_with_drakes_pictures(tmp_path):
+    """In a diagram of plant, renderer, sensor and filter, from unlabelled silhouettes."""
     result = run_experiment(runs=2, seed=5, observed=PICTURES)
     for key, figures in ((key, result.as_json()[key]) for key in CASES):
         assert figures["lost"] == 0
@@ -123,7 +123,7 @@ def test_lengths_are_learned_from_drakes_pictures(tmp_path):
     assert {"figure_17_pictures.png", "figure_18_shapes.png"} <= files
 
 
-def test_each_case_converges_to_its_own_truth_inside_table_1(result):
+def test_each_case_converges_to_its_true_lengths_inside_table_1(result):
     figures = result.as_json()
     rows = experiment_filter()[0].inequalities
     for key, r_13 in CASES.items():
@@ -159,8 +159,8 @@ def test_bad_arguments_are_named(run, bad, word):
     assert OBSERVED == ("full", "lines", "lines_wrist")
 
 
-def test_the_papers_own_filter_can_be_asked_for():
-    """One linearisation a frame, as (19, 20): it converges, but is far too sure."""
+def test_single_linearisation_converges_but_is_overconfident():
+    """One linearisation per frame, as in equations (19) and (20)."""
     words = ("--iterations", "1", "--truncation", "sequential", "--json")
     figures = reproduce("--runs", "3", *words)
     assert (figures["iterations"], figures["observed"]) == (1, "lines")
@@ -183,12 +183,12 @@ def test_the_papers_own_filter_can_be_asked_for():
         ),
     ],
 )
-def test_options_that_go_alone(words, others):
+def test_incompatible_options_are_refused(words, others):
     for other in others:
         assert f"{words[0]} " in reproduce(*words, *other, code=2)
 
 
-def test_a_hypothesis_is_born_lives_and_dies_once(hypotheses):
+def test_hypotheses_have_one_continuous_history(hypotheses):
     assert len(hypotheses.histories) > 20
     weights = np.zeros((20, 56))
     for one in hypotheses.histories:
@@ -199,7 +199,7 @@ def test_a_hypothesis_is_born_lives_and_dies_once(hypotheses):
     assert weights[:, 1:] == pytest.approx(1.0)
 
 
-def test_inequalities_reject_wrong_hypotheses_that_the_pictures_did_not(hypotheses):
+def test_inequalities_reject_hypotheses_that_explain_the_measurements(hypotheses):
     later = [one for one in hypotheses.histories if one.reason == "constraint" and one.lived]
     assert len(later) >= 3
     assert np.mean([one.wrong for one in later]) > 0.6
@@ -210,11 +210,11 @@ def test_inequalities_reject_wrong_hypotheses_that_the_pictures_did_not(hypothes
         assert one.c < -4
         assert rows.phi[k] @ one.means[-2] <= rows.b[k] + 1e-9
         beyond.append(rows.phi[k] @ one.means[-1] > rows.b[k])
-    # A row that comes late is judged after those before it have cut.
+    # A later row is evaluated after the truncation by earlier ones.
     assert np.mean(beyond) > 0.6
 
 
-def test_what_is_drawn_was_wrong_and_another_pose(hypotheses, tmp_path):
+def test_drawn_hypothesis_is_wrong_and_distinct(hypotheses, tmp_path):
     removed, survivor = hypotheses.example()
     assert removed.wrong
     assert removed.lived >= 2
@@ -226,8 +226,8 @@ def test_what_is_drawn_was_wrong_and_another_pose(hypotheses, tmp_path):
     assert files[0].stat().st_size > 20000
 
 
-def test_the_iterated_filter_has_no_such_hypotheses(tmp_path):
-    """Linearised again and again, mirrored predictions come to the same."""
+def test_iterated_filter_merges_mirrored_hypotheses(tmp_path):
+    """With iterated linearisations mirrored predictions converge to the same estimate."""
     words = ("--hypotheses", "--runs", "2", "--truncation", "joint", "--iterations", "20")
     figures = reproduce(*words, "--json")
     assert figures["rejected_later_than_made"] == 0
@@ -238,8 +238,8 @@ def test_the_iterated_filter_has_no_such_hypotheses(tmp_path):
 
 
 @pytest.mark.slow
-def test_recorded_hands_are_followed_by_the_filter(shared_data):
-    """Rendered elsewhere, and not of the model's measures; encoders tell the angles."""
+def test_recorded_hands_are_tracked(shared_data):
+    """Hands of other measures, rendered by another program, with angles by encoders."""
     found = run_sequence(shared_data / "hand_sequences" / "wave")
     figures = found.as_json()
     assert (figures["frames"], figures["lost"]) == (80, 0)

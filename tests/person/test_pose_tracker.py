@@ -27,17 +27,17 @@ class World:
         return posed(self.person, **degrees)
 
     def frame(self, q, left_out=0):
-        """What the cameras see but the first ones."""
+        """The views of all cameras but the first `left_out`."""
         views = [see_silhouette(mask, 4.0) for mask in see(self.person, self.ring, [q])[0].values()]
         return FrameViews(self.cameras[left_out:], views[left_out:])
 
     def off(self, values, q):
-        """The largest distance of a joint centre from where it is [mm]."""
+        """The largest error of a joint centre [mm]."""
         return joint_error(self.tracker, values, q)
 
 
 def joint_error(tracker, values, q):
-    """The largest distance of a joint centre at values from where it is at positions [mm]."""
+    """The largest distance of joint centres at values and at positions [mm]."""
     places = [
         tracker.plan.landmarks.positions(tracker.fit.kinematics.poses(v))
         for v in (values, tracker.values(q))
@@ -58,14 +58,14 @@ WALKING = {
 
 
 class TestTracker:
-    def test_positions_and_values_are_each_others_inverse(self, world):
+    def test_positions_and_values_are_inverse(self, world):
         q = world.pose(**WALKING, head_y=120)
         np.testing.assert_allclose(world.tracker.positions(world.tracker.values(q)), q, atol=1e-12)
         turned = world.tracker.values(q)
         turned[world.tracker.plan.heading] += 2 * np.pi
         np.testing.assert_allclose(world.tracker.positions(turned), q, atol=1e-12)
 
-    def test_person_is_found_and_followed_even_without_a_camera(self, world):
+    def test_person_is_found_and_tracked_although_a_camera_drops_out(self, world):
         q = world.pose(**WALKING)
         state = world.tracker.follow(None, world.frame(q))
         assert world.off(state.values, q) < 40.0
@@ -75,8 +75,8 @@ class TestTracker:
             assert world.off(state.values, q) < 30.0, k
 
     @pytest.mark.parametrize("frame", [30, 54], ids=["legs exchanged", "turned about"])
-    def test_person_is_not_taken_for_one_who_looks_much_alike(self, person, frame):
-        """Walking, before nine cameras: seen so, another pose fits nearly as well."""
+    def test_similar_pose_is_not_chosen(self, person, frame):
+        """Walking before nine cameras, where another pose fits nearly as well."""
         q = make_motion(load_skeleton(person), 120, 0).q[frame]
         ring = circle_of_cameras(9, face_camera=False)
         masks = [LabelRenderer(person, camera).mask(q) for camera in ring.values()]
@@ -84,7 +84,7 @@ class TestTracker:
         seen = FrameViews([*ring.values()], [see_silhouette(mask, 4.0) for mask in masks])
         assert joint_error(tracker, tracker.follow(None, seen).values, q) < 30.0
 
-    def test_destroyed_track_is_right_again_without_a_registered_pose(self, world):
+    def test_perturbed_track_recovers_without_a_registered_pose(self, world):
         q = world.pose(**WALKING, head_y=-70)
         state, fit = world.tracker.start(world.tracker.values(q)), world.tracker.fit
         wrong = state.values + np.random.default_rng(5).normal(0.0, 0.7, len(state.values))
@@ -94,7 +94,7 @@ class TestTracker:
         assert world.off(state.values, q) < 25.0
 
     def test_stretched_arms_are_not_bent_the_wrong_way(self, world):
-        # Slightly bent backwards and twisted about itself, a stretched arm looks almost the same.
+        # A stretched arm, slightly bent backwards and twisted, has almost the same silhouette.
         q = world.pose(left_upper_arm_z=80.0, right_upper_arm_z=-80.0)
         state = world.tracker.follow(None, world.frame(q))
         assert world.off(state.values, q) < 25.0
@@ -107,7 +107,7 @@ class TestTracker:
             state = world.tracker.follow(state, frame)
         assert world.off(state.values, lifted) < 25.0
 
-    def test_nobody_in_view(self, world):
+    def test_empty_silhouettes(self, world):
         empty = see_silhouette(np.zeros((240, 320), dtype=bool), 4.0)
         frame = FrameViews(world.cameras, [empty] * len(world.cameras))
         assert world.tracker.follow(None, frame) is None
@@ -116,7 +116,7 @@ class TestTracker:
         assert state.inlier_ratio == 0.0
         np.testing.assert_allclose(state.values, values, atol=1e-6)
 
-    def test_all_headings_are_tried_the_first_ones_all_around(self):
+    def test_all_headings_are_tried_and_the_first_ones_are_spread(self):
         tried = [EXACT.headings_of(k) for k in range(4)]
         assert sorted(turn for turns in tried for turn in turns) == list(range(12))
         assert tried[0] == [0, 4, 8]
@@ -130,7 +130,7 @@ class TestTracker:
 
 
 class TestPlan:
-    def test_limbs_move_nothing_else_and_their_poses_hold_the_limits(self, world):
+    def test_limb_values_move_the_limb_only_and_satisfy_the_limits(self, world):
         plan = world.tracker.plan
         for name, limb in plan.limbs.items():
             side, kind = name.split("_")
@@ -142,7 +142,7 @@ class TestPlan:
             assert (limb.poses >= plan.kinematics.lower[limb.values]).all()
             assert (limb.poses <= plan.kinematics.upper[limb.values]).all()
 
-    def test_points_beside_each_other_count_less(self):
+    def test_crowded_points_have_smaller_weights(self):
         samples = np.zeros((1, 3, 3))
         samples[0, 2, 0] = 1.0
         np.testing.assert_allclose(crowding_weights(samples), [[1 / 6, 1 / 6, 1 / 3]])
@@ -154,8 +154,8 @@ class TestPlan:
 
 
 @pytest.mark.slow
-def test_no_still_is_taken_for_another_pose_that_looks_alike(person):
-    """To end the search where 97 % of the contours fit took one of thirty for another pose."""
+def test_stills_of_a_motion_are_not_mistaken_for_similar_poses(person):
+    """In one of thirty stills a wrong pose has an inlier ratio of 97 %."""
     cameras = list(circle_of_cameras(3, size=(640, 480)).values())
     renderers = [LabelRenderer(person, camera) for camera in cameras]
     fit = ContourFit(person.pose_tree(), noise=NOISE)

@@ -49,8 +49,8 @@ POSE = {
 }  # fmt: skip
 
 
-def misshapen(outlines, generator, size):
-    """Every part of the body shifted and swollen by so much [m]."""
+def deformed(outlines, generator, size):
+    """Shift and stretch every part at random, with this standard deviation [m]."""
     found = []
     for outline in outlines:
         middle = outline.vertices.mean(axis=0)
@@ -64,13 +64,13 @@ def misshapen(outlines, generator, size):
 
 class TestUncertainty:
     @pytest.mark.parametrize("size", [0.0, 0.003])
-    def test_truths_lie_within_two_deviations(self, world, size):
+    def test_true_values_are_within_two_standard_deviations(self, world, size):
         generator = np.random.default_rng(3)
         ratios, surfaces = [], []
         for _ in range(6):
             pose = {name: angle * generator.uniform(0.7, 1.3) for name, angle in POSE.items()}
             true = world.values(**pose, head_y=generator.uniform(-20, 20))
-            views = world.views(true, misshapen(world.fit.outlines, generator, size))
+            views = world.views(true, deformed(world.fit.outlines, generator, size))
             values = world.fit.fit(views, true, [STEP] * 6).values
             found = pose_uncertainty(world.fit, world.fit.compare(views, values, STEP))
             ratios.append((values - true) / np.sqrt(np.diag(found.covariance)))
@@ -83,7 +83,7 @@ class TestUncertainty:
         else:
             assert np.median(surfaces) < 0.002
 
-    def test_what_silhouettes_do_not_tell_is_as_unsure_as_the_limits_allow(self, world):
+    def test_unobservable_values_have_the_variance_of_their_limits(self, world):
         values = world.values(**POSE)
         nobody = pack_views(world.cameras, [NO_EDGE] * len(world.cameras))
         found = world.deviations(values, nobody)
@@ -92,7 +92,7 @@ class TestUncertainty:
             if kinematics.is_angle[k]:
                 span = min(kinematics.upper[k] - kinematics.lower[k], 2.0 * np.pi)
                 assert found[name] == pytest.approx(span / np.sqrt(12.0), rel=1e-6)
-        # A hanging, stretched arm looks the same however it is turned about itself.
+        # Turning a hanging, stretched arm about its axis does not change the silhouettes.
         stretched = world.values(left_upper_arm_z=20.0)
         bent = world.values(left_upper_arm_z=20.0, left_forearm_x=-90.0)
         twists = [
@@ -101,7 +101,7 @@ class TestUncertainty:
         ]
         assert twists[0] > 1.5 * twists[1]
 
-    def test_held_values_bring_their_own_uncertainty(self, world):
+    def test_uncertainty_of_held_values_propagates(self, world):
         values = world.values(**POSE)
         edges = world.views(values)
         held = np.array([name == "left_upper_arm_z" for name in world.names])
@@ -112,7 +112,7 @@ class TestUncertainty:
         assert rough["left_upper_arm_y"] > 1.5 * exact["left_upper_arm_y"]
         assert rough["right_shin_x"] < 1.5 * exact["right_shin_x"]
 
-    def test_noise_is_measured_not_assumed(self, world):
+    def test_noise_is_estimated_from_the_residuals(self, world):
         values = world.values(**POSE)
         views = world.views(values)
         noise = replace(world.fit.noise, deviation=2.0 * world.fit.noise.deviation)
@@ -124,7 +124,7 @@ class TestUncertainty:
         assert (np.abs(np.log(modest / assumed)) < 2.0 * np.log(1.5)).all()
 
 
-def test_left_and_right_lengths_are_told_to_be_alike():
+def test_prior_couples_left_and_right_lengths():
     names, alike = ["left_shin", "trunk", "right_shin", "left_alone"], 3.0 * np.ones(6)
     H = _sides_information(names, 2)
     assert alike @ H @ alike == pytest.approx(0.0)

@@ -1,4 +1,4 @@
-"""A person of a known shape, against the model's own."""
+"""A tracker of a person of known shape."""
 
 import numpy as np
 import pytest
@@ -8,14 +8,14 @@ from drake_pose.errors import UnknownNameError
 from drake_pose.person.shape import KnownShape, shape_parts, shape_values, tracker_of_person
 
 
-def test_a_person_of_known_lengths_and_radius_scales(shaped_person: ArticulatedModel) -> None:
+def test_tracker_has_the_known_lengths_and_radius_scales(shaped_person: ArticulatedModel) -> None:
     tree = shaped_person.pose_tree()
     names = np.array([name for node in tree.nodes for name in node.value_names])
     held = shape_values(tree)
     assert held.any()
     assert not held[: len(tree.nodes[0].value_names)].any()
     length, (parts, groups) = str(names[held][0]), shape_parts(tree)
-    # Left and right are one part, and so is what ends it.
+    # Left, right and end pieces belong to one part.
     assert len(parts) < len(tree.nodes)
     assert not any(word in part for part in parts for word in ("left_", "right_", "_end"))
     plain = tracker_of_person(tree, None)
@@ -33,7 +33,7 @@ def test_a_person_of_known_lengths_and_radius_scales(shaped_person: ArticulatedM
     ("shape", "word"),
     [(KnownShape({"nose": 0.1}, {}), "nose"), (KnownShape({}, {"tail": 2.0}), "tail")],
 )
-def test_names_that_a_model_has_not(
+def test_unknown_lengths_and_parts_are_refused(
     shaped_person: ArticulatedModel, shape: KnownShape, word: str
 ) -> None:
     with pytest.raises(UnknownNameError, match=word):

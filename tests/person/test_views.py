@@ -9,8 +9,8 @@ def ellipse(rows: int, columns: int) -> np.ndarray:
     return ((x - 0.4 * columns) / (0.1 * columns)) ** 2 + ((y - 0.5 * rows) / (0.3 * rows)) ** 2 < 1
 
 
-def test_small_pictures_show_every_so_many_pixels():
-    """Of a camera of each kind."""
+def test_scoring_regions_are_subsampled_with_their_cameras():
+    """For a pinhole and a parallel camera."""
     pinhole = circle_of_cameras(2)["camera_0"]
     flat = ParallelCamera("flat", 320, 241, 90.0, 150.0, 118.0, pinhole.X_WC)
     cameras = [pinhole, flat]
@@ -25,7 +25,7 @@ def test_small_pictures_show_every_so_many_pixels():
         assert region.shape == (small.height, small.width)
 
 
-def test_a_speck_is_nobody():
+def test_speck_is_no_person():
     assert shows_somebody(see_silhouette(ellipse(480, 640), 6.0))
     speck = np.zeros((480, 640), bool)
     speck[10:14, 10:14] = True

@@ -1,4 +1,4 @@
-"""What the tests of bundled models share: reading .obj files, and what is inside a surface."""
+"""Helpers of the tests of bundled models: .obj files, closed surfaces and masks."""
 
 import subprocess
 import sys
@@ -17,21 +17,21 @@ URDF = Path(__file__).resolve().parents[2] / "urdf"
 
 
 def written_again(name: str, folder: Path, *options: str) -> list[Path]:
-    """Runs a model's script into a folder; returns the files, relative to it."""
+    """Run a model's script into a folder; return the files, relative to the folder."""
     script = URDF / name / f"make_{name}.py"
     subprocess.run([sys.executable, "-B", str(script), "--out", str(folder), *options], check=True)
     return sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
 
 
 def committed(name: str) -> list[Path]:
-    """The model's files that its script writes, relative to the model's folder."""
+    """Return the files that a model's script writes, relative to the model's folder."""
     folder = URDF / name
     kinds = (".obj", ".mtl", ".urdf", ".yaml")
     return sorted(p.relative_to(folder) for p in folder.rglob("*") if p.suffix in kinds)
 
 
 def read_obj(path: Path) -> trimesh.Trimesh:
-    """A surface as the file says, nothing merged; checks that normals point outwards."""
+    """Read a surface without merging vertices; check that normals point outwards."""
     vertices, normals, triangles = [], [], []
     for line in path.read_text().splitlines():
         kind, *rest = line.split()
@@ -52,7 +52,7 @@ def read_obj(path: Path) -> trimesh.Trimesh:
 
 
 def assert_closed(mesh: trimesh.Trimesh) -> None:
-    """Every shell is closed and faces outwards."""
+    """Check that every shell is closed and faces outwards."""
     assert np.all(mesh.area_faces > 0.0)
     for shell in mesh.split(only_watertight=False):
         assert shell.is_watertight
@@ -61,7 +61,7 @@ def assert_closed(mesh: trimesh.Trimesh) -> None:
 
 
 class Silhouettes:
-    """Masks of a model, seen by a parallel camera from any side."""
+    """Renders masks of a model by a parallel camera from any side."""
 
     def __init__(self, model: ArticulatedModel):
         self.tree = model.pose_tree()
@@ -70,7 +70,7 @@ class Silhouettes:
     def mask(
         self, q: np.ndarray, towards: np.ndarray, target: np.ndarray, size: float, pixels: int = 400
     ) -> np.ndarray:
-        """(pixels, pixels) bool, seen from direction towards (3,); size [m] fills the picture."""
+        """Return a mask (pixels, pixels) seen from a direction (3,); the picture is `size` [m] wide."""
         X_WC = look_at(target + 10.0 * np.asarray(towards) / np.linalg.norm(towards), target)
         middle = 0.5 * (pixels - 1)
         camera = ParallelCamera("side", pixels, pixels, pixels / size, middle, middle, X_WC)
@@ -79,5 +79,5 @@ class Silhouettes:
 
 
 def pieces(mask: np.ndarray) -> int:
-    """How many connected pieces a mask has."""
+    """Return the number of connected components of a mask."""
     return cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)[0] - 1

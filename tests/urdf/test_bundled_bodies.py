@@ -1,4 +1,4 @@
-"""The bundled models: reproducible, closed, mirrored, jointed as in the papers, no gaps."""
+"""The bundled models: reproducible, closed, mirrored, with the papers' joints, without gaps."""
 
 import itertools
 from functools import cache
@@ -20,7 +20,7 @@ from tests.urdf.surfaces import (
 from tests.written_files import assert_same_files
 
 BODIES = ("woman", "man")
-# Total mass [kg], and what of the space around the origin a picture of any pose shows [m].
+# Total mass [kg], and width of the picture that shows every pose [m].
 MODELS = {
     "woman/woman": (67.76, 3.2),
     "man/man": (85.52, 3.2),
@@ -71,7 +71,7 @@ def test_script_writes_the_committed_files(name, tmp_path):
 
 
 @pytest.mark.parametrize("path", MESHES, ids=lambda path: f"{path.parts[-3]}-{path.stem}")
-def test_surfaces_are_closed_small_and_mirrored(path):
+def test_surfaces_are_closed_have_few_triangles_and_are_mirrored(path):
     mesh = read_obj(path)
     assert_closed(mesh)
     if path.parts[-3] != "person":
@@ -83,7 +83,7 @@ def test_surfaces_are_closed_small_and_mirrored(path):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_masses_make_a_valid_simulation(name):
+def test_masses_are_valid_in_a_simulation(name):
     plant = load(name).plant
     context = plant.CreateDefaultContext()
     assert plant.CalcTotalMass(context) == pytest.approx(MODELS[name][0], rel=0.01)
@@ -92,7 +92,7 @@ def test_masses_make_a_valid_simulation(name):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_no_pose_falls_apart(name):
+def test_silhouettes_are_connected_in_every_pose(name):
     model, size = load(name), MODELS[name][1]
     silhouettes = Silhouettes(model)
     target = np.array([0.0, 0.0, 0.0 if "hand" in name else -0.5])
@@ -128,7 +128,7 @@ def test_limits_are_those_of_table_2(name):
 
 
 @pytest.mark.parametrize("name", BODIES)
-def test_link_axes_are_the_papers_when_standing_and_no_link_is_round(name):
+def test_link_axes_are_the_papers_and_links_are_not_rotationally_symmetric(name):
     plant = load(f"{name}/{name}").plant
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, np.zeros(plant.num_positions()))

@@ -1,4 +1,4 @@
-"""The bundled hands: of published size, jointed like a hand."""
+"""The bundled hands: published sizes, joints, limits and couplings."""
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ def tip(model, finger, q):
     return model.plant.CalcPointsPositions(context, link, point, palm).ravel()
 
 
-def test_joints(hand):
+def test_joints_and_limits(hand):
     fingers = [f"{f}_{joint}" for f in FINGERS for joint in ("mcp", "pip", "dip")]
     flexions = [f"{joint}_flexion" for joint in (*fingers, *THUMB, "wrist")]
     others = [f"{f}_mcp_abduction" for f in FINGERS] + ["thumb_cmc_abduction", "wrist_deviation"]
@@ -68,7 +68,7 @@ def test_size_is_the_published_one(both):
     zero = posed(left, {})
     tips = {finger: tip(left, finger, zero)[1] for finger in FINGERS}
     assert tips["middle"] == pytest.approx(HAND_LENGTH, rel=0.002)
-    # Index and ring end near the middle finger's last joint's end, the little one well below.
+    # Index and ring finger end near the middle finger's last segment, the little one well below.
     assert 0.92 <= tips["index"] / HAND_LENGTH <= 0.96
     assert 0.91 <= tips["ring"] / HAND_LENGTH <= 0.96
     assert 0.76 <= tips["little"] / HAND_LENGTH <= 0.83
@@ -105,7 +105,7 @@ def test_right_hand_mirrors_the_left(both):
             )
 
 
-def test_couplings_allow_a_fist_and_forbid_what_no_hand_does(hand):
+def test_couplings_allow_a_fist_and_refuse_impossible_poses(hand):
     inequalities = model_inequalities(hand)
 
     def allowed(degrees):

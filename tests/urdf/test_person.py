@@ -91,7 +91,7 @@ def test_degrees_of_freedom_are_those_of_figure_5_and_limits_are_mirrored(
     assert not person.lower[person.position_index("left_shin_x")]
 
 
-def test_positive_angles_move_as_told(person):
+def test_directions_of_positive_angles(person):
     rest = marks(person, np.zeros(23))
 
     def moved(name, degrees, landmark):
@@ -123,7 +123,7 @@ def test_shape_model_at_zero_is_the_plain_person(person, shape):
         assert np.count_nonzero(masks[0] != masks[1]) <= 0.002 * np.count_nonzero(masks[0])
 
 
-def test_shape_joints_change_the_lengths_one_for_one(shape):
+def test_shape_joints_change_the_lengths_by_their_values(shape):
     rng = np.random.default_rng(6)
     q = random_pose(shape, rng)
     before = marks(shape, q)
@@ -137,7 +137,7 @@ def test_shape_joints_change_the_lengths_one_for_one(shape):
         assert change == pytest.approx(0.02, abs=1e-6)
 
 
-def test_couplings_keep_the_sides_alike(shape):
+def test_couplings_bound_the_difference_of_both_sides(shape):
     inequalities = model_inequalities(shape)
     q = np.zeros(len(shape.position_names))
     assert np.all(inequalities.margins(q) >= 0.0)

@@ -56,7 +56,7 @@ class TestSkin:
         assert blobs.boxes[0].tolist() == [28, 18, 25, 25]
         assert np.array_equal(blobs.mask, discs[0] | discs[1])
 
-    def test_skin_outside_the_region_and_specks_do_not_count(self):
+    def test_skin_outside_the_region_and_specks_are_ignored(self):
         picture = np.full((120, 160, 3), SHIRT, np.uint8)
         picture[disc((120, 160), (40, 30), 12)] = SKIN
         picture[60:63, 60:63] = SKIN
@@ -72,7 +72,7 @@ class TestRays:
         ParallelCamera("flat", 300, 300, 226.0, 150, 150, look_at([2, 1, 1], [0, 0, 1])),
     )
 
-    def test_rays_pass_through_what_was_projected(self):
+    def test_rays_pass_through_projected_points(self):
         p_W = np.random.default_rng(1).uniform([-0.5, -0.5, 0.5], [0.5, 0.5, 1.5], (20, 3))
         for camera in self.cameras:
             origins, directions = viewing_rays(camera, camera.project(p_W)[0])
@@ -80,8 +80,8 @@ class TestRays:
             np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0)
 
     @pytest.mark.parametrize("apart", [0.03, 0.06])
-    def test_rays_meet_half_way_where_they_pass_each_other_closely(self, apart):
-        """Seen along x and along y: what is apart along z is the distance of the rays."""
+    def test_meeting_point_is_half_way_between_close_rays(self, apart):
+        """Rays along x and along y: their distance is along z."""
         point = np.array([0.2, -0.1, 1.0])
         poses = [look_at([4.0, 0, 1], [0, 0, 1]), look_at([0, 4.0, 1], [0, 0, 1])]
         cameras = [ParallelCamera(str(k), 300, 300, 90.0, 150, 150, X) for k, X in enumerate(poses)]
@@ -125,21 +125,21 @@ class TestFeatures:
         blobs = Blobs(centroids, np.ones(len(centroids)), np.ones((len(centroids), 4)), region)
         return PersonView(region, blobs, None)
 
-    def test_places_come_back(self):
+    def test_positions_are_recovered(self):
         cameras, views = self.seen(self.places)
         last = self.places + np.random.default_rng(3).normal(0, 0.03, self.places.shape)
         found = find_features(cameras, views, last)
         assert np.linalg.norm(found.positions - self.places, axis=1).max() < 0.01
         assert (found.support >= 20).all()
 
-    def test_rays_that_meet_by_chance_are_dropped(self):
+    def test_accidental_meeting_points_are_dropped(self):
         cameras, views = self.seen(self.places)
         points = meeting_points(cameras, [view.blobs.centroids for view in views], 0.05)
         found = find_features(cameras, views, self.places)
         for some, wrong in ((points, True), (found.points, False)):
             away = np.linalg.norm(some[:, None] - self.places[None], axis=2).min(axis=1)
             assert (away > 0.15).any() == wrong
-        # A place is the mean of the dense part of its points alone.
+        # A position is the mean of the densest points only.
         for k, place in enumerate(found.positions):
             mine = found.points[found.owners == k]
             near = np.linalg.norm(mine[:, None] - mine[None], axis=2) <= 0.08
@@ -147,7 +147,7 @@ class TestFeatures:
             means = [mine[row].mean(axis=0) for row in near]
             assert np.linalg.norm(means - place, axis=1).min() < 1e-12
 
-    def test_feature_that_nobody_sees_stays_and_a_camera_without_anybody_has_no_say(self):
+    def test_unseen_feature_stays_and_camera_with_an_empty_region_is_ignored(self):
         cameras, views = self.seen(np.delete(self.places, 2, axis=0))
         views[0] = self.view(np.empty((0, 2)), np.zeros_like(views[0].region))
         last = self.places + 0.01
@@ -171,7 +171,7 @@ class TestContours:
         mask = np.zeros((400, 500), np.uint8)
         return cv2.fillPoly(mask, [np.rint(points).astype(np.int32)], 1).astype(bool)
 
-    def test_place_and_size_do_not_matter_but_shape_does(self):
+    def test_contour_is_invariant_to_position_and_size(self):
         star = self.shape_of(self.star())
         moved = self.shape_of(self.star(1.5, 0.0, (230, 210)))
         turned = self.shape_of(self.star(1.0, 0.5))
@@ -179,7 +179,7 @@ class TestContours:
         assert similarity(star, moved) > 0.95
         assert similarity(star, turned) < 0.8
 
-    def test_middle_is_the_boxs_and_what_is_cut_off_or_empty_has_none(self):
+    def test_middle_is_the_boxs_and_cut_off_or_empty_regions_have_no_contour(self):
         mask = np.zeros((40, 50), bool)
         mask[10:21, 5:16] = True
         np.testing.assert_allclose(measure_contour(mask)[1], [10, 15])
@@ -188,7 +188,7 @@ class TestContours:
 
 
 class TestRecognition:
-    def test_registered_pose_is_found_wherever_it_stands(self, studio):
+    def test_registered_pose_is_recognised_anywhere(self, studio):
         registered = studio.registered
         generator = np.random.default_rng(0)
         cameras = list(studio.ring.values())
@@ -203,7 +203,7 @@ class TestRecognition:
             off = np.angle(np.exp(1j * (found[registered.heading_position] - heading)))
             assert abs(np.degrees(off)) < 5.0
 
-    def test_registered_pose_is_upright_and_symmetric_and_stands_below_what_is_seen(self, studio):
+    def test_registered_pose_is_upright_symmetric_and_placed_by_the_contours(self, studio):
         skeleton, cameras = studio.skeleton, list(studio.ring.values())
         spread = [skeleton.features(registered_positions(skeleton, by)) for by in (0.0, 30.0)]
         for head, left, right, *feet in spread:
@@ -222,11 +222,11 @@ class TestRecognition:
     @pytest.mark.parametrize(
         "other", [{}, {"left_upper_arm_z": 80}, {"left_upper_arm_x": -90, "right_upper_arm_x": -90}]
     )
-    def test_other_poses_are_not_taken_for_it(self, studio, other):
+    def test_other_poses_are_not_recognised(self, studio, other):
         cameras, views = list(studio.ring.values()), studio.views(studio.posed(**other))
         contours = [view.contour for view in views.values()]
         assert recognise(studio.skeleton, studio.registered, cameras, contours, 0.93) is None
-        # One camera is never enough.
+        # One camera is not enough.
         alone = [contours[0]] + [None] * 7
         assert recognise(studio.skeleton, studio.registered, cameras, alone, 0.0) is None
 
@@ -246,10 +246,12 @@ class TestFaces:
             # Turn about the vertical, then nod.
             ways = Rotation.from_euler("ZY", [direction, templates.directions[nearest]])
             errors.append(np.degrees(np.arccos(min(1.0, np.prod(ways.apply([1, 0, 0]), 0).sum()))))
-        # The templates are 15 and 12 degrees apart: 7 on average for the nearest one.
+        # Templates are 15 and 12 degrees apart, the nearest one 7 degrees on average.
         assert np.mean(errors) < 9.0
 
-    def test_template_finds_itself_and_other_things_are_far(self, studio, templates):
+    def test_template_finds_itself_and_other_pictures_have_a_large_residual(
+        self, studio, templates
+    ):
         q = studio.posed()
         q[studio.skeleton.head_angles] = templates.directions[20]
         picture, view = studio.face(q)
@@ -274,7 +276,7 @@ class TestFaces:
         _, _, rows = np.linalg.svd(data - data.mean(axis=0), full_matrices=False)
         np.testing.assert_allclose(np.abs(found.basis @ rows[:5].T), np.eye(5), atol=1e-3)
 
-    def test_no_face_where_skin_is_missing_or_cut_off_and_no_space_of_two(self):
+    def test_missing_or_cut_off_faces_and_too_few_templates_are_refused(self):
         picture = np.zeros((50, 60, 3), np.uint8)
         region = np.ones((50, 60), bool)
         assert cut_face(picture, skin_blobs(picture, region, SkinColour())) is None
@@ -288,7 +290,7 @@ class TestFaces:
         straight = np.array([0.0, 0.0, camera.X_WC[2, 3]])
         direction = np.array([0.3, 0.2])
         np.testing.assert_allclose(head_angles(direction, straight, camera), direction, atol=1e-12)
-        # A person beside the axis who looks into the camera faces it.
+        # A person beside the optical axis who looks into the camera has direction 0.
         head = np.array([0.0, 0.8, camera.X_WC[2, 3] - 0.4])
         turn, nod = head_angles(np.zeros(2), head, camera)
         looking = [np.cos(nod) * np.cos(turn), np.cos(nod) * np.sin(turn), -np.sin(nod)]
@@ -297,7 +299,7 @@ class TestFaces:
 
 
 class TestSkeleton:
-    def test_features_of_a_known_pose_change_the_skeleton_a_little_only(self, studio):
+    def test_measured_features_change_the_skeleton_by_a_bounded_distance(self, studio):
         skeleton = studio.skeleton
         q = studio.posed(left_forearm_x=-40, head_y=30)
         places = skeleton.features(q) + np.array([0.01, 0.0, 0.02])
@@ -313,7 +315,7 @@ class TestSkeleton:
 
 @pytest.fixture(scope="module")
 def folder(studio, tmp_path_factory):
-    """Faces recorded by the face camera, and the empty room."""
+    """Faces recorded by the face camera, and the background."""
     root = tmp_path_factory.mktemp("faces")
     lines = ["picture,turn,nod"]
     for turn, nod in product((-40.0, -20.0, 0.0, 20.0, 40.0), (-10.0, 10.0)):
@@ -346,7 +348,7 @@ class TestRecordedFaces:
             q[studio.skeleton.head_angles] = np.radians(direction)
             picture, view = studio.face(q)
             found = np.degrees(find_face(picture, view.blobs, faces, 60.0))
-            # The nearest template's: they are 20 degrees apart.
+            # The nearest template's direction; templates are 20 degrees apart.
             assert found == pytest.approx(np.round(np.divide(direction, 20)) * 20, abs=10.1)
             assert np.sign(found).tolist() == np.sign(direction).tolist()
 

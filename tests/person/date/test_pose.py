@@ -23,7 +23,7 @@ from tests.person.persons_in_view import SIDES, posed, see
 
 
 def drawn_pose(skeleton, generator, share=0.5):
-    """Positions somewhere in the middle of the limits."""
+    """Random positions within the middle `share` of the limits."""
     middle = 0.5 * (skeleton.lower + skeleton.upper)
     q = middle + share * generator.uniform(-0.5, 0.5, len(middle)) * (
         skeleton.upper - skeleton.lower
@@ -33,7 +33,7 @@ def drawn_pose(skeleton, generator, share=0.5):
 
 
 class TestSkeleton:
-    def test_points_are_drakes_and_ends_inside_hands_and_feet(self, person, skeleton):
+    def test_limb_points_match_drake_and_ends_are_inside_hands_and_feet(self, person, skeleton):
         generator, landmarks = np.random.default_rng(0), load_landmarks(person.path)
         for _ in range(5):
             q = drawn_pose(skeleton, generator, 1.0)
@@ -59,7 +59,7 @@ class TestSkeleton:
 
 class TestReach:
     @pytest.mark.parametrize("name", LIMBS)
-    def test_an_end_is_reached_in_small_steps_inside_the_limits(self, skeleton, name):
+    def test_end_reaches_its_target_in_small_steps_inside_the_limits(self, skeleton, name):
         generator, limb = np.random.default_rng(2), skeleton.limbs[name]
         for _ in range(10):
             true = drawn_pose(skeleton, generator, 0.6)
@@ -78,7 +78,7 @@ class TestReach:
             assert distance == pytest.approx(left)
 
     @pytest.mark.parametrize("face_known", [True, False])
-    def test_both_hands_are_reached(self, person, skeleton, face_known):
+    def test_both_hands_reach_their_targets(self, person, skeleton, face_known):
         before = posed(person, left_upper_arm_z=20, right_upper_arm_z=-20)
         after = posed(
             person, left_upper_arm_z=45, left_forearm_x=-40, right_upper_arm_x=-50,
@@ -94,7 +94,7 @@ class TestReach:
 
 class TestCircle:
     @pytest.mark.parametrize("name", LIMBS)
-    def test_places_are_as_far_from_both_ends_as_the_limb_is_long(self, skeleton, name):
+    def test_circle_keeps_the_segments_lengths(self, skeleton, name):
         generator = np.random.default_rng(3)
         limb = skeleton.limbs[name]
         for _ in range(20):
@@ -110,8 +110,8 @@ class TestCircle:
             np.testing.assert_allclose((places - middle) @ across, 0.0, atol=1e-9)
 
     @pytest.mark.parametrize("name", LIMBS)
-    def test_directions_are_the_papers(self, person, skeleton, name):
-        # Limbs are a little bent, he faces +x: 0 is behind the arm and in front of the leg.
+    def test_circle_angles_are_the_papers(self, person, skeleton, name):
+        # The person faces +x with slightly bent limbs: 0 is behind the arm and in front of the leg.
         bends = {"forearm_x": -40, "shin_x": 60, "thigh_x": -30}
         q = posed(person, **{f"{side}_{k}": a for k, a in bends.items() for side in SIDES})
         root, middle, end = skeleton.limb_points(q, name)
@@ -126,7 +126,7 @@ class TestCircle:
         assert (zero - half)[0] * (1.0 if limb.is_leg else -1.0) > 1.4 * radius
         assert (middle - center) @ (zero - center) > 0.9 * radius**2
 
-    def test_limb_beyond_its_reach_is_straight_and_rectangles_are_as_wide_as_said(self, skeleton):
+    def test_unreachable_end_straightens_the_limb_and_rectangles_have_their_widths(self, skeleton):
         limb, end, outward = skeleton.limbs["left_arm"], np.array([0, 0, -2.0]), np.eye(3)[1]
         places = joint_circle(limb, np.zeros(3), end, outward, np.array([0.0, 90.0]))
         expected = [0, 0, -2.0 * limb.lengths[0] / sum(limb.lengths)]
@@ -139,7 +139,7 @@ class TestCircle:
         assert np.abs(second[:, 1] - 0.3).max() == pytest.approx(0.02)
         np.testing.assert_allclose(first.mean(axis=0), [0, 0.15, 0], atol=1e-12)
 
-    def test_correlation_is_the_share_inside(self):
+    def test_correlation_is_the_fraction_inside(self):
         cameras = list(circle_of_cameras(2, face_camera=False).values())
         generator = np.random.default_rng(4)
         samples = generator.uniform([-2.5, -2.5, 0], [2.5, 2.5, 2], (3, 200, 3))
@@ -159,7 +159,7 @@ class TestCircle:
 
 class TestAngles:
     def test_straight_arm_is_not_turned_about_itself(self, skeleton):
-        """The shortest turn from the old direction of the arm to the new one, and no other."""
+        """Its rotation is the smallest one from the old direction of the arm to the new one."""
         limb, last = skeleton.limbs["left_arm"], np.array([0.2, 0.4, 0.5, 0.0])
         q = np.zeros(len(skeleton.lower))
         q[limb.positions] = last
@@ -176,7 +176,7 @@ class TestAngles:
 
 @pytest.fixture(scope="module")
 def seen(person):
-    """The cameras, and the regions in which they see a pose."""
+    """Cameras, and a function that returns their regions of a pose."""
     cameras = circle_of_cameras(8, size=(320, 240), face_camera=False)
 
     def seen(q):
@@ -214,8 +214,8 @@ class TestPose:
         assert errors[0] < min(0.07, 0.6 * errors[1])
 
     @pytest.mark.parametrize("name", LIMBS)
-    def test_a_limb_is_placed_where_its_limits_allow_it(self, skeleton, name):
-        """Anywhere on its circle, by its own kinematics; where it truly is, inside its limits."""
+    def test_limb_angles_reproduce_the_joints_inside_the_limits(self, skeleton, name):
+        """By the limb's kinematics anywhere on the circle; inside the limits at the true place."""
         generator = np.random.default_rng(5)
         limb = skeleton.limbs[name]
         for _ in range(20):
@@ -235,7 +235,7 @@ class TestPose:
                 points = skeleton.limb_points(turned, name)
                 np.testing.assert_allclose(points, [root, place, end], atol=1e-6)
 
-    def test_positions_hold_the_limits(self, person, skeleton, seen):
+    def test_positions_satisfy_the_limits(self, person, skeleton, seen):
         generator = np.random.default_rng(7)
         true = posed(person, left_upper_arm_z=40)
         views = seen(true)

@@ -18,7 +18,7 @@ from drake_pose.person.date.walking import (
 
 
 def stance(heading_deg=0.0, ahead=0.0, left=0.0, feet_ahead=None, nod_deg=0.0):
-    """Somebody who rests at (1, 2), facing along y: ahead is +y, left is -x."""
+    """Stance of a person whose rest is at (1, 2), facing +y: ahead is +y, left is -x."""
     R = Rotation.from_euler("ZY", [heading_deg + 90.0, nod_deg], degrees=True).as_matrix()
     feet = ahead if feet_ahead is None else feet_ahead
     head_W = np.array([1.0 - left, 2.0 + ahead, 1.6])
@@ -44,7 +44,7 @@ def test_heading_does_not_depend_on_the_nod(nod_deg):
     assert ahead == pytest.approx(0.0)
 
 
-def test_table_1():
+def test_gestures_give_table_1s_commands():
     turns = [stance(), stance(40.0), stance(), stance(-40.0), stance()]
     walks = [stance(ahead=0.3), stance(), stance(ahead=-0.3)]
     found = commands([*turns, *walks, stance(-40.0, ahead=0.3), stance()])
@@ -53,8 +53,8 @@ def test_table_1():
     assert found == list(zip(turn, walk, strict=True))
 
 
-def test_gestures_are_those_of_their_commands(skeleton):
-    """What is made by name is recognised by its commands, and who walks steps on the spot."""
+def test_made_gestures_are_recognised(skeleton):
+    """Each gesture gives its command, and walking gestures step on the spot."""
     motion = make_gestures(skeleton, 20)
     features = np.array([skeleton.features(q) for q in motion.q])
     stances = [
@@ -75,12 +75,12 @@ def test_gestures_are_those_of_their_commands(skeleton):
         lifted = np.ptp(features[rows, 3:, 2], axis=0)
         assert ((lifted > 0.1) == name.startswith("walk")).all()
         assert told[rows[-1]] == (0, 0)
-    # Shins of lifted legs hang down.
+    # The shins of lifted legs are vertical.
     index = skeleton.model.position_index
     for side in ("left", "right"):
         slant = motion.q[:, index(f"{side}_thigh_x")] + motion.q[:, index(f"{side}_shin_x")]
         assert np.degrees(np.abs(slant[names != REGISTERED]).max()) < 30.0
-    # Whoever lifts a foot stands on the other one.
+    # One foot stands while the other is lifted.
     np.testing.assert_allclose(features[:, 3:, 2].min(axis=1), features[23, 3, 2], atol=0.03)
 
 
@@ -92,10 +92,10 @@ def spot_walk(lifts, seconds=0.1):
     return found
 
 
-def test_one_foot_and_then_the_other_is_walking_on_the_spot():
+def test_alternating_feet_are_walking_on_the_spot():
     step = np.array([0.0, 0.1, 0.1, 0.0])
     assert spot_walk([*step, *-step, *step]) == [False] * 5 + [True] * 7
-    # It ends one pause after the last step.
+    # Walking ends `pause` after the last step.
     found = spot_walk([*step, *-step, *([0.0] * 12)])
     assert found[5:14] == [True] * 9
     assert not any(found[16:])
@@ -112,11 +112,11 @@ def test_one_foot_and_then_the_other_is_walking_on_the_spot():
     ],
     ids=["one foot held up", "the same foot", "noise", "slow", "lost"],
 )
-def test_what_is_no_walking_on_the_spot(lifts):
+def test_other_lifts_are_not_walking_on_the_spot(lifts):
     assert not any(spot_walk(lifts))
 
 
-def test_command_begins_late_and_ends_early():
+def test_command_has_hysteresis():
     degrees = [20.0, 26.0, 20.0, 16.0, 14.0, 20.0, -24.0, -26.0, -16.0, 16.0]
     assert [c[0] for c in commands(stance(d) for d in degrees)] == [0, 1, 1, 1, 0, 0, 0, -1, -1, 0]
     metres = [0.15, 0.2, 0.12, 0.09, 0.15, -0.2, -0.12, 0.12, 0.3]
@@ -124,18 +124,18 @@ def test_command_begins_late_and_ends_early():
     assert found == [0, 1, 1, 0, 0, -1, -1, 0, 1]
 
 
-def test_leaning_stepping_aside_and_being_lost_do_not_walk():
+def test_leaning_stepping_aside_or_being_lost_stops():
     for head, feet in ((0.4, 0.0), (0.0, -0.4), (0.3, -0.3)):
         assert commands([stance(ahead=head, feet_ahead=feet)]) == [(0, 0)]
     assert commands([stance(left=0.5)]) == [(0, 0)]
     assert commands([stance(ahead=0.4), np.full(5, np.nan)]) == [(0, 1), (0, 0)]
-    # Facing backwards is a turn whichever way the angle wraps.
+    # Facing backwards is a turn, however the angle wraps.
     assert commands([stance(175.0)]) == [(1, 0)]
     assert commands([stance(-175.0)]) == [(-1, 0)]
 
 
 @pytest.mark.parametrize("command", [(1, 1), (-1, 1), (0, -1), (1, -1), (1, 0)])
-def test_way_is_that_of_many_small_steps(command):
+def test_path_equals_that_of_many_small_steps(command):
     pose, count = np.array([0.3, -0.2, 0.7]), 20_000
     small, step = pose.copy(), 1.5 / count
     for _ in range(count):

@@ -1,4 +1,4 @@
-"""A person in clothes of several colours before a room of patches: the truth is known."""
+"""Tracking by colour of a simulated person in coloured clothes before a patchy background."""
 
 from dataclasses import replace
 
@@ -27,10 +27,10 @@ def cameras():
 
 @pytest.fixture(scope="module")
 def recording(person, cameras):
-    """What the cameras see of a few steps, the masks, and the positions."""
+    """Pictures and masks of a few steps, and the true positions."""
     generator = np.random.default_rng(11)
     renderers = {name: LabelRenderer(person, camera) for name, camera in cameras.items()}
-    # Clothes are warm, the room is cold.
+    # Clothes have warm colours, the background has cold ones.
     rooms = {
         name: generator.integers(0, 256, (24, 32, 3)).repeat(10, axis=0).repeat(10, axis=1)
         * np.array([0.4, 0.9, 1.0])
@@ -55,7 +55,7 @@ def _painted(segments, room, generator):
 
 
 def joint_errors(person, found, truth):
-    """Distances of joint centres [mm]."""
+    """Errors of joint centres [mm]."""
     landmarks = load_landmarks(person.path)
     places = [landmark_positions(person, landmarks, q) for q in (found, truth)]
     return 1e3 * np.linalg.norm(np.array(places[0]) - np.array(places[1]), axis=1)
@@ -66,12 +66,12 @@ def captured(person, cameras, recording, starts, pictures, on_frame=None):
     return capture_by_colour(person.pose_tree(), *given)[0]
 
 
-def test_followed_from_a_start_without_any_mask(person, cameras, recording):
+def test_person_is_tracked_from_a_start_without_masks(person, cameras, recording):
     heard, (pictures, _, truth) = [], recording
     found = captured(person, cameras, recording, {0: truth[0]}, pictures, heard.append)
     assert heard == list(range(FRAMES))
     errors = [joint_errors(person, *pair) for pair in zip(found.q, truth, strict=True)]
-    # The person has moved on by more than that.
+    # The person has moved by more than this.
     assert joint_errors(person, truth[0], truth[-1]).max() > 100.0
     assert np.mean(errors) < 15.0
     assert np.all(found.inlier_ratios > 0.8)
@@ -79,7 +79,7 @@ def test_followed_from_a_start_without_any_mask(person, cameras, recording):
     assert np.all(found.deviations[:, angles] > 0.0)
 
 
-def test_a_loss_is_said_and_a_start_goes_on(person, cameras, recording):
+def test_loss_is_reported_and_another_start_resumes(person, cameras, recording):
     grey = {name: np.full((240, 320, 3), 128, np.uint8) for name in cameras}
     pictures, _, truth = recording
     starts, shown = {k: truth[k] for k in (0, 5)}, [*pictures[:3], grey, grey, *pictures[5:]]
@@ -90,9 +90,7 @@ def test_a_loss_is_said_and_a_start_goes_on(person, cameras, recording):
     assert np.mean(joint_errors(person, found.q[-1], truth[-1])) < 20.0
 
 
-def test_a_limb_without_its_own_colours_is_searched_again_or_said_to_be_lost(
-    person, cameras, recording
-):
+def test_limb_without_its_own_colours_is_searched_again_or_lost(person, cameras, recording):
     pictures, masks, q = (one[0] for one in recording)
     tracker = PersonPoseTracker(ContourFit(person.pose_tree(), noise=NOISE))
     fit, values, seen = tracker.fit, tracker.values(q), list(pictures.values())
@@ -117,8 +115,8 @@ def test_a_limb_without_its_own_colours_is_searched_again_or_said_to_be_lost(
 
 
 class TestLearning:
-    def test_masks_say_which_colours_are_the_persons(self, person, cameras, recording):
-        """Of a model that is 4 cm off, colours are learned right where the masks are known."""
+    def test_masks_determine_the_persons_colours(self, person, cameras, recording):
+        """Although the model is displaced by 4 cm."""
         pictures, masks, q = (one[0] for one in recording)
         fit = ContourFit(person.pose_tree(), noise=NOISE)
         tracker = PersonPoseTracker(fit)
@@ -128,7 +126,7 @@ class TestLearning:
         wrong = []
         for regions in (None, masks):
             known = views.updated_colours(fit, tracker.values(off), regions)
-            # Red is little in the room.
+            # The background has little red.
             on = sum(one[:, Colour.ON].reshape(-1, 16, 256)[:, :7].sum() for one in known.values())
             seen = sum((one[:, Colour.ON].sum(axis=1) > 0.0).sum() for one in known.values())
             wrong.append(on / seen)
@@ -136,7 +134,7 @@ class TestLearning:
             assert np.all(np.isclose(beside, 0.0) | np.isclose(beside, 1.0, atol=1e-3))
         assert wrong[1] < 0.5 * wrong[0]
 
-        # A camera of which nothing is known says nothing.
+        # A camera without histograms is not compared.
         state = tracker.follow_by_colour(tracker.start(tracker.values(q)), views)
         assert state.inlier_ratio == 0.0
         assert state.is_lost

@@ -110,7 +110,7 @@ class TestMovedCamera:
         assert fault is not None
         assert (fault.name, fault.is_explained) == ("camera_1", True)
 
-    def test_of_three_cameras_nobody_can_tell_which(self, four: Stage) -> None:
+    def test_with_three_cameras_the_moved_one_stays_ambiguous(self, four: Stage) -> None:
         def three(masks: Masks) -> Masks:
             return [{n: m for n, m in own.items() if n != "camera_3"} for own in masks]
 
@@ -120,8 +120,8 @@ class TestMovedCamera:
         assert not fault.is_explained
         assert four.find(three(four.masks)) is None
 
-    def test_camera_whose_masks_are_poor_has_not_moved(self, nine: Stage) -> None:
-        """Each frame lacks another half of the person: no motion explains that."""
+    def test_camera_with_poor_masks_is_not_reported_as_moved(self, nine: Stage) -> None:
+        """Frames lack the upper or lower half of the person in turn: no motion explains that."""
         masks = [dict(own) for own in nine.masks]
         for k, own in enumerate(masks):
             half = own["camera_2"].copy()
@@ -132,7 +132,7 @@ class TestMovedCamera:
         fault = nine.find(masks)
         assert fault is None or (fault.name, fault.is_explained) == ("camera_2", False)
 
-    def test_motion_is_none_where_the_camera_stands(self, four: Stage) -> None:
+    def test_motion_of_an_unmoved_camera_is_zero(self, four: Stage) -> None:
         frames = four.frames(four.masks)
         camera = four.cameras["camera_0"]
         edges = [frame.edges["camera_0"] for frame in frames]
@@ -141,9 +141,7 @@ class TestMovedCamera:
         assert motion.pixels < 0.5
         np.testing.assert_allclose(motion.X_WC[:3, 3], camera.X_WC[:3, 3], atol=0.05)
 
-    def test_a_camera_rolled_about_its_axis_turns_its_pictures_the_other_way(
-        self, four: Stage
-    ) -> None:
+    def test_rolled_camera_turns_its_pictures_the_opposite_way(self, four: Stage) -> None:
         camera, view = four.cameras["camera_0"], four.frames(four.masks)[0]
         X_WC = camera.X_WC.copy()
         X_WC[:3, :3] = X_WC[:3, :3] @ Rotation.from_euler("z", 0.1).as_matrix()
@@ -156,7 +154,7 @@ class TestMovedCamera:
         assert motion.turn == pytest.approx(-0.1)
         assert motion.inlier_ratio_after < motion.inlier_ratio_before
 
-    def test_since_when_it_has_moved(self) -> None:
+    def test_first_frame_after_the_motion(self) -> None:
         good, bad = [0.9, 0.95, 0.9], [0.2, 0.1, 0.3]
         assert first_moved_frame([*good, *bad], [*bad, *good]) == 3
         assert first_moved_frame(bad, good) == 0
@@ -202,7 +200,7 @@ class TestRig:
 
 
 class TestOthers:
-    def test_two_persons_are_where_they_are(self, nine: Stage) -> None:
+    def test_two_persons_are_located(self, nine: Stage) -> None:
         poses = [nine.poses[0], stepping(nine.person, 1.0, 0.5, 1.2)]
         both = see(nine.person, nine.cameras, np.array(poses))
         masks = [one | other for one, other in zip(*(own.values() for own in both), strict=True)]
@@ -212,7 +210,7 @@ class TestOthers:
         np.testing.assert_allclose(places[0][:2], poses[0][:2], atol=0.2)
         np.testing.assert_allclose(places[1][:2], [0.5, 1.2], atol=0.2)
 
-    def test_the_other_is_cut_out(self, nine: Stage) -> None:
+    def test_other_person_is_cut_out(self, nine: Stage) -> None:
         other = see(nine.person, nine.cameras, np.array([stepping(nine.person, 1.0, 0.5, 1.2)]))[0]
         alone, place = nine.masks[0], np.array([-0.2, 0.1, 0.9])
         both = {name: mask | other[name] for name, mask in alone.items()}
@@ -249,8 +247,8 @@ class TestOthers:
         np.testing.assert_allclose(small.middle, [705.5, 299.5], atol=4.0)
         np.testing.assert_array_equal(cut_figures(mask, [small]), alone)
 
-    def test_who_is_hidden_or_away(self, four: Stage) -> None:
-        """Seen, hidden from all but one, away, and back."""
+    def test_frames_of_a_hidden_or_absent_person(self, four: Stage) -> None:
+        """Seen, hidden from all cameras but one, absent, and seen again."""
         masks = [dict(four.masks[min(k, 3)]) for k in range(5)]
         for name in four.cameras:
             if name != "camera_0":
@@ -263,8 +261,7 @@ class TestOthers:
         assert (faults.blind, faults.others) == ({}, {})
         assert 1.3 < recording.height < 2.1
 
-    def test_whose_a_figure_is_that_nobody_has(self) -> None:
-        """Nearer to another, or large beside the person's own and far away."""
+    def test_unassigned_figure_is_a_strangers_if_nearer_to_another_or_large_and_far(self) -> None:
         camera = circle_of_cameras(2, size=(160, 120), face_camera=False)["camera_0"]
         me = np.array([0.0, 0.0, 1.0])
         him, between, away = (me + by * camera.X_WC[:3, 0] for by in (0.9, 0.4, -0.8))
@@ -287,8 +284,8 @@ class TestOthers:
         assert not is_strangers(away, "large", {}, [])
 
     @pytest.mark.parametrize("side", [None, 0, 1, 2, 3], ids=lambda k: f"side {k}")
-    def test_one_figure_is_two_persons_where_its_box_is_about_both(self, side: int | None) -> None:
-        """A hidden person's middle inside the box, or a pixel outside of one of its sides."""
+    def test_figure_is_merged_if_its_box_contains_a_hidden_person(self, side: int | None) -> None:
+        """The hidden person's middle is inside the box, or a pixel outside one of its sides."""
         camera = circle_of_cameras(2, size=(160, 120), face_camera=False)["camera_0"]
         me = Person(np.array([0.0, 0.0, 1.0]), {0: 0}, 100.0)
         hidden = Person(np.array([-0.4, 0.0, 1.1]), {}, 90.0)
@@ -301,15 +298,15 @@ class TestOthers:
         assert found == {"0": ((), side is None)}
 
     @pytest.mark.parametrize(("gap", "far"), [(1, 0.39), (1, 0.41), (3, 0.59), (3, 0.61)])
-    def test_who_is_hidden_may_have_gone_further_meanwhile(self, gap: int, far: float) -> None:
-        """Four tenths of a metre from frame to frame, and one more for each that is missed."""
+    def test_track_may_move_farther_while_hidden(self, gap: int, far: float) -> None:
+        """0.4 m from frame to frame, and 0.1 m more for each frame without the person."""
         first, then = (Person(np.array([x, 0.0, 1.0]), {}, 100.0) for x in (0.0, far))
         tracks = find_tracks([[], [first], *[[]] * (gap - 1), [then]])
         same = far < 0.4 + 0.1 * (gap - 1)
         expected = [{1: first, gap + 1: then}] if same else [{1: first}, {gap + 1: then}]
         assert tracks == expected
 
-    def test_who_is_followed_is_seen_longest_and_comes_back(self) -> None:
+    def test_followed_person_is_seen_longest_and_may_return(self) -> None:
         def person(x: float, area: float = 100.0) -> Person:
             return Person(np.array([x, 0.0, 1.0]), {0: 0}, area)
 
@@ -318,25 +315,25 @@ class TestOthers:
         frames = [[me[0]], [him[0], me[1]], [], [him[1]], [me[2]], [me[3]], []]
         found = follow_one(frames, np.zeros(3), True)
         assert [found[k] for k in (0, 1, 4, 5, 6)] == [me[0], me[1], me[2], me[3], None]
-        # Where one is hidden one is on a straight way, without figures.
+        # Hidden persons are interpolated linearly, and have no figures.
         np.testing.assert_allclose(
             found[2].position, me[1].position + (me[2].position - me[1].position) / 3
         )
         assert found[2].figures == {}
-        # Who is there at the same time, if only in a frame, is somebody else.
+        # A track that overlaps the main one in a single frame is another person's.
         found = follow_one([[him[0]], [him[1], me[0]], [me[1]], [me[1]]], np.zeros(3), True)
         assert found == [None, me[0], me[1], me[1]]
         each = follow_one(frames, np.zeros(3), False)
         assert each == [me[0], me[1], None, him[1], me[2], me[3], None]
 
-    def test_cameras_around_a_place_look_at_it(self) -> None:
+    def test_middle_of_view_of_cameras_around_a_target_is_the_target(self) -> None:
         target = (0.3, -0.2, 1.1)
         cameras = circle_of_cameras(5, target=target, size=(161, 120), face_camera=False)
         np.testing.assert_allclose(middle_of_view(list(cameras.values())), target, atol=1e-6)
 
     @pytest.mark.parametrize(("side", "counts"), [(10, True), (7, False)])
-    def test_a_figure_is_no_speck_of_the_picture(self, side: int, counts: bool) -> None:
-        """Two ten-thousandths of it, or sixteen pixels: of this one 61."""
+    def test_specks_are_no_figures(self, side: int, counts: bool) -> None:
+        """The limit is 2e-4 of the picture, here 61 pixels, and 16 pixels at least."""
         mask = np.zeros((239, 1285), dtype=bool)
         mask[50 : 50 + side, 60 : 60 + side] = True
         found = find_figures(mask)
@@ -345,7 +342,7 @@ class TestOthers:
         small[10:15, 10:15] = True
         assert len(find_figures(small)) == 1
 
-    def test_another_stands_apart_and_is_no_part(self) -> None:
+    def test_separate_person_stands_apart_and_is_large(self) -> None:
         def person(x: float, area: float, z: float = 1.0) -> Person:
             return Person(np.array([x, 0.0, z]), {}, area)
 
@@ -353,7 +350,7 @@ class TestOthers:
         assert is_separate(person(2.0, 90.0), [first])
         assert not is_separate(person(2.0, 1.0), [first])
         assert not is_separate(person(0.1, 90.0), [first])
-        # Whatever is above one is oneself.
+        # A figure above the person belongs to the person.
         assert not is_separate(person(0.0, 90.0, 3.0), [first])
         assert not is_separate(person(2.1, 90.0), [first, person(2.0, 100.0)])
 

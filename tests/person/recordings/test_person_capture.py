@@ -26,7 +26,7 @@ def cameras():
 
 
 class TestShape:
-    def test_lengths_and_girths_are_found(self, shaped_person, cameras):
+    def test_lengths_and_radius_scales_are_found(self, shaped_person, cameras):
         fit = ContourFit(shaped_person.pose_tree(), noise=NOISE)
         order = [shaped_person.position_index(name) for name in fit.kinematics.names]
         factors = {"trunk": 1.1, "thigh": 1.2, "shin": 0.9}
@@ -64,16 +64,18 @@ class TestShape:
 
 class TestCapture:
     @pytest.mark.parametrize(("frames", "word"), [([], "one frame"), ([0, 1], "two cameras")])
-    def test_no_frame_and_nobody_in_any_frame(self, shaped_person, cameras, frames, word):
+    def test_recordings_without_frames_or_persons_are_refused(
+        self, shaped_person, cameras, frames, word
+    ):
         nobody = {name: np.zeros((240, 320), dtype=bool) for name in cameras}
         with pytest.raises(SettingsError, match=word):
             capture_person(shaped_person.pose_tree(), cameras, lambda _: nobody, frames)
 
     @pytest.mark.parametrize("frame", ["0025", "0040"], ids=["leg", "turned about"])
-    def test_a_still_of_unknown_measures_is_not_taken_for_another_pose(
+    def test_still_of_unknown_proportions_is_not_mistaken_for_another_pose(
         self, shaped_person, shared_data, frame
     ):
-        """In a body of average measures a leg elsewhere, or a person turned about, fits better."""
+        """With average proportions a wrong leg, or a person turned about, fits better."""
         scene = load_scene(shared_data / "human_four_views")
         masks = {name: scene.read(name, frame) for name in scene.cameras}
         captured = capture_person(
@@ -92,8 +94,10 @@ class TestCapture:
         assert np.nanmax(off) < 0.12
 
     @pytest.mark.slow
-    def test_stills_share_a_shape_and_none_spoils_the_others(self, shaped_person, shared_data):
-        """One still turned about in the common shape made others turn about, too."""
+    def test_wrong_pose_of_one_still_does_not_spoil_the_common_shape(
+        self, shaped_person, shared_data
+    ):
+        """A still turned about by 180 degrees can turn others through the common shape."""
         scene = load_scene(shared_data / "human_four_views")
         frames = scene.frames[::5]
         captured = capture_person(

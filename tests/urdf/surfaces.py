@@ -70,7 +70,7 @@ class Silhouettes:
     def mask(
         self, q: np.ndarray, towards: np.ndarray, target: np.ndarray, size: float, pixels: int = 400
     ) -> np.ndarray:
-        """Return a mask (pixels, pixels) seen from a direction (3,); the picture is `size` [m] wide."""
+        """Return a mask (pixels, pixels) seen from a direction (3,), `size` [m] wide."""
         X_WC = look_at(target + 10.0 * np.asarray(towards) / np.linalg.norm(towards), target)
         middle = 0.5 * (pixels - 1)
         camera = ParallelCamera("side", pixels, pixels, pixels / size, middle, middle, X_WC)

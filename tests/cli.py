@@ -1,4 +1,4 @@
-"""Runs the command line inside a test."""
+"""Run the command line inside a test."""
 
 import contextlib
 import io
@@ -14,7 +14,7 @@ from drake_pose.commands.main import main
 
 @dataclass(frozen=True)
 class Result:
-    """How it ended and what it wrote; `output` has both streams as they came."""
+    """Exit code and output of a command; `output` has both streams in order."""
 
     exit_code: int
     stdout: str
@@ -33,7 +33,7 @@ class _Stream(io.StringIO):
 
 
 def run_command(words: Sequence[str], env: Mapping[str, str] | None = None) -> Result:
-    """Runs `drake-pose` with these words."""
+    """Run `drake-pose` with arguments."""
     both = io.StringIO()
     out, err, status = _Stream(both), _Stream(both), 0
     with (
@@ -49,20 +49,20 @@ def run_command(words: Sequence[str], env: Mapping[str, str] | None = None) -> R
 
 
 def run_to_end(*words: object, status: int = 0) -> Result:
-    """Runs `drake-pose` with these words, which ends with this status."""
+    """Run `drake-pose` with arguments, and assert its exit status."""
     result = run_command([str(word) for word in words])
     assert result.exit_code == status, result.output
     return result
 
 
 def run_json(*words: object) -> dict[str, Any]:
-    """What a command says as JSON."""
-    told: dict[str, Any] = json.loads(run_to_end(*words, "--json").stdout)
-    return told
+    """Return the JSON output of a command."""
+    found: dict[str, Any] = json.loads(run_to_end(*words, "--json").stdout)
+    return found
 
 
 def assert_refused(result: Result, *parts: str, status: int = 1) -> None:
-    """A message of one line that has these parts, and nothing else."""
+    """Assert that a command failed with a one-line message that contains these parts."""
     assert result.exit_code == status, result.output
     message = " ".join(result.stderr.split())
     for part in ("drake-pose: error: ", *parts):
@@ -72,7 +72,7 @@ def assert_refused(result: Result, *parts: str, status: int = 1) -> None:
 
 
 class CliRunner:
-    """Runs commands; what tests call `runner`."""
+    """Runs commands; the fixture `runner`."""
 
     def invoke(
         self, app: object, words: Sequence[str], env: Mapping[str, str] | None = None

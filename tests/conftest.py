@@ -2,9 +2,9 @@
 
 import os
 
-# Before pydrake is imported: without it a process that forks after a render hangs.
+# Set before pydrake is imported; otherwise a process that forks after rendering hangs.
 os.environ.setdefault("LP_NUM_THREADS", "0")
-# And before numpy is: matrices are small, and threads wait for each other where cores are busy.
+# Set before numpy is imported: on small matrices BLAS's threads only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import shutil
@@ -22,7 +22,7 @@ from tests.search.bodies import forked_body
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder of recorded scenes beside the checkout; tests that need it are skipped without."""
+    """Folder of recorded scenes beside the checkout; tests that need it are skipped without it."""
     folder = Path(__file__).resolve().parents[2] / "shared" / "data"
     if not folder.is_dir():
         pytest.skip("no ../shared/data beside this checkout")
@@ -31,13 +31,13 @@ def shared_data() -> Path:
 
 @pytest.fixture(scope="session")
 def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> TinyScene:
-    """Three frames of one camera; shared, so do not change it."""
+    """Three frames of one camera; shared, so do not modify it."""
     return write_scene(tmp_path_factory.mktemp("tiny") / "scene")
 
 
 @pytest.fixture
 def own_scene(tiny_scene: TinyScene, tmp_path: Path) -> TinyScene:
-    """A copy to be spoilt."""
+    """A copy of tiny_scene that the test may modify."""
     shutil.copytree(tiny_scene.folder, tmp_path / "scene")
     return TinyScene(tmp_path / "scene", tiny_scene.model, tiny_scene.truth)
 
@@ -49,13 +49,13 @@ def runner() -> CliRunner:
 
 @pytest.fixture(scope="session")
 def person() -> ArticulatedModel:
-    """The bundled person, whose links have any lengths; shared, so do not change it."""
+    """The bundled person, whose link lengths are fixed; shared, so do not modify it."""
     return load_model(bundled_model("person"), check=False)
 
 
 @pytest.fixture(scope="session")
 def shaped_person() -> ArticulatedModel:
-    """The bundled person whose joints say how long links are; shared, so do not change it."""
+    """The bundled person with joints for its link lengths; shared, so do not modify it."""
     return load_model(bundled_model("person").with_name("person_shape.urdf"), check=False)
 
 
@@ -66,11 +66,11 @@ def skeleton(person: ArticulatedModel) -> Skeleton:
 
 @pytest.fixture(scope="session")
 def body(tmp_path_factory: pytest.TempPathFactory) -> ArticulatedModel:
-    """A trunk that turns, and two arms on it; shared, so do not change it."""
+    """A rotating trunk with two arms; shared, so do not modify it."""
     return forked_body(tmp_path_factory.mktemp("body"))
 
 
 @pytest.fixture(scope="session")
 def studio() -> Studio:
-    """A simulated person before nine small simulated cameras."""
+    """A simulated person and nine small simulated cameras."""
     return Studio()

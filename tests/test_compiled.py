@@ -1,4 +1,4 @@
-"""Kernels are compiled once for all processes, again when what they call changes, anywhere."""
+"""Kernels are compiled once for all processes, and again if anything they call changes."""
 
 import os
 import pickle
@@ -49,14 +49,14 @@ def start(package: Path, **variables: str) -> subprocess.Popen[str]:
 
 
 def run(package: Path, **variables: str) -> tuple[list[int], str]:
-    """What kernel(3) says and how often it was compiled, and what was logged."""
+    """Return kernel(3) and the number of compilations, and the log."""
     process = start(package, **variables)
     out, log = process.communicate(timeout=100)
     assert process.returncode == 0, log
     return [int(word) for word in out.split()], log
 
 
-def test_compiled_once_and_again_when_what_it_calls_changes(package: Path) -> None:
+def test_kernels_are_recompiled_only_when_a_dependency_changes(package: Path) -> None:
     values, log = run(package)
     assert values == [14, 1]
     assert log.count("compiling kernels: up to two minutes, once") == 1
@@ -68,8 +68,8 @@ def test_compiled_once_and_again_when_what_it_calls_changes(package: Path) -> No
     assert run(package) == ([28, 0], "")
 
 
-def test_stored_kernels_that_cannot_be_read_any_more(package: Path) -> None:
-    """As where a type of a kernel's arguments lives in another module than it did."""
+def test_unreadable_stored_kernels_are_recompiled(package: Path) -> None:
+    """As if a type of a kernel's arguments had moved to another module."""
     run(package)
     for index in package.glob("__pycache__/*.nbi"):
         data = index.read_bytes()
@@ -81,18 +81,18 @@ def test_stored_kernels_that_cannot_be_read_any_more(package: Path) -> None:
     assert run(package)[0] == [14, 0]
 
 
-def test_processes_side_by_side_compile_once(package: Path) -> None:
+def test_concurrent_processes_compile_once(package: Path) -> None:
     processes = [start(package) for _ in range(3)]
-    said = [process.communicate(timeout=100)[0].split() for process in processes]
-    assert sorted(said) == [["14", "0"], ["14", "0"], ["14", "1"]]
+    outputs = [process.communicate(timeout=100)[0].split() for process in processes]
+    assert sorted(outputs) == [["14", "0"], ["14", "0"], ["14", "1"]]
 
 
 def close_folder(folder: Path) -> None:
-    """Put a file where the cache folder would be: as root, no folder is read-only."""
+    """Put a file in place of the cache folder, because for root no folder is read-only."""
     (folder / "__pycache__").write_text("")
 
 
-def test_installation_that_cannot_be_written(package: Path, tmp_path: Path) -> None:
+def test_a_read_only_installation_uses_the_users_cache(package: Path, tmp_path: Path) -> None:
     close_folder(package)
     home = tmp_path / "home"
     places = {"HOME": str(home), "XDG_CACHE_HOME": str(home / ".cache")}
@@ -102,7 +102,7 @@ def test_installation_that_cannot_be_written(package: Path, tmp_path: Path) -> N
     assert run(package, **places) == ([14, 0], "")
 
 
-def test_nothing_can_be_written(package: Path, tmp_path: Path) -> None:
+def test_without_a_writable_folder_kernels_still_run(package: Path, tmp_path: Path) -> None:
     close_folder(package)
     home = tmp_path / "home"
     home.write_text("")

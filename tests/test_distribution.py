@@ -1,4 +1,4 @@
-"""The wheel and the source distribution, installed as a stranger installs them."""
+"""The wheel and the source distribution, installed in a fresh environment."""
 
 import json
 import os
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 
 
 def run(*command: object, cwd: Path) -> str:
-    # Of the environment only what finds programs and packages: no checkout on the search path.
+    # Keep the checkout off the search path.
     environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
     words = [str(word) for word in command]
     done = subprocess.run(words, cwd=cwd, env=environment, capture_output=True, text=True)
@@ -25,14 +25,14 @@ def run(*command: object, cwd: Path) -> str:
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """The wheel, which is built from the source distribution, and that distribution."""
+    """The wheel, built from the source distribution, and that distribution."""
     folder = tmp_path_factory.mktemp("distribution")
     run(sys.executable, "-m", "build", "--outdir", folder, ROOT, cwd=folder)
     (wheel,), (source,) = folder.glob("*.whl"), folder.glob("*.tar.gz")
     return wheel, source
 
 
-def test_what_is_in_them(built: tuple[Path, Path]) -> None:
+def test_distributions_have_the_expected_files(built: tuple[Path, Path]) -> None:
     wheel, source = built
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())

@@ -1,4 +1,4 @@
-"""What a stranger meets first: names, help, single things where several are expected."""
+"""First contact: public names, help texts, and errors for single values given as collections."""
 
 import inspect
 import pydoc
@@ -49,14 +49,14 @@ def test_every_public_name_can_be_imported():
 @pytest.mark.parametrize(
     "settings", [AuditSettings, EstimateSettings, MaskSettings, RegistrationSettings]
 )
-def test_help_of_settings_shows_plain_types_and_says_what_each_means(settings):
+def test_help_of_settings_has_plain_types_and_describes_each(settings):
     shown = pydoc.plain(pydoc.render_doc(settings)).partition("Data and other attributes")[0]
     assert "Annotated" not in shown
     for name in inspect.signature(settings).parameters:
         assert re.search(rf"^ \|      {name}: \w+", shown, re.M), name
 
 
-def test_one_name_is_taken_where_several_are_expected_and_a_number_is_refused():
+def test_a_single_name_is_a_collection_and_a_number_is_refused():
     one = RegistrationSettings(zeros="elbow_flex", cameras="left", exports="ros")
     assert (one.zeros, one.cameras, one.exports) == (("elbow_flex",), ("left",), ("ros",))
     assert RegistrationSettings(lengths=["a", "b"]).lengths == ("a", "b")
@@ -66,12 +66,12 @@ def test_one_name_is_taken_where_several_are_expected_and_a_number_is_refused():
 
 
 @pytest.mark.parametrize("make", [MultiStartSearch, BeamSearch, RegistrationBody])
-def test_a_model_in_place_of_its_tree_is_refused_by_name(make, model):
+def test_a_model_instead_of_its_tree_is_refused(make, model):
     with pytest.raises(SettingsError, match=r"model\.pose_tree\(\).*ArticulatedModel, '"):
         make(model)
 
 
-def test_one_camera_in_place_of_several_is_refused_by_name(model, tmp_path):
+def test_a_single_camera_instead_of_several_is_refused(model, tmp_path):
     search = MultiStartSearch(model.pose_tree())
     calls = [
         lambda: SilhouetteMatcher(search, CAMERA, 1.0),
@@ -87,12 +87,12 @@ def test_one_camera_in_place_of_several_is_refused_by_name(model, tmp_path):
         search.match(View(CAMERA, np.ones((48, 64), bool)))
 
 
-def test_a_mean_and_covariance_in_place_of_a_belief_are_refused_by_name():
+def test_a_tuple_instead_of_a_belief_is_refused():
     with pytest.raises(SettingsError, match=r"start must be a Belief.*not a tuple"):
         TruncatedEkf(object.__new__(TruncatedFilter), (np.zeros(3), np.eye(3)), 0.1)
 
 
-def test_a_model_shows_itself_in_one_line(model):
+def test_a_models_repr_is_one_line(model):
     for one in (model, model.pose_tree()):
         assert "\n" not in repr(one)
         assert len(repr(one)) < 300
@@ -100,7 +100,7 @@ def test_a_model_shows_itself_in_one_line(model):
 
 
 @pytest.mark.parametrize(
-    ("typed", "called"),
+    ("cli_text", "python_text"),
     [
         ("name those: --camera NAME", "name those: cameras=NAME"),
         ("(--joints FILE): --hold elbow=VALUE", "(joints=FILE): hold={'elbow': VALUE}"),
@@ -109,14 +109,14 @@ def test_a_model_shows_itself_in_one_line(model):
         ("(drake-pose masks --box 1) or --out", "(drake-pose masks --box 1) or out"),
     ],
 )
-def test_errors_of_python_calls_name_arguments_and_those_of_the_program_options(typed, called):
-    assert for_caller(typed) == called
+def test_messages_name_arguments_in_python_and_options_on_the_command_line(cli_text, python_text):
+    assert for_caller(cli_text) == python_text
     with options_in_messages():
-        assert for_caller(typed) == typed
-    assert for_caller(typed) == called
+        assert for_caller(cli_text) == cli_text
+    assert for_caller(cli_text) == python_text
 
 
-def test_a_python_call_is_answered_in_its_words():
+def test_errors_of_python_calls_name_arguments():
     scene = ROOT / "tutorials" / "data" / "human"
     with pytest.raises(DrakePoseError, match=r"joints") as refused:
         audit_scene(scene, bundled_model("man"))

@@ -8,8 +8,8 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "drake_pose"
 
-# A room may know those before it in this order; `body` and `camera` neither of each other.
-ROOMS = (
+# A subpackage may import those before it in this order, except the pairs in NOT_IMPORTED.
+SUBPACKAGES = (
     "body",
     "camera",
     "silhouette",
@@ -24,17 +24,17 @@ ROOMS = (
     "papers",
     "commands",
 )
-APART = {("camera", "body"), ("filtering", "registration"), ("person", "registration")}
+NOT_IMPORTED = {("camera", "body"), ("filtering", "registration"), ("person", "registration")}
 WITH_SYSTEMS = {"systems", "files", "jobs", "papers", "commands"}
-# Drake keeps three plain value types, ImageLabel16I, CameraInfo and CameraConfig, in
-# pydrake.systems.sensors.
+# These files may import three plain value types of pydrake.systems.sensors: ImageLabel16I,
+# CameraInfo and CameraConfig.
 VALUE_TYPES = {
     "camera/drake.py",
     "silhouette/pictures/label_images.py",
 }
 
-# Beside the rooms, for all of them.
-FOR_ALL = {
+# Modules that all subpackages may import.
+COMMON_MODULES = {
     *("arrays", "compiled", "csv_files", "errors", "regular_files", "version", "workers"),
     "yaml_files",
 }
@@ -50,7 +50,7 @@ MODULES = {
 
 @cache
 def imports_of(path: Path) -> list[tuple[str, list[str]]]:
-    """All imports of a file: at its head, inside functions, and for type checkers alone."""
+    """Return all imports of a file: at its top, inside functions, and for type checkers only."""
     found = []
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom):
@@ -61,7 +61,7 @@ def imports_of(path: Path) -> list[tuple[str, list[str]]]:
 
 
 def modules_imported(path: Path) -> set[str]:
-    """The modules of drake_pose that a file imports."""
+    """Return the modules of drake_pose that a file imports."""
     found = set()
     for module, names in imports_of(path):
         for name in names or [""]:
@@ -70,8 +70,8 @@ def modules_imported(path: Path) -> set[str]:
     return found & set(MODULES)
 
 
-def circles(arrows: dict[str, set[str]]) -> list[set[str]]:
-    """Groups of modules that reach each other."""
+def find_cycles(arrows: dict[str, set[str]]) -> list[set[str]]:
+    """Return groups of modules that reach each other."""
     reached: dict[str, set[str]] = {}
     for start in arrows:
         seen: set[str] = set()
@@ -90,12 +90,12 @@ def circles(arrows: dict[str, set[str]]) -> list[set[str]]:
     return [set(group) for group in groups]
 
 
-def test_every_folder_is_a_known_room():
-    rooms = {p.name for p in PACKAGE.iterdir() if p.is_dir() and (p / "__init__.py").exists()}
-    assert rooms == set(ROOMS)
+def test_every_folder_is_a_known_subpackage():
+    subpackages = {p.name for p in PACKAGE.iterdir() if p.is_dir() and (p / "__init__.py").exists()}
+    assert subpackages == set(SUBPACKAGES)
 
 
-def test_no_folder_is_too_full():
+def test_no_folder_has_too_many_files():
     counts = {str(folder): len(list(folder.glob("*.py"))) for folder in {p.parent for p in FILES}}
     assert {folder: count for folder, count in counts.items() if count > MOST_FILES + 1} == {}
 
@@ -106,7 +106,7 @@ def test_no_file_is_too_long():
 
 
 def test_no_function_is_too_long():
-    # A kernel cannot be parted at will: what it calls must be compiled with it.
+    # Kernels are exempt: functions that they call must be compiled with them.
     too_long = {}
     for path in [*FILES, *sorted((PACKAGE.parent / "urdf").rglob("*.py"))]:
         for node in ast.walk(ast.parse(path.read_text())):
@@ -120,49 +120,53 @@ def test_no_function_is_too_long():
 
 
 @pytest.mark.parametrize("path", FILES, ids=[str(p.relative_to(PACKAGE)) for p in FILES])
-def test_imports_point_left_only(path):
+def test_subpackages_import_earlier_ones_only(path):
     relative = path.relative_to(PACKAGE)
-    room = relative.parts[0]
-    if room not in ROOMS:
+    subpackage = relative.parts[0]
+    if subpackage not in SUBPACKAGES:
         return
-    may_know = set(ROOMS[: ROOMS.index(room) + 1]) - {one for here, one in APART if here == room}
+    may_import = set(SUBPACKAGES[: SUBPACKAGES.index(subpackage) + 1]) - {
+        one for here, one in NOT_IMPORTED if here == subpackage
+    }
     for module, names in imports_of(path):
         parts = module.split(".")
-        if parts[0] == "drake_pose" and len(parts) > 1 and parts[1] not in FOR_ALL:
-            assert parts[1] in may_know, f"{relative} imports {module}"
-        if module.startswith("pydrake.systems") and room not in WITH_SYSTEMS:
+        if parts[0] == "drake_pose" and len(parts) > 1 and parts[1] not in COMMON_MODULES:
+            assert parts[1] in may_import, f"{relative} imports {module}"
+        if module.startswith("pydrake.systems") and subpackage not in WITH_SYSTEMS:
             allowed = set(names) <= {"ImageLabel16I", "CameraInfo", "CameraConfig"}
             assert str(relative) in VALUE_TYPES, f"{relative} imports {module}"
             assert allowed, f"{relative} imports {names} from {module}"
         if module == "pydrake.multibody.parsing":
-            assert room == "body", f"{relative} parses models"
+            assert subpackage == "body", f"{relative} parses models"
         assert module != "pydrake.all", relative
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_folders_of_a_room_import_each_other_in_no_circle(room):
+@pytest.mark.parametrize("subpackage", SUBPACKAGES)
+def test_folders_of_a_subpackage_have_no_import_cycle(subpackage):
     arrows: dict[str, set[str]] = {}
-    for path in (PACKAGE / room).rglob("*.py"):
+    for path in (PACKAGE / subpackage).rglob("*.py"):
         here = path.parent.relative_to(PACKAGE).as_posix()
         there = {MODULES[m].parent for m in modules_imported(path)}
         inside = {
-            f.relative_to(PACKAGE).as_posix() for f in there if f.is_relative_to(PACKAGE / room)
+            f.relative_to(PACKAGE).as_posix()
+            for f in there
+            if f.is_relative_to(PACKAGE / subpackage)
         }
         arrows.setdefault(here, set()).update(inside - {here})
-    # What stands beside a room's folders may know them, and be known by them.
+    # Modules beside a subpackage's folders may import them, and be imported by them.
     folders = {
-        here: {one for one in known if one != room}
+        here: {one for one in known if one != subpackage}
         for here, known in arrows.items()
-        if here != room
+        if here != subpackage
     }
-    assert circles(folders) == []
+    assert find_cycles(folders) == []
 
 
-def test_no_modules_import_each_other_in_a_circle():
-    # drake_pose/__init__.py hands on names of its rooms when they are asked for.
+def test_modules_have_no_import_cycle():
+    # drake_pose/__init__.py imports names of its subpackages lazily.
     arrows = {
         module: modules_imported(path) - {"drake_pose"}
         for module, path in MODULES.items()
         if module != "drake_pose"
     }
-    assert circles(arrows) == []
+    assert find_cycles(arrows) == []

@@ -7,11 +7,11 @@ from drake_pose.workers import map_ordered, use_workers
 
 
 @pytest.mark.parametrize("workers", [1, 2, 5])
-def test_results_are_in_the_items_order(workers: int) -> None:
+def test_results_have_the_order_of_the_items(workers: int) -> None:
     assert map_ordered(lambda k: k * k, range(20), workers) == [k * k for k in range(20)]
 
 
-def test_so_many_threads_work_and_each_maps_alone() -> None:
+def test_nested_maps_use_a_single_thread() -> None:
     together = threading.Barrier(3, timeout=10.0)
 
     def names(_: int) -> set[str]:
@@ -24,19 +24,19 @@ def test_so_many_threads_work_and_each_maps_alone() -> None:
     assert len(set.union(*found)) == 3
 
 
-def test_an_error_comes_out() -> None:
+def test_errors_propagate() -> None:
     with pytest.raises(ZeroDivisionError):
         map_ordered(lambda k: 1 // k, range(3), 2)
 
 
-def test_who_names_no_number_keeps_the_one_before() -> None:
+def test_none_keeps_the_number_of_workers() -> None:
     with use_workers(1), use_workers(None):
         names = set(map_ordered(lambda _: threading.current_thread().name, range(4)))
     assert names == {threading.current_thread().name}
 
 
-def test_threads_collect_no_cycles_and_their_caller_does_again() -> None:
-    """What hangs in a cycle, as Drake's renderers may, is freed by the thread that made it."""
+def test_garbage_collection_is_paused_in_threads() -> None:
+    """Cyclic garbage, such as Drake's renderers, is freed by the thread that made it."""
     assert map_ordered(lambda _: gc.isenabled(), range(3), 2) == [False] * 3
     assert gc.isenabled()
     with pytest.raises(ZeroDivisionError):

@@ -1,4 +1,4 @@
-"""Files that scripts write, compared as text and numbers: the last digit depends on the machine."""
+"""Compare files written by scripts as text and numbers; last digits depend on the machine."""
 
 import re
 from pathlib import Path
@@ -8,10 +8,10 @@ LAST_PLACES = 2.1
 
 
 def assert_same_files(written: Path, committed: Path) -> None:
-    """Every written file is committed too, with the same words, and numbers that agree.
+    """Assert that every written file is committed, with the same words and matching numbers.
 
-    Whole numbers (indices) must be equal; others may differ by LAST_PLACES units of the last
-    decimal place that is committed.
+    Integers (indices) must be equal; other numbers may differ by LAST_PLACES units of the last
+    decimal place in the committed file.
     """
     names = sorted(path.relative_to(written) for path in written.rglob("*") if path.is_file())
     assert names
@@ -28,7 +28,7 @@ def assert_same_files(written: Path, committed: Path) -> None:
 
 
 def _tolerance(number: str) -> float:
-    """LAST_PLACES units of the last decimal place of a number as written; 0 for a whole one."""
+    """Return LAST_PLACES units of the last decimal place of a number's text; 0 for an integer."""
     mantissa, _, exponent = number.lower().partition("e")
     decimals = len(mantissa.partition(".")[2])
     return LAST_PLACES * 10.0 ** (int(exponent or 0) - decimals) if "." in mantissa else 0.0

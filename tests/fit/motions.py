@@ -1,4 +1,4 @@
-"""Motions of nodes against finite differences."""
+"""Check the motions of nodes against finite differences."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ STEP = 1e-6
 
 
 def world_points(placed):
-    """(2, nodes, 3) two points of each node's rigid surface in the world."""
+    """Return (2, nodes, 3) two points of each node's rigid surface in the world [m]."""
     starts = placed.packed.starts[:-1, 0]
     p_N = placed.packed.points.T[np.array([starts, starts + 1])]
     X_WN = placed.X_WN
@@ -14,7 +14,7 @@ def world_points(placed):
 
 
 def assert_motions_are_derivatives(body, theta):
-    """Every parameter of a body that can be placed moves all nodes as differences say."""
+    """Assert that a body's motions are the derivatives by all its parameters."""
     placed = body.place(theta)
     motions = placed.dense(len(theta)).reshape(len(placed.X_WN), len(theta), 3, 4)
     p_W = world_points(placed)

@@ -1,4 +1,4 @@
-"""Pictures as evidence: against sums over masks, and against what was painted."""
+"""Scores of colour images: against sums over masks, and against painted images."""
 
 import numpy as np
 import pytest
@@ -25,83 +25,87 @@ def episode(tmp_path_factory):
     return painted_episode(tmp_path_factory.mktemp("arm"), frames=6, size=(80, 60))
 
 
-def drawn(episode, X_CW):
-    """(f, H, W) masks of the body, and the kernel's arguments."""
+def draw_masks(episode, X_CW):
+    """Return (f, H, W) masks of the body, and the surfaces and poses for ``explain``."""
     outlines = episode.body.coarse
     poses = [X_CW @ episode.body.kinematics.poses(values) for values in episode.values]
     masks = np.array([draw_mask(outlines, X, episode.camera) for X in poses])
     return masks, (pack(outlines), np.ascontiguousarray(np.array(poses)[:, :, :3]))
 
 
-def test_what_a_pose_explains_is_a_sum_over_pixels(episode):
+def test_explain_sums_log_likelihoods_over_pixels(episode):
     backgrounds = Backgrounds.estimate(episode.pictures)
     sums = backgrounds.sums
-    masks, (packed, X_CN) = drawn(episode, episode.camera.X_CW)
-    still = np.zeros(X_CN.shape[1], bool)
-    told, pieces = explain(packed, X_CN, still, episode.camera.kernel_parameters(), sums, 20.0, 4)
+    masks, (packed, X_CN) = draw_masks(episode, episode.camera.X_CW)
+    is_static = np.zeros(X_CN.shape[1], bool)
+    totals, tiles = explain(
+        packed, X_CN, is_static, episode.camera.kernel_parameters(), sums, 20.0, 4
+    )
     covered = np.moveaxis(masks, 0, -1)
     each = sums.visible + np.where(covered[..., None], sums.covered, 0.0).sum(axis=2)
     gain = each.max(axis=-1) - sums.uncovered
     always = covered.all(axis=-1)
     gain[always] = 0.3 * np.maximum(gain[always], 0.0)
     gain[~covered.any(axis=-1)] = 0.0
-    assert told[Explained.AREA] == masks.sum()
-    np.testing.assert_allclose(told[Explained.GAIN], gain.sum(), rtol=1e-4)
+    assert totals[Explained.AREA] == masks.sum()
+    np.testing.assert_allclose(totals[Explained.GAIN], gain.sum(), rtol=1e-4)
     by_square = np.add.reduceat(np.add.reduceat(gain, [0, 20, 40], 0), [0, 20, 40, 60], 1)
-    np.testing.assert_allclose(pieces[:3], by_square, rtol=1e-3, atol=1e-2)
+    np.testing.assert_allclose(tiles[:3], by_square, rtol=1e-3, atol=1e-2)
 
 
-def test_outlines_are_where_neighbours_are_not_covered(episode):
+def test_outline_pixels_have_uncovered_neighbours(episode):
     sums = Backgrounds.estimate(episode.pictures).sums
-    masks, (packed, X_CN) = drawn(episode, episode.camera.X_CW)
+    masks, (packed, X_CN) = draw_masks(episode, episode.camera.X_CW)
     parameters = episode.camera.kernel_parameters()
-    for still in (False, True):
-        stands = np.full(X_CN.shape[1], still)
-        told, _ = explain(packed, X_CN, stands, parameters, sums, 1.0, 0)
+    for is_static in (False, True):
+        stands = np.full(X_CN.shape[1], is_static)
+        totals, _ = explain(packed, X_CN, stands, parameters, sums, 1.0, 0)
         inner = np.pad(masks, ((0, 0), (1, 1), (1, 1)), mode="edge")
         left, right = inner[:, 1:-1, :-2], inner[:, 1:-1, 2:]
         above, below = inner[:, :-2, 1:-1], inner[:, 2:, 1:-1]
         across_u, across_v = masks & ~(left & right), masks & ~(above & below)
-        assert told[Explained.OUTLINE] == (across_u | across_v).sum()
+        assert totals[Explained.OUTLINE] == (across_u | across_v).sum()
         u, v = (
             np.where(a, e, -np.inf) for a, e in zip((across_u, across_v), sums.edges, strict=True)
         )
         strongest = np.maximum(u, v)[across_u | across_v]
-        np.testing.assert_allclose(told[Explained.CONTOUR], strongest.sum(), rtol=1e-4)
-        # What stands still is its own background, and explains nothing else.
-        assert (told[Explained.GAIN] == 0.0) == still
+        np.testing.assert_allclose(totals[Explained.CONTOUR], strongest.sum(), rtol=1e-4)
+        # Static nodes belong to the background and score no gain.
+        assert (totals[Explained.GAIN] == 0.0) == is_static
 
 
-def test_light_is_told_whatever_else_changes():
+def test_photometric_gain_ignores_outliers():
     rng = np.random.default_rng(0)
     reference = rng.uniform(40.0, 200.0, (40, 50, 3)).astype(np.float32)
     gain, offset = np.array([0.8, 1.1, 1.2]), np.array([10.0, -5.0, 3.0])
     picture = ((reference - offset) / gain).astype(np.float32)
     picture[:15, :20] = 0.0
-    light = estimate_gain(picture, reference)
-    np.testing.assert_allclose(light[:, :3], np.diag(gain), rtol=0.01)
-    np.testing.assert_allclose(light[:, 3], offset, atol=1.0)
-    np.testing.assert_allclose(apply_gain(picture, light)[20:], reference[20:], atol=0.5)
+    fitted_gain = estimate_gain(picture, reference)
+    np.testing.assert_allclose(fitted_gain[:, :3], np.diag(gain), rtol=0.01)
+    np.testing.assert_allclose(fitted_gain[:, 3], offset, atol=1.0)
+    np.testing.assert_allclose(apply_gain(picture, fitted_gain)[20:], reference[20:], atol=0.5)
 
 
-def test_odds_show_the_body_and_the_background_behind_it(episode):
-    """The background is told where a frame shows it; and log-odds are for the body where it is."""
-    covered, _ = drawn(episode, episode.camera.X_CW)
+def test_log_odds_are_positive_on_the_body(episode):
+    """The background is estimated where a frame shows it, and log-odds are positive on the body."""
+    covered, _ = draw_masks(episode, episode.camera.X_CW)
     backgrounds = Backgrounds.estimate(episode.pictures)
     showing = backgrounds.shows_background(covered)
     assert not (showing & covered).any()
     known = KnownBackground.estimate(list(episode.pictures), backgrounds.gains, showing, covered)
     assert (known.unseen == ~showing.any(axis=0)).mean() > 0.99
-    seen = ~known.unseen
-    assert np.median(np.abs(known.colours - episode.background).max(axis=-1)[seen]) < 6.0
-    for picture, light, mask in zip(episode.pictures, backgrounds.gains, covered, strict=True):
-        foreground = known.foreground(picture, light)
-        assert ((foreground > 0.0) == mask)[seen].mean() > 0.97
+    visible = ~known.unseen
+    assert np.median(np.abs(known.colours - episode.background).max(axis=-1)[visible]) < 6.0
+    for picture, fitted_gain, mask in zip(
+        episode.pictures, backgrounds.gains, covered, strict=True
+    ):
+        foreground = known.foreground(picture, fitted_gain)
+        assert ((foreground > 0.0) == mask)[visible].mean() > 0.97
         found = mask_of_foreground(foreground, mask)
         assert (found & mask).sum() / (found | mask).sum() > 0.85
 
 
-def test_odds_pictures_are_read_as_they_were_written():
+def test_log_odds_images_decode_to_their_values():
     foreground = np.linspace(-9.0, 9.0, 120, dtype=np.float32).reshape(10, 12)
     picture = foreground_picture(foreground)
     red, green, blue = np.moveaxis(picture.astype(np.intp) >> 4, -1, 0)

@@ -1,4 +1,4 @@
-"""Bodies and cameras at their parameters: against Drake, and motions against finite differences."""
+"""Placement of bodies and cameras: against Drake, and motions against finite differences."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def test_body_parameters_against_finite_differences(body, theta):
     assert_motions_are_derivatives(body, theta)
 
 
-def test_values_alone_are_all_parameters_at_rest(body, theta):
+def test_zero_parameters_do_not_change_a_placement(body, theta):
     count = len(body.kinematics.names)
     alone = body.place(theta[:count])
     whole = body.place(np.concatenate([theta[:count], np.zeros(6)]))
@@ -47,8 +47,8 @@ def test_values_alone_are_all_parameters_at_rest(body, theta):
     np.testing.assert_allclose(alone.motions, whole.motions[:count], atol=1e-12)
 
 
-def picture(X_CW, kernel, p_W):
-    """(2,) where a point (3,) is seen."""
+def project(X_CW, kernel, p_W):
+    """Return (2,) the projection of a point (3,) [pixel]."""
     x, y, z = X_CW[:3, :3] @ p_W + X_CW[:3, 3]
     depth = 1.0 if kernel[0] == 1.0 else z
     return np.array([kernel[1] * x / depth + kernel[3], kernel[2] * y / depth + kernel[4]])
@@ -64,15 +64,23 @@ def test_camera_parameters_against_finite_differences():
         c, k = divmod(index, len(CAMERA_NAMES))
         above, below = (cameras.place(theta + by) for by in (step, -step))
         for p_W in np.array([[0.3, 0.1, 1.2], [-0.4, 0.2, 0.6]]):
-            seen = picture(above[0][c], above[1][c], p_W) - picture(below[0][c], below[1][c], p_W)
+            measured = project(above[0][c], above[1][c], p_W) - project(
+                below[0][c], below[1][c], p_W
+            )
             by = STEP * motions[c, k].reshape(3, 4) @ [*p_W, 1.0]
-            told = picture(X_CW[c], kernel[c], p_W + by) - picture(X_CW[c], kernel[c], p_W - by)
+            predicted = project(X_CW[c], kernel[c], p_W + by) - project(
+                X_CW[c], kernel[c], p_W - by
+            )
             np.testing.assert_allclose(
-                told / STEP, seen / STEP, rtol=1e-5, atol=2e-3, err_msg=cameras.names[index]
+                predicted / STEP,
+                measured / STEP,
+                rtol=1e-5,
+                atol=2e-3,
+                err_msg=cameras.names[index],
             )
 
 
-def test_cameras_where_nothing_is_changed():
+def test_zero_parameters_do_not_change_cameras():
     rig = list(circle_of_cameras(3).values())
     X_CW, kernel, _ = CameraParameters(rig, np.ones(3)).place(np.zeros(27))
     for c, camera in enumerate(rig):
@@ -80,8 +88,8 @@ def test_cameras_where_nothing_is_changed():
         np.testing.assert_allclose(kernel[c], camera.kernel_parameters())
 
 
-# A wrist of two joints, no link that is seen between them; a mount that is welded on before the
-# last joint; and a second joint on a link.
+# A wrist of two joints with an invisible link between them, a mount welded on before the last
+# joint, and a link with two joints.
 def box(*size):
     return f'<visual><geometry><box size="{" ".join(map(str, size))}"/></geometry></visual>'
 
@@ -107,7 +115,7 @@ URDF = urdf(
     joint("wave", "revolute", "upper", "flag", limits=LIMITS, axis="1 0 0",
           origin='xyz="0.2 0 0.1"'),
 )  # fmt: skip
-# For each link with a length: its joints' origins, and the same 1.25 times as far.
+# For each link with a scale: its joints' origins, and the same scaled by 1.25.
 LONGER = {
     "base": {"0.1 0 0": "0.125 0 0"},
     "upper": {"0.02 0.1 0.3": "0.025 0.125 0.375", "0.2 0 0.1": "0.25 0 0.125"},
@@ -125,7 +133,7 @@ def kinematics_of(path, text, root):
 
 @pytest.fixture(params=["base", "finger", "flag"])
 def scaled(tmp_path, request):
-    """The tree walks joints outwards from the base, inwards from the finger, and both ways."""
+    """The tree traverses joints outwards from the base, inwards from the finger, and both ways."""
     kinematics = kinematics_of(tmp_path / "odd.urdf", URDF, request.param)
     outlines = [outline_from_mesh(node.mesh) for node in kinematics.tree.nodes]
     return BodyParameters(kinematics, outlines, offsets=link_vectors(kinematics.tree))
@@ -136,12 +144,12 @@ def parameters(scaled, logs, placed=(0.0, 0.0, 0.0, 0.0)):
     return np.array([*values, *placed, *(logs.get(link, 0.0) for link in scaled.links)])
 
 
-def test_links_with_a_length(scaled):
+def test_links_that_carry_joints_have_scales(scaled):
     assert set(scaled.links) == {"base", "upper", "gimbal", "mount"}
 
 
 @pytest.mark.parametrize("link", LONGER)
-def test_nodes_stand_where_drake_has_them(link, scaled, tmp_path):
+def test_scaled_links_place_nodes_as_drake_does(link, scaled, tmp_path):
     text = URDF
     for origin, longer in LONGER[link].items():
         assert text.count(f'"{origin}"') == 1
@@ -154,15 +162,15 @@ def test_nodes_stand_where_drake_has_them(link, scaled, tmp_path):
     np.testing.assert_allclose(scaled.place(theta).X_WN, expected, atol=1e-12)
 
 
-def test_a_joint_behind_a_weld_is_moved_from_the_link_s_own_joint(scaled):
+def test_link_vector_of_a_joint_behind_a_weld(scaled):
     offset = next(one for one in link_vectors(scaled.kinematics.tree) if one.link == "mount")
-    # The slide stands 0.1 up the wrist and 0.05 along the y axis of what is turned there by 1 rad.
+    # The slide is 0.1 up the wrist and 0.05 along the y axis of a frame rotated by 1 rad.
     assert np.linalg.norm(offset.p_L) == pytest.approx(np.hypot(0.1, 0.05))
     np.testing.assert_allclose(offset.p_L, [0.0, 0.05, 0.1], atol=1e-12)
 
 
 def test_link_scales_against_finite_differences(scaled):
-    """Also of a scaled that has grown about its root and is shifted."""
+    """Also of a body whose root is scaled and translated."""
     logs = {"base": 0.1, "upper": -0.2, "gimbal": 0.3, "mount": -0.1}
     theta = parameters(scaled, logs, (0.1, -0.2, 0.3, 0.15))
     assert_motions_are_derivatives(scaled, theta)
@@ -190,14 +198,14 @@ def stretched(hand):
 
 
 def test_proportions_against_finite_differences(stretched, person):
-    """Of a hand that is held, and of a person whose root moves, too."""
+    """For a hand with a fixed root, and a person with a moving one."""
     tree = person.pose_tree()
     for body in (stretched, ProportionedBody(TreeKinematics(tree), TreeSurfaces(tree))):
         theta = np.random.default_rng(0).normal(0.0, 0.2, len(body.names))
         assert_motions_are_derivatives(body, theta)
 
 
-def test_parts_are_long_towards_what_they_carry_or_else_their_middle(stretched):
+def test_parts_are_stretched_towards_their_children_or_centroid(stretched):
     kinematics = stretched.kinematics
     X_WN = kinematics.poses(kinematics.flatten(kinematics.tree.default_values()))
     for node, axis, X in zip(kinematics.tree.nodes, stretched.axes, X_WN, strict=True):
@@ -210,7 +218,7 @@ def test_parts_are_long_towards_what_they_carry_or_else_their_middle(stretched):
     np.testing.assert_allclose(stretched.factors(theta), 1.0 + long)
 
 
-def test_planes_are_those_of_the_stretched_surfaces(stretched):
+def test_planes_match_the_stretched_surfaces(stretched):
     theta = np.random.default_rng(1).normal(0.0, 0.2, len(stretched.names))
     packed = stretched.place(theta).packed
     for node in range(3):
@@ -220,7 +228,7 @@ def test_planes_are_those_of_the_stretched_surfaces(stretched):
         np.testing.assert_allclose(packed.planes[:, t:t_end].T, own.planes, atol=1e-15)
 
 
-def test_a_stretched_model_stands_where_the_stretched_body_does(hand, stretched):
+def test_a_stretched_model_has_the_poses_of_the_stretched_body(hand, stretched):
     theta = np.random.default_rng(2).normal(0.0, 0.2, len(stretched.names))
     count = len(stretched.kinematics.names)
     theta[count : count + 4] = 0.0
@@ -235,18 +243,18 @@ def test_a_stretched_model_stands_where_the_stretched_body_does(hand, stretched)
         np.testing.assert_allclose(vertices[order], own[own_order], atol=1e-8)
 
 
-def test_a_sequence_is_as_usual_and_moves_on_as_it_did():
+def test_sequence_prior_penalises_unusual_values_and_accelerations():
     usual = np.array([[1.0, 2.0]]), np.array([0.5]), np.array([4.0])
     coupling = sequence_prior(5, usual, np.array([0.1, 0.2]))
     x = np.random.default_rng(1).normal(size=(5, 2))
-    told = ((coupling.rows @ x.ravel() - coupling.mean) ** 2 * coupling.information).sum()
-    off = 4.0 * ((x @ [1.0, 2.0] - 0.5) ** 2).sum()
+    predicted = ((coupling.rows @ x.ravel() - coupling.mean) ** 2 * coupling.information).sum()
+    deviations = 4.0 * ((x @ [1.0, 2.0] - 0.5) ** 2).sum()
     faster = (np.diff(x, 2, axis=0) / [0.1, 0.2]) ** 2
-    assert told == pytest.approx(off + faster.sum())
+    assert predicted == pytest.approx(deviations + faster.sum())
 
 
-def test_proportions_are_known_as_people_differ(stretched):
-    """With nothing seen, all is as it is expected, and as unsure; the hand's limbs have joints."""
+def test_without_evidence_proportions_follow_the_prior(stretched):
+    """Without evidence the result and its deviations are those of the prior."""
     camera, kinematics = (
         ParallelCamera("top", 60, 50, 100.0, 30.0, 25.0, np.eye(4)),
         stretched.kinematics,
@@ -256,11 +264,11 @@ def test_proportions_are_known_as_people_differ(stretched):
     limits = np.full(free, -np.inf), np.full(free, np.inf)
     starts = np.zeros((3, len(kinematics.names) + 4))
     rounds, prior = [AnnealingStage(1.0, 1.0, 30)], sequence_prior(3, usual, np.full(free, 1e3))
-    found, off = fit_proportions(
+    found, deviations = fit_proportions(
         stretched, camera, [NO_EDGE] * 3, starts, rounds, Noise(1.0, 1.0), limits, prior
     )
     np.testing.assert_allclose(found.own, 0.1, atol=1e-3)
-    np.testing.assert_allclose(off[:, off.any(axis=0)], 0.5, rtol=1e-3)
+    np.testing.assert_allclose(deviations[:, deviations.any(axis=0)], 0.5, rtol=1e-3)
     counts = [
         len(names)
         for names in (stretched.length_names, stretched.width_names, stretched.place_names)

@@ -32,7 +32,7 @@ def fit(person):
     return ContourFit(person.pose_tree())
 
 
-def standing(person, **degrees):
+def standing_pose(person, **degrees):
     q = np.zeros(len(person.position_names))
     q[person.position_index("position_z")] = 1.55
     for name, angle in degrees.items():
@@ -61,20 +61,20 @@ class TestEdges:
         assert edge.lengths[~outer].sum() == pytest.approx(2 * np.pi * 40.0, rel=0.03)
         assert (np.diff(edge.uv[:, 1]) >= 0.0).all()
 
-    def test_border_of_the_picture_is_no_edge(self):
+    def test_image_border_is_not_an_edge(self):
         mask = np.zeros((60, 80), dtype=bool)
         mask[20:, 30:50] = True
         edge = find_edge_points(mask, 2.0)
         assert edge.uv[:, 1].max() < 59.0
 
-    def test_nobody(self):
+    def test_an_empty_mask_has_no_edge(self):
         edge = find_edge_points(np.zeros((60, 80), dtype=bool), 2.0)
         assert len(edge.uv) == 0
         assert np.isnan(edge.middle).all()
 
     @pytest.mark.parametrize("degrees", [0.0, 10.0, 26.0, 45.0, 63.0, 80.0])
-    def test_points_are_on_the_edge_in_the_mean(self, degrees):
-        # Half a plane, of which a pixel belongs to it whose centre does; many offsets of its edge.
+    def test_points_are_on_the_edge_on_average(self, degrees):
+        # A half plane, rasterised by pixel centres, with many offsets of its edge.
         n = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
         v, u = np.mgrid[:200, :200]
         off = []
@@ -84,7 +84,7 @@ class TestEdges:
         assert abs(np.mean(off)) < 0.03
 
 
-def test_nearest_points_against_brute_force():
+def test_matched_points_against_brute_force():
     generator = np.random.default_rng(3)
 
     def cloud(count):
@@ -101,7 +101,7 @@ def test_nearest_points_against_brute_force():
         np.testing.assert_array_equal(found, wanted)
 
 
-def test_equations_are_collected_as_dense_products():
+def test_normal_equations_match_dense_products():
     generator = np.random.default_rng(0)
     half = generator.normal(size=(2, 12, 12))
     A = np.einsum("nij,nkj->nik", half, half)
@@ -129,7 +129,7 @@ def test_a_pixel_of_contour_has_the_weight_one(fit, pixels):
     weights = camera_weights(cameras, placement, step, Noise.per_pixel(pixels), pixels)
     expected = np.column_stack(np.broadcast_arrays(1.0 / pixels, 0.1 * pixels, 0.05 * pixels, 1.0))
     np.testing.assert_allclose(weights, np.broadcast_to(expected, (2, 4)))
-    # Where the metre is the unit, errors in pixels grow with the focal length; fine scales are cut.
+    # In units of a metre, errors in pixels grow with the focal length; fine scales are clipped.
     fine = AnnealingStage(1e-6, 1e-6)
     near, far = camera_weights(cameras, placement, fine, Noise(0.01, 0.1))
     np.testing.assert_allclose(near[0] / far[0], 2.0)
@@ -139,7 +139,7 @@ def test_a_pixel_of_contour_has_the_weight_one(fit, pixels):
     np.testing.assert_allclose(near[3] / half[0, 3], 8.0)
 
 
-def test_pixels_per_metre_are_those_of_projections():
+def test_pixels_per_metre_match_projections():
     (pinhole,) = circle_of_cameras(1, face_camera=False).values()
     parallel = ParallelCamera("parallel", 640, 480, 250.0, 320.0, 240.0, pinhole.X_WC)
     place = np.array([0.1, -0.2, 1.3])
@@ -149,7 +149,7 @@ def test_pixels_per_metre_are_those_of_projections():
         assert np.diff(camera.project(ends)[0][:, 0])[0] / 2e-3 == pytest.approx(size, rel=1e-6)
 
 
-def test_the_lower_triangle_is_the_whole():
+def test_symmetric_completes_the_lower_triangle():
     A = np.random.default_rng(0).normal(size=(2, 5, 5))
     full = symmetric(np.tril(A))
     np.testing.assert_array_equal(np.tril(full), np.tril(A))
@@ -158,8 +158,8 @@ def test_the_lower_triangle_is_the_whole():
 
 class TestFit:
     @pytest.mark.parametrize("count", [4, 9])
-    def test_pose_is_found_again_in_drakes_pictures(self, person, fit, count):
-        true = standing(
+    def test_pose_is_recovered_from_drakes_masks(self, person, fit, count):
+        true = standing_pose(
             person,
             left_upper_arm_z=50,
             left_forearm_x=-60,
@@ -183,22 +183,22 @@ class TestFit:
         assert (found.values >= fit.lower).all()
         assert (found.values <= fit.upper).all()
 
-    def test_held_values_stay_and_nothing_seen_changes_nothing(self, person, fit):
+    def test_fixed_values_and_unobserved_values_stay(self, person, fit):
         camera = circle_of_cameras(1, size=(160, 120), face_camera=False)["camera_0"]
         start = np.zeros(len(fit.lower))
         empty = find_edge_points(np.zeros((120, 160), dtype=bool), 4.0)
         found = fit.fit(pack_views([camera], [empty]), start, STEPS)
         np.testing.assert_allclose(found.values, start, atol=1e-9)
         assert (found.inlier_ratio, found.evaluations) == (0.0, len(STEPS))
-        # But a prior pulls, inside the limits.
+        # A prior pulls, within the limits.
         prior = Prior(start + 0.03, np.full(len(start), 100.0))
         found = fit.fit(pack_views([camera], [empty]), start, 4 * STEPS, prior)
         np.testing.assert_allclose(
             found.values, np.clip(start + 0.03, fit.lower, fit.upper), atol=2e-3
         )
-        edge = find_edge_points(LabelRenderer(person, camera).mask(standing(person)), 4.0)
+        edge = find_edge_points(LabelRenderer(person, camera).mask(standing_pose(person)), 4.0)
         order = [person.position_index(name) for name in fit.kinematics.names]
-        start = standing(person)[order] + 0.05
+        start = standing_pose(person)[order] + 0.05
         held = np.arange(len(start)) % 2 == 0
         found = fit.fit(pack_views([camera], [edge]), start, STEPS, None, held)
         clipped = np.clip(start, fit.lower, fit.upper)

@@ -1,4 +1,4 @@
-"""One damped step against the whole system solved at once, and a minimum against least squares."""
+"""One damped step against the full system, and the minimum against scipy's least squares."""
 
 import numpy as np
 import pytest
@@ -16,21 +16,21 @@ from drake_pose.fit.levenberg_marquardt import (
 
 
 def random_frames(generator, frames, p, q):
-    """Residuals A x - b of each frame, x its own unknowns and then the shared ones."""
+    """Return A and b of each frame's residuals A x - b; x are own unknowns, then shared ones."""
     A = generator.normal(size=(frames, 3 * (p + q), p + q))
     return A, generator.normal(size=A.shape[:2])
 
 
 def equations_at(A, b, own, shared):
-    """Of the sum of squares, whose slope is twice g."""
+    """Return the equations of the sum of squares, whose gradient is 2 g."""
     x = np.column_stack([own, np.tile(shared, (len(own), 1))])
     r = np.einsum("fij,fj->fi", A, x) - b
     H, g = np.einsum("fij,fik->fjk", A, A), np.einsum("fij,fi->fj", A, r)
     return Equations(H, g, float((r**2).sum()))
 
 
-def whole(A, b, p):
-    """The same residuals in the unknowns of all frames (rows, frames * p + q)."""
+def full_system(A, b, p):
+    """Return the same residuals in the unknowns of all frames (rows, frames * p + q)."""
     frames, rows, _ = A.shape
     matrix = np.zeros((frames * rows, frames * p + A.shape[2] - p))
     for f in range(frames):
@@ -55,11 +55,11 @@ def found_by_steps(A, b, p, bound, stages, coupling=None, **settings):
 @pytest.mark.parametrize("bound", [np.inf, 0.05])
 @pytest.mark.parametrize("couples", [False, True])
 @pytest.mark.parametrize(("frames", "p", "q"), [(1, 7, 0), (4, 3, 2), (3, 0, 4), (1, 1, 1)])
-def test_minimum_of_a_linear_problem(frames, p, q, couples, bound):
-    """Inside limits, and where own unknowns of all frames couple."""
+def test_minimum_matches_linear_least_squares(frames, p, q, couples, bound):
+    """With and without limits and coupling."""
     generator = np.random.default_rng(frames + 10 * p)
     A, b = random_frames(generator, frames, p, q)
-    matrix, right = whole(A, b, p)
+    matrix, right = full_system(A, b, p)
     coupling = None
     if couples and p:
         rows, mean = generator.normal(size=(7, frames * p)), generator.normal(size=7)
@@ -81,15 +81,15 @@ def test_minimum_of_a_linear_problem(frames, p, q, couples, bound):
 
 
 @pytest.mark.parametrize(("frames", "p", "q"), [(1, 7, 0), (4, 3, 2), (3, 0, 4)])
-def test_step_of_all_frames_is_that_of_the_whole_system(frames, p, q):
-    """Of free unknowns, damped alike: by a share of the diagonal of each frame's and the shared."""
+def test_step_matches_the_full_system(frames, p, q):
+    """Each frame's diagonal and the shared one are damped by the same fraction."""
     A, b = random_frames(np.random.default_rng(5), frames, p, q)
-    share = 0.3
+    damping = 0.3
     stage = [AnnealingStage(1.0, 1.0)]
-    own, shared, *_ = found_by_steps(A, b, p, np.inf, stage, max_step=1e3, damping=share)
-    matrix, right = whole(A, b, p)
+    own, shared, *_ = found_by_steps(A, b, p, np.inf, stage, max_step=1e3, damping=damping)
+    matrix, right = full_system(A, b, p)
     H = matrix.T @ matrix
-    step = np.linalg.solve(H + np.diag(share * np.diag(H) + 1e-9), matrix.T @ right)
+    step = np.linalg.solve(H + np.diag(damping * np.diag(H) + 1e-9), matrix.T @ right)
     np.testing.assert_allclose(own.reshape(-1), step[: frames * p], atol=1e-12)
     np.testing.assert_allclose(shared, step[frames * p :], atol=1e-12)
 

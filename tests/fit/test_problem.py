@@ -1,4 +1,4 @@
-"""Unknowns of every kind found again in drawn silhouettes, and their equations."""
+"""Unknowns of every kind recovered from drawn silhouettes, and their normal equations."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ from drake_pose.fit.surfaces import VERY_FEW, simplify_surfaces
 from drake_pose.silhouette.outline import TreeSurfaces, outline_from_mesh
 from drake_pose.silhouette.scoring import draw_mask
 
-ROUNDS = (
+STAGES = (
     AnnealingStage(0.08, 0.04, 3),
     AnnealingStage(0.04, 0.03, 3),
     AnnealingStage(0.01, 0.02, 8),
@@ -46,7 +46,7 @@ def parallel(pinhole, scale=150.0):
 
 
 def poses(body, count, seed):
-    """Some different poses (count, n) of the body."""
+    """Return (count, n) parameters of different poses of the body."""
     generator = np.random.default_rng(seed)
     kinematics = body.kinematics
     lower, upper = np.maximum(kinematics.lower, -1.0), np.minimum(kinematics.upper, 1.0)
@@ -62,7 +62,7 @@ def poses(body, count, seed):
 
 
 def few_outlines(body, theta):
-    """The surfaces of a body at its parameters, in its nodes' frames."""
+    """Return the surfaces of a body at its parameters, in its nodes' frames."""
     packed = body.place(theta).packed
     parts = np.split(packed.points.T, packed.starts[1:-1, 0])
     pairs = zip(parts, body.outlines, strict=True)
@@ -70,7 +70,7 @@ def few_outlines(body, theta):
 
 
 def draw(body, cameras, theta, camera_theta=None):
-    """The edges that cameras see of a body; drawn by the span kernel, not by the fit's."""
+    """Return the edges of a body's silhouettes, drawn by the span kernel and not by the fit."""
     placement, outlines = body.place(theta), few_outlines(body, theta)
     parameters = np.zeros(9 * len(cameras)) if camera_theta is None else camera_theta
     X_CW, kernel, _ = CameraParameters(cameras, root_of(body)).place(parameters)
@@ -88,19 +88,19 @@ def root_of(body):
     return kinematics.poses(kinematics.flatten(kinematics.tree.default_values()))[0, :3, 3]
 
 
-def test_joint_zeros_of_all_frames_are_found(body, rig):
+def test_shared_joint_offsets_are_recovered(body, rig):
     truth = poses(body, 4, 4)
-    zeros = np.array([0.08, -0.1, 0.07, 0.05])
+    offsets = np.array([0.08, -0.1, 0.07, 0.05])
     readings = truth.copy()
-    readings[:, [list(body.names).index(name) for name in BENT]] -= zeros
+    readings[:, [list(body.names).index(name) for name in BENT]] -= offsets
     problem = Problem(body, rig, [Unknowns(BENT, shared=True)])
     pairs = zip(truth, readings, strict=True)
     seen = [Observation(draw(body, rig, theta), row) for theta, row in pairs]
-    np.testing.assert_allclose(problem.solve(seen, ROUNDS).shared, zeros, atol=0.012)
+    np.testing.assert_allclose(problem.solve(seen, STAGES).shared, offsets, atol=0.012)
 
 
-def test_odds_of_pixels_draw_contours_as_masks_do(body, rig):
-    """And a boundary that is too wide in them is a width."""
+def test_log_odds_images_are_fitted_like_masks(body, rig):
+    """A dilated foreground is reported as a boundary bias."""
     truth = poses(body, 1, 4)[0]
     camera, outlines = rig[0], few_outlines(body, truth)
     mask = draw_mask(outlines, camera.X_CW @ body.place(truth).X_WN, camera)
@@ -117,8 +117,8 @@ def test_odds_of_pixels_draw_contours_as_masks_do(body, rig):
         assert found[2] == pytest.approx(grown, abs=0.5)
 
 
-def test_unknowns_are_added_to_what_is_known_of_a_frame(body, rig):
-    """Also where two are added to one parameter: a frame's own angle and a joint's offset."""
+def test_unknowns_are_added_to_known_values(body, rig):
+    """Including two unknowns added to one parameter: a frame's own angle and a joint offset."""
     own = Unknowns(BENT[:2])
     problem = Problem(body, rig, [Unknowns(BENT[1:3], shared=True), own])
     assert problem.names == (*BENT[:2], *BENT[1:3])
@@ -132,8 +132,8 @@ def test_unknowns_are_added_to_what_is_known_of_a_frame(body, rig):
     np.testing.assert_allclose(theta, expected)
 
 
-def test_equations_are_the_slope_of_the_cost(body, rig):
-    """Of every parameter at once, where all points have their counterparts."""
+def test_equations_are_the_gradient_of_the_cost(body, rig):
+    """For all parameters at once, where all points have matches."""
     cameras = [rig[1], parallel(rig[0])]
     truth = poses(body, 1, 7)
     names = parameter_names(body, cameras)
@@ -150,7 +150,7 @@ def test_equations_are_the_slope_of_the_cost(body, rig):
     steps = 2e-3 * np.eye(len(names))
     slopes = np.array([equations(d).cost - equations(-d).cost for d in steps]) / (2 * 2e-3)
     expected = 2.0 * equations(np.zeros(len(names))).g[0]
-    # Counterparts change on the way: the slopes agree on the whole.
+    # Matches change along the way, so only the whole gradients agree.
     several = slice(-len(cameras)), slice(-len(cameras), None)
     for some in several:
         cosine = (
@@ -175,8 +175,8 @@ def test_equations_are_the_slope_of_the_cost(body, rig):
         "log_radius_scale_odd",
     ],
 )
-def test_equations_of_some_unknowns_are_part_of_those_of_all(body, rig, some):
-    """Whatever stands still, of two frames and two cameras; also where all the others are 0."""
+def test_equations_of_some_unknowns_are_a_block_of_those_of_all(body, rig, some):
+    """For two frames and two cameras, with and without unknowns of the body."""
     cameras = rig[:2]
     every = parameter_names(body, cameras)
     names = [name for name in every if name.split(".")[-1] in some.split()]
@@ -184,7 +184,7 @@ def test_equations_of_some_unknowns_are_part_of_those_of_all(body, rig, some):
     count = len(body.kinematics.names)
     seen = [Observation(draw(body, cameras, theta), theta[:count] + 0.01) for theta in truth]
     none, step = np.zeros((2, 0)), AnnealingStage(0.1, 0.02)
-    part, whole = (
+    part, full = (
         Problem(body, cameras, [Unknowns(chosen, shared=True)]).equations(
             seen, (none, np.zeros(len(chosen))), step
         )
@@ -192,12 +192,12 @@ def test_equations_of_some_unknowns_are_part_of_those_of_all(body, rig, some):
     )
     at = [every.index(name) for name in names]
     assert np.abs(part.g).min() > 0.0
-    np.testing.assert_allclose(part.g, whole.g[:, at], rtol=1e-9, atol=1e-9 * np.abs(part.g).max())
-    np.testing.assert_allclose(part.H, whole.H[:, at][:, :, at], rtol=1e-9)
-    assert part.cost == pytest.approx(whole.cost)
+    np.testing.assert_allclose(part.g, full.g[:, at], rtol=1e-9, atol=1e-9 * np.abs(part.g).max())
+    np.testing.assert_allclose(part.H, full.H[:, at][:, :, at], rtol=1e-9)
+    assert part.cost == pytest.approx(full.cost)
 
 
-def test_cameras_stand_where_the_last_parameters_asked_for_say(body, rig):
+def test_cached_cameras_follow_the_parameters(body, rig):
     problem = Problem(body, rig, [Unknowns(BENT)])
     theta = np.zeros((2, len(parameter_names(body, rig))))
     theta[1, len(body.names) + 4] = 0.5
@@ -206,8 +206,8 @@ def test_cameras_stand_where_the_last_parameters_asked_for_say(body, rig):
     np.testing.assert_allclose((moved - first)[0, :3, 3], [0.5, 0.0, 0.0], atol=1e-12)
 
 
-def test_what_is_known_without_pictures_counts_once(body, rig):
-    """Of each frame's own unknowns in each, of the shared ones in all together."""
+def test_priors_count_once(body, rig):
+    """The prior of own unknowns counts in each frame, that of shared ones once in all."""
     names, radius_scales = BENT[:2], body.names[-2:]
     known, free = (
         Problem(
@@ -220,7 +220,7 @@ def test_what_is_known_without_pictures_counts_once(body, rig):
     own, shared = np.arange(6.0).reshape(3, 2), np.array([1.0, -2.0])
     about = np.ones((3, 2)), np.zeros(2)
     with_it, without = (
-        one.equations(seen, (own, shared), ROUNDS[0], about) for one in (known, free)
+        one.equations(seen, (own, shared), STAGES[0], about) for one in (known, free)
     )
     off, own_information, information = own - about[0], np.full(2, 4.0), np.full(2, 16.0)
     H, g = np.zeros((3, 4, 4)), np.zeros((3, 4))
@@ -232,16 +232,16 @@ def test_what_is_known_without_pictures_counts_once(body, rig):
     assert with_it.cost - without.cost == pytest.approx(cost)
 
 
-def test_what_does_not_fit_is_refused(body, rig):
+def test_unknown_names_and_wrong_shapes_are_refused(body, rig):
     with pytest.raises(UnknownNameError, match="no_such"):
         Problem(body, rig, [Unknowns(["no_such"])])
     seen = [Observation(draw(body, rig, poses(body, 1, 1)[0]))]
     with pytest.raises(SettingsError, match="1 frames with 4 own and 0 shared"):
-        Problem(body, rig, [Unknowns(BENT)]).solve(seen, ROUNDS, (np.zeros((1, 3)), np.zeros(0)))
+        Problem(body, rig, [Unknowns(BENT)]).solve(seen, STAGES, (np.zeros((1, 3)), np.zeros(0)))
 
 
 @pytest.mark.parametrize("couples", [False, True])
-def test_deviations_of_frames_are_those_of_the_whole_system(couples):
+def test_own_deviations_match_the_full_system(couples):
     generator = np.random.default_rng(4)
     frames, p, q = 4, 3, 2
     J = generator.normal(size=(frames, 9, p + q))
@@ -251,17 +251,17 @@ def test_deviations_of_frames_are_those_of_the_whole_system(couples):
     equations = Equations(H, np.zeros((frames, p + q)), 0.0)
     nothing = np.zeros((frames, p))
     fitted = Solution(nothing, np.zeros(q), nothing, 0.0, lambda: (equations, nothing), coupling)
-    whole = np.zeros((frames * p + q, frames * p + q))
+    full = np.zeros((frames * p + q, frames * p + q))
     for k in range(frames):
         at = np.r_[k * p : (k + 1) * p, frames * p : frames * p + q]
-        whole[np.ix_(at, at)] += H[k]
+        full[np.ix_(at, at)] += H[k]
     if couples:
-        whole[: frames * p, : frames * p] += rows.T @ np.diag(information) @ rows
-    expected = np.sqrt(np.diag(np.linalg.inv(whole))[: frames * p]).reshape(frames, p)
+        full[: frames * p, : frames * p] += rows.T @ np.diag(information) @ rows
+    expected = np.sqrt(np.diag(np.linalg.inv(full))[: frames * p]).reshape(frames, p)
     np.testing.assert_allclose(fitted.own_deviations(), expected, rtol=1e-3)
 
 
-def test_what_nothing_tells_has_a_large_deviation():
+def test_unobservable_unknowns_have_a_large_deviation():
     rows = csr_array(np.array([[1.0, -1.0]]))
     coupling = LinearPrior(rows, np.zeros(1), np.array([1e6]))
     H = np.zeros((2, 2, 2))

@@ -1,4 +1,4 @@
-"""Surfaces of few triangles against exact shapes, bundled bodies, and points taken one by one."""
+"""Simplified surfaces: against exact shapes, bundled bodies, and brute-force distances."""
 
 import fast_simplification
 import numpy as np
@@ -22,14 +22,14 @@ RADIUS, TUBE, ENDS = 0.08, 0.06, (0.1, 0.3)
 
 
 class Rigid:
-    """What ``simplify_surfaces`` asks of surfaces."""
+    """Minimal surfaces for ``simplify_surfaces``."""
 
     def __init__(self, *outlines):
         self.rigid, self.bending = outlines, [None] * len(outlines)
 
 
 def ball_and_tube(slivers):
-    """A ball of 5120 triangles and beside it a closed tube of slivers along its whole length."""
+    """Return a ball of 5120 triangles beside a closed tube of slivers along its whole length."""
     ball = trimesh.creation.icosphere(4, radius=RADIUS)
     tube = trimesh.creation.cylinder(TUBE, segment=[[0, 0, z] for z in ENDS], sections=slivers)
     both = trimesh.util.concatenate([ball, tube])
@@ -37,7 +37,7 @@ def ball_and_tube(slivers):
 
 
 def distance_to_shape(points):
-    """Of points (n, 3) to the ball's or the tube's exact surface, whichever is nearer."""
+    """Return distances of points (n, 3) to the exact surface of the ball or the tube [m]."""
     ball = np.abs(np.linalg.norm(points, axis=1) - RADIUS)
     across = np.linalg.norm(points[:, :2], axis=1) - TUBE
     along = np.abs(points[:, 2] - np.mean(ENDS)) - 0.5 * (ENDS[1] - ENDS[0])
@@ -46,28 +46,28 @@ def distance_to_shape(points):
 
 
 def on_surface(outline, count=4000):
-    """Points on triangles drawn by their areas."""
+    """Return points drawn uniformly from a surface."""
     mesh = trimesh.Trimesh(outline.vertices, outline.triangles, process=False)
     return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=4)[0])
 
 
 def nearest_sample(points, outline):
-    """The distance of each point to the nearest of many samples: a little too large."""
+    """Return the distance of each point to the nearest of many samples: slightly too large."""
     samples = on_surface(outline, 20_000)
     return np.array([np.sqrt(((samples - p) ** 2).sum(axis=1).min()) for p in points])
 
 
 @pytest.mark.parametrize("slivers", [40, 100])
-def test_slivers_leave_the_shape_as_it_is(slivers):
+def test_surfaces_with_slivers_keep_their_shape(slivers):
     given = ball_and_tube(slivers)
     (simple,) = simplify_surfaces(Rigid(given))
     assert 0.5 * FEW < len(simple.triangles) < 1.2 * FEW
-    # Nothing has been lost, and nothing sticks out.
+    # Nothing is lost, and nothing protrudes.
     assert nearest_sample(on_surface(given, 400), simple).max() < 0.012
     assert distance_to_shape(on_surface(simple)).max() < 0.008
 
 
-def test_without_slivers_surfaces_are_what_the_simplifier_makes():
+def test_surfaces_without_slivers_are_the_simplifiers():
     surfaces = TreeSurfaces(load_model(bundled_model("person"), check=False).pose_tree())
     for count in (FEW, VERY_FEW):
         for given, simple in zip(surfaces.rigid, simplify_surfaces(surfaces, count), strict=True):
@@ -78,14 +78,14 @@ def test_without_slivers_surfaces_are_what_the_simplifier_makes():
                 assert {*map(tuple, simple.vertices)} <= {*map(tuple, points.astype(float))}
 
 
-def test_thin_rod_of_many_triangles_is_not_lost():
+def test_a_thin_rod_is_kept():
     rod = trimesh.creation.cylinder(0.0005, height=1.0, sections=600)
     (simple,) = simplify_surfaces(Rigid(outline_from_mesh(TriangleMesh(rod.vertices, rod.faces))))
     assert len(simple.triangles) > 0
     np.testing.assert_allclose(np.ptp(simple.vertices, axis=0)[2], 1.0, atol=0.01)
 
 
-def test_distance_of_surfaces():
+def test_surface_distance_matches_brute_force():
     generator = np.random.default_rng(7)
     one, other = (
         outline_from_mesh(
@@ -102,7 +102,7 @@ def test_distance_of_surfaces():
     assert surface_distance(one, one) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_body_loaded_again_is_not_simplified_again_but_a_changed_one_is():
+def test_surfaces_are_simplified_once_per_shape_and_count():
     once, again = (simplify_surfaces(Rigid(ball_and_tube(40)))[0] for _ in range(2))
     given = ball_and_tube(40)
     wider = outline_from_mesh(TriangleMesh(1.1 * given.vertices, given.triangles))
@@ -113,7 +113,7 @@ def test_a_body_loaded_again_is_not_simplified_again_but_a_changed_one_is():
     assert len(coarser.triangles) < len(once.triangles)
 
 
-def test_threads_that_simplify_at_once_find_what_one_does(monkeypatch):
+def test_simplification_is_thread_safe(monkeypatch):
     balls = [
         outline_from_mesh(TriangleMesh(ball.vertices, ball.faces))
         for ball in (trimesh.creation.icosphere(5, radius=0.1 + 0.01 * k) for k in range(12))
@@ -131,13 +131,13 @@ def test_threads_that_simplify_at_once_find_what_one_does(monkeypatch):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """Where surfaces are stored."""
+    """Folder of the stored surfaces."""
     monkeypatch.setattr(surface_store, "kernel_folder", lambda: tmp_path)
     return tmp_path / "surfaces"
 
 
 class Maker:
-    """Makes a ball of few triangles, and counts how often."""
+    """Makes a ball of few triangles, and counts the calls."""
 
     def __init__(self, radius=1.0):
         mesh = trimesh.creation.icosphere(2, radius=radius)
@@ -156,7 +156,7 @@ def same(one, other):
     )
 
 
-def test_a_process_loads_to_the_last_digit_what_another_simplified(folder, monkeypatch):
+def test_stored_surfaces_are_exact(folder, monkeypatch):
     monkeypatch.setattr(surface_store.load_or_make, "__defaults__", (0.0, 500))
     given = ball_and_tube(40)
     _simplify_cached.cache_clear()
@@ -172,7 +172,7 @@ def test_a_process_loads_to_the_last_digit_what_another_simplified(folder, monke
 @pytest.mark.parametrize(
     "damage", [lambda b: b"", lambda b: b[:-9], lambda b: b[:99] + b"x" + b[100:]]
 )
-def test_a_damaged_file_is_made_again(folder, damage):
+def test_a_damaged_file_is_replaced(folder, damage):
     make = Maker()
     load_or_make((b"key",), make, 0.0)
     (file,) = folder.iterdir()
@@ -185,7 +185,7 @@ def test_a_damaged_file_is_made_again(folder, damage):
     assert file.read_bytes() == whole
 
 
-def test_parts_of_a_key_are_told_apart_and_the_oldest_files_go(folder):
+def test_key_parts_are_distinguished_and_oldest_files_removed(folder):
     makers = [Maker(1.0 + k) for k in range(4)]
     keys = [(b"ab", b"c"), (b"a", b"bc"), (b"abc",), (b"abc", b"")]
     for key, make in zip(keys, makers, strict=True):
@@ -197,7 +197,7 @@ def test_parts_of_a_key_are_told_apart_and_the_oldest_files_go(folder):
     assert makers[0].count == 2
 
 
-def test_where_nothing_can_be_written_surfaces_are_made(tmp_path, monkeypatch):
+def test_without_a_writable_folder_surfaces_are_made(tmp_path, monkeypatch):
     make = Maker()
     (tmp_path / "file").touch()
     for folder in (None, tmp_path / "file", tmp_path / "none"):

@@ -1,4 +1,4 @@
-"""Pictures that say their own numbers, and videos of them by the encoders of PyAV."""
+"""Images that encode their own numbers, and videos of them encoded by PyAV."""
 
 from collections.abc import Sequence
 from fractions import Fraction
@@ -14,7 +14,7 @@ GRID = np.moveaxis(np.indices((SIDE, SIDE))[::-1], 0, -1).reshape(-1, 1, 2).asty
 
 
 def numbered(k: int, width: int = SIDE) -> np.ndarray:
-    """A picture (64, width, 3) whose stripes are the bits of its number, red at the top."""
+    """Return an image (64, width, 3) whose stripes are the bits of its number, red at the top."""
     stripes = np.repeat([20 + 200 * (k >> b & 1) for b in range(BITS)], width // BITS)
     picture = np.tile(stripes.astype(np.uint8)[None, :, None], (SIDE, 1, 3))
     picture[: SIDE // 4] = 230, 20, 20
@@ -22,7 +22,7 @@ def numbered(k: int, width: int = SIDE) -> np.ndarray:
 
 
 def number_of(picture: np.ndarray) -> int:
-    """The number of a picture, which compression may have blurred; it must be upright and red."""
+    """Return the number encoded in a possibly lossy image, which must be upright and in colour."""
     red, _, blue = picture[:8].reshape(-1, 3).mean(axis=0)
     assert red > 150 > 100 > blue, "the top is not red"
     row = picture[SIDE // 2, :, 1].reshape(BITS, -1).mean(axis=1)
@@ -30,14 +30,14 @@ def number_of(picture: np.ndarray) -> int:
 
 
 def shade(rays: np.ndarray) -> np.ndarray:
-    """A smooth grey picture (64, 64) of the directions (x / z, y / z) that its pixels look in."""
+    """Return a smooth grey image (64, 64) of its pixels' directions (x / z, y / z)."""
     x, y = rays.reshape(-1, 2).T
     grey = 128 + 60 * np.sin(4 * x) + 60 * np.cos(3 * y)
     return grey.reshape(SIDE, SIDE).round().astype(np.uint8)
 
 
 def distorted(D: Sequence[float], fisheye: bool = False) -> np.ndarray:
-    """What a lens shows of `shade`, by OpenCV's own way from pixels to directions."""
+    """Return the image of `shade` through a lens, by OpenCV's map from pixels to directions."""
     undistort = cv2.fisheye.undistortPoints if fisheye else cv2.undistortPoints
     return shade(undistort(GRID, K, np.array(D)))
 
@@ -50,7 +50,7 @@ def write_video(
     width: int = SIDE,
     **options: str,
 ) -> Path:
-    """A video of numbered pictures at times [s], 10 a second where not given."""
+    """Write a video of numbered images at times [s]; by default at 10 Hz."""
     import av
 
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Bags that the writers of rosbags wrote, of ROS 1 and of both kinds of ROS 2."""
+"""Bags written by rosbags, of ROS 1 and both kinds of ROS 2."""
 
 from typing import Any
 
@@ -26,7 +26,7 @@ NONE = np.zeros(0)
 
 
 class Bag:
-    """Writes messages of sensors into a bag; times are in [s] after START."""
+    """Writes sensor messages into a bag; times are in [s] after START."""
 
     def __init__(self, folder, kind):
         from rosbags import rosbag1, rosbag2, typesys
@@ -105,7 +105,7 @@ def pose(seed):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_camera_on_a_hand_and_two_publishers_of_joints(tmp_path, kind):
+def test_hand_camera_and_joints_of_two_publishers(tmp_path, kind):
     bag = Bag(tmp_path, kind)
     with bag.writer:
         bag.info("/hand/camera_info", "plumb_bob", PLUMB)
@@ -132,8 +132,8 @@ def test_a_camera_on_a_hand_and_two_publishers_of_joints(tmp_path, kind):
     np.testing.assert_array_equal(
         [hand.read_recorded(k) for k in order], [numbered(k) for k in order]
     )
-    straight = cv2.undistort(numbered(5), K, np.array(PLUMB), None, hand.lens.undistorted_matrix)
-    np.testing.assert_array_equal(hand.read(5), straight)
+    undistorted = cv2.undistort(numbered(5), K, np.array(PLUMB), None, hand.lens.undistorted_matrix)
+    np.testing.assert_array_equal(hand.read(5), undistorted)
     assert hand.link == "hand"
     np.testing.assert_allclose(hand.camera.X_WC, pose(1) @ pose(2), rtol=0, atol=1e-9)
     assert (joints.names, joints.positions.shape) == (("elbow", "wrist", "finger"), (60, 3))
@@ -141,13 +141,13 @@ def test_a_camera_on_a_hand_and_two_publishers_of_joints(tmp_path, kind):
     np.testing.assert_allclose(
         joints.positions[1:58, 2], 0.02 * np.arange(1, 58), rtol=0, atol=1e-5
     )
-    said = "\n".join(episode.warnings)
-    assert "/other: also has joint elbow of /joint_states" in said
-    assert "/side/compressed: no calibration in /camera_info" in said
-    assert "depth" not in said
+    warnings = "\n".join(episode.warnings)
+    assert "/other: also has joint elbow of /joint_states" in warnings
+    assert "/side/compressed: no calibration in /camera_info" in warnings
+    assert "depth" not in warnings
 
 
-def test_encodings(tmp_path):
+def test_images_of_all_encodings_are_decoded(tmp_path):
     bag, red, grey = Bag(tmp_path, "sqlite3"), numbered(0), np.full((SIDE, SIDE), 140, np.uint8)
     with bag.writer:
         bag.joints("/joint_states", 0.0, x=0.0)
@@ -170,13 +170,13 @@ def test_encodings(tmp_path):
         found = episode.camera(pattern).read(0).astype(int)
         assert np.abs(found - red)[2 : SIDE // 4 - 2, 2:-2].max() < 3, pattern
     assert not {"depth", "strange", "deep"} & set(episode.cameras)
-    said = "\n".join(episode.warnings)
-    assert "/strange is left out: bayer_rggb16 is not one of rgb8, bgr8" in said
-    assert "/deep is left out: mono16 is not one of rgb8, bgr8" in said
-    assert "/depth" not in said
+    warnings = "\n".join(episode.warnings)
+    assert "/strange is left out: bayer_rggb16 is not one of rgb8, bgr8" in warnings
+    assert "/deep is left out: mono16 is not one of rgb8, bgr8" in warnings
+    assert "/depth" not in warnings
 
 
-def test_lenses_are_undone_as_their_formulas_say(tmp_path):
+def test_images_are_undistorted_by_their_lens_models(tmp_path):
     bag, P = Bag(tmp_path, "mcap"), [50, 0, 30, 0, 0, 51, 29, 0, 0, 0, 1, 0]
     rational = (-0.3, 0.1, 1e-3, -2e-3, 0.01, 0.05, 0.02, 0.003)
     fisheye = (0.1, -0.02, 0.003, -0.001)
@@ -194,8 +194,8 @@ def test_lenses_are_undone_as_their_formulas_say(tmp_path):
     for name in ("rational", "fish"):
         one, found = episode.camera(name).camera, episode.camera(name).read(0)[:, :, 0]
         rays = (GRID[:, 0] - [one.center_x, one.center_y]) / [one.focal_x, one.focal_y]
-        off = np.abs(found.astype(int) - shade(rays))
-        assert off[2:-2, 2:-2].max() < 4, name
+        difference = np.abs(found.astype(int) - shade(rays))
+        assert difference[2:-2, 2:-2].max() < 4, name
     rectified = episode.camera("fish_image_rect")
     assert (rectified.camera.focal_x, rectified.camera.center_y, rectified.lens) == (50, 29, None)
     text = "camera 'other' is left out: /other/image_raw: distortion_model 'thin_prism'"
@@ -203,7 +203,7 @@ def test_lenses_are_undone_as_their_formulas_say(tmp_path):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_bags_that_are_odd_or_cut_short(tmp_path, kind):
+def test_odd_and_truncated_bags(tmp_path, kind):
     bag, years = Bag(tmp_path, kind), 3e8 if kind == "mcap" else 0.0
     with bag.writer:
         for k in range(COUNT):
@@ -211,13 +211,13 @@ def test_bags_that_are_odd_or_cut_short(tmp_path, kind):
             bag.image("/a", time, numbered(k), "rgb8", logged=0.1 * k)
             bag.joints("/joint_states", 0.1 * k - years, x=1.0)
     episode = open_episode(bag.path)
-    said, one = "\n".join(episode.warnings), episode.camera("a")
+    warnings, one = "\n".join(episode.warnings), episode.camera("a")
     kept = [k for k in range(COUNT) if k != 5 or kind == "sqlite3"]
     np.testing.assert_allclose(one.times - 1.7e9, 0.1 * np.array(kept), rtol=0, atol=1e-6)
     assert [number_of(one.read(k)) for k in range(len(kept))] == kept
-    assert ("/a: pictures: headers without time stamps" in said) == (kind == "sqlite3")
-    assert ("/a: pictures: number 5" in said) == (kind != "sqlite3")
-    assert ("its clock differs from the joint log's" in said) == (kind == "mcap")
+    assert ("/a: pictures: headers without time stamps" in warnings) == (kind == "sqlite3")
+    assert ("/a: pictures: number 5" in warnings) == (kind != "sqlite3")
+    assert ("its clock differs from the joint log's" in warnings) == (kind == "mcap")
     file = next(p for p in (bag.path, *bag.path.glob("*")) if p.suffix in (".bag", ".db3", ".mcap"))
     assert list(open_episode(file).cameras) == ["a"]
     file.write_bytes(file.read_bytes()[: file.stat().st_size * 2 // 3])
@@ -225,7 +225,7 @@ def test_bags_that_are_odd_or_cut_short(tmp_path, kind):
         open_episode(bag.path)
 
 
-def test_a_bag_without_pictures_says_what_it_has(tmp_path):
+def test_a_bag_without_images_lists_its_topics(tmp_path):
     bag = Bag(tmp_path, "mcap")
     with bag.writer:
         bag.image("/depth", 0.0, np.zeros((4, 4, 2), np.uint8), "16UC1")

@@ -1,4 +1,4 @@
-"""Cameras that calibration tools wrote, against OpenCV's own projection."""
+"""Cameras of calibration tools' files, against OpenCV's own projection."""
 
 import cv2
 import numpy as np
@@ -92,8 +92,8 @@ def load(tmp_path, text, name="any.txt"):
         (kalibr(), "cam1", True, RADIAL[:4]),
     ],
 )
-def test_points_land_where_opencv_projects_them(tmp_path, text, name, placed, coefficients):
-    """The lens as OpenCV has it; and without distortion the camera that is written of it."""
+def test_projections_match_opencv(tmp_path, text, name, placed, coefficients):
+    """Through the lens, and through the camera of undistorted images."""
     found = load(tmp_path, text)
     assert (name not in found.unplaced) == placed
     lens, camera = found.lenses[name], found.cameras[name]
@@ -104,13 +104,13 @@ def test_points_land_where_opencv_projects_them(tmp_path, text, name, placed, co
     pose = (RVEC, T) if placed else (np.zeros(3), np.zeros(3))
     points = POINTS if placed else POINTS + np.array([0, 0, 3])
     uv = cv2.projectPoints(points, *pose, K, lens.distortion)[0]
-    straight = cv2.undistortPoints(uv, K, lens.distortion, P=lens.undistorted_matrix)
-    np.testing.assert_allclose(camera.project(points)[0], straight[:, 0], atol=0.01)
+    undistorted = cv2.undistortPoints(uv, K, lens.distortion, P=lens.undistorted_matrix)
+    np.testing.assert_allclose(camera.project(points)[0], undistorted[:, 0], atol=0.01)
     exact = cv2.projectPoints(points, *pose, lens.undistorted_matrix, None)[0].reshape(-1, 2)
     np.testing.assert_allclose(camera.project(points)[0], exact, atol=1e-9)
 
 
-def test_fisheyes_are_undistorted_as_opencv_does(tmp_path):
+def test_fisheye_undistortion_matches_opencv(tmp_path):
     for text, name in ((kalibr(), "cam0"), (camera_info("equidistant", FISHEYE), "left"),
                        (toml(distortions=FISHEYE, fisheye=True), "left")):  # fmt: skip
         lens = load(tmp_path, text).lenses[name]
@@ -118,11 +118,11 @@ def test_fisheyes_are_undistorted_as_opencv_does(tmp_path):
         picture = np.random.default_rng(1).integers(0, 255, (*SIZE[::-1], 3), dtype=np.uint8)
         picture = cv2.GaussianBlur(picture, (0, 0), 3)
         expected = cv2.fisheye.undistortImage(picture, K, FISHEYE, Knew=lens.undistorted_matrix)
-        off = np.abs(lens.undistort(picture).astype(int) - expected)
-        assert np.percentile(off, 99) <= 1
+        difference = np.abs(lens.undistort(picture).astype(int) - expected)
+        assert np.percentile(difference, 99) <= 1
 
 
-def test_a_chain_begins_in_its_first_camera(tmp_path):
+def test_the_first_camera_of_a_chain_is_the_world(tmp_path):
     found = load(tmp_path, kalibr())
     assert found.unplaced == ()
     np.testing.assert_array_equal(found.cameras["cam0"].X_WC, np.eye(4))
@@ -132,7 +132,7 @@ def test_a_chain_begins_in_its_first_camera(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "messages"),
     [
         (camera_info("omnidirectional"), ["'left'", "distortion_model 'omnidirectional'"]),
         (camera_info("plumb_bob", RADIAL[:3]), ["'left'", "3 distortion coefficients"]),
@@ -157,14 +157,14 @@ def test_a_chain_begins_in_its_first_camera(tmp_path):
         ('{"left": [0.71, -0.97, 1.13, -2.3, 0.1, 2.2]}', ["it has left;", "camera_info", "TOML"]),
     ],
 )
-def test_what_cannot_be_used_is_named_with_what_is_read(tmp_path, text, words):
+def test_unusable_files_are_named_with_the_supported_formats(tmp_path, text, messages):
     with pytest.raises(CameraError) as caught:
         load(tmp_path, text)
-    for word in ["any.txt", *words]:
+    for word in ["any.txt", *messages]:
         assert word in str(caught.value)
 
 
-def test_distortion_is_refused_where_pictures_must_be_free_of_it(tmp_path):
+def test_distortion_is_refused_unless_allowed(tmp_path):
     path = tmp_path / "calibration.toml"
     path.write_text(toml())
     with pytest.raises(CameraError, match=r"'left' has distortion.*drake-pose undistort"):
@@ -173,7 +173,7 @@ def test_distortion_is_refused_where_pictures_must_be_free_of_it(tmp_path):
     assert list(load_cameras(path)) == ["left"]
 
 
-def test_pictures_are_undistorted_and_their_cameras_written(tmp_path):
+def test_undistort_writes_images_and_cameras(tmp_path):
     picture = np.random.default_rng(1).integers(0, 255, (*SIZE[::-1], 3), dtype=np.uint8)
     for name in ("left", "right"):
         (tmp_path / "images" / name).mkdir(parents=True)
@@ -191,7 +191,7 @@ def test_pictures_are_undistorted_and_their_cameras_written(tmp_path):
     found = load_cameras(cameras / "cameras.yaml")
     np.testing.assert_allclose(found["left"].focal_x, lens.undistorted_matrix[0, 0])
     np.testing.assert_allclose(found["left"].X_WC, found["right"].X_WC)
-    # What a lens saw has no black rim.
+    # Undistorted images have no black rim.
     white = np.full((*SIZE[::-1], 3), 255, np.uint8)
     assert lens.undistort(white).min() > 200
     for spoil, message in (

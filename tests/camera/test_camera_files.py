@@ -53,7 +53,7 @@ def test_round_trip_is_exact(tmp_path):
         np.testing.assert_array_equal(camera.X_WC, written[name].X_WC)
 
 
-def test_principal_points_may_be_counted_as_drake_does(tmp_path):
+def test_pixel_centers_may_follow_drake(tmp_path):
     for kind in ("focal_x: 60, focal_y: 61", "projection: parallel, pixels_per_metre: 1e2"):
         text = f"{{{kind}, pixel_centers: drake, {SIDES}, X_WC: {EYE}}}"
         camera = load_cameras(write(tmp_path, f"7: {text}"))["7"]
@@ -99,7 +99,7 @@ def test_bad_files_are_refused(tmp_path, text, message):
     assert len(str(caught.value)) < 1000
 
 
-def test_files_that_cannot_be_read_or_written(tmp_path):
+def test_unreadable_and_unwritable_files_are_refused(tmp_path):
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x80")
     (tmp_path / "large.yaml").write_text("# " + "x" * (1 << 21))
     files = {
@@ -161,7 +161,7 @@ cameras:
 
 
 def require_same(camera, config):
-    """A camera is what Drake itself makes of a CameraConfig."""
+    """Assert that a camera is what Drake makes of a CameraConfig."""
     color, _ = config.MakeCameras()
     X_PB = config.X_PB.GetDeterministicValue()
     expected = camera_from_drake(camera.name, color.core(), X_PB)
@@ -174,21 +174,21 @@ def require_same(camera, config):
     [FRONT, f"any:\n{indented(FRONT, 2)}", f"cameras:\n  any:\n{indented(FRONT, 4)}",
      f"Demo:\n  cameras:\n    any:\n{indented(FRONT, 6)}"],
 )  # fmt: skip
-def test_a_config_is_known_wherever_it_stands(text, tmp_path):
+def test_a_camera_config_is_recognised_at_any_level(text, tmp_path):
     cameras = load_cameras(write(tmp_path, text))
     assert list(cameras) == ["front"]
     assert isinstance(cameras["front"], PinholeCamera)
     require_same(cameras["front"], yaml_load_typed(schema=CameraConfig, data=FRONT))
 
 
-def test_a_scenario(tmp_path):
+def test_a_scenarios_cameras_are_read(tmp_path):
     cameras = load_cameras(write(tmp_path, SCENARIO))
     assert list(cameras) == ["front", "side", "plain"]
     np.testing.assert_array_equal(cameras["side"].kernel_parameters()[1:4], [500.0, 500.0, 300.0])
     require_same(cameras["plain"], CameraConfig())
 
 
-def test_scenarios_that_are_written_are_read_and_known_to_drake(tmp_path):
+def test_written_scenarios_are_read_back_and_by_drake(tmp_path):
     written = circle_of_cameras(5, size=(320, 240))
     rng = np.random.default_rng(0)
     R = np.linalg.qr(rng.normal(size=(3, 3)))[0]
@@ -202,7 +202,7 @@ def test_scenarios_that_are_written_are_read_and_known_to_drake(tmp_path):
         expected = written[name].kernel_parameters()
         np.testing.assert_allclose(camera.kernel_parameters(), expected, rtol=1e-14)
         np.testing.assert_allclose(camera.X_WC, written[name].X_WC, atol=1e-14)
-        # Drake makes cameras of what was written.
+        # Drake reads the written cameras.
         require_same(written[name], camera_to_config(written[name]))
     assert "label: true" in dump_scenario(written)
 
@@ -225,7 +225,7 @@ def test_scenarios_that_are_written_are_read_and_known_to_drake(tmp_path):
         ("label: true", "label: true\nX_WC: 3", "needs center_x"),
     ],
 )
-def test_what_a_camera_cannot_be(old, new, message, tmp_path):
+def test_invalid_camera_configs_are_refused(old, new, message, tmp_path):
     with pytest.raises(CameraError, match=message) as raised:
         load_cameras(write(tmp_path, f"front:\n{indented(FRONT.replace(old, new), 2)}"))
     assert "cameras.yaml" in str(raised.value)
@@ -241,7 +241,7 @@ def test_what_a_camera_cannot_be(old, new, message, tmp_path):
         ("One: {cameras: {a: {}}}\nTwo: {cameras: {a: {}}}", "several scenarios .One, Two."),
     ],
 )
-def test_scenarios_that_cannot_be_read(text, message, tmp_path):
+def test_invalid_scenarios_are_refused(text, message, tmp_path):
     with pytest.raises(CameraError, match=message):
         load_cameras(write(tmp_path, text))
 
@@ -251,13 +251,13 @@ CAMERA = PinholeCamera("head left", 64, 48, 60.0, 70.0, 25.3, 30.1, PLACE.GetAsM
 PARALLEL = ParallelCamera("flat", 64, 48, 50.0, 31.5, 23.5, np.eye(4))
 
 
-def seen_points():
-    """(n, 3) points of the world that the camera sees."""
+def visible_points():
+    """Return (n, 3) world points that the camera sees."""
     p_C = np.array([[0.0, 0.0, 1.0], [0.1, 0.2, 2.0], [-0.3, 0.1, 1.5], [0.2, -0.4, 3.0]])
     return p_C @ CAMERA.X_WC[:3, :3].T + CAMERA.X_WC[:3, 3]
 
 
-def test_a_camera_info_projects_as_the_camera():
+def test_a_ros_camera_info_projects_like_the_camera():
     info = yaml.safe_load(ros_camera_info(CAMERA))
     K, D, R, P = (
         np.array(info[key]["data"]).reshape(info[key]["rows"], info[key]["cols"])
@@ -274,11 +274,11 @@ def test_a_camera_info_projects_as_the_camera():
     X_CW = np.linalg.inv(CAMERA.X_WC)
     turn, shift = cv2.Rodrigues(X_CW[:3, :3])[0], X_CW[:3, 3]
     for used in (K, P[:, :3]):
-        uv, _ = cv2.projectPoints(seen_points(), turn, shift, used, D)
-        np.testing.assert_allclose(uv[:, 0], CAMERA.project(seen_points())[0], atol=1e-9)
+        uv, _ = cv2.projectPoints(visible_points(), turn, shift, used, D)
+        np.testing.assert_allclose(uv[:, 0], CAMERA.project(visible_points())[0], atol=1e-9)
 
 
-def test_a_launch_file_publishes_the_optical_frame():
+def test_a_launch_file_publishes_the_optical_frames_pose():
     launch = ElementTree.fromstring(ros_transforms([CAMERA], {"head left": "panda_link0"}))
     (node,) = launch
     assert (node.get("pkg"), node.get("exec")) == ("tf2_ros", "static_transform_publisher")
@@ -291,7 +291,7 @@ def test_a_launch_file_publishes_the_optical_frame():
     np.testing.assert_allclose(pose.GetAsMatrix4(), CAMERA.X_WC, atol=1e-12)
 
 
-def test_mujoco_sees_points_at_the_same_pixels(tmp_path):
+def test_mujoco_projects_to_the_same_pixels(tmp_path):
     (tmp_path / "cameras.xml").write_text(mujoco_cameras([CAMERA]))
     text = '<mujoco><worldbody><include file="cameras.xml"/></worldbody></mujoco>'
     (tmp_path / "scene.xml").write_text(text)
@@ -304,19 +304,19 @@ def test_mujoco_sees_points_at_the_same_pixels(tmp_path):
     camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
     everything = mujoco.mjtCatBit.mjCAT_ALL
     mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, camera, everything, scene)
-    # What its renderer hands to glFrustum, and the pose that it looks from.
+    # The frustum of MuJoCo's renderer, and its camera's pose.
     view = scene.camera[0]
-    x, y, z = ((seen_points() - data.cam_xpos[0]) @ data.cam_xmat[0].reshape(3, 3)).T
+    x, y, z = ((visible_points() - data.cam_xpos[0]) @ data.cam_xmat[0].reshape(3, 3)).T
     left = view.frustum_center - view.frustum_width
     u = 64 * (view.frustum_near * x / -z - left) / (2.0 * view.frustum_width)
     height = view.frustum_top - view.frustum_bottom
     v = 48 * (view.frustum_top - view.frustum_near * y / -z) / height
-    # It counts from the picture's corner, half a pixel before the first centre.
-    expected = CAMERA.project(seen_points())[0]
+    # MuJoCo's pixels start at the image corner, half a pixel before the first centre.
+    expected = CAMERA.project(visible_points())[0]
     np.testing.assert_allclose(np.column_stack([u, v]) - 0.5, expected, atol=1e-3)
 
 
-def test_cameras_that_others_do_not_know_are_refused():
+def test_cameras_without_a_counterpart_are_refused():
     for export in (
         ros_camera_info,
         lambda one: mujoco_cameras([one]),

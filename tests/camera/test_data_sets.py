@@ -1,4 +1,4 @@
-"""Data sets of LeRobot (2.1, 3.0) and folders of DROID, written as their recorders do."""
+"""LeRobot data sets (2.1, 3.0) and DROID folders, written as by their recorders."""
 
 import json
 
@@ -67,7 +67,7 @@ def write_v30(folder):
     write_video(
         folder / f"videos/{V3.format(chunk_index=0, video_key=TOP, file_index=0)}.mp4", numbers
     )
-    # LeRobot adds up durations, which are rounded.
+    # LeRobot sums rounded durations.
     begin = np.cumsum([0, *LENGTHS.values()]) * 0.1 + 1e-7
     times = {"from_timestamp": begin[:-1], "to_timestamp": begin[1:]}
     meta = {"chunk_index": [0, 0, 0], "file_index": [0, 0, 0], **times}
@@ -79,7 +79,7 @@ def write_v30(folder):
 
 
 @pytest.mark.parametrize("write", [write_v21, write_v30])
-def test_each_episode_has_its_own_pictures_and_rows(tmp_path, write):
+def test_episodes_have_their_own_images_and_rows(tmp_path, write):
     write(tmp_path)
     for n, count in LENGTHS.items():
         episode = open_episode(tmp_path, episode=n)
@@ -97,7 +97,7 @@ def test_each_episode_has_its_own_pictures_and_rows(tmp_path, write):
         open_episode(tmp_path)
 
 
-def test_a_part_of_a_data_set_and_what_is_wrong_in_it(tmp_path):
+def test_incomplete_and_damaged_data_sets(tmp_path):
     write_v21(tmp_path, names=None)
     for n in (0, 1):
         (tmp_path / f"data/chunk-000//episode_{n:06d}.parquet").unlink()
@@ -122,7 +122,7 @@ def test_a_part_of_a_data_set_and_what_is_wrong_in_it(tmp_path):
         open_episode(tmp_path)
 
 
-def test_a_recorded_data_set(shared_data):
+def test_a_real_data_set_is_read(shared_data):
     folder = shared_data / "humanoid_head_camera"
     for n, count in ((10, 290), (20, 297)):
         episode = open_episode(folder, episode=n)
@@ -142,7 +142,7 @@ STATE, STAMPS = "observation/robot_state", "observation/timestamp"
 
 
 def write_episode(folder, **changed):
-    """`111` is the hand's camera, and `222` a stereo one; datasets may be changed or left out."""
+    """Write a DROID episode: `111` is a hand camera, `222` a stereo camera; datasets may change."""
     import h5py
 
     K = np.array([[520.0, 0.0, 640.0], [0.0, 522.0, 360.0], [0.0, 0.0, 1.0]])
@@ -166,10 +166,10 @@ def write_episode(folder, **changed):
     return write_video(folder / "recordings" / "MP4" / "111.mp4", range(COUNT))
 
 
-def test_cameras_and_joints_are_on_the_recorders_clock(tmp_path):
+def test_cameras_and_joints_share_the_recorders_clock(tmp_path):
     write_episode(tmp_path)
     episode = open_episode(tmp_path)
-    # 256 x 64 pixels are two pictures side by side.
+    # 256 x 64 pixels are a stereo pair side by side.
     assert list(episode.cameras) == ["111", "222_left", "222_right"]
     joints = episode.joints
     assert joints.names == (*(f"joint{k}" for k in range(1, 8)), "gripper_position")
@@ -187,7 +187,7 @@ def test_cameras_and_joints_are_on_the_recorders_clock(tmp_path):
     assert "camera '111' is on the hand" in "\n".join(episode.warnings)
 
 
-def test_videos_that_are_longer_than_their_time_stamps(tmp_path):
+def test_videos_longer_than_their_time_stamps_are_cut(tmp_path):
     video = write_video(write_episode(tmp_path), range(COUNT + 2))
     episode = open_episode(tmp_path)
     assert len(episode.camera("111").times) == COUNT
@@ -200,7 +200,7 @@ def test_videos_that_are_longer_than_their_time_stamps(tmp_path):
     np.testing.assert_allclose(timed.camera("111").times, 1e-3 * (received - 41), rtol=0, atol=1e-6)
 
 
-def test_what_is_missing_or_damaged_is_named(tmp_path):
+def test_missing_and_damaged_files_are_named(tmp_path):
     file, none = tmp_path / "trajectory.h5", {"111_estimated_capture": None}
     for changed, message in (
         (none | {"111_frame_received": None}, r"111\.mp4: has no .*cameras/111_est.* has: 222_est"),

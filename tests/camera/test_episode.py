@@ -1,4 +1,4 @@
-"""Episodes in folders, and what is wrong in the times of any recording."""
+"""Episodes in folders, and checks of a recording's times."""
 
 from pathlib import Path
 
@@ -33,7 +33,7 @@ def write_images(folder, numbers):
     return folder / "images" / "a"
 
 
-def test_videos_beside_a_faster_log(tmp_path):
+def test_videos_with_a_faster_joint_log(tmp_path):
     write_video(tmp_path / "videos" / "left.mp4", range(12))
     write_video(tmp_path / "videos" / "right.avi", range(7), codec="mpeg4")
     write_table(tmp_path / "joint_angles.csv", "time", [round(0.02 * k, 3) for k in range(60)])
@@ -43,9 +43,9 @@ def test_videos_beside_a_faster_log(tmp_path):
     assert [number_of(left.read(k)) for k in (0, 9, 4)] == [0, 9, 4]
     assert (left.camera.focal_x, left.camera.focal_y, left.link) == (70.0, 75.0, None)
     np.testing.assert_allclose(joints.at(left.times)[:, 1], 5.0 * np.arange(12), rtol=0, atol=1e-9)
-    said = "\n".join(episode.warnings)
-    assert "camera 'lost' of cameras.yaml has no pictures" in said
-    assert "camera 'right' has no entry in cameras.yaml" in said
+    warnings = "\n".join(episode.warnings)
+    assert "camera 'lost' of cameras.yaml has no pictures" in warnings
+    assert "camera 'right' has no entry in cameras.yaml" in warnings
     with pytest.raises(SettingsError, match=r"--episode 3: .* is a single episode"):
         open_episode(tmp_path, episode=3)
     with pytest.raises(
@@ -54,7 +54,7 @@ def test_videos_beside_a_faster_log(tmp_path):
         open_episode(tmp_path / "joint_angles.csv")
 
 
-def test_stills_by_frame_and_pictures_by_time(tmp_path):
+def test_images_are_matched_by_frame_or_by_time(tmp_path):
     stamps, table = write_images(tmp_path, [2, 9, 10]) / "timestamps.csv", tmp_path / "other.csv"
     write_table(tmp_path / "joint_angles.csv", "frame", ["010", "2", "9"])
     episode = open_episode(tmp_path)
@@ -62,8 +62,10 @@ def test_stills_by_frame_and_pictures_by_time(tmp_path):
     assert one.frames == ("2", "9", "10")
     assert [number_of(one.read(k)) for k in range(3)] == [2, 9, 10]
     np.testing.assert_array_equal(episode.joints.of_frames(one.frames)[:, 1], [1.0, 2.0, 0.0])
-    said = open_episode(tmp_path, joints=write_table(table, "frame", ["2", "9", "11"])).warnings
-    assert any("1 of 3 pictures have no row in the joint log, and 1 of 3 rows" in s for s in said)
+    warnings = open_episode(tmp_path, joints=write_table(table, "frame", ["2", "9", "11"])).warnings
+    assert any(
+        "1 of 3 pictures have no row in the joint log, and 1 of 3 rows" in s for s in warnings
+    )
     write_table(table, "time", [0.0, 0.5, 1.0])
     with pytest.raises(SceneError, match=r"rows and pictures both need times .*timestamps\.csv"):
         open_episode(tmp_path, joints=table)
@@ -81,8 +83,8 @@ def test_stills_by_frame_and_pictures_by_time(tmp_path):
     assert any("2 frames have no picture, or no time" in text for text in timed.warnings)
 
 
-def test_a_folder_means_the_same_wherever_it_is_read(tmp_path):
-    """Pictures go before a video; what macOS leaves behind is none."""
+def test_scenes_and_episodes_read_a_folder_alike(tmp_path):
+    """Images take precedence over a video; hidden files of macOS are ignored."""
     (write_images(tmp_path, [1, 2]) / "._2.png").write_bytes(b"no picture")
     write_video(tmp_path / "videos" / "a.mp4", range(9))
     pose = f"X_WC: {np.eye(4).tolist()}"
@@ -92,19 +94,19 @@ def test_a_folder_means_the_same_wherever_it_is_read(tmp_path):
     np.testing.assert_array_equal(scene.read_image("a", "2"), one.read(1))
 
 
-def test_distortion_is_taken_out_as_the_formula_says(tmp_path):
+def test_images_are_undistorted_by_the_lens_model(tmp_path):
     D = (-0.3, 0.1, 2e-3, -1e-3, 0.02)
     file = tmp_path / "cameras.yaml"
-    seen = np.repeat(distorted(D)[:, :, None], 3, axis=2)
-    cv2.imwrite(str(write_images(tmp_path, []) / "0.png"), seen)
+    recorded = np.repeat(distorted(D)[:, :, None], 3, axis=2)
+    cv2.imwrite(str(write_images(tmp_path, []) / "0.png"), recorded)
     file.write_text(f"a: {{{LENS}, distortion: {[*D]}, link: hand, X_LC: {np.eye(4).tolist()}}}")
     one = open_episode(tmp_path).camera("a")
     lens, found = one.camera, one.read(0)[:, :, 0].astype(int)
     rays = (GRID[:, 0] - [lens.center_x, lens.center_y]) / [lens.focal_x, lens.focal_y]
     assert one.link == "hand"
-    assert np.abs(found - seen[:, :, 0]).max() > 8
+    assert np.abs(found - recorded[:, :, 0]).max() > 8
     assert np.abs(found - shade(rays))[2:-2, 2:-2].max() < 3
-    # Masks are never of distorted pictures.
+    # Masks must be of undistorted images.
     with pytest.raises(CameraError, match=r"camera 'a' has distortion.*drake-pose undistort"):
         load_camera_file(file)
     for text, message in (
@@ -129,14 +131,14 @@ def test_distortion_is_taken_out_as_the_formula_says(tmp_path):
         ("frame,q\n5,1\n", "camera 'a': 1 of 1 pictures have no row .* the same names in both"),
     ],
 )
-def test_tables_that_cannot_be_used(tmp_path, table, message):
+def test_invalid_joint_tables_are_refused(tmp_path, table, message):
     write_images(tmp_path, [1])
     (tmp_path / "joint_angles.csv").write_text(table)
     with pytest.raises(SceneError, match=message):
         open_episode(tmp_path)
 
 
-def test_what_is_no_episode(tmp_path):
+def test_other_folders_are_refused(tmp_path):
     (tmp_path / "nothing").mkdir()
     (tmp_path / "notes.txt").touch()
     for name, message in ((".", "notes.txt, nothing"), ("nothing", "empty"), ("gone", "no such")):
@@ -144,7 +146,7 @@ def test_what_is_no_episode(tmp_path):
             open_episode(tmp_path / name)
 
 
-def test_recorded_episodes(shared_data):
+def test_real_episodes_are_read(shared_data):
     for name, count, rows in (("short", 62, 184), ("cloth", 124, 370)):
         episode = open_episode(shared_data / "droid_episodes" / name)
         assert (episode.warnings, episode.joints.positions.shape) == ((), (rows, 8))
@@ -174,13 +176,13 @@ def episode(times, joints):
     return Episode.checked(Path("here"), [camera(times)], joints)
 
 
-def test_positions_between_rows_and_none_beyond_them():
-    wanted = np.array([-0.06, -0.04, 0.0, 0.05, 1.84, 1.9, 1.94, 1.96, np.nan])
-    found = log(TIMES).at(wanted)
+def test_positions_are_interpolated_within_the_log():
+    times = np.array([-0.06, -0.04, 0.0, 0.05, 1.84, 1.9, 1.94, 1.96, np.nan])
+    found = log(TIMES).at(times)
     expected = [np.nan, 0.0, 0.0, 0.1, 3.68, 3.8, 3.8, np.nan, np.nan]
     np.testing.assert_allclose(found[:, 0], expected, atol=1e-12)
     assert found[3, 1] == pytest.approx(0.5 * np.sin(0.1))
-    # A reading that is missing leaves no position up to its neighbours, which stand.
+    # A missing reading leaves a gap up to its neighbours.
     broken = log(TIMES)
     broken.positions[3, 0] = np.nan
     assert np.isnan(broken.at(np.array([0.2, 0.25, 0.35, 0.4]))[:, 0]).tolist() == [0, 1, 1, 0]
@@ -188,7 +190,7 @@ def test_positions_between_rows_and_none_beyond_them():
     np.testing.assert_array_equal(one.at(np.array([1.99, 2.0]))[:, 0], [np.nan, 7.0])
 
 
-def test_rows_of_frames_are_found_by_name_or_number():
+def test_frames_match_by_name_or_number():
     rows = JointLog(("x",), None, np.array([[1.0], [2.0], [3.0]]), ("7", "last", "12.0"))
     found = rows.of_frames(["0012", "007", "last", "8"])
     np.testing.assert_array_equal(found[:, 0], [3.0, 1.0, 2.0, np.nan])
@@ -198,13 +200,13 @@ def test_rows_of_frames_are_found_by_name_or_number():
         log(TIMES).of_frames(["7"])
 
 
-def test_clocks_that_run_backwards():
+def test_time_stamps_out_of_order_are_dropped_or_refused():
     times = TIMES.copy()
     times[5], times[7] = times[4], 0.05
-    kept, said = ascending_indices(times, "the log")
+    kept, warnings = ascending_indices(times, "the log")
     np.testing.assert_array_equal(kept, np.delete(np.arange(20), [5, 7]))
-    assert "number 5" in said[0]
-    assert "2 of 20 are left out" in said[0]
+    assert "number 5" in warnings[0]
+    assert "2 of 20 are left out" in warnings[0]
     times[8:] -= 0.6
     with pytest.raises(SceneError, match=r"the log: number 5 .* runs backwards or stands still"):
         ascending_indices(times, "the log")
@@ -212,7 +214,7 @@ def test_clocks_that_run_backwards():
         ascending_indices(np.zeros(0), "the log")
 
 
-def test_what_is_odd_is_named():
+def test_anomalies_of_times_are_warned_of():
     broken = log(TIMES)
     broken.positions[[3, 9], 1] = np.nan, np.inf
     for times, joints, expected in (
@@ -230,11 +232,11 @@ def test_what_is_odd_is_named():
         (TIMES, broken, "'y' is not a number in 2 of 20 rows, first in row 3"),
         (TIMES, None, "here: has no joint positions"),
     ):
-        said = episode(times, joints).warnings
-        assert expected in said[0] if expected else said == ()
+        warnings = episode(times, joints).warnings
+        assert expected in warnings[0] if expected else warnings == ()
 
 
-def test_what_cannot_be_used_is_refused():
+def test_unusable_episodes_are_refused():
     with pytest.raises(SceneError, match="here: has no camera's pictures because"):
         Episode.checked(Path("here"), [], log(TIMES), ["because"])
     with pytest.raises(SceneError, match="has no row"):

@@ -21,7 +21,7 @@ WIDTH, HEIGHT = 32, 24
 
 
 def picture(value):
-    """A picture (blue, green, red) whose red tells which one it is."""
+    """Return an image (blue, green, red) with the given red value."""
     seen = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     seen[:, :, 2] = value
     return seen
@@ -48,14 +48,14 @@ def read_all(source):
 
 
 class TestFolder:
-    def test_pictures_come_in_order_at_the_rate(self, tmp_path):
+    def test_images_come_in_order_at_the_rate(self, tmp_path):
         names = ["a0", "a1", "a3"]
         found = read_all(open_source(specify(write_folder(tmp_path, names), offset=5.0)))
         assert [one.frame for one in found] == names
         assert [one.time for one in found] == pytest.approx([5.0, 5.1, 5.2])
         assert [one.picture[0, 0].tolist() for one in found] == [[0, 0, 0], [10, 0, 0], [20, 0, 0]]
 
-    def test_frames_of_other_folders_tell_what_is_missing(self, tmp_path):
+    def test_frames_of_other_folders_reveal_missing_ones(self, tmp_path):
         own = write_folder(tmp_path / "own", ["0000", "0001", "0003"])
         other = write_folder(tmp_path / "other", ["0000", "0001", "0002", "0003"], ".jpg")
         source = open_source(specify(own, beside=(str(other),)))
@@ -64,7 +64,7 @@ class TestFolder:
         assert "front" in source.problems[0]
         assert "0002" in source.problems[0]
 
-    def test_time_stamps(self, tmp_path):
+    def test_time_stamps_order_the_frames(self, tmp_path):
         folder = write_folder(tmp_path, ["9", "10", "11", "12", "extra"])
         rows = ["9,0.0", "10,0.11", "11,0.11", "12,0.05", "13,0.4"]
         (folder / "timestamps.csv").write_text("\n".join(["frame,time", *rows]) + "\n")
@@ -79,7 +79,7 @@ class TestFolder:
         assert "no time of frame extra" in text
 
     @pytest.mark.parametrize("suffix", [".png", ".jpg"])
-    def test_corrupt_picture_costs_only_itself(self, tmp_path, suffix):
+    def test_a_corrupt_image_costs_only_itself(self, tmp_path, suffix):
         folder = write_folder(tmp_path, ["0", "1", "2", "3"], suffix)
         whole = (folder / f"1{suffix}").read_bytes()
         (folder / f"1{suffix}").write_bytes(whole[:-30])
@@ -91,7 +91,7 @@ class TestFolder:
         assert what in source.problems[0]
         assert "7 x 5" in source.problems[1]
 
-    def test_masks(self, tmp_path):
+    def test_masks_are_binary(self, tmp_path):
         mask = np.zeros((HEIGHT, WIDTH), np.uint8)
         mask[4:9, 3:6] = 200
         many = np.arange(WIDTH * HEIGHT).reshape(HEIGHT, WIDTH) % 256
@@ -101,14 +101,14 @@ class TestFolder:
         source = open_source(specify(tmp_path, background=None))
         found = [one.picture for one in read_all(source)]
         assert [one.dtype for one in found] == [bool, bool, bool]
-        # Nobody in the last one is no fault.
+        # An empty mask is valid.
         for one, expected in zip(found, (mask > 0, mask > 0, np.zeros_like(mask)), strict=True):
             np.testing.assert_array_equal(one, expected)
         assert "must have two" in source.problems[0]
         assert "full" in source.problems[1]
 
     @pytest.mark.parametrize(
-        ("names", "more", "stamps", "why"),
+        ("names", "more", "stamps", "reason"),
         [
             ([], {}, None, "no picture"),
             (["0"], {"rate_hz": None}, None, "rate_hz"),
@@ -121,11 +121,11 @@ class TestFolder:
             (["0"], {}, "frame,time\n1,1\n", "no time of any picture"),
         ],
     )
-    def test_what_cannot_be_read_says_why(self, tmp_path, names, more, stamps, why):
+    def test_unusable_folders_are_refused(self, tmp_path, names, more, stamps, reason):
         folder = write_folder(tmp_path, names)
         if stamps is not None:
             (folder / "timestamps.csv").write_text(stamps)
-        with pytest.raises(SceneError, match=why):
+        with pytest.raises(SceneError, match=reason):
             open_source(specify(folder, **more))
 
 
@@ -149,7 +149,7 @@ class TestVideo:
         found = read_all(open_source(specify(path, "video", rate_hz=50.0)))
         assert [one.time for one in found] == pytest.approx(0.02 * np.arange(6))
 
-    def test_what_is_cut_off_is_counted(self, tmp_path):
+    def test_missing_frames_of_a_truncated_video_are_counted(self, tmp_path):
         path = write_video(tmp_path / "v.avi", 10)
         whole = path.read_bytes()
         path.write_bytes(whole[: 9 * len(whole) // 10])
@@ -159,7 +159,7 @@ class TestVideo:
         assert source.dropped == 10 - len(found)
         assert f"ends after {len(found)} of 10 pictures" in source.problems[0]
 
-    def test_masks_in_a_video_are_what_is_light_and_grey_pictures_are_none(self, tmp_path):
+    def test_masks_in_a_video_are_thresholded_and_grey_images_refused(self, tmp_path):
         path = write_video(tmp_path / "v.avi", 11)
         source = open_source(specify(path, "video", background=None))
         found = read_all(source)
@@ -168,17 +168,17 @@ class TestVideo:
         assert source.dropped == 5
         assert "picture 3: 100% of it is neither dark nor light" in source.problems[0]
 
-    def test_what_is_no_video_or_of_another_size_is_refused(self, tmp_path):
+    def test_other_files_and_sizes_are_refused(self, tmp_path):
         (tmp_path / "text.avi").write_text("no video")
         write_video(tmp_path / "large.avi", 2, (64, 48))
         reasons = {"text": "not a video", "none": "no such video", "large": "64 x 48"}
-        for name, why in reasons.items():
-            with pytest.raises(SceneError, match=why):
+        for name, reason in reasons.items():
+            with pytest.raises(SceneError, match=reason):
                 open_source(specify(tmp_path / f"{name}.avi", "video"))
 
 
 class FakeCamera:
-    """Stands for cv2.VideoCapture: a device that fails now and then."""
+    """A stand-in for cv2.VideoCapture: a device that fails now and then."""
 
     opened = 0
 
@@ -204,9 +204,9 @@ class FakeCamera:
         pass
 
 
-def wait_for(what, patience=10.0):
-    end = time.monotonic() + patience
-    while not what():
+def wait_for(condition, timeout=10.0):
+    end = time.monotonic() + timeout
+    while not condition():
         assert time.monotonic() < end, "nothing happened"
         time.sleep(0.005)
 
@@ -214,7 +214,7 @@ def wait_for(what, patience=10.0):
 class TestDevice:
     @pytest.fixture
     def device(self, monkeypatch):
-        """Opens it after so many tries."""
+        """A function that opens a source whose camera fails a number of times first."""
         monkeypatch.setattr(cv2, "VideoCapture", FakeCamera)
         opened = []
 
@@ -228,18 +228,18 @@ class TestDevice:
         opened[0].close()
         assert opened[0].ended
 
-    def test_newest_picture_is_kept_and_the_camera_opened_again(self, device):
+    def test_the_latest_image_is_kept_and_the_camera_reopened(self, device):
         source = device(0)
-        # It cannot be opened at first, then gives three pictures at a time, and fails again.
+        # It cannot be opened at first, then provides three images at a time, and fails again.
         wait_for(lambda: FakeCamera.opened >= 4)
         one = source.read()
-        assert int(one.frame) >= 5, "older ones are gone"
+        assert int(one.frame) >= 5, "older images are dropped"
         assert abs(one.time - time.monotonic()) < 5.0
         assert not source.ended
         for k, expected in enumerate(("cannot be opened", "answers again", "stopped")):
             assert expected in source.problems[k]
 
-    def test_wrong_size_ends_it(self, device):
+    def test_a_wrong_size_ends_the_source(self, device):
         source = device(1, width=640, height=480)
         wait_for(lambda: source.ended)
         assert source.read() is None
@@ -273,7 +273,7 @@ class TestSourcesFile:
         (studio / "sources.yaml").write_text(yaml.safe_dump(entries, sort_keys=False))
         return load_sources(studio)
 
-    def test_file_is_read_in_the_order_of_the_cameras(self, studio):
+    def test_sources_have_the_order_of_the_cameras(self, studio):
         found = self.load(studio, ENTRIES)
         assert list(found) == ["camera_0", "camera_1"]
         one = found["camera_0"]
@@ -292,7 +292,7 @@ class TestSourcesFile:
         assert all(one.live and one.gives_masks for one in found.values())
 
     @pytest.mark.parametrize(
-        ("change", "why"),
+        ("change", "reason"),
         [
             ({"camera_9": {}}, "'camera_9' is not calibrated"),
             ({"camera_1": None}, "camera_1.*mapping"),
@@ -304,30 +304,30 @@ class TestSourcesFile:
             ({"camera_1": VIDEO | {"masks": True, "rate_hz": -1}}, "rate_hz"),
         ],
     )
-    def test_wrong_entries_are_named(self, studio, change, why):
-        with pytest.raises(SceneError, match=why) as error:
+    def test_invalid_entries_are_named(self, studio, change, reason):
+        with pytest.raises(SceneError, match=reason) as error:
             self.load(studio, ENTRIES | change)
         assert "sources.yaml" in str(error.value)
         with pytest.raises(SceneError, match=r"'camera_1' of .* has no source"):
             self.load(studio, {"camera_0": ENTRIES["camera_0"]})
 
-    def test_background_that_is_missing_or_of_another_size_is_named(self, studio):
+    def test_an_unusable_background_is_named(self, studio):
         missing = {"camera_0": ENTRIES["camera_0"] | {"background": "nothing"}}
         cv2.imwrite(str(studio / "empty/camera_1/0.png"), np.zeros((5, 7, 3), np.uint8))
         found = self.load(studio, ENTRIES | missing)
-        for name, why in (("camera_0", "empty-room"), ("camera_1", "7 x 5")):
-            with pytest.raises(SceneError, match=why):
+        for name, reason in (("camera_0", "empty-room"), ("camera_1", "7 x 5")):
+            with pytest.raises(SceneError, match=reason):
                 load_background_pictures(found[name])
 
 
 @pytest.mark.parametrize(
-    ("more", "why"),
+    ("more", "reason"),
     [
         ({"kind": "film"}, "kind"),
         ({"rate_hz": 0.0}, "rate_hz"),
         ({"width": 0}, "invalid picture size"),
     ],
 )
-def test_specification_checks_itself(more, why):
-    with pytest.raises(SettingsError, match=why):
+def test_invalid_specifications_are_refused(more, reason):
+    with pytest.raises(SettingsError, match=reason):
         specify("x", **more)

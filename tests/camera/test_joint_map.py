@@ -1,4 +1,4 @@
-"""Which column is which joint, in which unit: never assumed without a word."""
+"""Joints and units of a joint log's columns; every assumption is reported."""
 
 import math
 from xml.etree import ElementTree
@@ -22,7 +22,7 @@ ARM = {"names": tuple(f"panda_joint{k}" for k in range(1, 8)), "lower": LOW, "up
 POSES = np.array([[0.1, -0.5, 0.3, -2.4, 0.2, 2.0, 0.7], [0.2, -0.4, 0.1, -2.0, 0.1, 1.5, 0.9]])
 
 
-def mapped(logged, readings, model, **more):
+def map_log(logged, readings, model, **more):
     readings = np.array(readings, dtype=float)
     log = JointLog(logged, 0.1 * np.arange(len(readings)), readings)
     is_angle = [not name.startswith("slide") for name in model["names"]]
@@ -37,30 +37,30 @@ def mapped(logged, readings, model, **more):
         ("kLeftElbow kRightElbow", "right_elbow_joint left_elbow_joint", [1, 0]),
         ("joint1 joint2", "panda_joint1 panda_joint2", [0, 1]),
         ("panda_joint1 main_elbow", "elbow joint1", [1, 0]),
-        # Not unique, from either side; and words end as words do: bow is no elbow, 1 is no 11.
+        # Ambiguous matches are refused, and only whole words match: bow is not elbow, 1 not 11.
         ("elbow", "left_elbow right_elbow", [None]),
         ("left_elbow right_elbow", "elbow", [None, None]),
         ("bow joint1", "elbow joint11", [None, None]),
-        # Numbers alone, which do not begin where the model's do, are its joints in order.
+        # Numbered names that start at another number are the model's joints in order.
         ("joint_0 joint_2 joint_1", "j1 j2 j3", [0, 2, 1]),
         ("joint_0 joint_1", "panda_joint1 panda_joint2", [0, 1]),
         ("joint_0 joint_1", "panda_joint1 panda_joint2 finger", [None, None]),
         ("m0 m1 finger", "a1 a2 finger", [0, 1, 2]),
     ],
 )
-def test_names(logged, wanted, found):
+def test_names_are_matched(logged, wanted, found):
     names, joints = logged.split(), wanted.split()
     expected = {a: joints[k] for a, k in zip(names, found, strict=True) if k is not None}
-    matched, said = match_names(names, joints)
+    matched, warnings = match_names(names, joints)
     assert matched == expected
     if "0" in logged and expected:
-        assert all(f"{a} for {b}" in said[0] for a, b in expected.items() if a != b)
+        assert all(f"{a} for {b}" in warnings[0] for a, b in expected.items() if a != b)
 
 
-def test_positions_are_in_the_models_order_and_what_is_missing_is_named():
+def test_positions_have_the_models_order_and_missing_joints_are_reported():
     order = [6, 5, 3, 2, 1, 0]
     names = ("gripper", *(f"joint{k + 1}" for k in order))
-    found = mapped(names, np.column_stack([[0.5, 0.6], POSES[:, order]]), ARM)
+    found = map_log(names, np.column_stack([[0.5, 0.6], POSES[:, order]]), ARM)
     expected = np.where(np.arange(7) == 4, np.nan, POSES)
     np.testing.assert_array_equal(found.log.positions, expected)
     np.testing.assert_allclose(found.log.at(np.array([0.05]))[0, 0], 0.15)
@@ -70,14 +70,14 @@ def test_positions_are_in_the_models_order_and_what_is_missing_is_named():
         "columns of the joint log that are not joints: gripper",
     )
     with pytest.raises(SceneError, match=r"its columns are x, y, the joints panda_joint1,"):
-        mapped(("x", "y"), np.zeros((2, 2)), ARM)
+        map_log(("x", "y"), np.zeros((2, 2)), ARM)
 
 
-def test_units_are_told_or_follow_from_the_limits():
+def test_units_are_given_or_inferred_from_the_limits():
     names, degrees = ARM["names"], np.rad2deg(POSES)
     wide = ARM | {"lower": np.full(7, -3.0), "upper": np.full(7, 3.0)}
     holes = np.where(np.eye(2, 7, dtype=bool), np.nan, POSES)
-    for readings, model, units, words in (
+    for readings, model, units, message in (
         (POSES, ARM, None, "in rad (units): only as radians"),
         (holes, ARM, None, "in rad (units): only as radians"),
         (degrees, ARM, None, "in deg (units): only as degrees"),
@@ -85,55 +85,55 @@ def test_units_are_told_or_follow_from_the_limits():
         (POSES, ARM, "rad", None),
         (degrees, ARM, "deg", None),
     ):
-        found = mapped(names, readings, model, units=units)
+        found = map_log(names, readings, model, units=units)
         expected = holes if readings is holes else POSES
         np.testing.assert_allclose(found.log.positions, expected, atol=1e-12)
-        assert words in found.warnings[0] if words else found.warnings == ()
-    # 0.3 rad beyond a limit is no reason to take radians for degrees.
+        assert message in found.warnings[0] if message else found.warnings == ()
+    # Readings 0.3 rad beyond a limit do not suffice to infer degrees.
     beyond = [[3.3, *np.zeros(6)]]
     with pytest.raises(
         SceneError, match=r"'panda_joint1' is 3\.3 to 3\.3.*and not clearly degrees"
     ):
-        mapped(names, beyond, wide)
-    told = mapped(names, beyond, wide, units="rad").warnings[0]
-    assert "joint 'panda_joint1': column 'panda_joint1' gives 3.3 in row 0" in told
+        map_log(names, beyond, wide)
+    warning = map_log(names, beyond, wide, units="rad").warnings[0]
+    assert "joint 'panda_joint1': column 'panda_joint1' gives 3.3 in row 0" in warning
     with pytest.raises(SettingsError, match="units must be rad or deg, not 'turns'"):
-        mapped(names, POSES, ARM, units="turns")
+        map_log(names, POSES, ARM, units="turns")
 
 
-def test_normalised_readings_ask_for_their_ranges():
+def test_normalised_readings_need_a_range():
     limits = {"lower": np.full(2, -1.92), "upper": np.full(2, 1.92)}
     model, names = {"names": ("pan", "lift"), **limits}, ("main_pan", "main_lift", "claw")
-    # As degrees they would all be within 110.
+    # As degrees all would be within the limits of 110 degrees.
     for columns, readings in (
         (names, [[-99.5, 3.0, 1.0], [40.0, 9.0, 2.0]]),
         (names, [[-60.0, 3.0, 1.0], [40.0, 9.0, 100.0]]),
         (("pan.pos", "lift.pos"), [[-40.0, 3.0], [40.0, 9.5]]),
     ):
         with pytest.raises(SceneError, match=r"normalised.*give units.*from: \[-100, 100\]"):
-            mapped(columns, readings, model)
+            map_log(columns, readings, model)
     pan = Column("main_pan", 0.0192, 0.0, (-100.0, 100.0))
     table = {"pan": pan, "lift": Column("main_lift", 0.01)}
-    found = mapped(names, [[-100.0, 3.0, 0], [50.0, 2.0, 0], [100.0, 0, 0]], model, table=table)
+    found = map_log(names, [[-100.0, 3.0, 0], [50.0, 2.0, 0], [100.0, 0, 0]], model, table=table)
     np.testing.assert_allclose(found.log.positions[:, 0], [-1.92, 0.96, 1.92])
     np.testing.assert_array_equal(found.clipped, [[True, False], [False, False], [True, False]])
-    beside = mapped(names[:2], [[-100.0, 1.0]], {**model, "names": ("pan", "main_lift")},
+    beside = map_log(names[:2], [[-100.0, 1.0]], {**model, "names": ("pan", "main_lift")},
                     table={"pan": pan}).warnings[0]  # fmt: skip
     assert "to be in rad" in beside
-    said = mapped(names, [[-101.0, 3.0, 0.0]], model, table=table).warnings[0]
-    assert "joint 'pan': column 'main_pan' has 1 of 1 readings outside the joint map's" in said
+    warnings = map_log(names, [[-101.0, 3.0, 0.0]], model, table=table).warnings[0]
+    assert "joint 'pan': column 'main_pan' has 1 of 1 readings outside the joint map's" in warnings
 
 
-def test_a_joint_without_limits_counts_on_over_a_turn():
+def test_a_joint_without_limits_is_unwrapped():
     turning = np.linspace(0.0, 9.0, 30)
     read = np.arctan2(np.sin(turning), np.cos(turning))[:, None]
     read[7] = turning[7] = np.nan
     model = {"names": ("wheel",), "lower": np.array([-np.inf]), "upper": np.array([np.inf])}
-    found = mapped(("wheel",), read, model).log.positions[:, 0]
+    found = map_log(("wheel",), read, model).log.positions[:, 0]
     np.testing.assert_allclose(found, turning, atol=1e-12)
 
 
-def test_tables_of_joints(tmp_path):
+def test_joint_maps_are_read_and_applied(tmp_path):
     path = tmp_path / "joint_map.yaml"
     path.write_text(
         "shoulder_pan: {column: main_shoulder_pan, from: [100, -100], to: [-1.92, 1.92]}\n"
@@ -145,7 +145,7 @@ def test_tables_of_joints(tmp_path):
     model = {"names": ("shoulder_pan", "finger_joint", "wrist", "slide"), **limits}
     log = ("wrist_deg", "gripper_position", "main_shoulder_pan", "slide")
     readings = [[90.0, 0.5, 50.0, 250.0], [-45.0, 1.0, 100.0, 0.0]]
-    found = mapped(log, readings, model, table=read_joint_map(path))
+    found = map_log(log, readings, model, table=read_joint_map(path))
     expected = [[-0.96, 0.5, math.pi / 2, 0.25], [-1.92, 0.9, -math.pi / 4, 0.0]]
     np.testing.assert_allclose(found.log.positions, expected, atol=1e-12)
     assert found.clipped.tolist() == [[False] * 4, [True, False, False, False]]
@@ -167,11 +167,11 @@ def test_tables_of_joints(tmp_path):
         ({"panda_joint1": Column("b")}, "the joint log has no column 'b'; it has: panda"),
     ):
         with pytest.raises(UnknownNameError, match=message):
-            mapped(ARM["names"], POSES, ARM, table=table)
+            map_log(ARM["names"], POSES, ARM, table=table)
 
 
 def joints_of(urdf):
-    """The moving joints of a URDF that no other joint moves, and their limits."""
+    """Return the movable joints of a URDF that are not mimic joints, and their limits."""
     moving = [one for one in ElementTree.parse(urdf).iter("joint") if one.get("type") != "fixed"]
     moving = [one for one in moving if one.find("mimic") is None]
     sides = {
@@ -181,18 +181,18 @@ def joints_of(urdf):
     return {"names": tuple(one.get("name") for one in moving), **arrays}
 
 
-def test_recorded_logs(shared_data):
-    """A humanoid's fourteen arm joints are in its URDF's order, as its README says."""
+def test_real_logs_are_mapped(shared_data):
+    """The fourteen arm joints of a humanoid are in its URDF's order, as its README says."""
     folder = shared_data / "humanoid_head_camera"
     log = open_episode(folder, episode=10).joints
     model = joints_of(folder / "robot" / "g1_upper_body_from_torso.urdf")
-    found = mapped(log.names, log.positions, model)
+    found = map_log(log.names, log.positions, model)
     arms = [k for k, name in enumerate(model["names"]) if name not in found.not_logged]
     np.testing.assert_array_equal(found.log.positions[:, arms], log.positions[:, :14])
     assert found.unused == log.names[14:]
     robot = joints_of(shared_data / "droid_episodes" / "robot" / "panda_robotiq.urdf")
     log = open_episode(shared_data / "droid_episodes" / "cloth").joints
     table = {"finger_joint": Column("gripper_position", 0.8)}
-    found = mapped(log.names, log.positions, robot, table=table)
+    found = map_log(log.names, log.positions, robot, table=table)
     assert found.not_logged == ()
     np.testing.assert_allclose(found.log.positions[:, -1], 0.8 * log.positions[:, -1])

@@ -28,12 +28,12 @@ POINTS = np.array([[0.1, -0.2, 1.3], [-0.4, 0.3, 2.0]])
 
 
 def points_before_camera(rng, low, high):
-    """Points (50, 3) of the camera's frame between two corners, and of the world."""
+    """Return points (50, 3) in the camera's frame, and the same points in the world."""
     p_C = rng.uniform(low, high, (50, 3))
     return p_C, p_C @ X_WC[:3, :3].T + X_WC[:3, 3]
 
 
-def test_pinhole_projects_as_opencv_does():
+def test_pinhole_projection_matches_opencv():
     p_C, p_W = points_before_camera(np.random.default_rng(0), [-1, -1, 0.5], [1, 1, 4])
     K = np.array([[600.0, 0, 300], [0, 610, 250], [0, 0, 1]])
     rotation, _ = cv2.Rodrigues(X_WC[:3, :3].T)
@@ -43,15 +43,15 @@ def test_pinhole_projects_as_opencv_does():
     np.testing.assert_allclose(depth, p_C[:, 2], atol=1e-12)
 
 
-def test_resized_pictures_show_the_same():
-    """Corners of the picture, half a pixel outside of the outermost centres, stay corners."""
+def test_resized_cameras_keep_the_image_corners():
+    """Image corners, half a pixel outside the outermost centres, stay corners."""
     camera = replace(PINHOLE, X_WC=np.eye(4))
     before, after = camera.project(POINTS)[0], camera.resized(160, 240).project(POINTS)[0]
     np.testing.assert_allclose((after + 0.5) * [4.0, 2.0], before + 0.5)
 
 
-def test_a_mirrored_camera_s_pictures_are_the_mirror_s():
-    """Of a scene behind a mirror in the plane x = 0 of the camera; twice mirrored is none."""
+def test_a_mirrored_camera_sees_the_mirrored_scene():
+    """For a scene mirrored in the plane x = 0 of the camera; mirroring twice is the identity."""
     camera = replace(PINHOLE, X_WC=np.eye(4))
     seen = camera.mirrored().project(POINTS * [-1, 1, 1])[0]
     expected = [camera.width - 1, 0] + camera.project(POINTS)[0] * [-1, 1]
@@ -60,10 +60,10 @@ def test_a_mirrored_camera_s_pictures_are_the_mirror_s():
     np.testing.assert_array_equal(again.kernel_parameters(), camera.kernel_parameters())
 
 
-def test_what_depth_means():
+def test_depth_is_along_the_optical_axis():
     points = np.array([[0.5, 0.5, -7.0], [0.0, 0.0, 2.0], [0.5, 0.5, 9.0]])
     uv, depth = replace(PINHOLE, X_WC=np.eye(4)).project(points)
-    assert np.isnan(uv[0]).all(), "behind the camera there is no pixel"
+    assert np.isnan(uv[0]).all(), "points behind the camera have no pixel"
     np.testing.assert_allclose(uv[1], [300.0, 250.0])
     np.testing.assert_array_equal(depth, points[:, 2])
     uv, depth = replace(PARALLEL, X_WC=np.eye(4)).project(points)
@@ -101,7 +101,7 @@ def test_poses_and_kernel_parameters(camera, expected):
         ("X_WC", [np.diag([1.0, 1.0, *two]) for two in [(2.0, 1.0), (-1.0, 1.0), (1.0, 2.0)]]),
     ],
 )
-def test_bad_parameters_are_named(field, values):
+def test_invalid_parameters_are_named(field, values):
     for value in values:
         with pytest.raises(CameraError, match=f"'cam'.*{field}"):
             replace(PINHOLE, **{field: value})
@@ -115,7 +115,7 @@ def test_rounded_rotation_becomes_exact():
     np.testing.assert_allclose(R, X_WC[:3, :3], atol=2e-6)
 
 
-def test_drake_and_back():
+def test_conversion_to_drake_and_back():
     camera = replace(PINHOLE, near=0.05)
     color, depth, X_WS = camera_to_drake(camera, renderer_name="vtk")
     info = color.core().intrinsics()
@@ -131,7 +131,7 @@ def test_drake_and_back():
         camera_to_drake(PINHOLE, renderer_name="vtk", depth_range=(2.0, 1.0))
 
 
-def test_sensor_offset_of_a_drake_core_is_kept():
+def test_sensor_offset_of_a_render_camera_is_applied():
     X_BS = RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), np.array([0.1, 0.0, -0.2]))
     core = RenderCameraCore("vtk", CameraInfo(100, 80, 1.0), ClippingRange(0.3, 9.0), X_BS)
     X_WB = RigidTransform(X_WC)
@@ -140,13 +140,13 @@ def test_sensor_offset_of_a_drake_core_is_kept():
     assert camera.near == 0.3
 
 
-def test_tele_camera_projects_as_the_parallel_one():
+def test_telephoto_camera_approximates_the_parallel_one():
     for camera in (PARALLEL, replace(PARALLEL, center_x=-40.0, center_y=900.0)):
         color, _, X_WS = camera_to_drake(camera, renderer_name="vtk", depth_range=(-1.0, 3.0))
         tele = camera_from_drake("tele", color.core(), X_WS)
         _, p_W = points_before_camera(np.random.default_rng(1), [-1, -1, -1], [1, 1, 3])
         uv, depth = tele.project(p_W)
-        # 2 m off the middle depth at 30 km: 7e-5 of at most 700 pixels from the picture's middle.
+        # 2 m from the middle depth at 30 km: an error of 7e-5 times at most 700 pixels.
         np.testing.assert_allclose(uv, camera.project(p_W)[0], atol=0.1)
         clipping = color.core().clipping()
         assert clipping.near() <= depth.min() <= depth.max() <= clipping.far()
@@ -155,7 +155,7 @@ def test_tele_camera_projects_as_the_parallel_one():
     assert clipping.near() > 0.8 * clipping.far(), "far enough away for deep scenes, too"
 
 
-def test_a_circle_of_cameras_looks_at_its_middle_and_one_at_the_face():
+def test_cameras_on_a_circle_look_at_its_centre_and_the_face():
     middle, face_target = (0.1, 0.2, 0.9), (0.1, 0.2, 1.6)
     cameras = circle_of_cameras(8, radius=2.5, height=1.1, target=middle, size=(64, 48))
     *circle, face = cameras.values()

@@ -8,7 +8,7 @@ from drake_pose.errors import SettingsError, UnknownNameError
 
 
 def play(synchroniser, recorded, delays):
-    """Adds pictures in the order in which they arrive; the moments that come out."""
+    """Add images in the order of arrival, and return the groups."""
     arrivals = sorted(
         (time + delay, camera, time, k)
         for camera, stream in recorded.items()
@@ -17,17 +17,17 @@ def play(synchroniser, recorded, delays):
     found = []
     for _, camera, time, k in arrivals:
         synchroniser.add(camera, time, k)
-        while (moment := synchroniser.take()) is not None:
-            found.append(moment)
+        while (group := synchroniser.take()) is not None:
+            found.append(group)
     for camera in recorded:
         synchroniser.finish(camera)
-    while (moment := synchroniser.take()) is not None:
-        found.append(moment)
+    while (group := synchroniser.take()) is not None:
+        found.append(group)
     return found
 
 
 def brute_force(recorded, tolerance):
-    """Scans all pictures again for every moment."""
+    """Group the images by scanning all of them for each group."""
     rest = {name: list(stream) for name, stream in recorded.items()}
     found = []
     while any(rest.values()):
@@ -43,13 +43,13 @@ def brute_force(recorded, tolerance):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_streams_of_any_rate_are_grouped_as_brute_force_groups_them(seed):
+def test_groups_match_brute_force(seed):
     generator = np.random.default_rng(seed)
     recorded = {
         f"c{k}": [(float(t), i) for i, t in enumerate(np.cumsum(generator.exponential(0.1, 80)))]
         for k in range(generator.integers(2, 5))
     }
-    # Pictures arrive late and across each other, but every camera's own in order.
+    # Images arrive late and interleaved, but in order for each camera.
     delays = {name: np.sort(generator.random(80)) for name in recorded}
     synchroniser = Synchroniser(recorded, 0.04, 1e9)
     found = play(synchroniser, recorded, delays)
@@ -57,7 +57,7 @@ def test_streams_of_any_rate_are_grouped_as_brute_force_groups_them(seed):
     assert not synchroniser.take_changes()
 
 
-def test_camera_that_stops_is_waited_for_left_out_and_taken_back():
+def test_a_camera_that_stops_is_awaited_then_ignored_until_it_returns():
     synchroniser = Synchroniser(["a", "b"], 0.05, 0.25)
     synchroniser.add("a", 0.0, "a0")
     synchroniser.add("b", 0.01, "b0")
@@ -68,12 +68,12 @@ def test_camera_that_stops_is_waited_for_left_out_and_taken_back():
     assert synchroniser.take(now=0.36).time == pytest.approx(0.1)
     assert synchroniser.take_changes() == [CameraChange("b", 0.01, stopped=True)]
     assert synchroniser.ignored_cameras == ("b",)
-    # Nobody waits for it any more, and nothing is said twice.
+    # It is not awaited again, and not reported twice.
     assert dict(synchroniser.take().items) == {"a": "a2"}
     assert dict(synchroniser.take().items) == {"a": "a3"}
     assert synchroniser.take() is None
     assert not synchroniser.take_changes()
-    # Its picture of a moment that is over is too late, and no return.
+    # An image of a finished group is late and does not count as a return.
     assert not synchroniser.add("b", 0.31, "b3")
     assert synchroniser.late == {"a": 0, "b": 1}
     assert synchroniser.ignored_cameras == ("b",)
@@ -84,7 +84,7 @@ def test_camera_that_stops_is_waited_for_left_out_and_taken_back():
     assert dict(synchroniser.take().items) == {"a": "a4", "b": "b4"}
 
 
-def test_camera_that_never_gave_a_picture_is_reported_so():
+def test_a_camera_without_any_image_is_reported():
     synchroniser = Synchroniser(["a", "b"], 0.0, 0.1)
     synchroniser.add("a", 0.0, 0)
     assert synchroniser.take() is None
@@ -95,15 +95,15 @@ def test_camera_that_never_gave_a_picture_is_reported_so():
 
 
 @pytest.mark.parametrize(
-    ("cameras", "tolerance", "patience"),
+    ("cameras", "tolerance", "timeout"),
     [([], 0.1, 0.1), (["a", "a"], 0.1, 0.1), (["a"], -0.1, 0.1), (["a"], 0.1, 0.05)],
 )
-def test_what_cannot_be_is_refused(cameras, tolerance, patience):
+def test_invalid_settings_are_refused(cameras, tolerance, timeout):
     with pytest.raises(SettingsError):
-        Synchroniser(cameras, tolerance, patience)
+        Synchroniser(cameras, tolerance, timeout)
 
 
-def test_pictures_that_cannot_be_used():
+def test_unknown_cameras_and_repeated_times_are_refused():
     synchroniser = Synchroniser(["a"], 0.1, 0.1)
     with pytest.raises(UnknownNameError, match="'b'"):
         synchroniser.add("b", 0.0, None)

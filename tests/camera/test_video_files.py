@@ -1,4 +1,4 @@
-"""Videos by number and by time; PyAV encodes them, OpenCV's decoder is the other opinion."""
+"""Videos read by number and by time; encoded by PyAV and checked against OpenCV's decoder."""
 
 import sys
 
@@ -12,7 +12,7 @@ from tests.camera.recordings import number_of, write_video
 
 
 @pytest.mark.parametrize("codec", ["libx264", "libsvtav1", "mpeg4"])
-def test_any_picture_is_read_in_any_order(tmp_path, codec):
+def test_images_are_read_in_any_order(tmp_path, codec):
     path = write_video(tmp_path / "a.mp4", range(23), codec=codec)
     video, plain = TimedVideo(path), VideoPictures(path)
     np.testing.assert_allclose(video.times, 0.1 * np.arange(23), atol=1e-9)
@@ -28,14 +28,14 @@ def test_any_picture_is_read_in_any_order(tmp_path, codec):
     assert (number_of(plain.read(5)), plain.rate_hz) == (5, pytest.approx(10.0, rel=0.1))
 
 
-def test_times_are_those_of_the_file_where_its_rate_varies(tmp_path):
+def test_times_follow_a_variable_frame_rate(tmp_path):
     times = [0.0, 0.04, 0.08, 0.3, 0.34, 1.5]
     video = TimedVideo(write_video(tmp_path / "a.mkv", range(6), times))
     np.testing.assert_allclose(video.times, times, atol=1e-3)
     assert [number_of(video.read(k)) for k in (5, 0, 3)] == [5, 0, 3]
 
 
-def test_a_video_that_is_to_be_turned_is_turned_as_players_do(tmp_path):
+def test_rotation_metadata_is_applied(tmp_path):
     path = write_video(tmp_path / "a.mp4", range(3))
     one, far, data = 1 << 16, 1 << 30, path.read_bytes()
     upright = np.array([one, 0, 0, 0, one, 0, 0, 0, far], dtype=">i4").tobytes()
@@ -47,7 +47,7 @@ def test_a_video_that_is_to_be_turned_is_turned_as_players_do(tmp_path):
     assert (found[:, -8:, 0].mean() > 150) & (found[:8, :32, 0].mean() < 100)
 
 
-def test_videos_that_are_cut_short(tmp_path):
+def test_truncated_videos_are_read_up_to_their_end(tmp_path):
     for name, flag in (("a.mp4", "faststart"), ("b.mp4", "disable_chpl")):
         path = write_video(tmp_path / name, range(60), movflags=flag)
         path.write_bytes(path.read_bytes()[: int(0.8 * path.stat().st_size)])
@@ -58,13 +58,13 @@ def test_videos_that_are_cut_short(tmp_path):
     assert number_of(video.read(last)) == last
     with pytest.raises(SceneError, match=f"is truncated: it has pictures 0 to {last} only"):
         video.read(last + 1)
-    # Where the index is at the end, nothing is left.
+    # A truncated file whose index was at the end is unreadable.
     for name in ("b.mp4", "none.mp4"):
         with pytest.raises(SceneError, match=rf"{name}: not a video that PyAV can read"):
             TimedVideo(tmp_path / name)
 
 
-def test_the_extra_is_named_where_its_library_is_missing(tmp_path, monkeypatch):
+def test_a_missing_library_names_its_extra(tmp_path, monkeypatch):
     path = write_video(tmp_path / "a.mp4", range(2), codec="libsvtav1")
     monkeypatch.setitem(sys.modules, "av", None)
     for reader in (TimedVideo, VideoPictures):

@@ -118,7 +118,7 @@ def test_errors_name_missing_parts(tmp_path):
     with pytest.raises(SceneError, match="no folder masks"):
         load_scene(tmp_path)
     (tmp_path / "masks" / "left").mkdir(parents=True)
-    with pytest.raises(SceneError, match="give one of its folders: "):
+    with pytest.raises(SceneError, match="give one of its subfolders: "):
         load_scene(tmp_path.parent)
     with pytest.raises(SceneError, match=r"no cameras\.yaml"):
         load_scene(tmp_path)

@@ -62,9 +62,9 @@ def test_node_poses_of_coupled_joints_match_the_plant(tmp_path, root):
     for _ in range(5):
         _, values = drawn(tree, generator)
         q, X_WB = tree.positions_from(kinematics.split(values))
-        told = dict(zip(model.position_names, q, strict=True))
-        np.testing.assert_allclose(told["mirror"], 0.1 - told["lead"], atol=1e-9)
-        np.testing.assert_allclose(told["bend"], -0.5 * told["lead"], atol=1e-9)
+        positions = dict(zip(model.position_names, q, strict=True))
+        np.testing.assert_allclose(positions["mirror"], 0.1 - positions["lead"], atol=1e-9)
+        np.testing.assert_allclose(positions["bend"], -0.5 * positions["lead"], atol=1e-9)
         poses = link_poses(model, q)
         for node, X_WN in zip(tree.nodes, kinematics.poses(values), strict=True):
             np.testing.assert_allclose(X_WN, X_WB @ poses[node.name], atol=1e-9)
@@ -74,9 +74,9 @@ def test_node_poses_of_coupled_joints_match_the_plant(tmp_path, root):
 
 def test_report_lists_enforced_couplings_and_warns_of_others(tmp_path):
     tree = tree_of(tmp_path)
-    (told,) = model_warnings(tree.model, tree)
-    assert "'far' is written to follow joint 'lead'" in told
-    nodes = {one["name"]: one["joints"] for one in describe_model(write(tmp_path, HAND)).nodes}
+    (warning,) = model_warnings(tree.model, tree)
+    assert "'far' is written to follow joint 'lead'" in warning
+    nodes = {node["name"]: node["joints"] for node in describe_model(write(tmp_path, HAND)).nodes}
     assert [joint["follows"] for name in ("one", "two") for joint in nodes[name]] == [
         "", "-1 lead +0.1"
     ]  # fmt: skip

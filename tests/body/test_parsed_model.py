@@ -39,11 +39,11 @@ def test_limits_wider_than_four_turns_are_ignored(tmp_path, limits, kind):
     model = one_joint(tmp_path, limits, kind)
     np.testing.assert_allclose([model.lower[0], model.upper[0]], [-math.pi, math.pi])
     assert model.turns_freely[0]
-    said = [warning for warning in model.warnings if "joint 'j'" in warning]
-    assert len(said) == (limits is not None)
+    about_joint = [warning for warning in model.warnings if "joint 'j'" in warning]
+    assert len(about_joint) == (limits is not None)
     if limits is not None:
-        assert "turn freely" in said[0]
-        assert f"{float(limits.split(chr(34))[3]):g} rad" in said[0]
+        assert "turn freely" in about_joint[0]
+        assert f"{float(limits.split(chr(34))[3]):g} rad" in about_joint[0]
     tree = model.pose_tree()
     node = tree.node_index("b")
     grid = np.degrees(tree.grid(node, math.radians(20.0))[:, 0])

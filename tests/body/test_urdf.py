@@ -51,7 +51,7 @@ def test_materials_of_one_name_keep_their_colours(tmp_path):
     def material(rgba):
         return f'<material name="m"><color rgba="{rgba}"/></material>'
 
-    looks = {
+    materials = {
         "a": material("0 1 0 1"),
         "b": '<material name="m"/>',
         "c": '<material name="nowhere"/>',
@@ -60,8 +60,8 @@ def test_materials_of_one_name_keep_their_colours(tmp_path):
     }
     text = urdf(
         *[material("1 0 0 1")] * 2,
-        *(link(name, visual('<sphere radius="0.1"/>', one)) for name, one in looks.items()),
-        *(joint(f"to_{one}", "fixed", "a", one, limits=None) for one in "bcde"),
+        *(link(name, visual('<sphere radius="0.1"/>', own)) for name, own in materials.items()),
+        *(joint(f"to_{child}", "fixed", "a", child, limits=None) for child in "bcde"),
     )
     model = read(tmp_path, text)
     inspector = model.scene_graph.model_inspector()
@@ -278,7 +278,7 @@ def test_given_packages_take_precedence(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("scale", "upper", "said"),
+    ("scale", "upper", "expected"),
     [
         (1.0, 1.0, []),
         (1000.0, 1.0, ["are its lengths and the scale of its meshes in metres"]),
@@ -286,7 +286,7 @@ def test_given_packages_take_precedence(tmp_path):
         (1.0, 0.0, ["they never move: turn"]),
     ],
 )
-def test_implausible_sizes_and_limits_give_warnings(tmp_path, scale, upper, said) -> None:
+def test_implausible_sizes_and_limits_give_warnings(tmp_path, scale, upper, expected) -> None:
     sides = f"{0.3 * scale} {scale} {0.1 * scale}"
     box = f'<visual><geometry><box size="{sides}"/></geometry></visual>'
     at = {"axis": "0 0 1", "limits": f'lower="0" upper="{upper}"', "origin": 'xyz="0 0 0"'}
@@ -294,5 +294,5 @@ def test_implausible_sizes_and_limits_give_warnings(tmp_path, scale, upper, said
     path = tmp_path / "r.urdf"
     path.write_text(f'<robot name="r">{link("a", box)}{link("b", box)}{turn}</robot>')
     warnings = describe_model(path).warnings
-    assert len(warnings) == len(said)
-    assert all(text in one for text, one in zip(said, warnings, strict=True))
+    assert len(warnings) == len(expected)
+    assert all(text in warning for text, warning in zip(expected, warnings, strict=True))

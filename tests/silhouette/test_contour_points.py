@@ -23,8 +23,8 @@ def covered(meshes, X_CN, camera, uv):
     inside = np.zeros(len(uv), dtype=bool)
     for mesh, X in zip(meshes, X_CN, strict=True):
         p_C = mesh.vertices @ X[:3, :3].T + X[:3, 3]
-        seen, _ = camera.project(p_C)  # X_WC is the identity
-        for a, b, c in seen[mesh.triangles]:
+        projected, _ = camera.project(p_C)  # X_WC is the identity
+        for a, b, c in projected[mesh.triangles]:
             M = np.column_stack([b - a, c - a])
             if abs(np.linalg.det(M)) < 1e-12:
                 continue
@@ -49,8 +49,8 @@ def test_points_are_on_the_border_of_the_union(camera, kind):
         assert out.mean() < 0.01
         assert into.mean() > 0.99
         p_C = np.einsum("nij,nj->ni", X[points.nodes][:, :3, :3], points.p_N)
-        seen, _ = camera.project(p_C + X[points.nodes][:, :3, 3])
-        assert np.abs(seen - points.uv).max() < 1e-9
+        projected, _ = camera.project(p_C + X[points.nodes][:, :3, 3])
+        assert np.abs(projected - points.uv).max() < 1e-9
         assert np.allclose(np.linalg.norm(points.normals, axis=1), 1.0)
         assert np.all(points.uv > -0.5)
         assert np.all(points.uv < [camera.width - 0.5, camera.height - 0.5])

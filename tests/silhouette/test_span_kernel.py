@@ -193,11 +193,11 @@ def require_nearest(meshes, X_CN, camera):
     outlines = [outline_from_mesh(mesh) for mesh in meshes]
     image = draw_labels(outlines, labels, X_CN, camera, EMPTY)
     depths = np.array([brute_force_depth(m, X, camera) for m, X in zip(meshes, X_CN, strict=True)])
-    seen = np.isfinite(depths).any(axis=0)
-    np.testing.assert_array_equal(image != EMPTY, seen)
-    own = np.take_along_axis(depths, np.where(seen, image - 1, 0)[None], axis=0)[0]
+    is_covered = np.isfinite(depths).any(axis=0)
+    np.testing.assert_array_equal(image != EMPTY, is_covered)
+    own = np.take_along_axis(depths, np.where(is_covered, image - 1, 0)[None], axis=0)[0]
     # The kernel's depths are 32-bit floats: either surface may win where depths are equal.
-    assert (own[seen] <= depths.min(axis=0)[seen] * (1.0 + 1e-5)).all()
+    assert (own[is_covered] <= depths.min(axis=0)[is_covered] * (1.0 + 1e-5)).all()
     return image, int((np.isfinite(depths).sum(axis=0) > 1).sum())
 
 

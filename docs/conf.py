@@ -51,6 +51,7 @@ include_patterns = ["*.md", "docs/**.md", "docs/*.rst", "tutorials/*.md", "urdf/
 exclude_patterns = [".*", "build", "results"]
 myst_heading_anchors = 4
 html_theme = "furo"
+html_theme_options = {"light_css_variables": {"code-font-size": "75%"}}
 html_title = f"drake_pose {__version__}"
 html_copy_source = False
 

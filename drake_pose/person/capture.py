@@ -482,7 +482,7 @@ def require_person(recording: PersonRecording, count: int) -> PersonRecording:
     the masks.
 
     Raises:
-        As `capture_checked`.
+        CameraError, MaskError, ModelError, SettingsError: as for `capture_checked`.
     """
     if not recording.seen:
         raise SettingsError(

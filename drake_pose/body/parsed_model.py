@@ -295,7 +295,9 @@ def _intersect_limits(
         if low > high + _ROUNDING:
             raise ModelError(f"{conflict}no value for both; widen them")
         if high - low <= _ROUNDING < leader_range[1] - leader_range[0]:
-            warnings.append(f"{conflict}only {low:g}: the follower's limits are ignored")
+            warnings.append(
+                f"{conflict}only {low:g}: the follower's limits are ignored; correct them"
+            )
             continue
         lower[leader], upper[leader], free[leader] = low, max(low, high), False
     for follower, leader, multiplier, offset in couplings:
@@ -334,7 +336,7 @@ def _search_limits(
     unlimited, one_sided = low == -high == -np.inf, np.isinf(low) != np.isinf(high)
     if is_length:  # Such slides may place the object in the world: see tree_builder.
         remark = f"{title} has limits of {low:g} and {high:g} m, more than {widest:g} m apart: "
-        remark = "" if unlimited or one_sided else f"{remark}they are ignored"
+        remark = "" if unlimited or one_sided else f"{remark}they are ignored; correct them"
         return -np.inf, np.inf, True, remark
     advice = (
         "give it a lower and an upper limit in the model file (or to load_model: "
@@ -354,7 +356,8 @@ def _search_limits(
     elif not unlimited:
         remark = (
             f"{title} has limits of {low:g} and {high:g} rad, more than {turns:g} turns apart: it "
-            f"is taken to turn freely, and its angle is reported from {searched}"
+            f"is taken to turn freely, and its angle is reported from {searched}; correct the "
+            "limits if it does not"
         )
     return float(start), float(end), True, remark
 

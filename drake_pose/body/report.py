@@ -101,7 +101,8 @@ def model_warnings(
     if constraints:
         warnings.append(
             f"{constraints} constraints between joints or links are written in the file; they are "
-            "not enforced: each joint is searched independently"
+            "not enforced: each joint is searched independently; hold dependent joints (--hold), "
+            "or write their dependence as <mimic>"
         )
     searched = {position for node in tree.nodes for position in node.positions} - {*tree.held}
     for follower, leader, *_ in model.couplings:
@@ -109,12 +110,13 @@ def model_warnings(
             first, second = (model.position_names[k] for k in (follower, leader))
             warnings.append(
                 f"joint '{first}' is written to follow joint '{second}' (<mimic>): not enforced, "
-                "the joint is searched independently, because other joints move their links, too"
+                "the joint is searched independently, because other joints move their links, too; "
+                "hold it (--hold) if its position is known"
             )
     if tree.unobserved_positions and tree.root == "world":
         warnings.append(
-            "these joints move no visual geometry and keep their default values: "
-            + ", ".join(tree.unobserved_positions)
+            "these joints move no visual geometry and keep their default values; add geometry to "
+            "their links to estimate them: " + ", ".join(tree.unobserved_positions)
         )
     warnings += _size_warnings(model, tree)
     slides = [
@@ -129,7 +131,7 @@ def model_warnings(
             "default values; a root position moves it: " + ", ".join(slides)
         )
     warnings += [
-        f"link '{node.name}' is not watertight: its silhouette may have gaps"
+        f"link '{node.name}' is not watertight: its silhouette may have gaps; close its mesh"
         for node in tree.nodes
         if not node.mesh.is_empty and not is_watertight(node.mesh)
     ]
@@ -153,8 +155,8 @@ def _size_warnings(
     warnings = []
     if not smallest <= size <= largest:
         warnings.append(
-            f"the body is {size:.3g} m long from end to end: are its lengths and the scale of its "
-            "meshes in metres?"
+            f"the body is {size:.3g} m long from end to end; check that its lengths and the scale "
+            "of its meshes are in metres"
         )
     immobile = [
         model.position_names[position]
@@ -164,7 +166,8 @@ def _size_warnings(
     ]
     if immobile:
         warnings.append(
-            f"the limits of these joints leave one value, so they never move: {', '.join(immobile)}"
+            "the limits of these joints leave one value (widen them if they move), so they never "
+            f"move: {', '.join(immobile)}"
         )
     return warnings
 
@@ -187,7 +190,8 @@ def _symmetry_warnings(model: ArticulatedModel) -> list[str]:
             if _is_symmetric(group.mesh, np.linalg.inv(X[0]) @ X[1]):
                 warnings.append(
                     f"joint '{model.position_names[position]}' turns link '{group.name}' about the "
-                    "link's own axis of symmetry: no silhouette can show its angle"
+                    "link's own axis of symmetry: no silhouette can show its angle; do not use it, "
+                    "or hold it (--hold)"
                 )
     return warnings
 

@@ -105,7 +105,10 @@ def map_joints(
         angles, rows = {column: readings_of[column] for column in turning}, [*turning.values()]
         others = np.array([one for name, one in readings_of.items() if name not in used])
         units, why = _find_unit(angles, others, lower[rows], upper[rows])
-        warnings.append(f"angles of the joint log are assumed to be in {units} (units): {why}")
+        warnings.append(
+            f"angles of the joint log are assumed to be in {units}: {why}; if they are not, give "
+            "the unit (units)"
+        )
     scale = UNITS[units or "rad"]
     columns |= {j: Column(c, scale if c in turning else 1.0) for c, j in matched.items()}
     positions = np.full((len(log.positions), len(names)), np.nan)
@@ -121,7 +124,10 @@ def map_joints(
     taken = {column.name for column in columns.values()}
     unused = tuple(name for name in log.names if name not in taken)
     if missing:
-        warnings.append(f"joints that are not logged: {', '.join(missing)}")
+        warnings.append(
+            f"joints that are not logged: {', '.join(missing)}; hold them (--hold) or map columns "
+            "to them (joint map)"
+        )
     if unused:
         warnings.append(f"columns of the joint log that are not joints: {', '.join(unused)}")
     mapped = JointLog(tuple(names), log.times, positions, log.frames)

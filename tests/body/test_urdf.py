@@ -281,8 +281,8 @@ def test_given_packages_take_precedence(tmp_path):
     ("scale", "upper", "expected"),
     [
         (1.0, 1.0, []),
-        (1000.0, 1.0, ["are its lengths and the scale of its meshes in metres"]),
-        (0.001, 1.0, ["are its lengths and the scale of its meshes in metres"]),
+        (1000.0, 1.0, ["its lengths and the scale of its meshes are in metres"]),
+        (0.001, 1.0, ["its lengths and the scale of its meshes are in metres"]),
         (1.0, 0.0, ["they never move: turn"]),
     ],
 )

@@ -66,7 +66,8 @@ def test_positions_have_the_models_order_and_missing_joints_are_reported():
     np.testing.assert_allclose(found.log.at(np.array([0.05]))[0, 0], 0.15)
     assert (found.not_logged, found.unused) == (("panda_joint5",), ("gripper",))
     assert found.warnings[-2:] == (
-        "joints that are not logged: panda_joint5",
+        "joints that are not logged: panda_joint5; hold them (--hold) or map columns to them (joint "
+        "map)",
         "columns of the joint log that are not joints: gripper",
     )
     with pytest.raises(SceneError, match=r"its columns are x, y, the joints panda_joint1,"):
@@ -78,10 +79,10 @@ def test_units_are_given_or_inferred_from_the_limits():
     wide = ARM | {"lower": np.full(7, -3.0), "upper": np.full(7, 3.0)}
     holes = np.where(np.eye(2, 7, dtype=bool), np.nan, POSES)
     for readings, model, units, message in (
-        (POSES, ARM, None, "in rad (units): only as radians"),
-        (holes, ARM, None, "in rad (units): only as radians"),
-        (degrees, ARM, None, "in deg (units): only as degrees"),
-        (POSES, wide, None, "in rad (units): but as degrees they would be within"),
+        (POSES, ARM, None, "in rad: only as radians"),
+        (holes, ARM, None, "in rad: only as radians"),
+        (degrees, ARM, None, "in deg: only as degrees"),
+        (POSES, wide, None, "in rad: but as degrees they would be within"),
         (POSES, ARM, "rad", None),
         (degrees, ARM, "deg", None),
     ):

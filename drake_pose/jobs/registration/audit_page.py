@@ -1,4 +1,4 @@
-"""The page of an audit: what contradicts the rest, by how much, and what would go unnoticed."""
+"""The page report.html of an audit: errors, their sizes, and minimum detectable offsets."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -20,7 +20,7 @@ from drake_pose.registration.findings import Diagnosis, Finding
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 
 OnePicture = tuple[str, str, list[Finding]]
-"""A frame, what is wrong there in a few words, and what is corrected in it."""
+"""A frame to draw: its name, words for its title, and the findings to be corrected."""
 
 
 def write_audit_page(
@@ -31,11 +31,15 @@ def write_audit_page(
     overlay: bool = True,
     most_pictures: int = 8,
 ) -> None:
-    """Writes report.html of an audit, and the outlines that it shows, as given and as found.
+    """Write report.html of an audit, and pictures of the robot as given and as found.
 
     Args:
-        overlay: whether outlines are drawn; those that lie in the folder are shown in any case.
-        most_pictures: how many frames have pictures, of each camera.
+        folder: the result folder.
+        inputs: inputs of the audit.
+        found: the diagnosis.
+        summary: content of summary.json.
+        overlay: whether pictures are drawn; the page shows existing ones in any case.
+        most_pictures: maximum number of frames with pictures, for each camera.
     """
     if overlay:
         _draw_outlines(folder, inputs, found, most_pictures)
@@ -107,9 +111,9 @@ def detectable_offset(offset: float, kind: str) -> str:
 
 
 def correction_row(one: Mapping[str, Any], normal: float = 1.96) -> dict[str, Any]:
-    """What is off as the page shows it: its correction, each part with its 95 % interval.
+    """Return an entry of ``contradictions`` with ``parts``: texts of value and 95 % interval.
 
-    ``normal``: standard deviations to either side that an interval has.
+    ``normal``: half-width of an interval in standard deviations.
     """
     parts = []
     for key in (key for key in one if key.startswith(("angle_deg", "shift_"))):
@@ -127,12 +131,12 @@ def _sd_key(key: str) -> str:
 
 
 def _cameras(summary: Mapping[str, Any]) -> list[str]:
-    """The cameras that were compared."""
+    """Return the names of the cameras that were compared."""
     return list(dict.fromkeys(name for one in summary["frames"].values() for name in one["fits"]))
 
 
 def _camera_row(name: str, summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Of a camera: how well its frames fit as given and when freed, and what is off."""
+    """Return a row of the table of cameras: mean inlier ratios as given and refined, and errors."""
     frames = [one for one in summary["frames"].values() if name in one["fits"]]
     freed = [one["fits_when_freed"][name] for one in frames if name in one["fits_when_freed"]]
     return {
@@ -169,7 +173,7 @@ def _errors_of(kinds: Sequence[str], name: str, summary: Mapping[str, Any]) -> l
 
 
 def _draw_outlines(folder: Path, inputs: RegistrationInputs, found: Diagnosis, most: int) -> None:
-    """Draws the robot at positions as given and as found, where joints explain what is off."""
+    """Draw the robot as given and as found in at most ``most`` frames with errors of joints."""
     names = TreeKinematics(inputs.tree).names
     common = [one for one in found.common if corrected(np.zeros(len(names)), names, one)]
     draw, chosen = body_drawer(inputs.tree, inputs.visible_nodes), list[OnePicture]()
@@ -192,7 +196,13 @@ def _draw_outlines(folder: Path, inputs: RegistrationInputs, found: Diagnosis, m
 
 
 def corrected(values: Array, names: Sequence[str], one: Finding) -> tuple[Array, ...]:
-    """Joint values (m,) with what a finding adds to them; empty: it says no joint's value."""
+    """Return joint values (m,) corrected by a finding; empty if it does not correct joints.
+
+    Args:
+        values: (m,) joint values [rad or m].
+        names: (m,) names of the joints.
+        one: the finding.
+    """
     added = dict(one.joints)
     if one.kind == "joint":
         added = {one.name: one.angle if one.angle_sd > 0.0 else one.shift}

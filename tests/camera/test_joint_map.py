@@ -66,8 +66,8 @@ def test_positions_have_the_models_order_and_missing_joints_are_reported():
     np.testing.assert_allclose(found.log.at(np.array([0.05]))[0, 0], 0.15)
     assert (found.not_logged, found.unused) == (("panda_joint5",), ("gripper",))
     assert found.warnings[-2:] == (
-        "joints that are not logged: panda_joint5; hold them (--hold) or map columns to them (joint "
-        "map)",
+        "joints that are not logged: panda_joint5; hold them (--hold) or map columns to them "
+        "(joint map)",
         "columns of the joint log that are not joints: gripper",
     )
     with pytest.raises(SceneError, match=r"its columns are x, y, the joints panda_joint1,"):

@@ -125,12 +125,12 @@ def test_covariance_gives_student_intervals_within_limits(tree):
     one, other = (
         covariance_pose_set(tree, pose, np.diag(deviations**2), count) for count in (1, 4)
     )
-    for told, count in ((one, 1), (other, 4)):
+    for pose_set, count in ((one, 1), (other, 4)):
         widths = student.ppf(0.975, 6 * count) * deviations
-        ends = [(joint.low, joint.high) for joint in told.joints]
+        ends = [(joint.low, joint.high) for joint in pose_set.joints]
         np.testing.assert_allclose(ends, np.array([[0.5], [0.2]]) + widths[:, None] * [-1, 1])
-        np.testing.assert_array_equal(told.modes[0].q, [7.0, 8.0])
-        assert told.modes[0].J == 7.0
+        np.testing.assert_array_equal(pose_set.modes[0].q, [7.0, 8.0])
+        assert pose_set.modes[0].J == 7.0
     wide = covariance_pose_set(tree, pose, 100.0 * np.eye(2), 1)
     lower, upper = kinematics.reach(np.array([0.5, 0.2]))
     np.testing.assert_allclose([joint.low for joint in wide.joints], lower)

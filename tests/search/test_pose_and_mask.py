@@ -33,23 +33,23 @@ def test_poses_and_masks_approach_the_ground_truth(episode):
     rng = np.random.default_rng(0)
     deviation = np.radians(4.0)
     starts = episode.values + rng.normal(0.0, deviation, episode.values.shape)
-    settings, told = PoseAndMaskSettings(angle=deviation, rounds=2), []
+    settings, rounds_done = PoseAndMaskSettings(angle=deviation, rounds=2), []
     cameras = [episode.camera, replace(episode.camera, name="often blind")]
     search = PoseAndMask(episode.body.kinematics, cameras, settings)
     pictures = [[one, one if k % 4 == 0 else None] for k, one in enumerate(episode.pictures)]
-    found = search.run(pictures, list(starts), told.append)
-    assert told == [1, 2]
-    overlaps, begun = [], []
+    found = search.run(pictures, list(starts), rounds_done.append)
+    assert rounds_done == [1, 2]
+    overlaps, overlaps_before = [], []
     for one, start, true in zip(found, starts, episode.values, strict=True):
         shown = drawn(episode, true)
         overlaps.append(intersection_over_union(one.masks[0], shown))
-        begun.append(intersection_over_union(drawn(episode, start), shown))
+        overlaps_before.append(intersection_over_union(drawn(episode, start), shown))
         np.testing.assert_allclose(one.deviations, (one.values - start) / deviation)
         assert one.agreements[0] > 0.8
     assert [one.masks[1] is None for one in found] == 2 * [False, True, True, True]
     assert [np.isnan(one.agreements[1]) for one in found] == 2 * [False, True, True, True]
     assert min(overlaps) > 0.9
-    assert np.median(overlaps) > np.median(begun)
+    assert np.median(overlaps) > np.median(overlaps_before)
     off = np.abs([one.values - true for one, true in zip(found, episode.values, strict=True)])
     assert np.median(off) < 0.5 * np.median(np.abs(starts - episode.values))
 

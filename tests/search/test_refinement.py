@@ -53,11 +53,11 @@ def drawn(body, parameters, camera):
     return draw_mask(outlines, camera.X_CW @ body.poses(parameters), camera)
 
 
-def random_pose(body, seed, share=0.8):
+def random_pose(body, seed, fraction=0.8):
     """Draw a pose in the middle fraction of the limits, with the root at its position."""
     rng = np.random.default_rng(seed)
     lower, upper = body.lower[:-4], body.upper[:-4]
-    middle, half = 0.5 * (upper + lower), 0.5 * share * (upper - lower)
+    middle, half = 0.5 * (upper + lower), 0.5 * fraction * (upper - lower)
     return np.append(middle + half * rng.uniform(-1.0, 1.0, len(middle)), np.zeros(4))
 
 
@@ -113,7 +113,7 @@ def test_one_step_reverts_a_small_change(body, kind):
 def test_a_refined_pose_is_a_local_optimum_within_the_limits(body):
     cameras = [camera_of("parallel"), camera_of("parallel", turned=True)]
     for seed in (7, 8):
-        true = random_pose(body, seed, share=1.0)
+        true = random_pose(body, seed, fraction=1.0)
         # Some values are at their limits.
         true[10:14] = body.upper[10:14]
         problem = problem_of(body, true, cameras)
@@ -137,7 +137,7 @@ def test_a_refined_pose_is_a_local_optimum_within_the_limits(body):
 
 
 def test_a_misplaced_part_is_corrected(body, search):
-    true = random_pose(body, 11, share=0.5)
+    true = random_pose(body, 11, fraction=0.5)
     problem = problem_of(body, true, [camera_of("parallel")])
     wrong = true.copy()
     names = [node.name for node in body.tree.nodes]
@@ -156,7 +156,7 @@ def test_slack_leaves_fewer_wrong_pixels_than_least_squares(body):
     """The last passes leave fewer wrong pixels and smaller errors than least squares."""
     gains, freedom = [], body.freedom()
     for seed in (51, 52, 53, 54):
-        true = random_pose(body, seed, share=0.5)
+        true = random_pose(body, seed, fraction=0.5)
         problem = problem_of(body, true, [camera_of("parallel")])
         start = true + 0.02 * np.random.default_rng(seed).normal(size=len(true))
         start[-4:] = 0.0
@@ -165,8 +165,8 @@ def test_slack_leaves_fewer_wrong_pixels_than_least_squares(body):
         last, _, _ = descend(problem, squares, freedom, PASSES.last)
         off, before = (np.median(np.abs(p - true)[freedom.columns]) for p in (last, squares))
         gains.append([problem.J(last) / problem.J(squares), off / before])
-    shares, errors = np.median(gains, axis=0)
-    assert shares < 0.8
+    ratios, errors = np.median(gains, axis=0)
+    assert ratios < 0.8
     assert errors < 0.9
 
 
@@ -187,7 +187,7 @@ def test_parts_do_not_extend_over_a_fork(tmp_path):
         assert all(len(tree.nodes[node].children) == 1 for node in part.nodes[:-1])
 
 
-def middles(body, parameters, part):
+def centers(body, parameters, part):
     """Return the centres (k, 3) of a part's nodes [m]."""
     X_WN = body.poses(parameters)[list(part.nodes)]
     p_N = np.array([body.surfaces.rigid[node].ball[:3] for node in part.nodes])
@@ -196,35 +196,35 @@ def middles(body, parameters, part):
 
 def test_a_mirrored_part_has_nearly_mirrored_centers(body, search):
     camera = camera_of("parallel")
-    true = random_pose(body, 4, share=0.5)
+    true = random_pose(body, 4, fraction=0.5)
     problem = problem_of(body, true, [camera])
     parts = [part for part in find_parts(body.tree) if len(part.nodes) == 2]
-    depth, shares = _X_WC[:3, 2], []
+    depth, ratios = _X_WC[:3, 2], []
     for part in parts:
         mirrored = search.mirror(true, part, problem.views[0])
         assert np.all(mirrored >= body.lower)
         assert np.all(mirrored <= body.upper)
         joint = body.poses(true)[part.nodes[0], :3, 3]
-        before, after = middles(body, true, part), middles(body, mirrored, part)
+        before, after = centers(body, true, part), centers(body, mirrored, part)
         wanted = before - 2.0 * np.outer((before - joint) @ depth, depth)
-        shares.append(np.linalg.norm(after - wanted) / np.linalg.norm(before - wanted))
+        ratios.append(np.linalg.norm(after - wanted) / np.linalg.norm(before - wanted))
     # Joint limits prevent some parts from being mirrored.
-    assert max(shares) < 1.0
-    assert np.median(shares) < 0.4
+    assert max(ratios) < 1.0
+    assert np.median(ratios) < 0.4
 
 
 def test_mirrored_halves_seen_from_the_side_have_the_same_silhouette(body, search):
     """The mirror image of a symmetric body is the body with left and right exchanged."""
     camera = camera_of("parallel", turned=True)
     for part in find_reflections(body.tree):
-        shares = []
+        ratios = []
         for seed in range(6, 13):
-            true = random_pose(body, seed, share=0.3)
+            true = random_pose(body, seed, fraction=0.3)
             problem = problem_of(body, true, [camera])
             mirrored = search.mirror(true, part, problem.views[0])
             assert np.abs(mirrored - true).max() > 0.1
-            shares.append(problem.J(mirrored) / problem.area)
-        assert np.median(shares) < 0.003
+            ratios.append(problem.J(mirrored) / problem.area)
+        assert np.median(ratios) < 0.003
 
 
 def test_a_mirrored_body_has_nearly_the_same_silhouette(body, search):
@@ -237,16 +237,16 @@ def test_a_mirrored_body_has_nearly_the_same_silhouette(body, search):
         sides = {"left": "right", "right": "left"}
         side = names[node].split("_")[0]
         assert names[source] == names[node].replace(side, sides.get(side, side))
-    shares = []
+    ratios = []
     for seed in range(6, 11):
-        true = random_pose(body, seed, share=0.3)
+        true = random_pose(body, seed, fraction=0.3)
         problem = problem_of(body, true, [camera])
         reflected = search.mirror(true, whole[0], problem.views[0])
         other, _, _ = descend(problem, reflected, body.freedom(), PASSES.coarse + PASSES.fine)
         assert np.abs(other - true).max() > 0.3
-        shares.append(problem.J(other) / problem.area)
+        ratios.append(problem.J(other) / problem.area)
     # Joint limits prevent some poses from being mirrored.
-    assert np.median(shares) < 0.1
+    assert np.median(ratios) < 0.1
 
 
 def test_intervals_of_exact_masks_contain_the_true_values(body, search):
@@ -256,9 +256,9 @@ def test_intervals_of_exact_masks_contain_the_true_values(body, search):
         true = random_pose(body, seed)
         problem = problem_of(body, true, cameras)
         refined, _, _ = descend(problem, true, body.freedom(), PASSES.fine + PASSES.last)
-        about = NeighbourhoodSearch(problem, search)
-        about.improve(refined, 0.0, everywhere=True)
-        others = about.others(refined, 2.0 * problem.J(refined) + 40.0, 0.1)
+        neighbourhood = NeighbourhoodSearch(problem, search)
+        neighbourhood.improve(refined, 0.0, everywhere=True)
+        others = neighbourhood.others(refined, 2.0 * problem.J(refined) + 40.0, 0.1)
         others = [pose for pose in others if problem.J(pose) <= problem.J(refined) + 20.0]
         intervals = find_intervals(problem, others, refined)
         assert len(intervals.joints) == len(true) - 4

@@ -82,8 +82,8 @@ def test_three_angles_at_the_root_give_every_rotation(tmp_path, ranges, free):
     """``ranges`` in half turns: two full turns and a half turn give every rotation."""
     names = [f"gimbal_{k}" for k in range(len(ranges) - 1)] + ["ball"]
     parts = [f'<link name="{name}"/>' for name in names[:-1]]
-    for k, (one, share) in enumerate(zip(names, ranges, strict=True)):
-        half, axis = 0.5 * math.pi * share, ("0 0 1", "0 1 0", "1 0 0")[k % 3]
+    for k, (one, half_turns) in enumerate(zip(names, ranges, strict=True)):
+        half, axis = 0.5 * math.pi * half_turns, ("0 0 1", "0 1 0", "1 0 0")[k % 3]
         parent = names[k - 1] if k else "world"
         parts.append(joint(f"turn_{k}", "revolute", parent, one, (-half, half), axis=axis))
     arms = [box_link(f"arm_{k}", 4, 4, y=3.0) for k in range(3)]

@@ -45,8 +45,8 @@ def test_multi_start_search_finds_one_value_for_both_fingers(models):
         np.testing.assert_allclose(found.q, q, atol=0.02)
         np.testing.assert_allclose(found.q[2:], q[2:], atol=1e-3)
         assert found.q[2] == found.q[3]
-        told = found.pose_set.position_intervals(matcher.tree)
-        np.testing.assert_array_equal(told[:, 2], told[:, 3])
+        intervals = found.pose_set.position_intervals(matcher.tree)
+        np.testing.assert_array_equal(intervals[:, 2], intervals[:, 3])
         names = [joint.name for joint in found.pose_set.joints]
         assert names == ["mast_joint", "hand_joint", "left_joint"]
 

@@ -1,4 +1,4 @@
-"""The program as it is run: start-up, help, Ctrl-C, checks."""
+"""The command line: start, help, Ctrl-C, check."""
 
 import json
 import os
@@ -47,7 +47,7 @@ def test_help_imports_nothing_heavy() -> None:
         (["reproduce", "kameda"], ["drake-pose reproduce kameda --images 20", "head"]),
     ],
 )
-def test_help_teaches(command: list[str], words: list[str]) -> None:
+def test_help_has_an_example_and_terms(command: list[str], words: list[str]) -> None:
     result = run_command([*command, "--help"])
     assert result.exit_code == 0
     for word in words:
@@ -66,7 +66,7 @@ def test_help_teaches(command: list[str], words: list[str]) -> None:
         (UnicodeEncodeError("utf-8", "a/\udcfc", 2, 3, "no"), r"'a/\udcfc': the name of this file"),
     ],
 )
-def test_whatever_ends_a_command_is_said_in_a_line(
+def test_every_failure_is_reported_in_one_line(
     ending: signal.Signals | Exception, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def read_job(*_: object) -> None:
@@ -82,7 +82,7 @@ def test_whatever_ends_a_command_is_said_in_a_line(
     assert result.output.count("\n") == 1
 
 
-def test_a_signal_while_words_are_read_is_said_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_signal_during_parsing_is_reported_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def parse_args(*_: object, **__: object) -> None:
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(10.0)
@@ -98,7 +98,7 @@ def test_version() -> None:
     assert result.stdout == f"drake-pose {drake_pose.__version__}\n"
 
 
-def test_check_of_a_fit_model(tiny_scene: TinyScene) -> None:
+def test_check_of_a_usable_model(tiny_scene: TinyScene) -> None:
     result = run_command(["check", str(tiny_scene.model)])
     assert result.exit_code == 0, result.output
     assert "crane: 3 segments" in result.stdout
@@ -127,7 +127,7 @@ def test_ctrl_c_keeps_finished_frames_and_the_job_can_be_resumed(tmp_path: Path)
     environment = {**os.environ, "COLUMNS": "200"}
     process = subprocess.Popen(
         command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        # Whoever runs the tests in the background has the signal ignored, which children inherit.
+        # Background jobs ignore SIGINT, which children inherit.
         env=environment, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     poses = out / "poses.csv"

@@ -1,4 +1,4 @@
-"""A small BVH reader of the tests' own, written from the format's description alone."""
+"""A small BVH reader for tests, written from the description of the format."""
 
 from dataclasses import dataclass, field
 
@@ -7,7 +7,7 @@ import numpy as np
 
 @dataclass
 class Joint:
-    """A joint of a BVH file; a site that ends a chain has no channels."""
+    """A joint of a BVH file; an end site has no channels."""
 
     name: str
     parent: int
@@ -17,14 +17,14 @@ class Joint:
 
 @dataclass
 class Motion:
-    """A BVH file: its joints, frame time [s] and a row of channels a frame."""
+    """A BVH file: joints, frame time [s], and channels (frames, n)."""
 
     joints: list[Joint]
     frame_time: float
     rows: np.ndarray
 
     def places(self) -> dict[str, np.ndarray]:
-        """(frames, 3) where each joint is [cm], by name."""
+        """Return the positions (frames, 3) of each joint by name [cm]."""
         found = [self._pose(row) for row in self.rows]
         return {
             joint.name: np.array([frame[k] for frame in found])
@@ -32,7 +32,7 @@ class Motion:
         }
 
     def _pose(self, row: np.ndarray) -> list[np.ndarray]:
-        """Walks the hierarchy: offset, or offset plus position channels, then the rotations."""
+        """Return the positions of all joints: offset plus position channels, then rotations."""
         turns, places, at = [], [], 0
         for joint in self.joints:
             turn, place = (
@@ -59,7 +59,7 @@ class Motion:
 
 
 def about(axis: int, angle: float) -> np.ndarray:
-    """The matrix (3, 3) of a turn about x, y or z."""
+    """Return the rotation matrix (3, 3) about x, y or z."""
     i, j = (axis + 1) % 3, (axis + 2) % 3
     matrix = np.eye(3)
     matrix[i, i] = matrix[j, j] = np.cos(angle)
@@ -68,7 +68,7 @@ def about(axis: int, angle: float) -> np.ndarray:
 
 
 def read_bvh(text: str) -> Motion:
-    """Reads a file of one skeleton."""
+    """Parse a file with one skeleton."""
     hierarchy, motion = text.split("MOTION\n")
     words = hierarchy.split()
     assert words.pop(0) == "HIERARCHY"

@@ -34,7 +34,7 @@ def row(frame, *q, base=None, error=0.25):
 LOST = row("0002", np.nan, np.nan, error=None)
 
 
-def test_rows_are_on_the_disk_when_append_returns_and_read_back(tmp_path):
+def test_appended_rows_are_on_disk_and_read_back(tmp_path):
     base = np.array([1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0])
     for with_base, cells in ((False, ""), (True, ",1,2,3,1,0,0,0")):
         table = PoseTable(tmp_path, NAMES, with_base)
@@ -53,7 +53,7 @@ def test_rows_are_on_the_disk_when_append_returns_and_read_back(tmp_path):
         assert (first.found, second.found) == (True, False)
 
 
-def test_reading_drops_a_row_that_was_cut_off(tmp_path):
+def test_reading_drops_an_incomplete_last_row(tmp_path):
     table = PoseTable(tmp_path, NAMES, False)
     assert table.read() == []
     table.write([row("0001", 0.5, -1.25)])
@@ -70,13 +70,13 @@ def test_reading_drops_a_row_that_was_cut_off(tmp_path):
         ("frame,a,b,error,seconds\n1,x,2,3,4\n", "line 2 is damaged"),
     ],
 )
-def test_what_cannot_be_resumed_is_refused(tmp_path, text, message):
+def test_a_damaged_table_or_one_of_another_model_is_refused(tmp_path, text, message):
     (tmp_path / "poses.csv").write_text(text)
     with pytest.raises(OutputError, match=message):
         PoseTable(tmp_path, NAMES, False).read()
 
 
-def test_a_folder_that_holds_something_or_cannot_be_is_refused(tmp_path):
+def test_a_folder_that_is_not_empty_or_cannot_exist_is_refused(tmp_path):
     (tmp_path / "out").write_text("mine")
     (tmp_path / "link").symlink_to("nowhere")
     for place, message in (
@@ -92,7 +92,7 @@ def test_a_folder_that_holds_something_or_cannot_be_is_refused(tmp_path):
 
     @writes_folder
     def job(out):
-        """Cannot be resumed."""
+        """A job without resume."""
 
     with pytest.raises(OutputError, match="not empty"):
         job(out=tmp_path)
@@ -108,7 +108,7 @@ with claimed(Path(sys.argv[1])):
 """
 
 
-def test_a_folder_belongs_to_one_run_until_that_ends_however_it_ends(tmp_path):
+def test_a_folder_is_locked_until_its_process_ends(tmp_path):
     place = tmp_path / "new" / "out"
     jobs = (estimate_scene, register_scene, audit_scene, make_masks, run_batch, capture_live)
     command = [sys.executable, "-c", HOLD, str(place)]
@@ -123,7 +123,7 @@ def test_a_folder_belongs_to_one_run_until_that_ends_however_it_ends(tmp_path):
                 with pytest.raises(OutputError, match="another run is writing its result there"):
                     job(**arguments)
         other.kill()
-    # Nothing was written, by any: no file is left, and the folders only as the one was killed.
+    # No job wrote a file; the killed process left its empty folders.
     assert not list(place.iterdir())
     with claimed(place):
         pass
@@ -133,7 +133,7 @@ def test_a_folder_belongs_to_one_run_until_that_ends_however_it_ends(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_files_appear_whole_or_not_at_all(tmp_path, monkeypatch):
+def test_files_are_written_atomically(tmp_path, monkeypatch):
     write_file(tmp_path / "out", "overlay/cam/1.png", b"first")
 
     def full_disk(path, data):
@@ -154,7 +154,7 @@ def test_summary_has_no_nan(tmp_path):
     assert read_summary(tmp_path) == json.loads(text)
 
 
-def test_the_same_job_is_resumed_and_no_other(tmp_path):
+def test_only_the_same_job_is_resumed(tmp_path):
     settings = {"interval": 20.0, "frames": ["0000"]}
     job = {"sha256": {"model": "m", "cameras": "c"}, "settings": settings}
     assert open_job(tmp_path, job, resume=False) is None
@@ -171,7 +171,7 @@ def test_the_same_job_is_resumed_and_no_other(tmp_path):
             open_job(tmp_path, job | other, resume=True)
 
 
-def test_finished_frames_whose_masks_were_replaced_are_forgotten(own_scene, tmp_path):
+def test_finished_frames_with_changed_masks_are_estimated_again(own_scene, tmp_path):
     scene, model, out = load_scene(own_scene.folder), load_model(own_scene.model), tmp_path / "out"
 
     def writer(**more):

@@ -33,7 +33,7 @@ def q(person):
 
 @pytest.fixture(scope="module")
 def centres(person, q):
-    """Names and places of the person's joint centres."""
+    """Names and positions of the person's joint centres."""
     landmarks = load_landmarks(person.path)
     return list(landmarks), joint_centres(person, landmarks, q)
 
@@ -65,7 +65,7 @@ def test_trc_is_in_millimetres_with_y_up(centres):
     assert cells[8][2:] == [""] * (3 * len(names))
 
 
-def test_a_results_files_honour_the_base_and_leave_out_what_is_not_known(tmp_path):
+def test_motion_files_use_the_base_pose_and_skip_frames_without_a_pose(tmp_path):
     (tmp_path / "crane.urdf").write_text(URDF)
     marks = tmp_path / "landmarks.yaml"
     marks.write_text("landmarks:\n  hook: {link: jib, point: [0, 0, 0.4]}\n")
@@ -91,7 +91,7 @@ def test_a_results_files_honour_the_base_and_leave_out_what_is_not_known(tmp_pat
     mot = (tmp_path / "out" / "positions.mot").read_text().splitlines()
     assert mot[mot.index("endheader") + 1].split("\t")[-7:] == list(BASE_COLUMNS)
     assert [float(cell) for cell in mot[-1].split("\t")[-7:]] == pytest.approx(base, abs=1e-5)
-    # A robot is no character: without landmarks or a skin there is no skeleton to animate.
+    # Without landmarks or a skin there is no BVH file.
     marks.unlink()
     assert not write_motion(tmp_path / "robot", model, frames, rows, 25.0)
     assert {file.name for file in (tmp_path / "robot").iterdir()} == {"positions.mot"}
@@ -119,7 +119,7 @@ def open_model(name):
 
 
 def random_positions(model, rng):
-    """Anywhere within the limits; lengths but the root's are the same in every frame."""
+    """Random positions within the limits; lengths, except the root's, are constant."""
     lower = np.clip(model.lower, -3.0, 3.0)
     upper = np.clip(model.upper, -3.0, 3.0)
     q = rng.uniform(lower, upper, (FRAMES, len(lower)))
@@ -130,7 +130,7 @@ def random_positions(model, rng):
 
 
 def link_places(model, link, q):
-    """(frames, 3) where the plant has a link's origin, in the file's axes [cm]."""
+    """Return a link's origin (frames, 3) by the plant, in the file's axes [cm]."""
     x, y, z = 100.0 * np.array([link_poses(model, row)[link][:3, 3] for row in q]).T
     return np.column_stack([x, z, -y])
 
@@ -138,7 +138,7 @@ def link_places(model, link, q):
 @pytest.mark.parametrize(
     "name", ["person/person.urdf", "person/person_shape.urdf", "hand/hand.urdf"]
 )
-def test_the_file_has_every_link_where_the_plant_has_it(name):
+def test_bvh_places_every_link_where_the_plant_does(name):
     model = open_model(name)
     q = random_positions(model, np.random.default_rng(5))
     text, filled = motion_as_bvh(model, q, None, RATE_HZ)
@@ -147,7 +147,7 @@ def test_the_file_has_every_link_where_the_plant_has_it(name):
     assert filled == 0
     assert motion.frame_time == pytest.approx(1.0 / RATE_HZ)
     links = [link for link, _ in skeleton_of(model, q)]
-    # Every part that is seen, but for the lower half of a limb, whose place is the upper half's.
+    # All links with geometry, except lower halves of limbs, which share the upper halves' origin.
     assert set(links) == {link for link in model.link_meshes if not link.endswith("_end")}
     for part in links:
         error = places[part] - link_places(model, part, q)
@@ -161,7 +161,7 @@ def test_the_file_has_every_link_where_the_plant_has_it(name):
     assert all(one.channels == ["Zrotation", "Xrotation", "Yrotation"] for one in others)
 
 
-def test_the_skeleton_at_rest_stands_as_the_model_does_with_the_captured_lengths():
+def test_bvh_rest_pose_is_the_default_pose_with_captured_lengths():
     model = open_model("person/person_shape.urdf")
     q = np.tile(model.default_positions, (2, 1))
     q[:, model.position_index("left_thigh_stretch")] = 0.05
@@ -172,13 +172,13 @@ def test_the_skeleton_at_rest_stands_as_the_model_does_with_the_captured_lengths
             parent = motion.joints[one.parent].name
             rest = link_places(model, one.name, q[:1]) - link_places(model, parent, q[:1])
             np.testing.assert_allclose(one.offset, rest[0], atol=1e-3)
-    # Up is y: the head above the feet, the toes before the heels.
+    # y is up: the head is above the feet, and the toes are before the heels.
     places = motion.places()
     assert places["head"][0, 1] - places["left_foot"][0, 1] > 100.0
     assert places["left_foot_end"][0, 0] - places["left_foot"][0, 0] > 5.0
 
 
-def test_a_part_that_slides_in_time_has_position_channels_and_no_offset(tmp_path):
+def test_a_sliding_part_has_position_channels_and_zero_offset(tmp_path):
     parts = map(link, ("mast", "carriage", "arm", "left_finger"))
     text = urdf(
         *parts,
@@ -198,7 +198,7 @@ def test_a_part_that_slides_in_time_has_position_channels_and_no_offset(tmp_path
         np.testing.assert_allclose(places[name], link_places(model, name, q), atol=0.01)
 
 
-def test_several_parts_in_the_world_hang_on_it(tmp_path):
+def test_several_roots_are_children_of_the_world(tmp_path):
     turn = {"axis": "0 1 0", "kind": "revolute", "parent": "world"}
     text = urdf(
         *map(link, "ab"),
@@ -212,7 +212,7 @@ def test_several_parts_in_the_world_hang_on_it(tmp_path):
     np.testing.assert_allclose(motion.places()["b"], [[100.0, 100.0, 0.0]] * 2, atol=0.01)
 
 
-def test_the_base_pose_moves_the_file():
+def test_bvh_uses_the_base_pose():
     model = open_model("hand/hand.urdf")
     q = np.tile(model.default_positions, (2, 1))
     X_WB = np.tile(np.eye(4), (2, 1, 1))
@@ -220,11 +220,11 @@ def test_the_base_pose_moves_the_file():
     X_WB[1, :3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     places = read_bvh(motion_as_bvh(model, q, X_WB, RATE_HZ)[0]).places()
     x, y, z = places["palm"][0]
-    # 90 degrees about the vertical, and a step: x forward, z right, y up.
+    # A base pose of 90 degrees about the vertical and a translation; x forward, z right, y up.
     np.testing.assert_allclose(places["palm"][1], [z + 10.0, y + 30.0, -x - 20.0], atol=0.01)
 
 
-def test_frames_without_a_pose_are_filled_by_the_last_known_one():
+def test_bvh_frames_without_a_pose_repeat_the_last_known_one():
     model = open_model("person/person.urdf")
     q = random_positions(model, np.random.default_rng(6))
     whole = read_bvh(motion_as_bvh(model, q, None, RATE_HZ)[0])
@@ -239,7 +239,7 @@ def test_frames_without_a_pose_are_filled_by_the_last_known_one():
         motion_as_bvh(model, np.full_like(q, np.nan), None, RATE_HZ)
 
 
-def test_a_turn_past_half_a_circle_does_not_jump():
+def test_bvh_angles_are_continuous_past_half_a_turn():
     model = open_model("person/person.urdf")
     q = np.tile(model.default_positions, (40, 1))
     q[:, model.position_index("head_y")] = np.linspace(2.0, 4.5, 40)

@@ -16,7 +16,7 @@ from tests.cli import run_command
 FRAMES = ("0001", "0002", "0010", "still")
 
 
-def test_texts_become_values():
+def test_option_texts_are_parsed():
     assert parse_assignments(["a=1", "b=c=-2.5"]) == {"a": 1.0, "b=c": -2.5}
     assert parse_packages(["b=.", "c=/"]) == {"b": Path.cwd(), "c": Path("/")}
     assert parse_root_position("1,-2,0.5") == (1.0, -2.0, 0.5)
@@ -38,7 +38,7 @@ BAD = {
 
 
 @pytest.mark.parametrize(("option", "text"), [(one, text) for one in BAD for text in BAD[one]])
-def test_bad_texts_name_the_option_in_one_line(option, text):
+def test_a_bad_option_text_names_the_option_in_one_line(option, text):
     done = run_command(["estimate", "a", "-m", "b", "-o", "c", option, text])
     assert done.exit_code == 2
     assert done.stderr.startswith(f"drake-pose: error: {option}: ")
@@ -55,7 +55,7 @@ def test_bad_texts_name_the_option_in_one_line(option, text):
         (["0002:still"], ("0002", "0010", "still")),
     ],
 )
-def test_frames(wanted, selected):
+def test_frames_are_selected_by_name_number_and_range(wanted, selected):
     assert select_frames(FRAMES, wanted, "scene") == selected
 
 
@@ -67,7 +67,7 @@ def test_frames(wanted, selected):
         (FRAMES, "10:1", "'10:1'"),
     ],
 )
-def test_frames_that_are_unknown_or_unclear_list_those_that_exist(frames, text, words):
+def test_unknown_or_ambiguous_frames_are_refused_with_a_list(frames, text, words):
     with pytest.raises((UnknownNameError, SettingsError), match=words):
         select_frames(frames, [text], "scene")
 
@@ -75,6 +75,6 @@ def test_frames_that_are_unknown_or_unclear_list_those_that_exist(frames, text, 
 @pytest.mark.parametrize(
     ("parse", "texts"), [(parse_assignments, ["a=1", "a=2"]), (parse_packages, ["a=.", "a=/"])]
 )
-def test_a_name_is_given_once(parse, texts):
+def test_a_name_given_twice_is_refused(parse, texts):
     with pytest.raises(SettingsError, match="'a' is given twice"):
         parse(texts)

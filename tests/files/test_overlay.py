@@ -25,7 +25,7 @@ def count(picture, colour):
     return int((picture == np.array(colour, dtype=np.uint8)).all(axis=2).sum())
 
 
-def test_each_kind_of_pixel_has_its_colour():
+def test_agreement_missing_and_excess_have_their_colours():
     mask = rectangle((6, 8), slice(1, 5), slice(1, 5))
     body = rectangle((6, 8), slice(1, 5), slice(3, 7))
     picture = paint_agreement(mask, body)
@@ -39,7 +39,7 @@ def test_each_kind_of_pixel_has_its_colour():
         assert count(picture, colour) == pixels
 
 
-def test_borders_between_segments_are_drawn_and_no_others():
+def test_only_borders_between_segments_are_drawn():
     mask = rectangle((6, 8), slice(1, 5), slice(1, 7))
     segments = np.where(mask, 1, -1)
     assert count(paint_agreement(mask, mask, segments), OUTLINE_RGB) == 0
@@ -49,7 +49,7 @@ def test_borders_between_segments_are_drawn_and_no_others():
     assert count(picture, OUTLINE_RGB) == 4
 
 
-def test_a_large_picture_is_cut_to_the_surroundings_of_the_body():
+def test_a_large_overlay_is_cropped_to_the_body():
     mask = rectangle((1900, 1100), slice(1000, 1600), slice(300, 600))
     body = rectangle((1900, 1100), slice(1000, 1600), slice(310, 610))
     picture = PALETTE[draw_overlay(mask, body, None, "title")]
@@ -58,32 +58,32 @@ def test_a_large_picture_is_cut_to_the_surroundings_of_the_body():
         assert count(picture, colour) >= 600 * columns
 
 
-def test_shapes_are_drawn_as_contours_over_the_silhouette():
+def test_shapes_are_contours_over_the_silhouette():
     mask = rectangle((600, 600), slice(100, 500), slice(100, 500))
     first = rectangle((600, 600), slice(100, 500), slice(150, 450))
     corrected = rectangle((600, 600), slice(100, 500), slice(200, 400))
     names = ("the file's", "corrected")
     picture = draw_shapes(mask, [first, corrected], names, "title")
     legend = draw_shapes(mask, [np.zeros_like(mask)] * 2, names, "title")
-    # Their upper and lower sides lie upon each other, where the corrected one is drawn last.
+    # The upper and lower sides coincide, and the second contour covers the first.
     for colour, own in ((MISSING_RGB, 2 * 400 + 2 * 100), (EXCESS_RGB, 2 * 400 + 2 * 200)):
         shown = count(picture, colour) - count(legend, colour)
         assert own < shown < 4 * own
     assert count(picture, AGREEMENT_RGB) > 0.95 * 400 * 400
 
 
-def test_two_bodies_over_a_picture():
+def test_shapes_are_contours_over_a_whole_picture():
     photo = np.full((500, 600, 3), 91, np.uint8)
     given = rectangle((500, 600), slice(100, 200), slice(150, 300))
     picture = draw_shapes(photo, [given, np.zeros_like(given)], ("as given", "as found"), "title")
     assert picture.shape[1] == 600
     assert count(picture, (91, 91, 91)) > 0.95 * 500 * 600
-    # The contour, and its square in the legend.
+    # The contour, and the square in the legend.
     assert count(picture, MISSING_RGB) > 2 * 100 + 2 * 150
     assert count(picture, AGREEMENT_RGB) < 50
 
 
-def test_a_small_picture_is_enlarged_by_whole_pixels_and_nothing_lies_on_it():
+def test_a_small_overlay_is_enlarged_by_an_integer_without_text_on_it():
     whole, none = np.ones((40, 40), dtype=bool), np.zeros((40, 40), dtype=bool)
     drawn = [PALETTE[draw_overlay(whole, body, None, "t")] for body in (none, whole)]
     shown = [count(picture, MISSING_RGB) for picture in drawn]
@@ -92,7 +92,7 @@ def test_a_small_picture_is_enlarged_by_whole_pixels_and_nothing_lies_on_it():
     assert shown[0] - shown[1] == (40 * scale) ** 2
 
 
-def test_where_nothing_is_shown_the_whole_picture_stays():
+def test_an_empty_overlay_is_not_cropped():
     nothing = np.zeros((500, 700), dtype=bool)
     assert draw_overlay(nothing, nothing, None, "title").shape[1] == 700
 
@@ -105,7 +105,7 @@ def test_title_and_legend_are_written():
     assert 100 < max(legend) < 1.1 * min(legend)
 
 
-def test_png_of_colours_or_of_their_numbers_shows_the_palettes_colours():
+def test_png_of_rgb_and_of_palette_indices_are_equal():
     numbers = np.arange(len(PALETTE), dtype=np.uint8).reshape(4, -1)
     for picture in (numbers, PALETTE[numbers]):
         decoded = cv2.imdecode(np.frombuffer(encode_png(picture), np.uint8), cv2.IMREAD_COLOR)

@@ -1,4 +1,4 @@
-"""What is known of frames, told in numbers that a table of one's own gives."""
+"""Records of frames, summaries and warnings, from given numbers."""
 
 import math
 
@@ -23,7 +23,7 @@ from tests.body.models import joint, link, urdf, write
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory):
-    """Angles from 1 to 2 and all around, and a length from 3 to 3.4."""
+    """A model with an angle from 1 to 2 rad, a length from 3 to 3.4 m, and a continuous angle."""
     parts = [link(name) for name in ("base", "arm", "slide", "wheel")]
     parts += [
         joint("weld", "fixed", "world", "base", limits=None),
@@ -40,7 +40,7 @@ def record(E_total=0.1, **more):
     return FrameRecord("a", q, None, E_total, 2.0, **more)  # type: ignore[arg-type]
 
 
-def test_an_interval_ends_at_the_limits_and_determines_below_half_the_range(model):
+def test_intervals_end_at_limits_and_are_determined_below_half_the_range(model):
     q = np.array([1.9, 3.2, 3.0])
     told = record_deviations(model, q, np.array([0.1, 0.06, 0.5]))
     assert told["bend"]["determined"]
@@ -52,7 +52,7 @@ def test_an_interval_ends_at_the_limits_and_determines_below_half_the_range(mode
         (3.2 - 0.1176, 3.2 + 0.1176)
     )
     assert told["turn"]["determined"]
-    # Beyond half a turn it goes on.
+    # The interval of a continuous joint may go beyond half a turn.
     assert told["turn"]["high"] == pytest.approx(math.degrees(3.98))
     unknown = record_deviations(model, q, np.full(3, np.nan))
     assert not any(one["determined"] for one in unknown.values())
@@ -61,7 +61,7 @@ def test_an_interval_ends_at_the_limits_and_determines_below_half_the_range(mode
     assert record_deviations(model, np.full(3, np.nan), np.zeros(3)) == {}
 
 
-def test_what_was_measured_is_the_pose_less_its_error_inside_the_limits(model):
+def test_measured_position_is_estimate_minus_error_within_limits(model):
     q = np.array([1.9, 3.2, 3.0])
     errors = {"bend": math.degrees(0.2), "reach": -0.1}
     measured = measured_positions(model, [record(q=q, joint_errors=errors)])
@@ -72,18 +72,18 @@ def test_what_was_measured_is_the_pose_less_its_error_inside_the_limits(model):
     assert again[0, 0] == pytest.approx(1.7)
 
 
-def test_a_base_is_told_in_seven_numbers_and_back():
+def test_base_columns_and_pose_are_inverse():
     X_WB = np.eye(4)
     X_WB[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     X_WB[:3, 3] = [0.1, -0.2, 0.3]
     np.testing.assert_allclose(base_pose(base_cells(X_WB)), X_WB, atol=1e-8)
     np.testing.assert_array_equal(base_pose(None), np.eye(4))
-    # However long its quaternion was written.
+    # The quaternion need not be normalised.
     longer = base_cells(X_WB) * [1.0, 1.0, 1.0, *[1.01] * 4]
     np.testing.assert_allclose(base_pose(longer), X_WB, atol=1e-8)
 
 
-def test_a_summary_counts_and_averages_what_was_found():
+def test_summary_counts_and_averages_frames_with_a_pose():
     records = {
         "a": record(0.1, ious={"left": 0.9, "right": 0.7}, joint_errors={"bend": -3.0}),
         "b": record(0.3, ious={"left": 0.5}, joint_errors={"bend": 1.0}),
@@ -101,7 +101,7 @@ def test_a_summary_counts_and_averages_what_was_found():
     assert again.as_json() == records["a"].as_json()
 
 
-def test_a_camera_that_agrees_less_than_the_others_is_named_once():
+def test_a_camera_with_low_iou_is_named_once():
     records = {"a": record(ious={"left": 0.9, "right": 0.6, "top": 0.92, "back": 0.8})}
     (text,) = camera_warnings(records)
     assert "'right'" in text
@@ -110,10 +110,10 @@ def test_a_camera_that_agrees_less_than_the_others_is_named_once():
     assert not camera_warnings({"a": record(ious={"left": 0.9, "right": 0.1})})
 
 
-def test_frames_without_a_pose_share_a_line():
+def test_frames_without_a_pose_share_a_warning():
     records = {name: record() for name in ("0", "1", "2", "3", "4")}
     records |= {"1": record(None), "2": record(None), "4": record(stopped_by="time_limit")}
-    # Of a person that is followed it is said elsewhere.
+    # The method person warns of its frames without a pose itself.
     records["3"] = record(None, share=0.2)
     lost, stopped = frame_warnings(records)
     assert lost.startswith("frame 1-2 (2 of 5): ")
@@ -121,7 +121,7 @@ def test_frames_without_a_pose_share_a_line():
     assert "time limit" in stopped
 
 
-def test_a_bad_fit_says_what_stands_at_a_limit_and_what_was_held(model):
+def test_warning_of_a_bad_fit_names_joints_at_limits_and_held_ones(model):
     def told(bend, error):
         known = {"a": record(error, q=np.array([bend, 3.2, -np.pi]))}
         return poor_fit_warnings(known, model, ["reach"])
@@ -133,7 +133,7 @@ def test_a_bad_fit_says_what_stands_at_a_limit_and_what_was_held(model):
     assert "the held positions (reach)" in told(1.5, 0.4)[0]
 
 
-def test_an_overlay_gives_shares_of_the_silhouette(monkeypatch):
+def test_overlay_legend_has_fractions_of_the_silhouettes_area(monkeypatch):
     seen, body = np.zeros((20, 20), dtype=bool), np.zeros((20, 20), dtype=bool)
     seen[2:12, 2:12], body[4:14, 2:12] = True, True
     legends = []

@@ -31,7 +31,7 @@ from tests.jobs.scenes import NAMES, camera, read_rows
 
 
 class Page:
-    """A page read back: its tables, texts by id, and figures; every tag must be closed."""
+    """A parsed page: tables, texts by id, and figures; every tag must be closed."""
 
     def __init__(self, text):
         text = re.sub(r"<!doctype[^>]*>", "", text, flags=re.IGNORECASE)
@@ -53,12 +53,12 @@ class Page:
         assert all(one.get("alt") for one in self.root.iter("img"))
 
     def table(self, *head):
-        """The table that begins with these cells."""
+        """Return the table whose header starts with these cells."""
         return next(table for table in self.tables if table[0][: len(head)] == [*head])
 
 
 def require_plain_page(text, warnings=()):
-    """The answer comes first, each warning once with its number, no number has four decimals."""
+    """Check that the answer is the first text, each warning stands once, and decimals are few."""
     page = Page(text)
     body = [part.strip() for part in page.root.find("body").itertext() if part.strip()]
     assert body[0] == page.by_id["answer"]
@@ -79,7 +79,7 @@ def result(tiny_scene, tmp_path_factory):
     return out
 
 
-def test_page_says_what_the_tables_say(result):
+def test_page_agrees_with_poses_and_summary(result):
     page = require_plain_page((result / "report.html").read_text())
     poses = read_rows(result / "poses.csv")
     records = json.loads((result / "summary.json").read_text())["frames"].values()
@@ -103,7 +103,7 @@ def test_page_says_what_the_tables_say(result):
     assert "No warnings." in page.by_id["warnings"]
 
 
-def test_page_needs_nothing_but_itself_and_its_links_lead_somewhere(result):
+def test_page_is_self_contained_and_its_links_exist(result):
     text = (result / "report.html").read_text()
     page = Page(text)
     assert "http" not in re.sub(r"data:image/\w+;base64,[\w+/=]*", "", text)
@@ -119,7 +119,7 @@ def test_page_needs_nothing_but_itself_and_its_links_lead_somewhere(result):
 
 
 def long_report(frames):
-    """A person in many frames: two cameras, gaps, frames not found, names that are no HTML."""
+    """Return a person's estimate with gaps, frames without a pose, and names to be escaped."""
     model = load_model(bundled_model("person").with_name("person_shape.urdf"), check=False)
     rng = np.random.default_rng(2)
     records, masks = {}, {}
@@ -158,7 +158,7 @@ def report():
     return long_report(1000)
 
 
-def test_a_thousand_frames_stay_small_and_names_are_shown_as_they_are(report):
+def test_page_of_a_thousand_frames_is_small_and_escapes_names(report):
     text = make_report(Path("nowhere"), *report)
     assert len(text) < 2_500_000
     page = require_plain_page(text, report[2].summary["warnings"])
@@ -174,7 +174,7 @@ def test_a_thousand_frames_stay_small_and_names_are_shown_as_they_are(report):
 
 
 def part(whole, frames, errors=None, **changes):
-    """Some frames of a report, with some joints' errors."""
+    """Return the estimate of some frames, with joint errors by frame."""
     records = {frame: whole.records[frame] for frame in frames}
     for frame, off in (errors or {}).items():
         records[frame] = replace(records[frame], joint_errors=off)
@@ -184,7 +184,7 @@ def part(whole, frames, errors=None, **changes):
     return replace(whole, records=records, summary=whole.summary | {"joint_errors": names})
 
 
-def test_measured_positions_and_bands_are_explained_where_there_are_some(report, monkeypatch):
+def test_legend_explains_only_what_plots_show(report, monkeypatch):
     for name in ("plot_curves", "plot_uri"):
         monkeypatch.setattr(report_page, name, lambda *_, **__: "data:,")
     model, scene, whole = report
@@ -198,7 +198,7 @@ def test_measured_positions_and_bands_are_explained_where_there_are_some(report,
     assert " band" not in make_report(Path("nowhere"), model, scene, replace(whole, records=bare))
 
 
-def test_a_frame_is_a_table_without_plots(report):
+def test_page_of_one_frame_has_a_table_and_no_plots(report):
     """The table has estimate, interval and measured position; a frame without a pose has no row."""
     model, scene, whole = report
     name = "left_forearm_x"
@@ -217,13 +217,13 @@ def test_a_frame_is_a_table_without_plots(report):
 
 
 def plotted(values, **more):
-    """The axes of a plot of one curve, and the curve."""
+    """Return the axes of a plot with one curve, and the curve."""
     names = [str(k) for k in range(len(values))]
     (axes,) = plot_curves(names, [("one", values)], **{"joined": True, **more}).axes
     return axes, axes.get_lines()[0]
 
 
-def test_a_curve_is_drawn_with_limits_that_are_near():
+def test_plots_show_only_limits_that_are_near():
     values = np.sin(np.linspace(0.0, 20.0, 5000))
     values[2500], values[1000:1100] = 3.0, np.nan
     axes, curve = plotted(values, limits=(-1, 4))
@@ -232,7 +232,7 @@ def test_a_curve_is_drawn_with_limits_that_are_near():
     assert [line.get_ydata()[0] for line in axes.get_lines()[1:]] == [-1, 4]
     low, high = axes.get_ylim()
     assert low < -1 < 4 < high
-    # Limits that are far do not flatten it.
+    # Distant limits do not change the scale.
     axes, _ = plotted(np.linspace(0.0, 1.0, 50), limits=(-90, 90))
     assert np.ptp(axes.get_ylim()) < 1.3
     assert len(axes.get_lines()) == 1
@@ -240,7 +240,7 @@ def test_a_curve_is_drawn_with_limits_that_are_near():
     assert axes.get_ylim()[0] == 0.0
 
 
-def test_stills_are_dots_and_intervals_stand_at_their_frames():
+def test_stills_are_dots_and_intervals_are_at_their_frames():
     _, curve = plotted(np.array([1.0, np.nan]), joined=False)
     assert curve.get_linestyle() == "None"
     known = np.array([True, False, True])
@@ -251,11 +251,11 @@ def test_stills_are_dots_and_intervals_stand_at_their_frames():
     assert of_open == [[[1, 1], [1, 3]]]
 
 
-def test_grid_joins_neighbours_of_one_state():
+def test_grid_joins_equal_neighbours():
     states = ["used", "used", "no-picture", "used"]
     (axes,) = draw_grid(["0", "1", "2", "3"], [("left", states), ("right", states)]).axes
     rows = [[path.get_extents() for path in one.get_paths()] for one in axes.collections]
-    # A row's bars stand beside its name, and leave the next one's free.
+    # The bars of a row are at its name, and rows do not overlap.
     assert [one.y0 + one.y1 for row in rows for one in row] == pytest.approx([0.0] * 3 + [2.0] * 3)
     assert rows[0][0].y1 < rows[1][0].y0
     spans = rows[0]
@@ -265,7 +265,7 @@ def test_grid_joins_neighbours_of_one_state():
 
 
 def played(page):
-    """What a replay tells Meshcat, by what is told and of which path."""
+    """Return the Meshcat commands of a replay by (type, path)."""
     told = {}
     for text in re.findall(r"base64,([\w+/=]+)", page):
         with suppress(ValueError):
@@ -275,7 +275,7 @@ def played(page):
     return told
 
 
-def test_a_replay_shows_all_of_the_body_the_cameras_and_what_was_measured(tiny_scene):
+def test_replay_shows_body_cameras_and_measured_ghost(tiny_scene):
     model = load_model(tiny_scene.model, check=False)
     q, off = np.array([*tiny_scene.truth.values()]), np.array([0.3, -0.1])
     X_WB = np.repeat(np.eye(4)[None], len(q), axis=0)
@@ -291,7 +291,7 @@ def test_a_replay_shows_all_of_the_body_the_cameras_and_what_was_measured(tiny_s
         pixels, depth = one.project(p_W[np.linalg.norm(p_W - one.X_WC[:3, 3], axis=1) > 1e-6])
         assert {tuple(row) for row in np.round(pixels, 2).tolist()} == corners
         assert 0.0 < depth.max() < 2.5
-    # Meshcat's y is up. Of its window of 75 degrees the body takes up a good part.
+    # Meshcat's y is up; the body fills a good part of its field of view of 75 degrees.
     view = told["set_property", "/Cameras/default/rotated/<object>"]["value"]
     eye, target = (np.array([x, -z, y]) for x, y, z in (view, told["set_target", None]["value"]))
     pinhole = PinholeCamera(
@@ -311,7 +311,7 @@ def test_a_replay_shows_all_of_the_body_the_cameras_and_what_was_measured(tiny_s
                 if not measured:
                     seen += [mesh.vertices @ X_WL[:3, :3].T + X_WL[:3, 3]]
                     continue
-                # Ten steps a frame; it stands still until just before the next.
+                # Ten steps per frame; the body stands still until just before the next frame.
                 keys = tracks[f"/drake/measured/{link}"][".position"]
                 found = {key["time"]: key["value"] for key in keys}
                 for step in (10 * k, 10 * k + 9):
@@ -321,13 +321,13 @@ def test_a_replay_shows_all_of_the_body_the_cameras_and_what_was_measured(tiny_s
     assert (pixels >= -0.5).all()
     assert (pixels <= 999.5).all()
     assert np.ptp(pixels, axis=0).max() > 300.0
-    # Seen from the first camera's side.
+    # The view is from the side of the first camera.
     directions = [place - target for place in (eye, left.X_WC[:3, 3])]
     directions = [one / np.linalg.norm(one) for one in directions]
     assert directions[0] @ directions[1] > np.cos(np.radians(30.0))
 
 
-def test_a_replay_of_many_triangles_is_small_and_shows_the_body_as_it_is(tmp_path):
+def test_replay_of_many_triangles_is_small_and_accurate(tmp_path):
     ball = trimesh.creation.icosphere(6, radius=0.1)
     ball.export(tmp_path / "ball.obj", include_normals=True)
     (tmp_path / "ball.urdf").write_text(

@@ -1,4 +1,4 @@
-"""Fixtures of what several jobs are tested with."""
+"""Fixtures for tests of several jobs."""
 
 from pathlib import Path
 
@@ -19,5 +19,5 @@ def cluster():
 
 @pytest.fixture
 def out(tmp_path: Path) -> Path:
-    """Where a job writes its result."""
+    """The result folder of a job."""
     return tmp_path / "out"

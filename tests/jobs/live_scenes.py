@@ -1,4 +1,4 @@
-"""Studios of a simulated person: cameras.yaml, sources.yaml, and the pictures."""
+"""Live scenes of a simulated person: cameras.yaml, sources.yaml and pictures."""
 
 from pathlib import Path
 
@@ -17,20 +17,20 @@ RATE_HZ = 15.0
 
 
 def standing(person: ArticulatedModel, ahead: float = 0.0, arm_deg: float = 30.0) -> np.ndarray:
-    """A person who stands, ahead of the middle [m], with raised arms and bent elbows."""
+    """Return positions (nq,) of a person who stands ahead of the middle [m] with raised arms."""
     q = np.zeros(len(person.position_names))
     q[person.position_index("position_x")] = ahead
     q[person.position_index("position_z")] = 1.55
     q[person.position_index("left_upper_arm_z")] = np.radians(arm_deg)
     q[person.position_index("right_upper_arm_z")] = -np.radians(30.0)
     for side in ("left", "right"):
-        # Silhouettes must tell front from back.
+        # A pose whose silhouettes distinguish front and back.
         q[person.position_index(f"{side}_forearm_x")] = np.radians(-70.0)
     return q
 
 
 def absent(person: ArticulatedModel) -> np.ndarray:
-    """Nobody to be seen."""
+    """Return positions (nq,) out of view, 9 m below the ground."""
     q = standing(person)
     q[person.position_index("position_z")] = -9.0
     return q
@@ -44,7 +44,7 @@ def write_studio(
     cameras: int = 3,
     size: tuple[int, int] = SIZE,
 ) -> None:
-    """Write what the cameras see: kind videos, with noise and backgrounds, or masks in folders."""
+    """Write a live scene: noisy videos with backgrounds, or folders of masks."""
     placed = circle_of_cameras(cameras, size=size, radius=2.6, face_camera=False)
     save_cameras(folder / "cameras.yaml", placed)
     rig = build_camera_rig(person, placed)

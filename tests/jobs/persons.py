@@ -13,14 +13,14 @@ from tests.jobs.scenes import write_masks
 
 @dataclass(frozen=True)
 class PersonScene:
-    """A scene's folder, the person in it, and the true positions (frames, nq)."""
+    """A scene's folder, its model, and the true positions (frames, nq)."""
 
     folder: Path
     person: ArticulatedModel
     truth: np.ndarray
 
     def estimate(self, out: Path, command: str = "estimate") -> list[str]:
-        """The words of an estimate, or a capture."""
+        """Return the words of an estimate or capture command."""
         model = str(self.person.path)
         return [command, str(self.folder), "--model", model, "--out", str(out), "--no-replay"]
 
@@ -31,7 +31,7 @@ def record_person(
     sequence: bool = True,
     size: tuple[int, int] = (160, 120),
 ) -> PersonScene:
-    """Records a person who raises an arm."""
+    """Write a recording of a person who raises an arm."""
     folder.mkdir(parents=True, exist_ok=True)
     person = load_model(bundled_model("person"), check=False)
     cameras = circle_of_cameras(4, size=size, face_camera=False)

@@ -42,25 +42,25 @@ URDF = (
 
 NAMES = ("lift", "luff")
 ANGLES = ((20.0, -40.0), (-40.0, -80.0), (60.0, 0.0))
-"""Degrees, multiples of 20 (the grid's are of 10), a row a frame."""
+"""(frames, 2) joint angles [deg], multiples of 20."""
 
 
 @dataclass(frozen=True)
 class TinyScene:
-    """A scene's folder, its body's file, and the truth [rad] by frame."""
+    """A scene's folder, its model file, and the true positions by frame [rad]."""
 
     folder: Path
     model: Path
     truth: dict[str, np.ndarray]
 
     def estimate(self, out: Path) -> list[str]:
-        """The words of an estimate."""
+        """Return the words of an estimate command."""
         given = [self.folder, "--model", self.model, "--out", out]
         return ["estimate", *map(str, given)]
 
 
 def camera(name: str, turn_deg: float = 0.0) -> PinholeCamera:
-    """A camera 3 m before the body, turned about the vertical."""
+    """Return a camera 3 m from the body, rotated about the vertical axis."""
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     X_WC = np.eye(4)
@@ -72,7 +72,7 @@ def camera(name: str, turn_deg: float = 0.0) -> PinholeCamera:
 def write_scene(
     folder: Path, angles: Sequence[Sequence[float]] = ANGLES, cameras: Sequence[str] = ("front",)
 ) -> TinyScene:
-    """Write the body and a scene in which it stands at the given angles [deg]."""
+    """Write the model and a scene with the given joint angles (frames, 2) [deg]."""
     folder.mkdir(parents=True, exist_ok=True)
     model_path = folder.parent / "crane.urdf"
     model_path.write_text(URDF)
@@ -89,7 +89,7 @@ def write_scene(
 def write_masks(
     folder: Path, model: ArticulatedModel, cameras: Iterable[Camera], poses: Iterable[np.ndarray]
 ) -> None:
-    """Writes what cameras see of a model in each of some poses (nq,), as Drake draws it."""
+    """Write the masks of cameras of a model at positions (nq,), drawn by Drake."""
     poses = list(poses)
     for camera in cameras:
         renderer, masks = LabelRenderer(model, camera), folder / "masks" / camera.name
@@ -99,13 +99,13 @@ def write_masks(
 
 
 def write_truth(scene: TinyScene, path: Path | None = None) -> Path:
-    """Write the truth as a joint_angles.csv; frames are plain numbers there."""
+    """Write the true positions as joint_angles.csv, with frames as plain numbers."""
     path = path or scene.folder / "joint_angles.csv"
     return write_joints(path, NAMES, {str(int(frame)): q for frame, q in scene.truth.items()})
 
 
 def write_joints(path: Path, names: Sequence[str], values: Mapping[str, Iterable[object]]) -> Path:
-    """Writes a table of joint positions by frame."""
+    """Write a table of joint positions by frame."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["frame", *names])
@@ -114,22 +114,22 @@ def write_joints(path: Path, names: Sequence[str], values: Mapping[str, Iterable
 
 
 class Estimated(Protocol):
-    """A scene that says how it is estimated."""
+    """A scene with a command to estimate it."""
 
     def estimate(self, out: Path) -> list[str]:
-        """The words of an estimate."""
+        """Return the words of an estimate command."""
 
 
 def run_estimate(
     scene: Estimated, out: Path, *more: object, status: int = 0
 ) -> tuple[Result, dict[str, Any]]:
-    """What the command said, and the summary that it wrote."""
+    """Run an estimate; return its output and its summary.json."""
     result = run_to_end(*scene.estimate(out), *more, status=status)
     return result, json.loads((out / "summary.json").read_text())
 
 
 def edit_camera(path: Path, name: str, to: Path | None = None, **fields: object) -> Path:
-    """Changes fields of a camera in its file, or in a copy; those that are None are taken out."""
+    """Change fields of a camera in its file or a copy; None removes a field."""
     content = yaml.safe_load(path.read_text())
     changed = {**content[name], **fields}
     content[name] = {key: value for key, value in changed.items() if value is not None}
@@ -139,6 +139,6 @@ def edit_camera(path: Path, name: str, to: Path | None = None, **fields: object)
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
-    """The rows of a CSV file."""
+    """Return the rows of a CSV file."""
     with path.open(newline="") as file:
         return list(csv.DictReader(file))

@@ -1,4 +1,4 @@
-"""Many scenes by any number of workers."""
+"""Batches of scenes by any number of workers."""
 
 import dataclasses
 import gc
@@ -32,7 +32,7 @@ QUICK = {"method": "paper", "replay": False, "overlay": False}
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory):
-    """Five stills, and a sequence of three frames."""
+    """A folder with scenes of five stills and of a sequence of three frames."""
     base = tmp_path_factory.mktemp("scenes")
     write_scene(base / "stills", MOTION)
     write_scene(base / "motion", MOTION[:3])
@@ -55,14 +55,14 @@ def jobs(scenes):
 
 @pytest.fixture(scope="module")
 def alone(jobs, tmp_path_factory):
-    """What this process makes of them."""
+    """The result of a batch without workers."""
     out = tmp_path_factory.mktemp("alone") / "out"
     run_batch(jobs, out)
     return out
 
 
 def rows(folder: Path) -> list[list[str]]:
-    """poses.csv without the seconds."""
+    """Return the rows of poses.csv without the seconds."""
     return [line.split(",")[:-1] for line in (folder / "poses.csv").read_text().splitlines()]
 
 
@@ -75,7 +75,7 @@ def slow(task: Task) -> Outcome:
     return perform(task)
 
 
-def test_chunks_put_together_are_the_result_of_the_whole_scene(jobs, alone, scenes, tmp_path):
+def test_joined_chunks_equal_the_whole_scene(jobs, alone, scenes, tmp_path):
     assert sorted(path.name for path in alone.iterdir()) == ["batch.json", "motion", "stills"]
     plain = tmp_path / "plain"
     estimate_scene(
@@ -92,7 +92,7 @@ def test_chunks_put_together_are_the_result_of_the_whole_scene(jobs, alone, scen
 
 
 @pytest.mark.slow
-def test_results_depend_neither_on_who_works_nor_on_who_is_killed(jobs, alone, cluster, tmp_path):
+def test_results_are_independent_of_workers_and_their_deaths(jobs, alone, cluster, tmp_path):
     victims, out = list(cluster.run(os.getpid).values())[:1], tmp_path / "two"
 
     def kill(done: int, total: int, message: str) -> None:
@@ -107,7 +107,7 @@ def test_results_depend_neither_on_who_works_nor_on_who_is_killed(jobs, alone, c
 
 
 @pytest.mark.slow
-def test_failing_scene_is_named_and_resume_computes_only_what_is_missing(
+def test_a_failed_scene_is_named_and_resume_runs_only_missing_tasks(
     scenes, jobs, alone, tmp_path, out
 ):
     shutil.copytree(scenes, tmp_path / "own")
@@ -122,7 +122,7 @@ def test_failing_scene_is_named_and_resume_computes_only_what_is_missing(
     assert not (out / "motion").exists()
     written = (out / "stills" / "poses.csv").stat().st_mtime_ns
     assert "--resume" in run_to_end(*words, status=1).stderr
-    # The model is mended: another job by its digest.
+    # The corrected model has another digest, so the job is another one.
     shutil.copyfile(scenes / "crane.urdf", tmp_path / "own" / "broken.urdf")
     assert "sha256" in run_to_end(*words, "--resume", status=1).stderr
     write_job(tmp_path / "own", {"stills": both["stills"], "mended": both["motion"]})
@@ -134,7 +134,7 @@ def test_failing_scene_is_named_and_resume_computes_only_what_is_missing(
 
 
 def die_on_second_chunk(task: Task) -> Outcome:
-    """A chunk that kills whoever touches it."""
+    """Perform a task, but kill the process at the second chunk."""
     if task.index == 1 and task.job.name == "stills":
         with (task.out / "deaths").open("a") as file:
             file.write("x")
@@ -143,7 +143,7 @@ def die_on_second_chunk(task: Task) -> Outcome:
 
 
 @pytest.mark.slow
-def test_poisoned_chunk_is_given_up_and_the_rest_is_kept(jobs, alone, cluster, out):
+def test_a_chunk_that_kills_workers_is_given_up_and_others_are_kept(jobs, alone, cluster, out):
     heard = []
     result = run_batch(
         jobs, out, cluster, work=die_on_second_chunk, tries=2,
@@ -169,7 +169,7 @@ def test_poisoned_chunk_is_given_up_and_the_rest_is_kept(jobs, alone, cluster, o
     assert not (out / ".chunks").exists()
 
 
-def test_everything_listens_on_the_loopback_address(cluster):
+def test_scheduler_and_workers_listen_on_the_loopback_address(cluster):
     this = psutil.Process()
     listening = [
         connection.laddr.ip
@@ -181,7 +181,7 @@ def test_everything_listens_on_the_loopback_address(cluster):
     assert all(ip.startswith("127.") for ip in listening)
 
 
-def test_workers_must_be_like_this_program(cluster, tmp_path, monkeypatch):
+def test_workers_of_another_version_are_refused(cluster, tmp_path, monkeypatch):
     require_fit_workers(cluster, tmp_path / "new")
     assert list((tmp_path / "new").iterdir()) == []
     monkeypatch.setattr("drake_pose.version.VERSION", "99.0")
@@ -190,7 +190,7 @@ def test_workers_must_be_like_this_program(cluster, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("words", [b"", b"HTTP/1.0 400 Bad request\r\n\r\n" * 8])
-def test_who_listens_but_is_no_scheduler_is_named_in_time(words, caplog, capfd):
+def test_a_server_that_is_not_a_scheduler_is_refused_in_time(words, caplog, capfd):
     with socket.create_server(("127.0.0.1", 0)) as listening:
 
         def talk():
@@ -220,13 +220,13 @@ def test_who_listens_but_is_no_scheduler_is_named_in_time(words, caplog, capfd):
 
 
 @pytest.mark.parametrize("address", ["foo", "10.0.0.7:8786", "tcp://foo", "htp://x:1"])
-def test_what_is_no_address_of_a_scheduler_is_named(address):
+def test_a_bad_scheduler_address_is_named(address):
     message = f"'{address}' is not a scheduler's address"
     with pytest.raises(ClusterError, match=message), open_cluster(scheduler=address):
         pass
 
 
-def test_without_the_extra_this_process_works_and_workers_are_refused(tmp_path, out, monkeypatch):
+def test_without_dask_one_process_works_and_workers_are_refused(tmp_path, out, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     path = tmp_path / "jobs.yaml"
     path.write_text("scenes: {gone: {scene: gone}}")
@@ -299,13 +299,13 @@ def test_job_file_is_checked(text, words, tmp_path):
 
 
 def finish(task: Task) -> Outcome:
-    """What becomes of a task that needs no work: a folder, and all its frames found."""
+    """Create a task's folder and return its outcome without work."""
     task.place.mkdir(parents=True)
     totals = {"frame_count": len(task.frames), "found_count": len(task.frames)}
     return Outcome(None, 2.0, None if task.index is not None else totals)
 
 
-def test_a_scene_is_cut_into_chunks_and_put_together(scenes, out):
+def test_a_scene_is_cut_into_chunks_and_joined(scenes, out):
     one = {"stills": {"scene": "stills"}}
     (job,) = read_job(write_job(scenes, one, "one.yaml"))
     tasks = plan_scene(job, out)
@@ -327,14 +327,14 @@ def test_a_scene_is_cut_into_chunks_and_put_together(scenes, out):
     assert (state["frame_count"], state["found_count"]) == (5, 5)
     assert result.scenes["stills"].seconds == 8.0
     assert not (out / ".chunks").exists()
-    # Other frames are other chunks, wherever they lie.
+    # Chunks of other frames have other folders.
     longer = dataclasses.replace(
         job, settings=dataclasses.replace(job.settings, frames=("0001:0004",))
     )
     assert not {task.place for task in plan_scene(longer, out)} & {task.place for task in tasks}
 
 
-def test_what_is_finished_is_not_done_again(scenes, out):
+def test_finished_tasks_are_not_repeated(scenes, out):
     (job,) = read_job(write_job(scenes, {"stills": {"scene": "stills"}}, "one.yaml"))
     first, *_ = plan_scene(job, out)
     (first.work / f"{first.place.name}.part-1").mkdir(parents=True)
@@ -347,7 +347,7 @@ def test_what_is_finished_is_not_done_again(scenes, out):
 
 
 def finish_again(task: Task) -> Outcome:
-    """A scene of which a frame has gone."""
+    """Return the outcome of a scene that lacks a frame."""
     return Outcome(None, 0.0, {"frame_count": len(task.frames) - 1})
 
 
@@ -373,7 +373,7 @@ def test_failed_chunks_do_not_stop_the_others_until_three_have_failed(scenes, ou
     assert not json.loads((out / "batch.json").read_text())["complete"]
 
 
-def test_another_job_is_not_resumed(scenes, out):
+def test_a_changed_job_is_not_resumed(scenes, out):
     (job,) = read_job(write_job(scenes, {"stills": {"scene": "stills"}}, "one.yaml"))
     with pytest.raises(OutputError, match="there is no batch to resume"):
         run_batch([job], out, resume=True)

@@ -1,4 +1,4 @@
-"""Many scenes are audited: what contradicts is told by scene; finished ones are left alone."""
+"""Batches of audits: errors by scene, and finished audits are kept."""
 
 import json
 from pathlib import Path
@@ -14,10 +14,8 @@ from tests.jobs.scenes import read_rows
 
 
 @pytest.mark.slow
-def test_what_contradicts_is_named_by_scene_and_the_rest_is_resumed(
-    tmp_path: Path, out: Path
-) -> None:
-    """A scene that is right, one with a frame whose elbow reads otherwise, one without joints."""
+def test_errors_are_listed_by_scene_and_finished_audits_are_kept(tmp_path: Path, out: Path) -> None:
+    """A correct scene, one with a frame whose elbow reading is wrong, one without joints."""
     for name in ("first", "second"):
         (tmp_path / name).mkdir()
     right = write_arm_scene(tmp_path / "first")
@@ -33,7 +31,7 @@ def test_what_contradicts_is_named_by_scene_and_the_rest_is_resumed(
     }
     path = tmp_path / "jobs.yaml"
     path.write_text(yaml.safe_dump({"defaults": given, "scenes": scenes}, sort_keys=False))
-    # The scene that failed did not stop the others.
+    # The failed scene does not stop the others.
     audited = run_to_end("batch", path, "--out", out, status=1)
     assert "scene 'lost'" in audited.stderr
     assert "nowhere.csv" in audited.stderr
@@ -57,7 +55,7 @@ def test_what_contradicts_is_named_by_scene_and_the_rest_is_resumed(
     assert told["found"]["state"] == "finished"
     assert [file.stat().st_mtime_ns for file in written] == before
     assert told["wrong"]["contradictions"] == [named]
-    # Masks that are others by now are not those that were audited.
+    # A finished audit whose masks have changed is refused.
     masks = right.folder / "masks" / "left"
     (masks / "0000.png").write_bytes((masks / "0001.png").read_bytes())
     result = run_to_end(*words, status=1)

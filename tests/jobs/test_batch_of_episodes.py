@@ -1,4 +1,4 @@
-"""Episodes in batches: one row for each and camera, and who has moved."""
+"""Batches of audited episodes: a row for each camera, and moved cameras."""
 
 import csv
 import io
@@ -39,10 +39,10 @@ def totals(place, turn_deg=0.0, sd=0.001):
     }  # fmt: skip
 
 
-def test_a_camera_has_moved_that_differs_significantly_from_the_episodes_before(tmp_path):
+def test_a_significant_difference_to_earlier_episodes_is_a_move(tmp_path):
     episodes = {
         "first": totals([1.0, 0.0, 0.5]),
-        # Within what two errors of a millimetre an axis make.
+        # Within the error of two poses with 1 mm per axis.
         "same": totals([1.001, -0.001, 0.5]),
         "bumped": totals([1.0, 0.02, 0.5], 1.0),
         "failed": {},
@@ -63,13 +63,13 @@ def test_a_camera_has_moved_that_differs_significantly_from_the_episodes_before(
     assert episodes_table({"scene": {"frame_count": 3, "agreeing_count": 3}})[1] == {}
 
 
-def test_a_camera_of_many_episodes_is_where_they_say_by_how_sure_they_are():
-    # Slow drift, each step of which is too small to be significant, is a move, too.
+def test_combined_pose_is_the_information_weighted_mean():
+    # A slow drift of insignificant steps is a move as well.
     far = 5.0 * 0.001
     text, _ = episodes_table({str(k): totals([k * far, 0.0, 0.0], sd=0.002) for k in range(9)})
     moved = [row["moved"] for row in csv.DictReader(io.StringIO(text))]
     assert 0 < moved.count("yes") < 5
-    # A second camera stands where it stood, in the file of those before the first moved, too.
+    # The second camera has not moved and has one pose in all files.
     episodes = {str(k): totals([float(k), 0.0, 0.0]) for k in range(2)}
     sds = (0.001, 0.002)
     for one, x, sd in zip(episodes.values(), (0.0, 0.005), sds, strict=True):
@@ -80,7 +80,7 @@ def test_a_camera_of_many_episodes_is_where_they_say_by_how_sure_they_are():
     assert [file["right"]["X_WC"][0][3] for file in files] == pytest.approx([weighted] * 2)
 
 
-def test_an_episode_of_a_job_has_the_settings_of_audits(tmp_path, out):
+def test_episodes_of_a_job_have_the_settings_of_audits(tmp_path, out):
     painted = painted_episode(tmp_path, frames=6)
     write_episode(tmp_path / "scene", painted)
     entry = {"scene": "scene", "model": "boxes.urdf", "audit": True, "every": 2, "units": "rad"}

@@ -29,7 +29,7 @@ def test_demo(tmp_path: Path) -> None:
     mask = scene.read(camera.name, frame)
     difference = (LabelRenderer(model, camera).mask(q) ^ mask).sum() / mask.sum()
     assert float(row["error"]) == pytest.approx(difference, abs=0.003)
-    # The paper reports 22.3 % in the mean, with a model of the person herself.
+    # The paper reports a mean of 22.3 %, with a model of the person.
     assert difference < 0.2
     ankle = np.array([float(read_rows(scene.path / "root_position.csv")[0][a]) for a in "xyz"])
     context = model.plant.CreateDefaultContext()
@@ -48,7 +48,7 @@ def test_demo(tmp_path: Path) -> None:
         assert kept <= {path.name for path in folder.iterdir()}
 
 
-def test_the_recipe_is_the_papers() -> None:
+def test_settings_are_those_of_the_paper() -> None:
     settings = demo_settings(demo_scene())
     assert settings.root == "right_foot"
     assert settings.root_position == (demo_scene() / "root_position.csv", "right_ankle")

@@ -1,4 +1,4 @@
-"""A real robot arm in damaged masks: found, and honest about what hardly shows."""
+"""Estimates of a real robot arm from damaged masks, with intervals that contain the truth."""
 
 import itertools
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ BASE = slice(0, 4)
 
 
 def flipped_arms(values: np.ndarray) -> Iterator[np.ndarray]:
-    """The same arm's other angles: A1 + 180, -A2, A3 + 180, and so on up the chain."""
+    """Return other angles of the same pose: A1 + 180, -A2, A3 + 180, and so on."""
     for chosen in itertools.product((False, True), repeat=3):
         flipped = values.copy()
         for k in np.flatnonzero(chosen):
@@ -28,14 +28,14 @@ def flipped_arms(values: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def base_errors(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """(4,) from the encoders' angles, or from a flip of them, whichever is nearer [deg]."""
+    """Return errors (4,) to the encoders' angles or equivalent ones, whichever is nearer [deg]."""
     turns = [(one - truth + np.pi) % (2.0 * np.pi) - np.pi for one in flipped_arms(found)]
     best = min(turns, key=lambda turn: (np.abs(turn[BASE]).sum(), np.abs(turn).sum()))
     return np.degrees(np.abs(best[BASE]))
 
 
 def view_errors(inputs: EstimateInputs, views: list[View], values: np.ndarray) -> np.ndarray:
-    """E_total in each view alone."""
+    """Return E_total in each view."""
     tree, errors = inputs.search.tree, []
     counts = [len(node.value_names) for node in tree.nodes]
     by_node = np.split(values, np.cumsum(counts)[:-1])
@@ -47,7 +47,7 @@ def view_errors(inputs: EstimateInputs, views: list[View], values: np.ndarray) -
 
 
 @pytest.mark.slow
-def test_the_recorded_arm(shared_data: Path) -> None:
+def test_estimates_of_a_real_arm_lie_in_their_intervals(shared_data: Path) -> None:
     scene = shared_data / "arm_two_views"
     inputs = read_inputs(scene, scene / "med7" / "med7.urdf", EstimateSettings(), None)
     all_held, errors = [], []
@@ -74,10 +74,10 @@ def test_the_recorded_arm(shared_data: Path) -> None:
             key=sum,
         )
         assert all(held[BASE]), (frame, held)
-        # Nobody can tell from these masks how the flange is turned.
+        # These masks do not determine the flange's angle.
         assert not answer.determined[-1], frame
         all_held.append(held)
         errors.append(base_errors(found, truth))
-    # As often as claimed: how the flange is turned hardly shows.
+    # The coverage is as claimed, although the flange's angle is hardly visible.
     assert np.mean(all_held) >= 0.95
     assert np.median(errors) <= 1.5

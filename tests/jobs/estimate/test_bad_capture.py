@@ -1,4 +1,4 @@
-"""Recordings with faults: each is named, and the other frames are as good as without it."""
+"""Recordings with faults: each fault is named, and other frames do not suffer."""
 
 import json
 import shutil
@@ -34,7 +34,7 @@ PLACE = tuple(f"position_{axis}" for axis in "xyz")
 
 @dataclass(frozen=True)
 class Walk:
-    """A person who steps through the picture: what four cameras see, and the truth."""
+    """A person who walks through the view of four cameras: masks and true positions."""
 
     person: ArticulatedModel
     cameras: Mapping[str, Camera]
@@ -42,11 +42,11 @@ class Walk:
     truth: np.ndarray
 
     def places(self) -> np.ndarray:
-        """Where the person is in each frame (frames, 3) [m]."""
+        """Return the person's true position (frames, 3) [m]."""
         return self.truth[:, [self.person.position_index(name) for name in PLACE]]
 
     def write(self, folder: Path) -> Path:
-        """A scene of the masks."""
+        """Write the masks as a scene and return its folder."""
         (folder / "masks").mkdir(parents=True)
         save_cameras(folder / "cameras.yaml", self.cameras)
         (folder / "scene.yaml").write_text("sequence: true\nframe_rate_hz: 30\n")
@@ -57,7 +57,7 @@ class Walk:
         return folder
 
     def capture(self, scene: Path, out: Path) -> tuple[list[str], np.ndarray]:
-        """Captures on the command line: warnings, which are the summary's, too; where it was."""
+        """Run capture; return the summary's warnings and the positions (frames, 3) [m]."""
         given = ["--model", self.person.path, "--out", out, "--no-replay", "--no-overlay"]
         result = run_to_end("capture", scene, *given)
         warnings = json.loads((out / "summary.json").read_text())["warnings"]
@@ -75,7 +75,7 @@ def walk() -> Walk:
     return Walk(person, cameras, see(person, cameras, truth), truth)
 
 
-def test_each_fault_of_the_files_is_named_and_costs_only_itself(
+def test_each_damaged_file_is_named_and_others_are_used(
     walk: Walk, tmp_path: Path, out: Path
 ) -> None:
     scene = walk.write(tmp_path / "scene")
@@ -101,8 +101,10 @@ def test_each_fault_of_the_files_is_named_and_costs_only_itself(
     assert np.abs(found - walk.places()).max() < 0.03
 
 
-def test_nobody_in_view_and_back_elsewhere(walk: Walk, tmp_path: Path, out: Path) -> None:
-    """First nobody, then the person, whom one camera alone sees for a while; then elsewhere."""
+def test_a_person_who_leaves_and_returns_elsewhere_is_found_again(
+    walk: Walk, tmp_path: Path, out: Path
+) -> None:
+    """First nobody, then a person, for a while before one camera only, then elsewhere."""
     truth = walk.truth.copy()
     truth[6:] = [stepping(walk.person, 2.0 + 0.1 * k, 0.4, -0.4) for k in range(FRAMES - 6)]
     masks = see(walk.person, walk.cameras, truth)
@@ -161,7 +163,7 @@ COLOURS = np.dstack([np.tile(np.arange(160, dtype=np.uint8), (120, 1)), *np.zero
         (lambda _: COLOURS, ("none of 8 masks", "two")),
     ],
 )
-def test_recordings_that_cannot_be_right_are_refused(
+def test_recordings_with_impossible_cameras_are_refused(
     spoiled, parts, walk: Walk, tmp_path: Path, out: Path
 ) -> None:
     scene = replace(walk, masks=walk.masks[:2]).write(tmp_path / "scene")
@@ -180,7 +182,7 @@ def test_recordings_that_cannot_be_right_are_refused(
 NAMED = ("0", "1", "2", "3")
 
 
-def test_who_was_in_view():
+def test_warnings_name_frames_without_the_person_and_with_others():
     views = ViewFaults((3,), {"a": (1,)}, {"a": (0, 1), "b": (1,)}, {"b": (1,)})
     nobody, blind, others = describe_views(views, NAMED)
     assert nobody.startswith("frame 3: fewer than two cameras")
@@ -197,13 +199,13 @@ def test_who_was_in_view():
         ((), (), "are cameras.yaml, the folders' names or the masks wrong?"),
     ],
 )
-def test_a_rig_at_fault(mirrored, exchanged, what):
+def test_warning_of_mirrored_or_exchanged_masks(mirrored, exchanged, what):
     (warning,) = describe_rig(RigFault(mirrored, exchanged, {"a": 0.6, "b": 0.8}))
     assert what in warning
     assert "60 % of camera 'a'" in warning
 
 
-def test_a_camera_that_moved_or_contradicts():
+def test_warning_of_a_moved_or_inconsistent_camera():
     motion = CameraMotion(np.eye(4), np.array([3.0, -4.0]), 5.0, 0.07, 0.1, 0.5, 0.9)
     moved = CameraFault("a", motion, True, (), 0.95, 2, True)
     unclear = CameraFault("a", motion, False, ("b",), 0.95)
@@ -215,7 +217,7 @@ def test_a_camera_that_moved_or_contradicts():
     assert "still used" in second
 
 
-def test_who_fits_badly():
+def test_warning_of_a_person_who_fits_badly():
     assert describe_fit([0.0, 0.9, 0.7]) == ()
     (warning,) = describe_fit([0.0, 0.5, 0.7, 0.3])
     assert "only 50 % of the contours fit" in warning

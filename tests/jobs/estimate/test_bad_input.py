@@ -1,4 +1,4 @@
-"""Bad input on the command line: a message that names the culprit, exit status, no traceback."""
+"""Bad input on the command line: one message with the cause, an exit status, no traceback."""
 
 import os
 import re
@@ -27,19 +27,19 @@ GREY[40:80], GREY[80:90] = 255, 128
 
 
 def camera(**fields: object) -> Callable[[Path], object]:
-    """Gives the front camera other fields."""
+    """Change fields of the front camera."""
     return lambda folder: edit_camera(folder / "cameras.yaml", "front", **fields)
 
 
 def placed(*place: float, turned: object = 1.0) -> Callable[[Path], object]:
-    """Puts the front camera at another place, its pose multiplied."""
+    """Multiply the pose of the front camera."""
     X_WC = FRONT * np.array(turned)
     X_WC[:3, 3] = place
     return camera(X_WC=X_WC.tolist())
 
 
 def mask(picture: np.ndarray | bytes) -> Callable[[Path], object]:
-    """Puts another picture in the place of the first mask."""
+    """Replace the first mask."""
     data = picture if isinstance(picture, bytes) else cv2.imencode(".png", picture)[1].tobytes()
     return lambda folder: (folder / "masks" / "front" / "0000.png").write_bytes(data)
 
@@ -99,7 +99,7 @@ def make_socket(path: Path) -> None:
 
 NO_FILES = {
     "named pipe": os.mkfifo,
-    "device": lambda path: path.symlink_to("/dev/zero"),  # Reading it never ends.
+    "device": lambda path: path.symlink_to("/dev/zero"),  # An endless file.
     "socket": make_socket,
     "folder": Path.mkdir,
 }
@@ -107,7 +107,7 @@ NO_FILES = {
 
 @pytest.mark.parametrize("place", ["masks/front/0000.png", "cameras.yaml", "joint_angles.csv"])
 @pytest.mark.parametrize("kind", NO_FILES)
-def test_what_is_no_file_is_never_opened(kind: str, place: str, own_scene: TinyScene) -> None:
+def test_devices_and_sockets_are_never_opened(kind: str, place: str, own_scene: TinyScene) -> None:
     for other in own_scene.folder.glob("masks/*/000[12].png"):
         other.unlink()
     path = own_scene.folder / place
@@ -164,7 +164,7 @@ def test_model_file(own_scene: TinyScene, tmp_path: Path) -> None:
         ("--root jib", ("root 'jib'",)),
     ],
 )
-def test_what_scene_and_model_do_not_have(options, parts, own_scene: TinyScene) -> None:
+def test_unknown_names_are_refused(options, parts, own_scene: TinyScene) -> None:
     centres = own_scene.folder / "centres.csv"
     centres.write_text("frame,joint,x,y,z\n0,hook,0,0,1\n1,hook,0,0,1\n")
     assert_refused(run(own_scene, *options.format(centres).split()), *parts)
@@ -201,7 +201,7 @@ def test_missing_options_are_usage_errors() -> None:
     assert_refused(run_command(["judge"]), "judge", status=2)
 
 
-def test_output_in_the_place_of_something_else(own_scene: TinyScene) -> None:
+def test_output_folder_with_other_files_is_refused(own_scene: TinyScene) -> None:
     out = own_scene.folder.parent / "out"
     out.mkdir()
     (out / "mine.txt").write_text("mine")
@@ -212,7 +212,7 @@ def test_output_in_the_place_of_something_else(own_scene: TinyScene) -> None:
     assert_refused(run(own_scene, "--out", below), "mine.txt", "is a file")
 
 
-def test_what_ends_a_job_is_said_but_bugs_stay_visible(
+def test_expected_errors_are_one_line_and_bugs_keep_their_traceback(
     own_scene: TinyScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ends: list[BaseException] = []
@@ -221,7 +221,7 @@ def test_what_ends_a_job_is_said_but_bugs_stay_visible(
         raise ends[-1]
 
     monkeypatch.setattr("drake_pose.jobs.estimate.scene.read_inputs", fail)
-    ends.append(SystemExit("condition 'q.size() == 7' failed"))  # Drake's failed demands.
+    ends.append(SystemExit("condition 'q.size() == 7' failed"))  # A failed DRAKE_DEMAND.
     assert_refused(run(own_scene), "q.size() == 7")
     ends.append(KeyboardInterrupt())
     assert_refused(run(own_scene), "interrupted before anything was written")
@@ -232,7 +232,7 @@ def test_what_ends_a_job_is_said_but_bugs_stay_visible(
         run(own_scene)
 
 
-def test_no_time(own_scene: TinyScene) -> None:
+def test_time_limit_of_zero_is_reported(own_scene: TinyScene) -> None:
     result = run(own_scene, "--time-limit", "0")
     assert result.exit_code == 0, result.output
     assert "stopped by the time limit" in result.stderr

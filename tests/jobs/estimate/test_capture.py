@@ -25,20 +25,20 @@ FILES = {
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> PersonScene:
-    """Shared, so do not change it."""
+    """A recording; shared, do not change it."""
     return record_person(tmp_path_factory.mktemp("person") / "scene", FRAMES)
 
 
 @pytest.fixture
 def own_recording(recording: PersonScene, tmp_path: Path) -> PersonScene:
-    """A copy to be spoilt."""
+    """A copy that may be changed."""
     shutil.copytree(recording.folder, tmp_path / "scene")
     return PersonScene(tmp_path / "scene", recording.person, recording.truth)
 
 
 @pytest.fixture
 def known(recording: PersonScene, monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Puts the truth in the place of the capture, which takes seconds; how many were asked for."""
+    """Replace the capture, which takes seconds, by the truth; return the numbers of frames."""
     counts: list[int] = []
 
     def capture(tree, cameras, read, count, settings, on_frame):
@@ -62,7 +62,7 @@ def known(recording: PersonScene, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return counts
 
 
-def test_what_is_done_is_told(recording: PersonScene, known: list[int]) -> None:
+def test_stages_are_reported(recording: PersonScene, known: list[int]) -> None:
     stages: list[tuple[str, int]] = []
     estimate_scene(
         recording.folder, recording.person.path, replay=False,
@@ -72,7 +72,7 @@ def test_what_is_done_is_told(recording: PersonScene, known: list[int]) -> None:
     assert stages == [(name, k) for name in names for k in range(1, 1 + FRAMES)]
 
 
-def test_estimate_follows_a_person_and_says_so(
+def test_estimate_chooses_the_method_person_and_says_so(
     recording: PersonScene, known: list[int], out: Path
 ) -> None:
     result, summary = run_estimate(recording, out)
@@ -82,11 +82,11 @@ def test_estimate_follows_a_person_and_says_so(
     assert summary["complete"] is True
     assert summary["method"] == "person"
     assert summary["cameras"]["camera_3"]["frames"] == FRAMES
-    # The person stands in front of the cameras as the masks show: what is compared is the truth.
+    # The masks agree with the truth, which replaces the capture.
     assert summary["mean_iou"] > 0.94
     assert {path.parent.name for path in out.glob("overlay/*/*.png")} == set(summary["cameras"])
     assert len(list(out.glob("overlay/*/*.png"))) == 4 * FRAMES
-    # Deviations become intervals of 95 %; at a limit the interval ends there.
+    # 95 % intervals from standard deviations end at limits.
     joints = {(row["frame"], row["joint"]): row for row in read_rows(out / "joints.csv")}
     row, half = joints["0001", "left_upper_arm_z"], np.degrees(1.96 * 0.01)
     assert float(row["low"]) == pytest.approx(40.0 - half, abs=1e-3)
@@ -95,7 +95,7 @@ def test_estimate_follows_a_person_and_says_so(
     assert float(joints["0001", "left_forearm_x"]["high"]) == 0.0
 
 
-def test_a_pose_that_explains_a_frame_as_well_is_given_and_named(
+def test_an_equally_good_pose_is_written_and_named_in_a_warning(
     recording: PersonScene, known: list[int], out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     follow = person.capture_checked
@@ -130,7 +130,7 @@ def test_a_pose_that_explains_a_frame_as_well_is_given_and_named(
     assert row["modes"] == "2"
 
 
-def test_stills_cameras_and_frames_are_chosen_like_an_estimates(
+def test_capture_selects_cameras_and_frames_as_estimate_does(
     known: list[int], tmp_path: Path, out: Path
 ) -> None:
     scene = record_person(tmp_path / "scene", FRAMES, sequence=False)
@@ -142,7 +142,7 @@ def test_stills_cameras_and_frames_are_chosen_like_an_estimates(
     assert len(read_rows(out / "joint_centres.csv")) == 2 * 14
 
 
-def test_a_capture_is_of_a_sequence_unless_the_scene_says_otherwise(
+def test_capture_is_a_sequence_unless_the_scene_says_otherwise(
     own_recording: PersonScene, known: list[int], tmp_path: Path
 ) -> None:
     own_recording.folder.joinpath("scene.yaml").unlink()
@@ -153,7 +153,7 @@ def test_a_capture_is_of_a_sequence_unless_the_scene_says_otherwise(
         own_recording.folder.joinpath("scene.yaml").write_text("sequence: false\n")
 
 
-def test_the_command_capture_takes_the_bundled_person(
+def test_capture_uses_the_bundled_person(
     recording: PersonScene, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = {}
@@ -173,7 +173,7 @@ def interrupt(*_: object) -> None:
     raise KeyboardInterrupt
 
 
-def test_an_interrupted_recording_does_not_look_whole_and_loses_no_frames(
+def test_an_interrupted_capture_is_incomplete_and_resumes_without_loss(
     recording: PersonScene, known: list[int], out: Path
 ) -> None:
     with pytest.MonkeyPatch.context() as patch:
@@ -186,7 +186,7 @@ def test_an_interrupted_recording_does_not_look_whole_and_loses_no_frames(
     for frames, finished, asked in (
         ("0", ["0000"], [1]),
         ("1:2", ["0000", "0001", "0002"], [1, FRAMES]),
-        # Nothing is left to be done.
+        # No frame is missing.
         ("0:2", ["0000", "0001", "0002"], [1, FRAMES]),
     ):
         _, summary = run_estimate(recording, out, "--resume", "--frame", frames)
@@ -205,11 +205,11 @@ def test_an_interrupted_recording_does_not_look_whole_and_loses_no_frames(
     ],
     ids=["method", "one camera", "hold", "root"],
 )
-def test_options_of_the_search_lead_to_the_search(
+def test_options_of_the_search_choose_the_search(
     recording: PersonScene, settings: EstimateSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Searched(Exception):
-        """Stands for the search."""
+        """Replaces the search."""
 
     def search(*_: object, **__: object) -> None:
         raise Searched
@@ -219,7 +219,9 @@ def test_options_of_the_search_lead_to_the_search(
         estimate_scene(recording.folder, recording.person.path, None, settings)
 
 
-def test_what_the_method_person_cannot_do_is_refused(recording: PersonScene, out: Path) -> None:
+def test_scenes_and_options_unfit_for_the_method_person_are_refused(
+    recording: PersonScene, out: Path
+) -> None:
     with pytest.raises(SettingsError, match="leave hold out"):
         EstimateSettings(method="person", hold={"head_y": 1.0})
     hand = bundled_model("hand")

@@ -1,4 +1,4 @@
-"""A sequence of pictures without masks, painted over Drake's label images."""
+"""Tracking by colour in pictures without masks, painted over Drake's label images."""
 
 import shutil
 
@@ -25,7 +25,7 @@ FRAMES = 8
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    """A scene of pictures, the model's file, the true positions, and a file of the first ones."""
+    """A scene of pictures, the model file, the true positions, and a start file."""
     folder = tmp_path_factory.mktemp("recording")
     model, camera = forked_body(folder), near_camera()
     generator = np.random.default_rng(9)
@@ -46,14 +46,14 @@ def recording(tmp_path_factory):
 
 
 def errors(estimate, truth):
-    """(frames,) the greatest error of each frame [deg]."""
+    """Return the largest joint error (frames,) of each frame [deg]."""
     found = np.array([one.q for one in estimate.records.values()])
     return np.degrees(np.abs(found - truth).max(axis=1))
 
 
 @pytest.fixture(scope="module")
 def filmed(recording, tmp_path_factory):
-    """The same scene with a video in place of the pictures."""
+    """The same scene with a video instead of pictures."""
     scene = recording[0]
     copy = tmp_path_factory.mktemp("filmed")
     shutil.copy(scene / "cameras.yaml", copy)
@@ -69,12 +69,12 @@ def filmed(recording, tmp_path_factory):
     return copy
 
 
-def test_a_video_stands_for_pictures(recording, filmed):
+def test_a_video_gives_the_same_poses_as_pictures(recording, filmed):
     scene, model, truth, start = recording
     loaded = load_scene(filmed)
     assert loaded.frames == tuple(f"{k:06d}" for k in range(FRAMES))
     assert loaded.frame_rate_hz == pytest.approx(25.0)
-    # In order, back, and over some: compression changes little.
+    # Frames are read in order, backwards and with gaps; compression changes little.
     still = load_scene(scene)
     for k in (0, 1, 5, 2, 7):
         off = loaded.read_image("front", f"{k:06d}").astype(float)
@@ -85,7 +85,7 @@ def test_a_video_stands_for_pictures(recording, filmed):
     assert np.median(errors(estimate, truth)) < 3.0
 
 
-def test_every_frame_by_colour_has_intervals_that_hold_the_truth(recording):
+def test_intervals_of_frames_by_colour_contain_the_truth(recording):
     scene, model, truth, start = recording
     records = estimate_scene(scene, model, None, EstimateSettings(start=start)).records
     assert len(records) == FRAMES
@@ -96,7 +96,7 @@ def test_every_frame_by_colour_has_intervals_that_hold_the_truth(recording):
         assert max(joint["high"] - joint["low"] for joint in record.joints.values()) < 12.0
 
 
-def test_frames_of_a_video_are_named_as_its_masks_are(recording, filmed, tmp_path):
+def test_frames_of_a_video_have_the_names_of_its_masks(recording, filmed, tmp_path):
     copy = shutil.copytree(filmed, tmp_path / "scene")
     (copy / "masks" / "front").mkdir(parents=True)
     shutil.copy(recording[0].parent / "first.png", copy / "masks" / "front" / "0.png")
@@ -117,14 +117,14 @@ def test_frames_of_a_video_are_named_as_its_masks_are(recording, filmed, tmp_pat
         (False, {"track": False}, "leave track=False out"),
     ],
 )
-def test_what_does_not_say_where_the_body_is_is_refused(recording, with_start, more, words):
+def test_a_sequence_of_pictures_without_a_start_is_refused(recording, with_start, more, words):
     scene, model, _, start = recording
     settings = EstimateSettings(start=start if with_start else None, **more)
     with pytest.raises((SceneError, SettingsError), match=words):
         estimate_scene(scene, model, settings=settings)
 
 
-def test_a_bad_picture_is_met_before_the_work_begins(recording, tmp_path, out):
+def test_a_damaged_picture_is_refused_before_the_work_begins(recording, tmp_path, out):
     scene, model, _, start = recording
     copy = shutil.copytree(scene, tmp_path / "scene")
     cv2.imwrite(str(copy / "images" / "front" / "0005.png"), np.zeros((10, 20, 3), np.uint8))
@@ -136,7 +136,7 @@ def test_a_bad_picture_is_met_before_the_work_begins(recording, tmp_path, out):
     assert not (out / "poses.csv").exists()
 
 
-def test_an_interrupted_sequence_of_pictures_goes_on_as_if_it_had_not_been(recording, out):
+def test_a_resumed_sequence_of_pictures_equals_an_uninterrupted_one(recording, out):
     scene, model, _, start = recording
     settings, heard = EstimateSettings(start=start), []
 
@@ -154,18 +154,18 @@ def test_an_interrupted_sequence_of_pictures_goes_on_as_if_it_had_not_been(recor
         np.testing.assert_allclose(one.q, other.q, atol=1e-6)
     assert whole.found_count == FRAMES
     assert np.median(errors(whole, recording[2])) < 1.5
-    # Overlays show an orange contour over the pictures.
+    # Overlays show an orange contour over pictures.
     shown = cv2.imread(str(out / "overlay" / "front" / "0001.png"))
     line = np.all(shown == (0, 94, 213), axis=-1)
     assert 100 < line.sum() < 0.1 * line.size
 
 
-def test_where_the_body_is_lost_no_pose_is_written(recording, tmp_path, out):
+def test_frames_in_which_the_body_is_lost_have_no_pose(recording, tmp_path, out):
     scene, model, _, start = recording
     copy = shutil.copytree(scene, tmp_path / "scene")
     picture = cv2.imread(str(copy / "images" / "front" / "0003.png"))
     for k, grey in ((3, 128), (4, None)):
-        # Without any colours, and with those of a room that the body has left.
+        # A grey picture, and one with the body elsewhere.
         seen = np.full_like(picture, 128) if grey else np.roll(picture, 150, axis=1)
         cv2.imwrite(str(copy / "images" / "front" / f"{k:04d}.png"), seen)
     (copy / "masks" / "front").mkdir(parents=True)
@@ -183,7 +183,7 @@ def test_where_the_body_is_lost_no_pose_is_written(recording, tmp_path, out):
     assert [k for k, row in enumerate(rows) if ",,,," in row] == [3, 4]
     text = (out / "report.html").read_text()
     assert "0003-0004 (2 of 8): no pose was found" in text
-    # The page counts pictures, not the only mask, whose IoU makes no plot.
+    # The page counts pictures instead of masks; a single IoU has no plot.
     page = Page(text)
     cameras = next(table for table in page.tables if table[0][0] == "camera")
     assert cameras[1][:3] == ["front", "8", "6"]
@@ -216,18 +216,18 @@ def episode(tmp_path_factory):
     return folder / "scene", painted
 
 
-def test_an_arm_is_followed_from_where_its_log_begins(episode):
+def test_an_arm_is_tracked_from_its_first_logged_positions(episode):
     scene, painted = episode
     result = estimate_scene(scene, painted.path)
     assert list(result.records) == [f"{k:04d}" for k in range(6)]
     off = np.array([list(one.joint_errors.values()) for one in result.records.values()])
     assert off.shape == painted.values.shape
-    # The boxes' tip turns about its own axis.
+    # The last link turns about its axis of symmetry.
     assert np.median(np.abs(off[:, :3])) < 1.0
     assert np.abs(off[:, :3]).max() < 4.0
 
 
-def test_frames_are_chosen_and_truth_is_of_the_same_moments(episode):
+def test_selected_frames_are_compared_with_synchronised_positions(episode):
     scene, painted = episode
     result = estimate_scene(scene, painted.path, settings=EstimateSettings(every=2))
     assert list(result.records) == ["0000", "0002", "0004"]
@@ -236,7 +236,7 @@ def test_frames_are_chosen_and_truth_is_of_the_same_moments(episode):
         np.testing.assert_allclose(truth, painted.values[k], atol=5e-3)
 
 
-def test_cameras_of_another_file_are_taken(episode, tmp_path):
+def test_cameras_of_another_file_are_used(episode, tmp_path):
     scene, painted = episode
     nowhere = edit_camera(scene / "cameras.yaml", "camera", tmp_path / "nowhere.yaml", X_WC=None)
     with pytest.raises(SceneError, match="no camera has a pose X_WC; find"):

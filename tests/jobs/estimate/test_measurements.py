@@ -40,7 +40,7 @@ def test_damaged_joint_centres(tmp_path: Path, text: str, message: str) -> None:
         read_joint_centres(path, "ankle", ["0000"])
 
 
-def test_joint_centres_that_are_not_there_are_named(tmp_path: Path) -> None:
+def test_missing_joint_centres_are_named(tmp_path: Path) -> None:
     path = written(tmp_path / "centres.csv", CENTRES)
     with pytest.raises(SceneError, match=r"centres\.csv.*'ankle'.*'still'"):
         read_joint_centres(path, "ankle", ["0000", "still"])
@@ -50,7 +50,7 @@ def test_joint_centres_that_are_not_there_are_named(tmp_path: Path) -> None:
         read_joint_centres(tmp_path / "nowhere.csv", "ankle", ["0000"])
 
 
-def test_true_angles(tmp_path: Path) -> None:
+def test_measured_positions_are_read_by_frame(tmp_path: Path) -> None:
     path = written(tmp_path / "angles.csv", "frame,b,a\n3,0.5,-1\n")
     truth = read_measured_positions(path, ["a", "b", "c"])
     assert truth.names == ("b", "a")
@@ -59,7 +59,7 @@ def test_true_angles(tmp_path: Path) -> None:
     assert values.tolist() == [0.5, -1.0]
     assert truth.of("0004") is None
     assert truth.of("still") is None
-    # A number of so many digits is one to nobody.
+    # Too long for a number: compared as a name.
     assert (
         read_measured_positions(written(path, f"frame,b\n{'9' * 5000},0\n"), ["b"]).of("9") is None
     )

@@ -1,4 +1,4 @@
-"""A person in a sequence of pictures without masks, painted over Drake's label images."""
+"""Tracking of a person by colour in pictures without masks, painted over Drake's label images."""
 
 import shutil
 
@@ -21,7 +21,7 @@ FRAMES = 5
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    """A scene of pictures, the masks of another folder, the model, the truth, and a start."""
+    """A scene of pictures, masks in another folder, the model, true positions, and a start file."""
     folder = tmp_path_factory.mktemp("person")
     scene = record_person(folder / "scene", FRAMES, size=(240, 180))
     shutil.move(folder / "scene" / "masks", folder / "masks")
@@ -42,12 +42,12 @@ def recording(tmp_path_factory):
 
 
 def moved(estimate, truth):
-    """Errors of the arm that moves [degrees]."""
+    """Return the errors of the moving arm's joints [deg]."""
     k = list(estimate.position_names).index("left_upper_arm_z")
     return np.abs(np.degrees([one.q[k] for one in estimate.records.values()] - truth[:, k]))
 
 
-def test_a_person_is_followed_from_a_start(recording, out):
+def test_a_person_is_tracked_by_colour_from_a_start(recording, out):
     scene, _, truth, start = recording
     settings = EstimateSettings(start=start, method="person")
     model = bundled_model("person")
@@ -60,7 +60,7 @@ def test_a_person_is_followed_from_a_start(recording, out):
         estimate_scene(scene, model, out, settings, on_frame=stop)
     words = ["capture", scene, "--out", out, "--start", start, "--model", model]
     run_to_end(*words, "--resume", "--no-replay")
-    # Nothing is left to be done.
+    # No frame is missing.
     found = estimate_scene(scene, model, out, settings, resume=True, replay=False)
     assert found.summary["method"] == "person"
     assert found.found_count == FRAMES
@@ -72,7 +72,7 @@ def test_a_person_is_followed_from_a_start(recording, out):
     assert len(overlays) == 4 * FRAMES
 
 
-def test_a_person_who_is_lost_is_said_to_be(recording, tmp_path):
+def test_a_lost_person_is_reported(recording, tmp_path):
     scene, _, _, start = recording
     copy = shutil.copytree(scene, tmp_path / "scene")
     for file in copy.glob("images/*/0003.png"):
@@ -83,7 +83,7 @@ def test_a_person_who_is_lost_is_said_to_be(recording, tmp_path):
     assert any("frame 0003" in text and "is lost" in text for text in found.warnings)
 
 
-def test_one_mask_does_not_say_where_a_person_is(recording, tmp_path):
+def test_a_person_with_a_single_mask_is_refused(recording, tmp_path):
     scene, masks, _, _ = recording
     copy = shutil.copytree(scene, tmp_path / "scene")
     (copy / "masks" / "camera_0").mkdir(parents=True)
@@ -93,7 +93,7 @@ def test_one_mask_does_not_say_where_a_person_is(recording, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_person_is_followed_from_masks_of_the_first_frame(recording, tmp_path):
+def test_a_person_is_tracked_by_colour_from_masks_of_the_first_frame(recording, tmp_path):
     scene, masks, truth, _ = recording
     copy = shutil.copytree(scene, tmp_path / "scene")
     for folder in masks.iterdir():

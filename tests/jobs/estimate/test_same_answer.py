@@ -1,4 +1,4 @@
-"""The same answer whatever the machine is set to: locale, time zone, threads, hashes, paths."""
+"""Results do not depend on locale, time zone, threads, hash seeds or paths."""
 
 import os
 import shutil
@@ -18,7 +18,7 @@ NUMBERS = {
 
 
 def start(scene: TinyScene, out: Path, settings: dict[str, str]) -> subprocess.Popen[str]:
-    """A child that estimates; every other setting is this process's own."""
+    """Run an estimate in a child process with some environment variables changed."""
     command = [sys.executable, "-m", "drake_pose.commands.main", *scene.estimate(out)]
     return subprocess.Popen(
         [*command, "--no-overlay", "--no-replay"],
@@ -30,7 +30,7 @@ def start(scene: TinyScene, out: Path, settings: dict[str, str]) -> subprocess.P
     )
 
 
-def test_the_answer_does_not_depend_on_what_the_machine_is_set_to(
+def test_result_is_independent_of_locale_time_zone_and_threads(
     tiny_scene: TinyScene, tmp_path: Path, out: Path
 ) -> None:
     far = tmp_path / "Größe 模型 mit Leerzeichen"
@@ -40,7 +40,7 @@ def test_the_answer_does_not_depend_on_what_the_machine_is_set_to(
     nowhere.write_text("a file, so that nothing can be written beneath it")
     threads = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
     plain = {"PYTHONHASHSEED": "1", "LC_ALL": "C", "TZ": "UTC", **dict.fromkeys(threads, "1")}
-    # A locale that writes 0,5, where there is one.
+    # A locale with a decimal comma, if there is one.
     other = {"PYTHONHASHSEED": "77", "LC_ALL": "de_DE.UTF-8", "TZ": "Asia/Kolkata"}
     other |= {"HOME": str(nowhere / "of" / "nobody"), **dict.fromkeys(threads, "2")}
     outs = out, far / "out ä"
@@ -55,8 +55,8 @@ def test_the_answer_does_not_depend_on_what_the_machine_is_set_to(
     finally:
         for child in children:
             child.kill()
-    # Once in about ten runs, with nothing compiled, one joint differed by 0.04 degrees: why is not
-    # known; a sum's last bit that depends on where its array lies in memory would do it.
+    # With an empty cache of kernels, one joint differs by 0.04 degrees in one of about ten runs;
+    # the cause is unknown. Rounding that depends on the alignment of arrays would explain it.
     for file, numbers in NUMBERS.items():
         tolerance = 2e-3 if file == "poses.csv" else 0.2
         rows = [read_rows(out / file) for out in outs]

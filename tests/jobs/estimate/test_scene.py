@@ -1,4 +1,4 @@
-"""Estimates of scenes: result folders, roots and cameras that are not known, packages."""
+"""Estimates of scenes: result folders, unknown roots and cameras, packages."""
 
 import html
 import json
@@ -38,7 +38,7 @@ from tests.jobs.scenes import (
 
 
 def positions(out: Path) -> dict[str, np.ndarray]:
-    """The positions [rad] by frame."""
+    """Return the positions by frame [rad]."""
     rows = read_rows(out / "poses.csv")
     return {row["frame"]: np.array([float(row[name]) for name in NAMES]) for row in rows}
 
@@ -83,7 +83,7 @@ def test_summary(tiny_scene: TinyScene, out: Path) -> None:
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-7)
 
 
-def test_error_and_overlay_are_what_drakes_renderer_sees(tiny_scene: TinyScene, out: Path) -> None:
+def test_error_and_overlay_agree_with_drakes_renderer(tiny_scene: TinyScene, out: Path) -> None:
     settings = EstimateSettings(method="paper", hold={"luff": -90.0})
     result = estimate_scene(tiny_scene.folder, tiny_scene.model, out, settings, replay=False)
     scene = load_scene(tiny_scene.folder)
@@ -99,7 +99,7 @@ def test_error_and_overlay_are_what_drakes_renderer_sees(tiny_scene: TinyScene, 
         ]
         scale = counts[1] / shares[1]
         assert scale == round(scale)
-        # Black lines between segments lie on the other two.
+        # Borders between segments cover some pixels of both.
         for painted, share in zip(counts[::2], shares[::2], strict=True):
             assert 0.9 * scale * share < painted <= scale * share
 
@@ -118,7 +118,7 @@ def test_nothing_is_written_without_a_folder(tiny_scene: TinyScene) -> None:
     assert heard == [(0, 1, ""), (1, 1, "0001")]
 
 
-def test_several_cameras_are_matched_together(tmp_path: Path) -> None:
+def test_several_cameras_are_used_together(tmp_path: Path) -> None:
     scene = write_scene(tmp_path / "scene", [(20.0, -40.0)], ["front", "side"])
     for options, names in (
         (("--method", "paper"), ["front", "side"]),
@@ -130,7 +130,7 @@ def test_several_cameras_are_matched_together(tmp_path: Path) -> None:
         assert sorted(path.name for path in (out / "overlay").iterdir()) == names
 
 
-def test_truth_in_the_scene_is_compared_with(own_scene: TinyScene) -> None:
+def test_estimates_are_compared_with_measured_positions_of_the_scene(own_scene: TinyScene) -> None:
     write_truth(own_scene)
     folder = own_scene.folder.parent
     held = ["--hold", "lift=27", "--frame", "0", "--no-replay"]
@@ -138,7 +138,7 @@ def test_truth_in_the_scene_is_compared_with(own_scene: TinyScene) -> None:
     assert "Joint errors" in result.stdout
     assert summary["frames"]["0000"]["joint_errors"]["lift"] == pytest.approx(7.0)
     assert summary["joint_errors"]["lift"]["greatest"] == pytest.approx(7.0)
-    # That of another model is left alone.
+    # A table of another model is ignored.
     (own_scene.folder / "joint_angles.csv").write_text("frame,A1\n0,0.5\n")
     _, summary = run_estimate(own_scene, folder / "other", *held)
     assert summary["joint_errors"] == {}
@@ -150,7 +150,7 @@ def test_truth_in_the_scene_is_compared_with(own_scene: TinyScene) -> None:
 
 
 def jib_positions(scene: TinyScene) -> dict[str, np.ndarray]:
-    """Where the jib's origin is in each frame, from a plant of the test's own."""
+    """Return the position of the jib's origin by frame, from a separate plant [m]."""
     plant = MultibodyPlant(0.0)
     Parser(plant).AddModels(str(scene.model))
     plant.Finalize()
@@ -194,8 +194,8 @@ def test_a_frame_without_a_pose(own_scene: TinyScene, monkeypatch: pytest.Monkey
     assert (out / "overlay" / "front" / "0000.png").is_file()
 
 
-def test_what_is_known_of_each_joint_and_of_frames_before(own_scene: TinyScene) -> None:
-    """One camera, angles between the samples: the truth lies in the intervals of some mode."""
+def test_intervals_and_modes_are_written_and_kept_on_resume(own_scene: TinyScene) -> None:
+    """One camera, angles between the samples: some mode's intervals contain the truth."""
     scene = write_scene(own_scene.folder.parent / "between", [(13.0, -47.0), (-31.0, -22.0)])
     out = own_scene.folder.parent / "out"
     run_estimate(scene, out, "--frame", "1", "--no-replay")
@@ -212,7 +212,7 @@ def test_what_is_known_of_each_joint_and_of_frames_before(own_scene: TinyScene) 
         k = NAMES.index(name)
         truth, value = np.degrees(scene.truth[frame][k]), np.degrees(found[frame][k])
         assert abs(value - truth) < 2.0
-        # A pixel, by which the camera may be off, is half a segment's width here.
+        # A pixel, the assumed error of the camera, is half the width of a link here.
         assert row["determined"] == "yes" or name == "luff"
         assert float(row["low"]) <= truth <= float(row["high"]) < float(row["low"]) + 30.0
         (answer,) = (
@@ -223,7 +223,7 @@ def test_what_is_known_of_each_joint_and_of_frames_before(own_scene: TinyScene) 
         assert answer == pytest.approx(value, abs=1e-3)
 
 
-def test_what_the_model_does_not_enforce_is_told(
+def test_constraints_that_are_not_enforced_are_warned_of(
     tiny_scene: TinyScene, tmp_path: Path, out: Path
 ) -> None:
     text = URDF.replace('<joint name="bolt" type="fixed">', '<joint name="bolt" type="prismatic">')
@@ -245,7 +245,7 @@ def test_what_the_model_does_not_enforce_is_told(
 
 @pytest.fixture
 def bare_scene(own_scene: TinyScene) -> TinyScene:
-    """Masks alone."""
+    """A scene of masks without cameras.yaml."""
     (own_scene.folder / "cameras.yaml").unlink()
     for path in (own_scene.folder / "masks" / "front").iterdir():
         path.rename(own_scene.folder / "masks" / path.name)
@@ -254,14 +254,14 @@ def bare_scene(own_scene: TinyScene) -> TinyScene:
 
 
 def run(scene: TinyScene, out: Path, *more: str) -> tuple[np.ndarray, dict]:
-    """The positions and the record of the first frame."""
+    """Return the positions and the record of the first frame."""
     _, summary = run_estimate(scene, out, "--method", "beam", "--frame", "0", "--no-replay", *more)
     (row,) = read_rows(out / "poses.csv")
     return np.array([float(row[name]) for name in NAMES]), summary["frames"]["0000"]
 
 
-def test_masks_alone(bare_scene: TinyScene, out: Path) -> None:
-    """Pose and scale are found, as far as a parallel camera can stand for the pinhole."""
+def test_masks_without_cameras_give_pose_and_scale(bare_scene: TinyScene, out: Path) -> None:
+    """A parallel camera approximates the pinhole camera that drew the masks."""
     q, record = run(bare_scene, out)
     np.testing.assert_allclose(q, bare_scene.truth["0000"], atol=np.radians(6.0))
     assert record["E_total"] < 0.08
@@ -270,7 +270,7 @@ def test_masks_alone(bare_scene: TinyScene, out: Path) -> None:
     depth = np.linalg.norm(true_camera.X_WC[:2, 3])
     assert record["camera_scale"] == pytest.approx(true_camera.focal_x / depth, rel=0.06)
     assert (out / "overlay" / "camera" / "0000.png").is_file()
-    # Nothing says how sure it is: each joint may be anywhere inside its limits.
+    # Without intervals each joint has the range of its limits.
     limits = load_model(bare_scene.model, check=False)
     for k, joint in enumerate(record["joints"].values()):
         ends = np.degrees([limits.lower[k], limits.upper[k]])
@@ -278,14 +278,16 @@ def test_masks_alone(bare_scene: TinyScene, out: Path) -> None:
         assert [joint["low"], joint["high"]] == pytest.approx(ends)
 
 
-def test_a_root_position_that_is_not_known(tiny_scene: TinyScene, out: Path) -> None:
+def test_an_unknown_root_position_is_estimated(tiny_scene: TinyScene, out: Path) -> None:
     q, record = run(tiny_scene, out, "--root-position", "unknown")
     np.testing.assert_allclose(q, tiny_scene.truth["0000"], atol=np.radians(6.0))
     assert record["E_total"] < 0.03
     assert record["camera_scale"] is None
 
 
-def test_what_needs_a_known_root_is_refused(tiny_scene: TinyScene, bare_scene: TinyScene) -> None:
+def test_options_that_need_a_known_root_are_refused(
+    tiny_scene: TinyScene, bare_scene: TinyScene
+) -> None:
     settings = EstimateSettings(method="paper")
     for scene, more in ((bare_scene, None), (tiny_scene, "unknown")):
         with pytest.raises(SettingsError, match="method beam"):
@@ -297,7 +299,7 @@ BOOM = LINK.format(name="boom", z=0.25, size="0.1 0.12 0.5")
 
 @pytest.fixture
 def far(tmp_path: Path, tiny_scene: TinyScene) -> tuple[Path, Path]:
-    """A model whose boom is a mesh of a package that lies far away, and that package's folder."""
+    """A model whose boom is a mesh of a package elsewhere, and the package's folder."""
     folder = tmp_path / "far away" / "crane parts"
     folder.mkdir(parents=True)
     trimesh.creation.box((0.1, 0.12, 0.5)).export(folder / "boom.stl")
@@ -309,7 +311,7 @@ def far(tmp_path: Path, tiny_scene: TinyScene) -> tuple[Path, Path]:
     return model, folder
 
 
-def test_a_package_is_named_where_it_is_missing_and_may_not_move(
+def test_a_missing_package_is_named_and_must_stay_the_same_on_resume(
     out: Path, tiny_scene: TinyScene, far: tuple[Path, Path]
 ) -> None:
     model, folder = far

@@ -1,4 +1,4 @@
-"""Sequences are tracked; poses and cameras that do not explain the pictures are reported."""
+"""Tracking of sequences, and warnings of poses and cameras that do not fit."""
 
 import re
 from pathlib import Path
@@ -19,7 +19,7 @@ from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.jobs.scenes import URDF, TinyScene, camera, edit_camera, write_scene
 from tests.search.turning import crane
 
-# A crane that swings, and stands otherwise after a cut.
+# A swinging crane, with a cut before the last frames.
 BEFORE = [(20 + 3 * k, -40 - 2 * k) for k in range(6)]
 AFTER = [(-60 + 2 * k, -90 + 3 * k) for k in range(5)]
 
@@ -30,13 +30,13 @@ def write_sequence(folder: Path, text: str) -> TinyScene:
     return scene
 
 
-def test_a_sequence_is_matched_first_tracked_and_matched_after_a_cut(tmp_path: Path) -> None:
+def test_a_sequence_is_searched_then_tracked_and_searched_after_a_cut(tmp_path: Path) -> None:
     scene = write_sequence(tmp_path / "scene", "sequence: true\nframe_rate_hz: 30\n")
     settings = EstimateSettings(method="paper")
     result = estimate_scene(scene.folder, scene.model, settings=settings, replay=False)
     how = [result.records[frame].stopped_by == TRACKED for frame in scene.truth]
     runs = [result.records[frame].runs for frame in scene.truth]
-    # A matched frame is refined by its contour; a tracked one has asked no search.
+    # Tracked frames have no runs of the search.
     assert how.count(True) >= 9
     assert runs[1:6] == [0] * 5
     errors = np.degrees(
@@ -46,7 +46,7 @@ def test_a_sequence_is_matched_first_tracked_and_matched_after_a_cut(tmp_path: P
     assert np.median(errors) < 1.0
 
 
-def test_every_frame_of_a_sequence_has_intervals_that_hold_the_truth(tmp_path: Path) -> None:
+def test_intervals_of_every_frame_contain_the_truth(tmp_path: Path) -> None:
     scene = write_sequence(tmp_path / "scene", "sequence: true\nframe_rate_hz: 30\n")
     result = estimate_scene(scene.folder, scene.model, replay=False)
     names, inside = result.position_names, []
@@ -63,8 +63,8 @@ def test_every_frame_of_a_sequence_has_intervals_that_hold_the_truth(tmp_path: P
     assert np.mean(inside) >= 0.95
 
 
-def test_a_sequence_need_not_be_tracked(tmp_path: Path) -> None:
-    """Unrelated stills whose scene.yaml says otherwise: as if it did not."""
+def test_without_track_every_frame_is_searched(tmp_path: Path) -> None:
+    """Unrelated stills that scene.yaml declares a sequence give the same poses as stills."""
     said = write_sequence(tmp_path / "said", "sequence: true\nframe_rate_hz: 30\n")
     stills = write_sequence(tmp_path / "stills", "sequence: false\n")
     found = []
@@ -77,7 +77,7 @@ def test_a_sequence_need_not_be_tracked(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found[0], found[1])
 
 
-def test_how_a_scene_is_tracked(tiny_scene: TinyScene) -> None:
+def test_tracking_settings_follow_the_scene(tiny_scene: TinyScene) -> None:
     model, scene = load_model(tiny_scene.model), load_scene(tiny_scene.folder)
     for search in (None, RootPlacementSearch.__new__(RootPlacementSearch)):
         assert EstimateInputs(scene, model, scene.frames, False, search, None).tracking() is None
@@ -87,10 +87,8 @@ def test_how_a_scene_is_tracked(tiny_scene: TinyScene) -> None:
         assert not tracking.scale_unknown
 
 
-def test_an_encoder_that_has_turned_once_more_is_no_error(
-    tiny_scene: TinyScene, tmp_path: Path
-) -> None:
-    """As a UR5: measured 331.5 degrees inside limits of 360, which looks like -28.5."""
+def test_joint_errors_are_modulo_full_turns(tiny_scene: TinyScene, tmp_path: Path) -> None:
+    """As for a UR5 with limits of 360 degrees: 331.5 degrees measured, -28.5 estimated."""
     model, scene = crane(tmp_path), load_scene(tiny_scene.folder)
     truth = MeasuredPositions(tmp_path, model.position_names, {0: np.radians([178.0, 331.5])})
     inputs = EstimateInputs(scene, model, scene.frames, False, None, truth)
@@ -99,7 +97,7 @@ def test_an_encoder_that_has_turned_once_more_is_no_error(
     assert inputs.joint_errors("0001", np.zeros(2)) == {}
 
 
-def test_a_track_goes_on_from_what_is_known_and_searches_after_a_loss() -> None:
+def test_a_track_continues_from_known_poses_and_searches_after_a_loss() -> None:
     search, known = _StartedSearch.__new__(_StartedSearch), object()
     search.first = known
     with pytest.MonkeyPatch.context() as patch:
@@ -122,17 +120,17 @@ def warnings_of(scene: TinyScene, model: Path | None = None, **more: object) -> 
 
 
 def turn_camera(scene: TinyScene, name: str, degrees: float) -> None:
-    """Turn a calibrated camera about the world's vertical, as if it had been moved about it."""
+    """Rotate a camera about the world's vertical axis."""
     X_WC = camera(name, degrees).X_WC.tolist()
     edit_camera(scene.folder / "cameras.yaml", name, X_WC=X_WC)
 
 
-def test_a_sound_scene_has_no_warning(scene: TinyScene) -> None:
+def test_a_correct_scene_has_no_warning(scene: TinyScene) -> None:
     assert warnings_of(scene) == ()
     assert warnings_of(scene, cameras=("side",)) == ()
 
 
-def test_cameras_that_are_exchanged_or_moved(scene: TinyScene) -> None:
+def test_exchanged_and_moved_cameras_are_warned_of(scene: TinyScene) -> None:
     masks = scene.folder / "masks"
     for one, other in (("front", "other"), ("side", "front"), ("other", "side")):
         (masks / one).rename(masks / other)
@@ -145,7 +143,9 @@ def test_cameras_that_are_exchanged_or_moved(scene: TinyScene) -> None:
     assert re.match(r"camera(s 'front' and)? 'side' (is|are) inconsistent", first)
 
 
-def test_what_keeps_the_truth_out(scene: TinyScene, tmp_path: Path) -> None:
+def test_a_wrong_held_joint_and_wrong_limits_are_warned_of(
+    scene: TinyScene, tmp_path: Path
+) -> None:
     (text,) = warnings_of(scene, hold={"lift": 80.0})
     assert "frame 0000-0001 (of 2, E_total " in text
     assert "the pose fits the pictures badly" in text
@@ -157,8 +157,8 @@ def test_what_keeps_the_truth_out(scene: TinyScene, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("left", "is_told"), [(0.3, True), (0.02, False)])
-def test_a_track_of_a_wrong_pose_is_told(scene: TinyScene, left: float, is_told: bool) -> None:
-    """Frame 1 is said to be tracked half a radian off, which leaves so much of its area."""
+def test_a_track_of_a_wrong_pose_is_warned_of(scene: TinyScene, left: float, is_told: bool) -> None:
+    """Frame 1 has a pose tracked half a radian off, with an E_total of ``left``."""
     inputs = read_inputs(scene.folder, scene.model, EstimateSettings(), None)
     wrong = np.radians(ANGLES[1]) + np.array([0.0, 0.5])
     records = {
@@ -183,8 +183,8 @@ def test_a_track_of_a_wrong_pose_is_told(scene: TinyScene, left: float, is_told:
         ({}, None, False),
     ],
 )
-def test_who_contradicts_whom(errors, cameras, exchanged):
-    """E_total is .4 but for the given cameras; (b, a): those with each other's masks."""
+def test_inconsistent_and_exchanged_cameras_are_identified(errors, cameras, exchanged):
+    """E_total is 0.4 except for the given cameras; (b, a): with exchanged masks."""
     rig = {name: camera(name) for name in "abc"}
     masks = {name: np.arange(200) > k + np.zeros((160, 1)) for k, name in enumerate("cba")}
 

@@ -20,7 +20,7 @@ SHOWN = [k for k in range(FRAMES + 1) if k != HOLE]
 
 @pytest.fixture(scope="module")
 def studio(tmp_path_factory, person):
-    """Masks of a person who raises an arm; nobody is there at first, a camera or all pause."""
+    """Masks of a person who raises an arm; at first nobody is in view, and cameras pause."""
     folder = tmp_path_factory.mktemp("studio")
     poses = [absent(person)] + [standing(person, arm_deg=30.0 + 3.0 * k) for k in range(FRAMES)]
     write_studio(folder, person, poses, "masks")
@@ -40,7 +40,7 @@ def captured(studio, person, tmp_path_factory):
     return out, result, "\n".join(reports)
 
 
-def test_person_is_captured_as_pictures_come(captured, person):
+def test_person_is_captured_frame_by_frame(captured, person):
     out, result, _ = captured
     assert not result.interrupted
     rows = rows_of(out / "poses.csv")
@@ -48,7 +48,7 @@ def test_person_is_captured_as_pictures_come(captured, person):
     assert rows[0]["error"] == "", "nobody was there"
     found = [np.degrees(float(row["left_upper_arm_z"])) for row in rows[1:]]
     off = np.abs(np.array(found) - 30.0 - 3.0 * (np.array(SHOWN[1:]) - 1.0))
-    # Three small pictures do not always tell where an arm is.
+    # Three small pictures do not always determine an arm.
     assert np.median(off) < 3.0
     assert np.sort(off)[-2] < 9.0
     times = [float(row["time"]) for row in rows_of(out / "timestamps.csv")]
@@ -60,7 +60,7 @@ def test_person_is_captured_as_pictures_come(captured, person):
     assert result.estimate.summary["mean_iou"] > 0.85
 
 
-def test_how_sure_each_position_is_is_written(captured, person):
+def test_intervals_of_positions_are_written(captured, person):
     out, _, _ = captured
     rows = rows_of(out / "joints.csv")
     frames = [row["frame"] for row in rows if row["joint"] == "left_upper_arm_z"]
@@ -73,12 +73,12 @@ def test_how_sure_each_position_is_is_written(captured, person):
         found = factor * float(poses[row["frame"]][row["joint"]])
         assert low - 1e-3 <= found <= high + 1e-3
         widths.setdefault(row["frame"], []).append((high - low) / factor)
-    # With a camera less one is less sure.
+    # With one camera less the intervals are wider.
     fewer, all_three = ([np.median(widths[f"{k:06d}"]) for k in own] for own in (GAP, (1, 2, 10)))
     assert np.mean(fewer) > np.mean(all_three)
 
 
-def test_what_happened_to_cameras_is_told(captured):
+def test_stops_and_returns_of_cameras_are_reported(captured):
     out, result, text = captured
     assert "camera 'camera_1' stopped at 0.27 s" in text
     assert "camera 'camera_1' returned at 0.67 s" in text
@@ -92,7 +92,7 @@ def test_what_happened_to_cameras_is_told(captured):
     assert not result.unreported or "could not be used" in result.unreported[0]
 
 
-def test_ctrl_c_keeps_everything(studio, person, tmp_path):
+def test_ctrl_c_keeps_all_frames(studio, person, tmp_path):
     def interrupt(count, found):
         if count == 6:
             raise KeyboardInterrupt
@@ -131,7 +131,7 @@ def test_command_captures_and_refuses(studio, captured, person, tmp_path):
 
 
 @pytest.mark.slow
-def test_persons_own_shape_is_found_in_a_video_and_taken_from_its_result(person, tmp_path):
+def test_shape_is_fitted_to_a_video_and_reused_from_its_result(person, tmp_path):
     folder = tmp_path / "studio"
     folder.mkdir()
     poses = [standing(person, arm_deg=20.0 + 4.0 * k) for k in range(10)]
@@ -146,7 +146,7 @@ def test_persons_own_shape_is_found_in_a_video_and_taken_from_its_result(person,
     assert again.estimate.summary["mean_iou"] > 0.85
 
 
-def test_known_shape_is_worn(person):
+def test_known_shape_is_used(person):
     model = load_model(bundled_model("person").with_name("person_shape.urdf"), check=False)
     tree = model.pose_tree()
     shape = KnownShape({"left_thigh_stretch": 0.02}, {"trunk": 1.2})

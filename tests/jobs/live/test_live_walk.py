@@ -15,7 +15,7 @@ REST, AHEAD, AWAY = round(1.4 * RATE_HZ), round(1.0 * RATE_HZ), round(0.6 * RATE
 
 @pytest.fixture(scope="module")
 def studio(tmp_path_factory, person):
-    """Videos: a person rests, stands ahead, is gone, and is back where the person was."""
+    """Videos of a person who rests, stands ahead, leaves, and returns."""
     folder = tmp_path_factory.mktemp("studio")
     step = [standing(person, x) for x in np.linspace(0.0, 0.4, 5)]
     poses = [standing(person)] * REST + step + [standing(person, 0.4)] * AHEAD
@@ -28,21 +28,21 @@ def studio(tmp_path_factory, person):
 def test_person_before_the_cameras_walks_is_lost_and_found_again(studio, person):
     scene = load_live_scene(studio)
     commands, reports = [], []
-    # The simulation's time, so that a busy computer skips nothing.
+    # Simulated time, so that a busy computer skips no frame.
     player = live_player(scene, person.path, None, lambda: scene.open_sensors(live=False))
     found = walk(player, open_page(), on_command=commands.append, on_report=reports.append)
     assert commands == ["walk ahead", "", "walk ahead"]
     assert reports == ["the person is found", "the person is lost", "the person is found"]
     walked = found["commands"]["walk ahead"]
     assert walked == pytest.approx((2 * AHEAD + 2) / RATE_HZ, abs=0.4)
-    # The walker goes at the walking pace, and neither loss nor return moves him otherwise.
+    # The avatar moves at its walking speed; loss and return of the person do not move it.
     assert found["x"] - WALK.start[0] == pytest.approx(walked * WALK.speed, abs=0.1)
     assert abs(found["y"] - WALK.start[1]) < 0.05
     assert found["seconds"] > REST / RATE_HZ > 1.0
     assert 0.6 < found["found_share"] < 0.95
 
 
-def test_recordings_are_walked_as_if_live(studio, person):
+def test_recordings_play_as_if_live(studio, person):
     words = ["walk", "--live", str(studio), "--model", str(person.path), "--no-browser", "--json"]
     done = run_command([*words, "--seconds", "1.5"])
     assert done.exit_code == 0, done.output
@@ -61,7 +61,7 @@ def test_wrong_usage_is_refused(studio, tmp_path):
     assert "sources.yaml" in done.stderr
 
 
-def test_a_slow_computer_does_not_make_up_for_lost_time(studio, monkeypatch):
+def test_a_slow_computer_skips_ahead(studio, monkeypatch):
     clock = {"now": 0.0}
     monkeypatch.setattr("drake_pose.jobs.live.scene.time.monotonic", lambda: clock["now"])
     sensors = load_live_scene(studio).open_sensors(live=False)
@@ -77,5 +77,5 @@ def test_a_slow_computer_does_not_make_up_for_lost_time(studio, monkeypatch):
             clock["now"] += 1.0
 
     run_live(diagram, sensors, 10.0, monitor=work)
-    # Ten seconds of the clock, one a period: the simulation's time does not run after it.
+    # Each period takes a second of the clock; simulated time does not catch up.
     assert len(times) == pytest.approx(10, abs=1)

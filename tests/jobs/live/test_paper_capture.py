@@ -1,4 +1,4 @@
-"""Date's stages on recorded colour pictures, from the command line."""
+"""The method of Date et al. on recorded colour pictures, from the command line."""
 
 import csv
 import json
@@ -41,7 +41,7 @@ def studio(tmp_path_factory, person, path):
 
 
 @pytest.mark.slow
-def test_person_is_followed_from_the_registered_pose_on(studio, person, skeleton, path, tmp_path):
+def test_person_is_tracked_from_the_registered_pose(studio, person, skeleton, path, tmp_path):
     out = tmp_path / "out"
     words = ["capture", str(studio), "--method", "paper", "--no-replay", "--json"]
     done = run_command([*words, "--out", str(out)])
@@ -59,7 +59,7 @@ def test_person_is_followed_from_the_registered_pose_on(studio, person, skeleton
         head, left_hand, right_hand, *feet = np.linalg.norm(
             skeleton.features(found) - skeleton.features(q), axis=1
         )
-        # A hand's middle is told by what cameras of 320 x 240 see of its skin.
+        # The position of a hand is that of its skin in pictures of 320 x 240.
         assert max(head, left_hand, right_hand) < 0.06
         assert max(feet) < 0.08
         elbow = skeleton.limb_points(found, "left_arm")[1] - skeleton.limb_points(q, "left_arm")[1]
@@ -69,14 +69,14 @@ def test_person_is_followed_from_the_registered_pose_on(studio, person, skeleton
 
 
 @pytest.mark.slow
-def test_whoever_never_shows_the_registered_pose_is_refused(tmp_path, person):
+def test_a_recording_without_the_registered_pose_is_refused(tmp_path, person):
     write_studio(tmp_path, person, [standing(person)] * 3, "videos", cameras=3)
     with pytest.raises(SettingsError, match=r"registered pose.*best similarity"):
         capture_live(load_live_scene(tmp_path), tmp_path / "out", person.path, method="paper")
     assert not (tmp_path / "out").exists()
 
 
-def test_what_cannot_be_captured_so_is_refused_before(tmp_path, person):
+def test_inputs_unfit_for_the_paper_method_are_refused(tmp_path, person):
     write_studio(tmp_path, person, [standing(person)], "masks")
     scene, out = load_live_scene(tmp_path), tmp_path / "out"
     with pytest.raises(SceneError, match="'camera_0' delivers masks"):

@@ -32,7 +32,7 @@ def page():
 
 
 def record(folder, ahead, lost=()):
-    """A result of capture with the model whose lengths are fitted: stands, then stands ahead."""
+    """A result of capture with fitted lengths: the person stands, then stands ahead."""
     model = load_model(bundled_model("person").with_name("person_shape.urdf"), check=False)
     rows = []
     standing = stride_positions(model)[-1]
@@ -46,7 +46,7 @@ def record(folder, ahead, lost=()):
     write_summary(folder, {"model": model.path.name, "frame_rate_hz": 10.0})
 
 
-def test_recorded_capture_is_walked_and_once_more_from_the_start(tmp_path, page):
+def test_recorded_capture_is_played_and_repeated_from_the_start(tmp_path, page):
     record(tmp_path, [0.0] * 10 + [0.4] * 20 + [0.0] * 10, lost=range(12, 18))
     player = recorded_player(tmp_path, None, None)
     assert player.q.shape[0] == 40
@@ -61,7 +61,7 @@ def test_recorded_capture_is_walked_and_once_more_from_the_start(tmp_path, page)
     assert len(asked) == 2
     assert found["seconds"] == pytest.approx(4.0)
     assert said == 2 * ["walk ahead", "", "walk ahead", ""]
-    # 20 frames of a tenth of a second, less the six in which nobody is found.
+    # 20 frames of 0.1 s, without the six in which nobody is found.
     assert found["commands"]["walk ahead"] == pytest.approx(1.4, abs=0.05)
     assert found["x"] - WALK.start[0] == pytest.approx(1.4 * WALK.speed, abs=0.1)
 
@@ -79,7 +79,7 @@ def test_results_that_cannot_be_played_say_why(tmp_path):
             recorded_player(tmp_path / name, model, rate_hz)
 
 
-def test_command_ends_by_itself():
+def test_walk_ends_by_itself():
     words = ["walk", "--simulate", "--no-browser", "--seconds", "16", "--speed", "0", "--json"]
     done = run_command(words)
     assert done.exit_code == 0, done.output
@@ -119,7 +119,7 @@ def test_port_that_is_taken_is_named(page):
 
 
 @pytest.mark.skipif(not Path("/proc/net/tcp").is_file(), reason="the system lists no sockets")
-def test_page_listens_on_the_loopback_address_alone(page):
+def test_page_listens_on_the_loopback_address_only(page):
     addresses = []
     for table in ("/proc/net/tcp", "/proc/net/tcp6"):
         for line in Path(table).read_text(encoding="ascii").splitlines()[1:]:
@@ -127,13 +127,13 @@ def test_page_listens_on_the_loopback_address_alone(page):
             address, port = local.split(":")
             if state == "0A" and int(port, 16) == page.port():
                 addresses.append(address)
-    # 127.0.0.1, or ::1, in the kernel's order of bytes.
+    # 127.0.0.1 or ::1 in the byte order of the kernel.
     assert addresses
     assert set(addresses) <= {"0100007F", "0" * 24 + "01000000"}
 
 
 def connect(url):
-    """A browser's connection to a page, which it is told of by its socket."""
+    """Connect to a page's web socket as a browser does."""
     opened = HTTPConnection("localhost", int(url.rpartition(":")[2]), timeout=10.0)
     key = {"Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ=="}
     opened.request("GET", "/", headers=key | {"Connection": "Upgrade", "Upgrade": "websocket"})
@@ -141,11 +141,11 @@ def connect(url):
     return opened
 
 
-def test_browser_that_does_not_come_is_not_waited_for_for_ever(page):
+def test_waiting_for_a_browser_ends_after_the_timeout(page):
     assert not wait_for_browser(page, patience=0.1)
 
 
-def test_recording_waits_for_a_browser_and_is_played_again(tmp_path, monkeypatch):
+def test_recording_waits_for_a_browser_and_can_be_repeated(tmp_path, monkeypatch):
     record(tmp_path, [0.0] * 5)
     pages, browsers = [], []
     monkeypatch.setattr(
@@ -159,7 +159,7 @@ def test_recording_waits_for_a_browser_and_is_played_again(tmp_path, monkeypatch
         browsers.append(connect(urls[0]))
 
     def press(page):
-        """Play again once; then Ctrl-C."""
+        """Click once, then raise Ctrl-C."""
         presses.append(page)
         return len(presses) == 1
 
@@ -181,8 +181,8 @@ def test_recording_waits_for_a_browser_and_is_played_again(tmp_path, monkeypatch
     assert "waiting until a browser" in done.stderr
 
 
-def test_button_and_control_c_end_the_wait_for_another_play(monkeypatch, page):
-    # What the browser sends for a button: a map of two texts as MessagePack.
+def test_button_or_ctrl_c_ends_the_wait_for_a_repeat(monkeypatch, page):
+    # The browser's message for a click: a map of two strings as MessagePack.
     texts = ["type", "button", "name", "play again"]
     packed = b"\x82" + b"".join(bytes([0xA0 + len(text)]) + text.encode() for text in texts)
     monkeypatch.setattr("time.sleep", lambda _: page._InjectWebsocketMessage(message=packed))
@@ -197,7 +197,7 @@ def test_button_and_control_c_end_the_wait_for_another_play(monkeypatch, page):
     assert "play again" not in page.GetButtonNames()
 
 
-def test_keys_alone_leave_the_walker_where_he_is(page):
+def test_walker_without_keys_stays_where_it_is(page):
     found = walk(Player(), page, seconds=1.0, speed=0.0)
     assert (found["x"], found["y"], found["heading_deg"]) == WALK.start
     assert not any(found["commands"].values())

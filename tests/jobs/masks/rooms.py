@@ -1,4 +1,4 @@
-"""Pictures of the small crane before a textured room, by Drake's silhouettes."""
+"""Pictures of the tiny crane in a textured room, from Drake's silhouettes."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from tests.jobs.scenes import TinyScene, write_scene
 
 
 def texture(rng, shape=(160, 200)):
-    """A smooth random picture (H, W, 3)."""
+    """Return a smooth random picture (H, W, 3)."""
     values = cv2.GaussianBlur(rng.integers(0, 256, (*shape, 3)).astype(np.float32), (0, 0), 4.0)
     return 20.0 + 200.0 * (values - values.min()) / np.ptp(values)
 
@@ -18,7 +18,7 @@ def texture(rng, shape=(160, 200)):
 def write_pictures(
     folder: Path, angles, cameras=("front",), noise: float = 3.0, seed: int = 0
 ) -> TinyScene:
-    """A scene, and beside it pictures: images/<camera>/<frame>.png and background/<camera>.png."""
+    """Write a scene with images/<camera>/<frame>.png and background/<camera>.png."""
     scene, rng = write_scene(folder, angles, cameras), np.random.default_rng(seed)
     loaded = load_scene(folder)
     skin = texture(rng)
@@ -38,7 +38,7 @@ def write_pictures(
 
 
 def moving(count=40):
-    """Joint angles [deg] that lead the crane about."""
+    """Return joint angles [deg] of a moving crane."""
     t = np.linspace(0.0, 4.0 * np.pi, count)
     return np.column_stack([60.0 * np.sin(t), -60.0 + 50.0 * np.cos(1.7 * t)])
 

@@ -1,4 +1,4 @@
-"""Masks of other tools, and masks found by the empty room or a box, become a scene."""
+"""Scenes of masks, read from other tools or segmented by background or box."""
 
 import filecmp
 import json
@@ -28,7 +28,7 @@ from tests.jobs.scenes import write_scene
 
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory):
-    """A moving crane, filmed by two cameras; shared, so do not change it."""
+    """Pictures of a moving crane by two cameras; shared, do not change them."""
     return write_pictures(
         tmp_path_factory.mktemp("filmed") / "scene", moving(), ("front", "side")
     ).folder
@@ -36,7 +36,7 @@ def filmed(tmp_path_factory):
 
 @pytest.fixture
 def pictures(filmed, tmp_path):
-    """Its pictures and cameras alone, to be spoilt."""
+    """A copy of its pictures and cameras that may be changed."""
     folder = tmp_path / "pictures"
     for name in ("images", "background"):
         shutil.copytree(filmed / name, folder / name)
@@ -45,7 +45,7 @@ def pictures(filmed, tmp_path):
 
 
 def agreement(made, filmed, moves=False):
-    """IoU with the true masks; of what moves alone."""
+    """Return IoUs with the true masks, of the moving links only."""
     true, found = load_scene(filmed), load_scene(made)
     values = []
     for camera in true.cameras:
@@ -57,7 +57,7 @@ def agreement(made, filmed, moves=False):
     return np.array(values)
 
 
-def test_empty_room_beside_the_pictures_is_used(filmed, pictures, out):
+def test_background_beside_the_pictures_is_used(filmed, pictures, out):
     result = make_masks(pictures, out)
     assert result.count == 80
     assert agreement(out, filmed).mean() > 0.88
@@ -66,7 +66,7 @@ def test_empty_room_beside_the_pictures_is_used(filmed, pictures, out):
     assert overlay.shape == (160, 200, 3)
 
 
-def test_median_of_a_recording_finds_what_moves_alone(filmed, pictures, tmp_path, out):
+def test_median_of_a_recording_segments_only_what_moves(filmed, pictures, tmp_path, out):
     shutil.rmtree(pictures / "background")
     settings = MaskSettings(background="median")
     result = make_masks(pictures, out, settings)
@@ -88,7 +88,7 @@ def test_pictures_of_two_sizes_are_refused(pictures, out):
         make_masks(pictures, out, MaskSettings(background="median"))
 
 
-def test_light_that_changed_and_pictures_of_another_size_are_named(pictures, tmp_path, out):
+def test_changed_light_and_pictures_of_another_size_are_named(pictures, tmp_path, out):
     files = sorted((pictures / "images" / "front").iterdir())
     cv2.imwrite(str(files[3]), 255 - cv2.imread(str(files[3])) // 2)
     result = make_masks(pictures, out)
@@ -114,14 +114,14 @@ def test_light_that_changed_and_pictures_of_another_size_are_named(pictures, tmp
         ({"box": (1, 2, 3)}, "4 numbers"),
     ],
 )
-def test_ways_cannot_be_mixed(settings, words):
+def test_two_segmentation_methods_are_refused(settings, words):
     with pytest.raises(SettingsError, match=words):
         MaskSettings(**settings)
 
 
 @pytest.fixture
 def still(tmp_path):
-    """A blue box with a hole before a yellow table, and the truth."""
+    """A picture of a blue box with a hole on a yellow table, and its true mask."""
     rng = np.random.default_rng(3)
     true = np.zeros((120, 160), bool)
     true[30:90, 40:110] = True
@@ -133,7 +133,7 @@ def still(tmp_path):
     return path, true
 
 
-def test_box_cuts_a_still_out(still, tmp_path, out):
+def test_box_segments_a_still(still, tmp_path, out):
     path, true = still
 
     words = ["masks", path, "-o", out, "--box"]
@@ -144,7 +144,7 @@ def test_box_cuts_a_still_out(still, tmp_path, out):
     run_to_end(*words, "1,2,3", status=2)
 
 
-def test_masks_of_nothing_of_all_and_of_two_objects_are_judged():
+def test_empty_and_full_masks_are_rejected_and_two_objects_warned_of():
     mask = np.zeros((40, 60), bool)
     assert "not found" in refuse_mask(mask)
     assert "fills" in refuse_mask(~mask)
@@ -166,12 +166,12 @@ POLYGON = [60.0, 40.0, 120.0, 40.0, 120.0, 100.0, 60.0, 100.0]
 
 @pytest.fixture
 def two_views(tmp_path):
-    """A scene of two cameras: three frames."""
+    """Masks of two cameras in three frames."""
     return write_scene(tmp_path / "scene", cameras=("front", "side"))
 
 
 def runs_of(mask, packed):
-    """A mask as run lengths of COCO."""
+    """Return a mask as COCO run lengths."""
     runs = coco.encode(np.asfortranarray(mask, dtype=np.uint8))
     if packed:
         return {"size": list(mask.shape), "counts": runs["counts"].decode()}
@@ -181,7 +181,7 @@ def runs_of(mask, packed):
 
 
 def write_coco(path, scene, annotate, paths="{camera}/{frame}.jpg"):
-    """A file whose annotations are annotate(mask) of each picture: (class, segmentation)s."""
+    """Write a COCO file; annotate(mask) returns the (class, segmentation) pairs of a picture."""
     images, annotations = [], []
     for k, ((camera, frame), _) in enumerate(scene.masks.items()):
         mask = scene.read(camera, frame)
@@ -231,7 +231,7 @@ def test_coco_polygons_without_cameras(tmp_path, out, two_views):
     assert (mask == expected).all()
 
 
-def test_pictures_of_an_object_that_is_not_there_are_named(tmp_path, out, two_views):
+def test_pictures_without_the_object_are_named(tmp_path, out, two_views):
     scene = load_scene(two_views.folder)
     count = iter(range(6))
     file = write_coco(tmp_path / "a.json", scene, lambda _: [(3, [POLYGON])] if next(count) else [])
@@ -298,7 +298,7 @@ def test_an_episode_of_a_data_set_is_a_source(tmp_path, out):
     assert (out / "scene.yaml").read_text() == "frame_rate_hz: 10.0\nsequence: true\n"
 
 
-def test_a_camera_without_pictures_has_its_video(tmp_path, out):
+def test_a_camera_without_pictures_uses_its_video(tmp_path, out):
     for k, name in enumerate(("a", "b")):
         (tmp_path / "images" / "a").mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(tmp_path / "images" / "a" / f"{k}.png"), numbered(k))
@@ -308,7 +308,7 @@ def test_a_camera_without_pictures_has_its_video(tmp_path, out):
     assert counts == {"a": 2, "b": 3}
 
 
-def test_sources_in_doubt_are_refused(tmp_path, out, two_views):
+def test_ambiguous_sources_are_refused(tmp_path, out, two_views):
     masks = two_views.folder / "masks"
     with pytest.raises(SceneError, match="no such folder or file"):
         make_masks(tmp_path / "none", out)

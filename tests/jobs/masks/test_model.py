@@ -1,4 +1,4 @@
-"""Pose and mask in turn: an arm before textured rooms, begun from poses that are off."""
+"""Masks by a model: an arm in textured rooms, from rough poses."""
 
 import csv
 from dataclasses import replace
@@ -17,7 +17,7 @@ OFF = 5.0
 
 
 def write_start(path, names, truth, off=OFF, turned=slice(None), seed=0):
-    """A table of the truth, angles of some columns off by so much [deg]."""
+    """Write a table of the true positions, with offsets of some columns [deg]."""
     rng, starts = np.random.default_rng(seed), {}
     for frame, q in truth.items():
         starts[frame] = np.array(q, dtype=float)
@@ -37,7 +37,7 @@ def filmed(tmp_path):
 
 
 @pytest.mark.slow
-def test_single_still_is_cut_in_the_band_of_its_rough_pose(tmp_path, out):
+def test_single_still_is_segmented_near_its_rough_pose(tmp_path, out):
     scene = write_pictures(tmp_path / "scene", [(20.0, -60.0)], seed=4)
     start = write_start(tmp_path / "start.csv", NAMES, scene.truth, off=2.0)
     settings = MaskSettings(model=scene.model, start=start, start_error=2.0)
@@ -46,7 +46,7 @@ def test_single_still_is_cut_in_the_band_of_its_rough_pose(tmp_path, out):
 
 
 @pytest.mark.slow
-def test_masks_are_found_from_poses_five_degrees_off_and_empty_rooms_named(filmed, tmp_path, out):
+def test_masks_are_found_from_poses_five_degrees_off(filmed, tmp_path, out):
     start = write_start(tmp_path / "start.csv", NAMES, filmed.truth)
     for camera in ("front", "side"):
         room = cv2.imread(str(filmed.folder / "background" / f"{camera}.png"))
@@ -63,8 +63,8 @@ def test_masks_are_found_from_poses_five_degrees_off_and_empty_rooms_named(filme
 
 
 @pytest.mark.slow
-def test_starts_far_off_are_refused_or_named(filmed, tmp_path, out):
-    """Whatever is written without a word is right."""
+def test_bad_starts_are_rejected_or_warned_of(filmed, tmp_path, out):
+    """Masks that are written without a warning are correct."""
     start = write_start(tmp_path / "start.csv", NAMES, filmed.truth, off=35.0)
     settings = MaskSettings(model=filmed.model, start=start)
     result = make_masks(filmed.folder, out, settings)
@@ -74,7 +74,7 @@ def test_starts_far_off_are_refused_or_named(filmed, tmp_path, out):
         assert named or iou(true.read(camera, frame), made.read(camera, frame)) > 0.9
 
 
-def test_what_is_missing_is_named(filmed, tmp_path):
+def test_missing_cameras_and_starts_are_named(filmed, tmp_path):
     start = write_start(tmp_path / "start.csv", NAMES, filmed.truth)
     with pytest.raises(SettingsError, match="model and start"):
         MaskSettings(model=filmed.model)
@@ -99,7 +99,7 @@ def test_what_is_missing_is_named(filmed, tmp_path):
 
 @pytest.mark.slow
 def test_real_arm_from_five_degrees_off(shared_data, tmp_path, out):
-    """Of the ten masks that are given two have a part of the table, others lack the fingers."""
+    """Two of the ten given masks include a part of the table, others lack the fingers."""
     scene = shared_data / "franka_one_view"
     with (scene / "joint_angles_fitted.csv").open() as file:
         header, *rows = csv.reader(file)

@@ -239,8 +239,8 @@ class _BranchAndBound:
                 layers = [Layer(i, nothing, nothing, nothing) for i in range(len(self.nodes))]
                 graph = PartialPoseGraph(layers, np.zeros(0))
                 return PosesWithin(self.J_limit, graph, False, True, bound)
-        # All nodes are placed: the bounds are the objectives, except for areas beyond the bands,
-        # of which the bound has the largest and the upper limit of J the sum.
+        # All nodes are placed: the bounds are the objectives, except for areas beyond the bands.
+        # There the bound contains only the largest area of a node, and ``highs`` their sum.
         highs = partial.bounds + partial.beyond[:, 1] - partial.beyond[:, 0]
         graph = PartialPoseGraph(self._layers, highs).up_to(self.J_limit)
         self._drop(partial.bounds[highs > self.J_limit])

@@ -159,8 +159,8 @@ def find_intervals(
 ) -> PoseSet:
     """Return the pose set of exact silhouettes: modes, and an interval for each value.
 
-    The covariance of the values x, of which the limits are a prior of the variance of a uniform
-    distribution, is
+    The limits of the values are a prior with the variance of a uniform distribution. The covariance
+    of the values is
 
         C = (H / s^2 + diag(12 / span^2))^-1,   s = noise_factor max(1 / sqrt(12), rms distance)
 

@@ -134,7 +134,7 @@ def _single_flips(
 
 
 def _chained_pairs(kinematics: TreeKinematics, moves: np.ndarray) -> list[tuple[int, int]]:
-    """Return pairs of angles of which the second is one or two movable angles behind the first.
+    """Return pairs of angles: the second is one or two movable angles behind the first.
 
     ``moves``: (nodes, m) which nodes each value moves.
     """

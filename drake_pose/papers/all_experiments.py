@@ -40,6 +40,7 @@ class Experiment(NamedTuple):
 
 
 def _kameda(short: bool, folder: Path, count: Count) -> Outcome:
+    """Run Kameda's experiment A by the paper's search and by the beam search."""
     searches: dict[str, PoseSearch] = {
         "paper": kameda.experiment_search(),
         "beam": kameda.beam_experiment_search(),
@@ -64,12 +65,14 @@ def _kameda(short: bool, folder: Path, count: Count) -> Outcome:
 
 
 def _kameda_continuous(short: bool, _folder: Path, count: Count) -> Outcome:
+    """Run Kameda's experiment A with continuous angles."""
     search = MultiStartSearch(kameda.experiment_tree(), exact_masks=True)
     result = kameda.run_experiment(search, 1 if short else 30, 77, count)
     return kameda.continuous_figures(result), [kameda.continuous_table(result)], ()
 
 
 def _kameda_pictures(experiment: str, short: bool, folder: Path, count: Count) -> Outcome:
+    """Run Kameda's experiment B or C."""
     figures = kameda.run_real_experiment(experiment, 1 if short else None, folder, count)
     paper, beam = figures["paper"], figures["beam"]
     said = "{paper_mean_e_total:.1%} ({paper_images} pictures)".format(**paper)
@@ -91,6 +94,7 @@ def _filters() -> tuple[tuple[str, str, int], ...]:
 
 
 def _shimada(observed: str, runs: int, short: bool, folder: Path, count: Count) -> Outcome:
+    """Run Shimada's experiment with the paper's filter and with ours."""
     figures: dict[str, dict[str, Any]] = {}
     shown = []
     for name, truncation, iterations in _filters():
@@ -121,6 +125,7 @@ def _shimada(observed: str, runs: int, short: bool, folder: Path, count: Count) 
 
 
 def _shimada_hypotheses(short: bool, folder: Path, count: Count) -> Outcome:
+    """Run Shimada's experiment with several hypotheses, with both filters."""
     figures, shown = {}, []
     for name, truncation, iterations in _filters():
         runs = 2 if short else 50
@@ -141,6 +146,7 @@ def _shimada_hypotheses(short: bool, folder: Path, count: Count) -> Outcome:
 
 
 def _date(short: bool, folder: Path, count: Count) -> Outcome:
+    """Run Date's experiment."""
     cameras, frames, size = (4, 40, (320, 240)) if short else (9, 240, (640, 480))
     result = date.run_experiment(cameras, frames, 0, "silhouette", count, size)
     date_walk.save_pictures(result, folder)
@@ -162,6 +168,7 @@ def _date(short: bool, folder: Path, count: Count) -> Outcome:
 
 
 def _date_walk(short: bool, folder: Path, count: Count) -> Outcome:
+    """Run Date's walk through a virtual place."""
     cameras, size = (4, (320, 240)) if short else (9, (640, 480))
     walk = date_walk.run_walk_through(cameras, 0, count, size)
     walk.save(folder)
@@ -242,7 +249,6 @@ def reproduce_all(out: Path, short: bool, count: Count, say: Callable[[str], Non
     Args:
         out: folder of the results.
         short: whether to run few images, runs and frames, as a test.
-        count: reports the progress.
         say: called with messages.
 
     Raises:

@@ -280,11 +280,9 @@ def run_experiment(
 
     Args:
         cameras: number of cameras, including the face camera.
-        frames: number of frames.
         seed: of the motions and the noise.
         method: "paper": the paper's methods only; "silhouette": the fit to all silhouettes, too,
             whose figures lead.
-        count: reports the progress.
         size: width and height of the pictures [pixel].
 
     Raises:

@@ -210,7 +210,6 @@ def run_experiment(
             of ``experiment_tree``.
         images: number of poses; 219 in the paper.
         seed: of the random angles.
-        count: reports the progress.
         views: number of cameras, 180 degrees / views apart: a silhouette from behind is the mirror
             image of that from the front.
 
@@ -315,6 +314,7 @@ def grid_figures(*runs: RandomPoses) -> dict[str, Any]:
 
 
 def _grid_figures(result: RandomPoses) -> dict[str, Any]:
+    """Return the figures of one run."""
     trials = result.trials
     found = [trial.result for trial in trials]
     E_total = [one.E_total for one in found if one.found]
@@ -497,7 +497,6 @@ def run_real_experiment(
         experiment: "B" or "C".
         images: number of pictures, from the first; None: all.
         out: folder for the poses and overlays of each method; None: write nothing.
-        count: reports the progress.
 
     Returns:
         The figures by method. Mean E_total is over the pictures in which a pose was found.

@@ -209,8 +209,6 @@ def save_modes(
     Below: the joints that are free in the mode.
 
     Args:
-        answer: the pose set.
-        views: the silhouettes.
         most: largest number of modes.
         margin: around the body [pixel].
         most_names: largest number of joints named below a mode.

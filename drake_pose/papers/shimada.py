@@ -154,7 +154,6 @@ def run_experiment(
         truncation: "joint", "sequential" (the paper's), "clip" or "none".
         observed: "lines": axes, tips and the palm's outline, as in the paper; "lines_wrist": the
             wrist's position, too; "full": all; or PICTURES.
-        count: reports the progress.
         iterations: largest number of linearisations per update; 1 in the paper; None: the default.
         noise: factor on the noise, known to the filter.
         acceleration: factor on the accelerations that the filter expects.
@@ -218,6 +217,7 @@ def experiment_filter(
 
 
 def _hand() -> ArticulatedModel:
+    """Return the bundled model of the two-finger hand."""
     return load_model(bundled_model("two_finger_hand"), check=False)
 
 
@@ -347,7 +347,6 @@ class HypothesisHistory:
     """A hypothesis of one run, from the frame in which it was made to its end.
 
     Attributes:
-        run: index of the run.
         frames: (k,) frames in which it lived, counted from 1; in the last one it ended.
         means: (k, n) mean states; the last one before truncation if it was rejected.
         weights: (k,) between 0 and 1; NaN in the last frame if it was rejected.

@@ -122,6 +122,7 @@ def save_hypotheses(result: HypothesesResult, folder: Path) -> list[Path]:
 def _draw_hand(
     axes: Axes, state: Array, colour: str, observation: HandObservation = _OBSERVATION
 ) -> None:
+    """Draw axes and joints of the fingers and the palm's outline for a state (n,)."""
     points, shape = observation.drawing(state), observation.hand.radii.shape
     for finger in points[: shape[0] * shape[1]].reshape(*shape, 2):
         axes.plot(finger[:, 0], finger[:, 1], "-o", color=colour, markersize=3, linewidth=2)
@@ -131,6 +132,7 @@ def _draw_hand(
 
 
 def _draw_sequence(trial: FilteredHand) -> Figure:
+    """Draw figure 10: true and estimated hands in six frames."""
     figure = Figure(figsize=(15, 5.2))
     frames = (1, 8, 16, 32, 40, 55)
     grid = figure.subplots(2, len(frames), sharex=True, sharey=True)
@@ -220,6 +222,7 @@ def _draw_shapes(first: dict[str, FilteredHand]) -> Figure:
 
 
 def _flat(state: Array, hand: HandModel = TWO_FINGERS) -> Array:
+    """Return the state (n,) of a hand with the given sizes, laid flat."""
     flat = np.zeros_like(state)
     shape = hand.layout.indices(hand.layout.constant)
     flat[shape] = state[shape]
@@ -229,6 +232,7 @@ def _flat(state: Array, hand: HandModel = TWO_FINGERS) -> Array:
 
 
 def _draw_curve(label: str, true: Array, estimate: Array, deviation: Array) -> Figure:
+    """Draw a true value and its estimate with 2 standard deviations over the frames."""
     figure = Figure(figsize=(6, 4))
     axes = figure.subplots()
     frames = np.arange(1, len(true) + 1)

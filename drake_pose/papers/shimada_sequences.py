@@ -135,7 +135,6 @@ def make_sequence(
 
     Args:
         observed: one of ``OBSERVED``.
-        observation: of the hand.
         r_13, yaw_middle: as of ``true_states``.
     """
     states = true_states(r_13, generator.uniform(-0.6, 0.6, 6), yaw_middle)
@@ -255,7 +254,6 @@ def follow_pictures(
     Args:
         parts: the diagram, with the filter and the sensor in it.
         period: between frames [s].
-        frames: number of frames.
         shown: indices of the frames whose pictures are kept.
         advance: called with the number of frames done.
     """
@@ -288,7 +286,6 @@ class SequenceResult:
     """A filtered recorded sequence.
 
     Attributes:
-        observation: of the hand.
         guess: belief about the rough pose of the first frame.
         truth: (frames,) true values by name of the angle [deg], where the sequence has them.
     """
@@ -381,7 +378,6 @@ def run_sequence(
             angles are in it: [rad], or [deg] if it has columns that the bundled hand lacks.
         settings: None: ``experiment_settings("joint")``.
         acceleration: factor on the accelerations that the filter expects.
-        count: reports the progress.
 
     Raises:
         DrakePoseError: the scene has several cameras, or no hand in it can be matched.

@@ -82,7 +82,6 @@ class CameraFault:
     """A camera whose silhouettes disagree with the others'.
 
     Args:
-        name: of the camera.
         motion: how it has moved; turns about the camera itself may be undetermined.
         is_explained: whether the motion explains the silhouettes. If not, the masks may be poor,
             mirrored, or another camera's.
@@ -105,8 +104,6 @@ class CameraComparison:
     """Compares cameras with each other by a person that they see.
 
     Args:
-        fit: for the person's pose tree.
-        cameras: by name.
         held: (m,) values that stay fixed.
     """
 

@@ -55,7 +55,6 @@ class PersonCapture:
         inlier_ratios: (frames,) inlier ratio of the contours; 0 where no person was seen.
         shape: the person's; None where the model has no shape joints.
         outlines: simplified surfaces of the tree's nodes with the person's radius scales.
-        tree: the model's pose tree.
         deviations: (frames, nq) standard deviations of q [rad, m] by pictures and limits, or nan.
         alternatives: (q, deviations) of distinct alternative poses that fit as well, by frame. Only
             frames in which the person was searched have any.
@@ -105,7 +104,6 @@ def capture_person(
     Args:
         tree: of a model with a person's landmarks, best with shape joints, as
             urdf/person/person_shape.urdf has.
-        cameras: by name.
         read: returns the masks of a frame.
         frames: indices, in order, of the frames in which the person is seen. After a gap the
             person is also searched anew.
@@ -159,6 +157,7 @@ class _Capture:
         self._kept: dict[int, dict[str, tuple[NDArray[np.uint8], EdgePoints]]] = {}
 
     def _see(self, frame: int) -> FrameViews:
+        """Return the views of a frame, from memory if they were kept."""
         if frame in self._kept:
             cameras, views = [self._cameras[name] for name in self._kept[frame]], []
             for camera, (bits, edge) in zip(cameras, self._kept[frame].values(), strict=True):
@@ -229,21 +228,21 @@ class _Capture:
         if self._has_shape:
             found = [self._with_shape(frame, one.fit.values) for one in found]
         ranked = {id(one.fit): one for one in found}
-        unlike = tracker.search.distinct(one.fit for one in found)
-        found = [ranked[id(fit)] for fit in unlike]
+        distinct = tracker.search.distinct(one.fit for one in found)
+        found = [ranked[id(fit)] for fit in distinct]
         self.alternatives[frame] = tuple(
-            (own.positions(fit.values), own.deviations(fit.values, seen))
-            for fit, own in found[1:]
-            if fit.closeness > unlike[0].closeness - tracker.settings.ambiguity_margin
+            (shaped.positions(fit.values), shaped.deviations(fit.values, seen))
+            for fit, shaped in found[1:]
+            if fit.closeness > distinct[0].closeness - tracker.settings.ambiguity_margin
         )
         return found
 
     def _with_shape(self, frame: int, values: Array) -> "_Explanation":
         """Refine a pose (m,) of a frame together with the person's shape."""
         seen = self._see(frame)
-        shape, own = self._fit_shape([frame], [values])
-        shaped = own.search.refine(shape.poses[0], seen)
-        return _Explanation(own.search.improve_limbs(shaped, seen), own)
+        shape, shaped = self._fit_shape([frame], [values])
+        refined = shaped.search.refine(shape.poses[0], seen)
+        return _Explanation(shaped.search.improve_limbs(refined, seen), shaped)
 
     def follow_all(
         self,
@@ -277,11 +276,12 @@ class _Capture:
             begin, start = min(known), known[min(known)]
         else:
             begin, start = self._best_start(frames)
-        place = list(frames).index(begin)
-        for way in (frames[place:], frames[:place][::-1]):
+        index = list(frames).index(begin)
+        # Forwards from the start, then backwards.
+        for ordered in (frames[index:], frames[:index][::-1]):
             state: TrackState | None = start
             last = begin
-            for frame in way:
+            for frame in ordered:
                 state, last = follow(state, frame, last), frame
         return found
 
@@ -342,7 +342,6 @@ def capture_by_colour(
     Masks or given positions start the track, and start it again after a loss.
 
     Args:
-        count: number of frames.
         pictures: returns a frame's pictures (H, W, 3) by camera.
         starts: approximate positions (nq,) of the plant by frame [rad, m].
         masked: masks by camera of each frame that has some.
@@ -359,32 +358,32 @@ def capture_by_colour(
     tracker = PersonPoseTracker(
         fit, LENIENT, shape_values(tree), None if shape is None else shape.values
     )
-    places = {frame: k for k, frame in enumerate(masked)}
+    known_indices = {frame: k for k, frame in enumerate(masked)}
     captured, distances = PersonCapture.empty(count, shape, fit), np.full(count, np.nan)
     state: TrackState | None = None
     colours: KnownColours = {}
-    own: PartColours | None = None
+    part_colours: PartColours | None = None
     for frame in range(count):
         seen = pictures(frame)
         views = ColourViews([cameras[name] for name in seen], list(seen.values()), colours)
-        place = places.get(frame)
-        if known is not None and place is not None and np.isfinite(known.q[place]).all():
-            values, last = tracker.values(known.q[place]), state
+        index = known_indices.get(frame)
+        if known is not None and index is not None and np.isfinite(known.q[index]).all():
+            values, last = tracker.values(known.q[index]), state
             state = tracker.start(values)
             if last is not None and not last.is_lost:
                 state = replace(state, step=values - last.values)
             captured.q[frame], captured.inlier_ratios[frame] = (
-                known.q[place],
-                known.inlier_ratios[place],
+                known.q[index],
+                known.inlier_ratios[index],
             )
-            captured.deviations[frame] = known.deviations[place]
+            captured.deviations[frame] = known.deviations[index]
             colours = views.updated_colours(fit, values, masked[frame])
             shown = zip(views.cameras, views.pictures, strict=True)
             X_WN = fit.kinematics.poses(values)
-            own = PartColours.learn(colours.values(), fit.outlines, X_WN, shown)
+            part_colours = PartColours.learn(colours.values(), fit.outlines, X_WN, shown)
         else:
             if state is not None:
-                state = tracker.follow_by_colour(state, views, own)
+                state = tracker.follow_by_colour(state, views, part_colours)
             if frame in starts and (state is None or state.is_lost):
                 began = tracker.start(tracker.values(starts[frame]))
                 if not views.known:
@@ -576,4 +575,5 @@ class _CaptureComparison(CameraComparison):
         return first_moved_frame(before, [max(one, least) for one in after])
 
     def _edge(self, name: str, mask: Mask) -> EdgePoints:
+        """Return the edge points of a camera's mask."""
         return find_edge_points(mask, edge_spacing(self._cameras[name]))

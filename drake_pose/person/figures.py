@@ -171,7 +171,7 @@ def find_persons(
 def _person(
     cameras: Sequence[Camera], figures: Sequence[Sequence[Figure]], taken: dict[int, int]
 ) -> Person:
-    """Return the person with these figures, by index of the camera."""
+    """Return the person whose figures have these indices, by index of the camera."""
     chosen = [figures[k][i] for k, i in taken.items()]
     areas = sorted(figure.area for figure in chosen)
     position = triangulate([cameras[k] for k in taken], [figure.middle for figure in chosen])
@@ -271,7 +271,6 @@ def sort_figures(
 
     Args:
         figures: of each mask, in the order of the persons' camera indices.
-        persons: all persons of the frame.
         person: the followed one; None: absent.
         far, large: a figure of no known person is a stranger's if it is farther away [m] and
             larger than this fraction of the followed person's figure.
@@ -369,7 +368,6 @@ def follow_one(
     """Choose the person to follow: the one seen longest and largest.
 
     Args:
-        frames: the persons in each frame.
         middle: (3,) middle of the cameras' view [m].
         is_sequence: whether the frames follow each other; if not, the largest in each is chosen.
 
@@ -454,9 +452,7 @@ class PersonRecording:
             backgrounds do.
 
     Args:
-        cameras: by name.
         read: returns the masks of a frame; each of `count` frames is read once here.
-        count: number of frames.
         is_sequence: whether frames follow each other.
         measured: least number of frames in which the height is measured.
     """

@@ -164,7 +164,6 @@ class PersonPoseTracker:
     """Tracks a person from frame to frame.
 
     Args:
-        fit: for the person's pose tree.
         settings: EXACT, or LENIENT where the model only resembles the person.
         held: (m,) values that stay fixed, for instance lengths; None: none.
         rest: (m,) values of the person at rest, held values included; None: the tree's defaults.
@@ -284,7 +283,7 @@ class PersonPoseTracker:
         )
 
     def follow_by_colour(
-        self, last: TrackState, colours: ColourViews, own: PartColours | None = None
+        self, last: TrackState, colours: ColourViews, part_colours: PartColours | None = None
     ) -> TrackState:
         """Return the state after a frame of colour pictures.
 
@@ -292,11 +291,11 @@ class PersonPoseTracker:
         shows them, the person is lost.
         """
         fitted, shown = self._fit_predicted(last, colours), 1.0
-        if own is not None:
+        if part_colours is not None:
 
             def shows(values: Array) -> Array:
                 seen = zip(colours.cameras, colours.pictures, strict=True)
-                return own.relative_fractions(
+                return part_colours.relative_fractions(
                     self.fit.outlines, self.fit.kinematics.poses(values), seen
                 )
 
@@ -304,7 +303,9 @@ class PersonPoseTracker:
             for limb in self.plan.limbs.values():
                 worst = float(np.nanmin([*ratios[limb.nodes], 1.0]))
                 if worst < enough:
-                    placed = self.search.place_by_colour(fitted.values, limb, colours, own.is_own)
+                    placed = self.search.place_by_colour(
+                        fitted.values, limb, colours, part_colours.is_own
+                    )
                     scored = [(one, np.nan_to_num(shows(one.values))) for one in placed]
                     shown_again = [one for one in scored if one[1][limb.nodes].min() >= enough]
                     if shown_again:

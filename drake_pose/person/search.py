@@ -210,6 +210,7 @@ class BodyPlan:
         }
 
     def _node(self, landmark: str) -> int:
+        """Return the index of a landmark's node."""
         return int(self.landmarks.nodes[self.landmarks.names.index(landmark)])
 
     def _plan(self, names: Sequence[str], count: int = 2048) -> PlannedLimb:
@@ -274,9 +275,6 @@ class PersonSearch:
     """Searches limbs and persons by fits from coarse guesses.
 
     Args:
-        fit: of the person.
-        plan: the person's limbs.
-        settings: of the search.
         information: (m,) inverse variances of the values about a guess.
         held: (m,) values that stay fixed.
         rest: (m,) values of the person at rest.
@@ -375,7 +373,7 @@ class PersonSearch:
         return self.distinct(found)
 
     def find_starts(self, frame: FrameViews, known: Array | None = None) -> list[PoseFit]:
-        """Return the most promising fresh starts of all headings, doubtful limbs searched."""
+        """Return the best fresh starts of all headings, after a search of their doubtful limbs."""
         starts = self._fresh_starts(frame, range(self._settings.headings), known)
         return [self.improve_limbs(one, frame) for one in starts[: self._settings.searched_starts]]
 
@@ -510,10 +508,10 @@ class PersonSearch:
                 (limb.nodes[:half], np.s_[:, :first]),
                 (limb.nodes[half:], np.s_[:, first:]),
             ):
-                own_colours = np.where(own[nodes].any(axis=0), 1, -1).astype(np.int8)[colours]
+                pixel_scores = np.where(own[nodes].any(axis=0), 1, -1).astype(np.int8)[colours]
                 weights = np.ascontiguousarray(limb.weights[points])
                 here = np.ascontiguousarray(places[points])
-                scores += sum_at_points(camera, own_colours, here, weights)[0]
+                scores += sum_at_points(camera, pixel_scores, here, weights)[0]
         chosen = self._distinct_poses(values, limb, scores, self._settings.placements)
         return [self.refine(one, views) for one in chosen]
 
@@ -528,8 +526,11 @@ class PersonSearch:
                 other = self._move_trunk(other, plan.trunk_middle(X_WN))
             for part in parts:
                 for side, other_side in (("left", "right"), ("right", "left")):
-                    limb, there = plan.limbs[f"{side}_{part}"], plan.limbs[f"{other_side}_{part}"]
-                    distances = self._distances(other, limb, plan.samples(there, X_WN))
+                    limb, other_limb = (
+                        plan.limbs[f"{side}_{part}"],
+                        plan.limbs[f"{other_side}_{part}"],
+                    )
+                    distances = self._distances(other, limb, plan.samples(other_limb, X_WN))
                     other[limb.values] = limb.poses[np.argmin(distances)]
             found.append(other)
         return found
@@ -552,4 +553,5 @@ class PersonSearch:
 
 
 def _better(one: PoseFit, other: PoseFit) -> PoseFit:
+    """Return the fit with the higher closeness."""
     return other if other.closeness > one.closeness else one

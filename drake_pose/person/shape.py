@@ -52,7 +52,6 @@ class PersonShape:
     """A person's fitted shape.
 
     Args:
-        known: lengths and radius scales.
         values: (m,) values of the pose tree: fitted shape joints [m], others 0.
         covariance: (h, h) covariance of the shape joints [m^2].
         poses: (frames, m) values in the fitted frames [rad, m].
@@ -120,7 +119,6 @@ def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
     """Fit lengths, radius scales and the poses of all frames.
 
     Args:
-        fit: for the model's pose tree.
         frames: cameras and edge points of each frame.
         poses: (frames, m) initial values [rad, m].
 

@@ -74,8 +74,6 @@ class ColourViews:
         """Compare a body's contour with the edges that the colours show.
 
         Args:
-            fit: gives the weights.
-            placement: pose of the body.
             step: scale of the fit [m].
             offset: distance between candidate edges on a search line, over the fit's scale.
         """
@@ -108,7 +106,6 @@ class ColourViews:
         """Return the colour histograms, updated by this frame's pictures.
 
         Args:
-            fit: of the body.
             values: (m,) values of the pose tree in this frame [rad or m].
             regions: (H, W) region of the person by camera, where known. A camera without a region
                 and without histograms learns from both sides of the body's contour.

@@ -79,7 +79,6 @@ class Skeleton:
         order: (m,) indices in q of the pose tree's values.
         chains: for each node: the chain of nodes from the root to it, packed, and the indices in q
             of the chain's values.
-        limbs: by name.
         lower, upper: (nq,) limits of q [rad, m].
     """
 

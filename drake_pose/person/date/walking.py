@@ -123,7 +123,6 @@ def follow_command(
     Args:
         pose: (3,) x, y [m] and heading [rad].
         command: from recognise_command.
-        seconds: for which the command is followed.
         obstacles: (n, 3) x, y and radius of round obstacles [m].
         half_size: half the side of the place [m].
     """

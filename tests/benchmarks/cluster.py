@@ -1,6 +1,6 @@
-"""Benchmark of several processes: a batch on workers, and pictures that come by LCM (`make bench`).
+"""Benchmark of several processes: a batch on workers, and images sent by LCM (`make bench`).
 
-Milliseconds are the processor's own, so that a busy machine changes little but the frames a second.
+Milliseconds are CPU time, so a busy machine affects only the frames per second.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 
 def write_stills(folder: Path, count: int = 8, chunk: int = 2) -> SceneJob:
-    """Kameda's woman, who moves her arms before the paper's camera, and the job for that scene."""
+    """Write a scene of Kameda's woman with random arm poses, and return the job for it."""
     model_path = bundled_model("woman")
     model = load_model(model_path, check=False)
     camera = experiment_camera()
@@ -67,7 +67,7 @@ def write_stills(folder: Path, count: int = 8, chunk: int = 2) -> SceneJob:
 
 
 def measure_batch(job: SceneJob, out: Path, client: Client | None) -> float:
-    """Frames a second of a batch; what is loaded or compiled once, or to start workers, is not."""
+    """Return frames per second of a batch, without the time to compile and to start workers."""
     settings = replace(job.settings, frames=("0000",))
     warm_up = [replace(job, name=f"warm_up_{k}", settings=settings) for k in range(2)]
     run_batch(warm_up, out / "warm_up", client)
@@ -79,7 +79,7 @@ def measure_batch(job: SceneJob, out: Path, client: Client | None) -> float:
 def measure_lcm(
     image: ImageLabel16I | ImageRgba8U, kind: PixelType, count: int = 60
 ) -> tuple[float, float]:
-    """Processor time of an image to send and to receive [ms], by multicast on this machine."""
+    """Return the CPU time to send and to receive an image [ms], by multicast on this machine."""
     url = "udpm://239.255.76.67:7691?ttl=0&recv_buf_size=4000000"
     sends, receives = DiagramBuilder(), DiagramBuilder()
     source = sends.AddSystem(ConstantValueSource(AbstractValue.Make(image)))
@@ -107,7 +107,7 @@ def measure_lcm(
                 context = simulator.get_context()
                 simulator.get_system().get_output_port().Eval(context)
             seconds[k, end] = time.process_time() - begin
-            # The network's own thread.
+            # Let the network thread work.
             time.sleep(0.02)
     context = ends[1].get_context()
     received = ends[1].get_system().get_output_port().Eval(context)
@@ -117,7 +117,7 @@ def measure_lcm(
 
 
 def main() -> None:
-    """Print what workers bring on this machine, and what LCM costs."""
+    """Print the speed-up by workers and the cost of LCM."""
     with tempfile.TemporaryDirectory() as name, open_cluster(1) as one, open_cluster(2) as two:
         folder, who = Path(name), {"this process": None, "1 worker": one, "2 workers": two}
         job = write_stills(folder / "stills")

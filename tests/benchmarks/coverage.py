@@ -1,10 +1,10 @@
-"""Benchmark of intervals: how many truths lie in what a user reads, and how wide that is.
+"""Benchmark of intervals: the fraction that covers the truth, and their widths.
 
 Run as ``python -m tests.benchmarks.coverage [DATA] [--draws N] [--only TEXT]``; DATA is a folder
-with ``franka_one_view/panda`` (sequences of this arm are drawn by Drake), ``arm_two_views`` and
-``hand_sequences``; sets whose files are not there are left out. Read are ``joints.csv`` and the
-warnings of ``summary.json``. A frame is wrong, and not said, where a joint lies outside its
-interval and is off by more than 10 degrees, or 5 cm.
+with ``franka_one_view/panda`` (Drake renders sequences of this arm), ``arm_two_views`` and
+``hand_sequences``; sets with missing files are skipped. Intervals are read from ``joints.csv``, and
+lost frames from ``summary.json``. A frame is wrong without warning if a true joint position lies
+more than 10 degrees, or 5 cm, outside its interval.
 """
 
 import argparse
@@ -32,24 +32,27 @@ from drake_pose.silhouette.pictures.masks import write_mask
 from tests.benchmarks.tables import print_table
 
 Damage = Callable[[Mask, np.random.Generator, int], Mask]
-"""Of a mask, random numbers and the frame's number."""
+"""Function of a mask, random numbers and the frame's number."""
 
 _FRAMES, _RATE_HZ, _FASTEST = 24, 30.0, 2.0
 _WRONG_DEGREES, _WRONG_METRES = 10.0, 0.05
 _PANDA, _LBR = "franka_one_view/panda/panda.urdf", "arm_two_views"
 _ARM_JOINTS, _HAND_JOINTS = ("panda_joint", "A"), ("index_", "middle_", "ring_", "little_")
-# Cameras are turned by so much that pictures shift by so many pixels [pixel].
+# Image shift caused by the orientation error of cameras [pixel].
 _CAMERAS_OFF = 1.4
 
 
 class CoverageSet(NamedTuple):
-    """Scenes of one kind: where they are, by what they are estimated, and which joints count.
+    """Scenes of one kind, the settings of their estimates, and the joints that are evaluated.
 
     Args:
-        make: draws the n-th scene into a folder, or names one that is there.
-        joints: how the names of joints begin that count.
-        draws: so many scenes at most.
-        in_degrees: whether the true angles are.
+        name: name of the set.
+        model: model file.
+        make: renders the n-th scene into a folder, or returns an existing scene.
+        joints: prefixes of the names of evaluated joints.
+        settings: settings of the estimate.
+        draws: maximum number of scenes; None: as given on the command line.
+        in_degrees: whether the true angles are in degrees.
     """
 
     name: str
@@ -61,8 +64,8 @@ class CoverageSet(NamedTuple):
     in_degrees: bool = False
 
 
-class Told(NamedTuple):
-    """Of all joints and frames: inside, determined, width [deg or m]; frames wrong and not said."""
+class Evaluation(NamedTuple):
+    """Per joint and frame: inside, determined, width [deg or m]; and the number of wrong frames."""
 
     inside: Array
     determined: Array
@@ -72,7 +75,7 @@ class Told(NamedTuple):
 
 
 def coverage_sets(data: Path | None) -> Iterator[CoverageSet]:
-    """The sets whose files are there."""
+    """Yield the sets whose files exist."""
     person = bundled_model("person")
     for name, damage in _damages():
         yield CoverageSet(
@@ -92,7 +95,7 @@ def coverage_sets(data: Path | None) -> Iterator[CoverageSet]:
         make = _draw_arm(panda, _half_hidden)
         yield CoverageSet("arm, sequence, half hidden for 8 frames", panda, make, ("panda_",))
         stills = EstimateSettings(track=False, frames=("0000:0005",))
-        make = _draw_arm(panda, _ragged)
+        make = _draw_arm(panda, _with_ragged_edges)
         yield CoverageSet("arm, stills, edges 1.5 px off", panda, make, ("panda_",), stills)
         make = _draw_arm(panda, views=1)
         yield CoverageSet("arm, stills, one view, exact masks", panda, make, ("panda_",), stills)
@@ -102,37 +105,37 @@ def coverage_sets(data: Path | None) -> Iterator[CoverageSet]:
         yield CoverageSet("real arm, stills", model, lambda _, k: arm, _ARM_JOINTS[1:], draws=1)
     for scene in sorted(data.glob("hand_sequences/*/scene.yaml")):
         model = bundled_model("hand").with_name("right_hand.urdf")
-        make = _there(scene.parent)
+        make = _existing(scene.parent)
         yield CoverageSet(
             f"hand, {scene.parent.name}", model, make, _HAND_JOINTS, draws=1, in_degrees=True
         )
 
 
-def _there(scene: Path) -> Callable[[Path, int], Path]:
+def _existing(scene: Path) -> Callable[[Path, int], Path]:
     return lambda _, k: scene
 
 
 def _damages() -> Iterator[tuple[str, Damage]]:
     yield "exact masks", lambda mask, rng, k: mask
-    yield "edges 1.5 px off", _ragged
-    yield "masks a pixel too wide", lambda mask, rng, k: _grown(mask)
+    yield "edges 1.5 px off", _with_ragged_edges
+    yield "masks a pixel too wide", lambda mask, rng, k: _dilated(mask)
     yield "holes", _with_holes
 
 
-def _ragged(mask: Mask, rng: np.random.Generator, k: int) -> Mask:
-    """A mask whose edge wanders by one and a half pixels, eight pixels of it alike."""
+def _with_ragged_edges(mask: Mask, rng: np.random.Generator, k: int) -> Mask:
+    """Return a mask with an edge noise of 1.5 pixels, correlated over eight pixels."""
     noise = cv2.GaussianBlur(rng.normal(size=mask.shape), (0, 0), 8.0)
     inside = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
     outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
     return inside - outside + 1.5 * noise / noise.std() > 0.0
 
 
-def _grown(mask: Mask) -> Mask:
+def _dilated(mask: Mask) -> Mask:
     return cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.bool_)
 
 
 def _with_holes(mask: Mask, rng: np.random.Generator, k: int) -> Mask:
-    """A mask without 3 % of its area, in round holes."""
+    """Return a mask with round holes of 3 % of its area."""
     drawn = mask.astype(np.uint8)
     rows, columns = np.nonzero(drawn)
     while np.count_nonzero(drawn) > 0.97 * len(rows):
@@ -144,9 +147,13 @@ def _with_holes(mask: Mask, rng: np.random.Generator, k: int) -> Mask:
 def swinging(
     lower: Array, upper: Array, frames: int, rng: np.random.Generator, fastest: float = _FASTEST
 ) -> Array:
-    """(frames, n) positions that swing inside limits, in full motion from the first frame on.
+    """Return (frames, n) positions that oscillate inside limits, at full speed from the start.
 
-    fastest: of any joint [rad or m a second].
+    Args:
+        lower, upper: (n,) limits.
+        frames: number of frames.
+        rng: random numbers.
+        fastest: maximum velocity of a joint [rad/s or m/s].
     """
     middle, reach = 0.5 * (lower + upper), 0.4 * (upper - lower)
     amplitude = reach * rng.uniform(0.3, 1.0, len(lower))
@@ -158,7 +165,7 @@ def swinging(
 
 
 def _half_hidden(mask: Mask, rng: np.random.Generator, k: int) -> Mask:
-    """A mask without its left half in eight frames."""
+    """Return a mask without its left half in frames 8 to 15."""
     rest = mask.copy()
     if 8 <= k < 16:
         rest[:, : int(np.median(np.nonzero(mask)[1])) + 1] = False
@@ -172,7 +179,7 @@ def _draw_arm(
     colours: bool = False,
     views: int = 2,
 ) -> Callable[[Path, int], Path]:
-    """Draws an arm that swings before one camera, or two 75 degrees apart."""
+    """Return a function that renders an oscillating arm for one camera, or two 75 degrees apart."""
 
     def make(folder: Path, draw: int) -> Path:
         rng = np.random.default_rng([5, draw])
@@ -192,7 +199,7 @@ def _draw_arm(
 
 
 def _draw_person(damage: Damage) -> Callable[[Path, int], Path]:
-    """Draws a person who turns, and swings arms and legs, before four cameras."""
+    """Return a function that renders a person swinging arms and legs, for four cameras."""
 
     def make(folder: Path, draw: int) -> Path:
         rng = np.random.default_rng([6, draw])
@@ -220,10 +227,12 @@ def _draw(
     cameras_off: float = 0.0,
     colours: bool = False,
 ) -> Path:
-    """A scene of masks by Drake's renderer, of pictures where asked, and joint_angles.csv."""
+    """Write a scene of masks by Drake's renderer, optionally of images, and joint_angles.csv."""
     folder.mkdir(parents=True)
-    told = {name: _turned(camera, cameras_off, rng) for name, camera in cameras.items()}
-    save_cameras(folder / "cameras.yaml", told)
+    saved_cameras = {
+        name: _with_orientation_error(camera, cameras_off, rng) for name, camera in cameras.items()
+    }
+    save_cameras(folder / "cameras.yaml", saved_cameras)
     (folder / "scene.yaml").write_text(f"sequence: true\nframe_rate_hz: {_RATE_HZ:.0f}\n")
     rows = [["frame", *model.position_names], *([k, *row] for k, row in enumerate(q))]
     (folder / "joint_angles.csv").write_text(csv_text(rows))
@@ -249,8 +258,10 @@ def _draw(
     return folder
 
 
-def _turned(camera: PinholeCamera, pixels: float, rng: np.random.Generator) -> PinholeCamera:
-    """A camera whose place is told wrongly, so that its picture is off by some pixels."""
+def _with_orientation_error(
+    camera: PinholeCamera, pixels: float, rng: np.random.Generator
+) -> PinholeCamera:
+    """Return a camera with an orientation error that shifts its image by about ``pixels``."""
     if pixels == 0.0:
         return camera
     by = rng.normal(size=3) * pixels / camera.focal_x
@@ -259,8 +270,8 @@ def _turned(camera: PinholeCamera, pixels: float, rng: np.random.Generator) -> P
     return replace(camera, X_WC=X_WC)
 
 
-def read_told(out: Path, scene: Path, joints: Sequence[str], in_degrees: bool) -> Told:
-    """What a result's files say, beside the truth of its scene."""
+def evaluate_result(out: Path, scene: Path, joints: Sequence[str], in_degrees: bool) -> Evaluation:
+    """Return the intervals in a result's files, compared with the scene's truth."""
     unit = 1.0 if in_degrees else np.degrees(1.0)
     truth = {int(row["frame"]): row for row in _rows(scene / "joint_angles.csv")}
     frames = json.loads((out / "summary.json").read_text())["frames"]
@@ -280,8 +291,8 @@ def read_told(out: Path, scene: Path, joints: Sequence[str], in_degrees: bool) -
         off = max(low - value, value - high)
         if off > (_WRONG_DEGREES if is_angle else _WRONG_METRES):
             wrong.add(row["frame"])
-    told = (np.array(one) for one in (inside, determined, width, angles))
-    return Told(*told, len(wrong))
+    arrays = (np.array(one) for one in (inside, determined, width, angles))
+    return Evaluation(*arrays, len(wrong))
 
 
 def _rows(path: Path) -> Iterator[dict[str, str]]:
@@ -289,22 +300,23 @@ def _rows(path: Path) -> Iterator[dict[str, str]]:
         yield from csv.DictReader(file)
 
 
-def measure(one: CoverageSet, draws: int, folder: Path) -> list[Told]:
-    """What the files say of each scene of a set."""
-    told = []
+def measure(one: CoverageSet, draws: int, folder: Path) -> list[Evaluation]:
+    """Return the evaluation of each scene of a set."""
+    results = []
     for draw in range(one.draws or draws):
         place = folder / f"{one.name} {draw}".replace("/", " ")
         scene, out = one.make(place / "scene", draw), place / "out"
         estimate_scene(scene, one.model, out, one.settings, replay=False, overlay=False)
-        told.append(read_told(out, scene, one.joints, one.in_degrees))
-    return told
+        results.append(evaluate_result(out, scene, one.joints, one.in_degrees))
+    return results
 
 
 def _table(sets: Iterator[CoverageSet], draws: int, folder: Path) -> Iterator[tuple[str, ...]]:
     for one in sets:
-        told = measure(one, draws, folder)
+        results = measure(one, draws, folder)
         inside, determined, width, angles = (
-            np.concatenate([getattr(part, name) for part in told]) for name in Told._fields[:4]
+            np.concatenate([getattr(part, name) for part in results])
+            for name in Evaluation._fields[:4]
         )
         half = 0.5 * np.median(width[angles]) if angles.any() else np.nan
         sure = 0.5 * np.median(width[angles & determined]) if (angles & determined).any() else 0.0
@@ -315,12 +327,12 @@ def _table(sets: Iterator[CoverageSet], draws: int, folder: Path) -> Iterator[tu
             f"{determined.mean():.0%}",
             f"{inside[determined].mean():.1%}" if determined.any() else "",
             f"{half:.2f} ({sure:.2f})",
-            str(sum(part.wrong for part in told)),
+            str(sum(part.wrong for part in results)),
         )
 
 
 def main() -> None:
-    """Print how far intervals hold."""
+    """Print the coverage of intervals."""
     parser = argparse.ArgumentParser(description="Whether intervals hold, and how wide they are.")
     parser.add_argument("data", nargs="?", type=Path, help="a folder of recorded scenes")
     parser.add_argument("--draws", type=int, default=2, help="scenes drawn for each set")

@@ -1,9 +1,9 @@
-"""Benchmark of registrations from pictures alone: simulated episodes of arms in rooms, by Drake.
+"""Benchmark of registration from images only: simulated episodes of arms in rooms, by Drake.
 
 Run as ``python -m tests.benchmarks.episodes DATA [--rooms N] [--first K] [--only TEXT]``; DATA is a
-folder with the arms ``arm_two_views/med7``, ``franka_one_view/panda`` and ``droid_episodes/robot``.
-N rooms for each arm and set. Of a set with wrong rows the frames near where they begin and end are
-not counted.
+folder with the arms ``arm_two_views/med7``, ``franka_one_view/panda`` and ``droid_episodes/robot``,
+N the number of rooms per arm and set. In sets with wrong rows, frames near the start and end of
+these rows are not evaluated.
 """
 
 import argparse
@@ -32,20 +32,20 @@ _ARMS = {
     "Franka Panda": "franka_one_view/panda/panda.urdf",
     "Panda with Robotiq": "droid_episodes/robot/panda_robotiq.urdf",
 }
-# How joints of arms begin, not those of grippers.
+# Prefixes of arm joints, without those of grippers.
 _JOINTS = ("A", "panda_joint", "lbr_")
-# Every how manieth room is grey on grey.
+# Every fifth room has little contrast (grey on grey).
 _GREY = 5
-# Clocks are off by so much at most [s]; zeros by so much [degrees]; wrong rows last so long [s].
+# Maximum time offset [s], joint offset [deg], and duration of wrong rows [s].
 _LATE, _ZERO, _WRONG = 0.3, 2.0, 2.0
-# A camera that is farther off is a wrong one [mm].
+# Maximum position error of a correct camera [mm].
 _FAR = 50.0
-# Frames so near to where wrong rows begin or end are neither [s].
+# Frames this close to the start or end of wrong rows are not evaluated [s].
 _BETWEEN = 0.15
 
 
 class EpisodeSet(NamedTuple):
-    """Episodes spoilt in one way: late at random, at another rate, zeros off, rows wrong."""
+    """Episodes with one kind of error: time offset, log rate, joint offsets, or wrong rows."""
 
     name: str
     late: bool = False
@@ -63,11 +63,17 @@ SETS = (
 
 
 class Outcome(NamedTuple):
-    """What became of an episode; all but found and seconds are empty where it was refused.
+    """Result of an episode; only found and seconds are set if the registration was refused.
 
-    off: [mm, degrees]; inside: of the pose's six coordinates; clock: by how much the offset is off
-    [s]; zeros: by how much the three are [degrees]; false: sound zeros that were named; named:
-    shares of wrong frames that were, and of right ones; seconds: of the processor.
+    Attributes:
+        found: whether a camera was found.
+        seconds: CPU time [s].
+        off: position and orientation error of the camera [mm, deg].
+        inside: number of the pose's six coordinates inside their 95 % intervals.
+        clock: error of the time offset [s].
+        zeros: errors of the three wrong joint offsets [deg].
+        false: number of correct joint offsets reported as wrong.
+        named: fractions of wrong and of correct frames reported as outliers.
     """
 
     found: bool
@@ -81,11 +87,13 @@ class Outcome(NamedTuple):
 
 
 def measure_episode(path: Path, folder: Path, seed: int, kind: EpisodeSet) -> Outcome:
-    """Draws an episode, spoils it, and finds its camera.
+    """Simulate an episode with errors, and find its camera.
 
     Args:
-        path: of the arm's model.
-        folder: for its files.
+        path: the arm's model file.
+        folder: folder for the files.
+        seed: seed of the episode.
+        kind: errors of the episode.
     """
     rng = np.random.default_rng([10, seed])
     model = load_model(path, check=False)
@@ -98,7 +106,7 @@ def measure_episode(path: Path, folder: Path, seed: int, kind: EpisodeSet) -> Ou
     ]
     turned = {}
     if kind.zeros:
-        # The first joint goes with the camera, the last one with nothing that is seen.
+        # Offsets of the first joint are absorbed by the camera, those of the last are invisible.
         three = rng.choice(moving[1:-1], 3, replace=False).tolist()
         turned = dict(zip(three, rng.choice([-_ZERO, _ZERO], 3).tolist(), strict=True))
     wrong = (0.0, 0.0)
@@ -124,7 +132,7 @@ def _write(
     turned: dict[str, float],
     wrong: tuple[float, float],
 ) -> None:
-    """An episode's files: pictures, a log at some rate, and a camera that stands nowhere."""
+    """Write an episode's files: images, a joint log at some rate, and a camera without pose."""
     images = folder / "images" / "camera"
     images.mkdir(parents=True)
     for k, picture in enumerate(episode.pictures):
@@ -156,35 +164,38 @@ def _outcome(
     wrong: tuple[float, float],
     seconds: float,
 ) -> Outcome:
-    """How well an episode's camera, clock, zeros and rows were found."""
+    """Return the errors of an episode's camera, clock, joint offsets and outliers."""
     one, summary = found.registered["camera"], found.summary
     error = pose_error(one.camera.X_WC, episode.camera.X_WC)
     inside = np.abs(error) < 1.96 * np.sqrt(np.diag(one.covariance))
     offset, zeros, false = summary["time_offset_s"], list[float](), 0
-    for name, told in summary["zeros"].items():
+    for name, estimate in summary["zeros"].items():
         if name in turned:
-            # What is added to readings.
-            off = (told["value_deg"] or 0.0) + turned[name] if told["significant"] else _ZERO
-            zeros.append(abs(off))
+            # The estimated offset is added to readings, so it should cancel the error.
+            error_deg = (
+                (estimate["value_deg"] or 0.0) + turned[name] if estimate["significant"] else _ZERO
+            )
+            zeros.append(abs(error_deg))
         else:
-            false += bool(told["significant"])
-    contradicting = set(one.outliers)
+            false += bool(estimate["significant"])
+    outliers = set(one.outliers)
     is_wrong = (episode.times >= wrong[0]) & (episode.times < wrong[1])
     between = np.abs(episode.times[:, None] - np.array(wrong)).min(axis=1) < _BETWEEN
-    named = np.array([f"{k:04d}" in contradicting for k in range(len(episode.times))])
-    shares = [
+    named = np.array([f"{k:04d}" in outliers for k in range(len(episode.times))])
+    fractions = [
         float(named[own].mean()) if own.any() else np.nan
         for own in (is_wrong & ~between, ~is_wrong & ~between)
     ]
     return Outcome(
         True, seconds, (1e3 * float(np.linalg.norm(error[3:])),
         float(np.degrees(np.linalg.norm(error[:3])))), int(inside.sum()),
-        np.nan if offset is None else offset - late, tuple(zeros), false, (shares[0], shares[1]),
+        np.nan if offset is None else offset - late, tuple(zeros), false,
+        (fractions[0], fractions[1]),
     )  # fmt: skip
 
 
 def _row(name: str, outcomes: Sequence[Outcome]) -> list[str]:
-    """A row of the table."""
+    """Return a row of the table."""
     found = [one for one in outcomes if one.found]
     right = [one for one in found if one.off[0] <= _FAR]
     off = np.array([one.off for one in found]).reshape(-1, 2)
@@ -225,7 +236,7 @@ def _rows(data: Path, rooms: range, only: str) -> Iterator[list[str]]:
 
 
 def main() -> None:
-    """Prints a row for each set and arm."""
+    """Print a row for each set and arm."""
     parser = argparse.ArgumentParser(description="Cameras, clocks, zeros of recorded episodes.")
     parser.add_argument("data", type=Path)
     parser.add_argument("--rooms", type=int, default=10)

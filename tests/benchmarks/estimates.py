@@ -1,9 +1,9 @@
-"""Benchmark of whole estimates: CPU time a frame, as label images of the same process, and errors.
+"""Benchmark of whole estimates: errors, and CPU time per frame relative to Drake's label images.
 
 Run as ``python -m tests.benchmarks.estimates [DATA] [--hands]``; DATA is a folder with the scenes
-``arm_two_views``, ``human_four_views``, ``hand_photos`` and ``hand_sequences``. Rows whose scene is
-not there are left out; the demonstration's always is. ``--hands``: all sequences of hands before
-one camera that nobody knows, instead.
+``arm_two_views``, ``human_four_views``, ``hand_photos`` and ``hand_sequences``. Missing scenes are
+skipped; the demonstration is always there. ``--hands``: instead, all sequences of hands with an
+uncalibrated camera.
 """
 
 import argparse
@@ -39,8 +39,14 @@ _FLEXIONS = tuple(
 
 
 class Work(NamedTuple):
-    """One row: an estimate of a scene with a model. So many frames are not counted, as the search
-    is asked in them; the errors of some joints are told, by joint_angles.csv beside the scene.
+    """An estimate of a scene, one row of the table.
+
+    Attributes:
+        name: name of the row.
+        scene, model: scene folder and model file.
+        settings: settings of the estimate.
+        uncounted: number of initial frames that are not evaluated, because they include the search.
+        joints: joints whose errors are evaluated, by joint_angles.csv in the scene.
     """
 
     name: str
@@ -52,7 +58,7 @@ class Work(NamedTuple):
 
 
 def works(data: Path | None, folder: Path) -> Iterator[Work]:
-    """The rows whose scenes are there; what is drawn goes to a folder."""
+    """Yield the rows whose scenes exist; rendered scenes are written to a folder."""
     man, demo = bundled_model("man"), demo_scene()
     yield Work("demo: man, one view", demo, man, demo_settings(demo))
     if data is None:
@@ -85,7 +91,7 @@ def _right_hand() -> Path:
 
 
 def draw_arm_sequence(arm: Path, out: Path, frames: int = _FRAMES) -> Path:
-    """A scene of the recorded arm on its way from its first pose to its second, drawn by Drake."""
+    """Write a scene of the recorded arm moving from its first to its second pose, by Drake."""
     model, scene = load_model(arm / "med7" / "med7.urdf", check=False), load_scene(arm)
     truth = _truth(arm)
     names, poses = list(truth[0]), np.array([list(truth[k].values()) for k in (0, 1)])
@@ -107,14 +113,14 @@ def draw_arm_sequence(arm: Path, out: Path, frames: int = _FRAMES) -> Path:
 
 
 def _truth(scene: Path) -> dict[int, dict[str, float]]:
-    """The joints' true positions, by the frame's number."""
+    """Return the true joint positions by frame number."""
     with (scene / "joint_angles.csv").open(encoding="utf-8", newline="") as file:
         rows = [{name: float(cell) for name, cell in row.items()} for row in csv.DictReader(file)]
     return {int(row.pop("frame")): row for row in rows}
 
 
 def measure(work: Work) -> tuple[float, float, str]:
-    """CPU seconds a frame, E_total in the mean, and the error in words; the first run warms up."""
+    """Return CPU seconds per frame, mean E_total, and the error as text; the first run warms up."""
     ends: list[float] = []
     for _ in range(2 if work.uncounted == 0 else 1):
         ends.clear()
@@ -127,7 +133,7 @@ def measure(work: Work) -> tuple[float, float, str]:
         truth, names = _truth(work.scene), found.position_names
         pairs = [(row, name) for row in rows for name in work.joints]
         off = np.abs([r.q[names.index(n)] - truth[int(r.frame)][n] for r, n in pairs])
-        # A flip of the chain looks the same: what is off by more is one.
+        # Larger errors are mirrored poses with the same silhouette; they are left out.
         median = np.degrees(np.median(off[off < 0.5]))
         error = f"{work.joints[0]} to {work.joints[-1]}: {median:.2f} deg in the median"
     seconds = float(np.median(np.diff(ends)[work.uncounted :]))
@@ -153,7 +159,7 @@ def _rows(data: Path | None, folder: Path) -> Iterator[tuple[str, ...]]:
 
 
 def _hand_rows(data: Path) -> Iterator[tuple[str, ...]]:
-    """Each sequence: flexions off, how many lie in their intervals and these' widths [deg]."""
+    """Yield for each sequence: errors of flexions, coverage and widths of intervals [deg]."""
     for scene in sorted(path.parent for path in data.glob("*/scene.yaml")):
         begin = time.process_time()
         found = estimate_scene(scene, _right_hand(), None, EstimateSettings(), overlay=False)
@@ -180,7 +186,7 @@ def _hand_rows(data: Path) -> Iterator[tuple[str, ...]]:
 
 
 def main() -> None:
-    """Print what estimates cost and reach here."""
+    """Print the costs and errors of estimates."""
     parser = argparse.ArgumentParser(description="Whole estimates: times and errors.")
     parser.add_argument("data", nargs="?", type=Path, help="a folder of recorded scenes")
     parser.add_argument("--hands", action="store_true", help="sequences of hands alone")

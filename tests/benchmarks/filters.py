@@ -1,8 +1,8 @@
-"""A filter for a system of one's own (``python -m tests.benchmarks.filters [FIRST [ARMS]]``).
+"""Benchmark of the truncated filter on a custom system (``python -m tests.benchmarks.filters``).
 
-A planar arm of three links whose lengths nobody knows; its joints have limits. A camera sees elbow
-and tip, or elbow, wrist and tip, each with noise. 16 arms, of the seeds from FIRST on, move for 120
-frames as the filter's motion says, and stay within their limits.
+A planar arm has three links of unknown length and joints with limits. A camera measures elbow and
+tip, or elbow, wrist and tip, with noise. 16 arms move for 120 frames by the filter's motion model
+and stay within their limits. Arguments: [FIRST seed [number of ARMS]].
 """
 
 import sys
@@ -22,23 +22,24 @@ from tests.benchmarks.tables import print_table
 JOINTS, LINKS = ("shoulder", "elbow", "wrist"), ("upper", "fore", "hand")
 LAYOUT = StateLayout(JOINTS, LINKS)
 LIMITS = from_bounds((*JOINTS, *LINKS), [-1.5, 0, 0, 0.1, 0.1, 0.1], [1.5, 2.4, 1.6, 0.5, 0.5, 0.5])
-"""Of the angles [rad] and the lengths [m]."""
+"""Limits of the angles [rad] and the lengths [m]."""
 
-SEEN = {"elbow, tip": (1, 3), "elbow, wrist, tip": (1, 2, 3)}
+OBSERVED = {"elbow, tip": (1, 3), "elbow, wrist, tip": (1, 2, 3)}
 PERIOD, FRAMES, ARMS = 1 / 30, 120, 16
-USUAL, SHARE = np.array([0.30, 0.25, 0.20]), 0.2
-"""Lengths that are expected [m], and the standard deviation of their error as a share of them."""
+USUAL, RELATIVE_DEVIATION = np.array([0.30, 0.25, 0.20]), 0.2
+"""Prior mean of the lengths [m], and its relative standard deviation."""
 
 RATE_CHANGE, NOISE, ANGLE, RATE = 0.75, 0.02, 0.3, 0.5
-"""Standard deviations: rates in a second [rad/s], points [m], first angles [rad], first rates."""
+"""Standard deviations: change of rates in a second [rad/s], measured points [m], initial angles
+[rad] and initial rates [rad/s]."""
 
 
 class Run(NamedTuple):
-    """True states (frames, 9), what is measured (frames, m), and the first guess."""
+    """True states (frames, 9), measurements (frames, m), and the initial belief."""
 
     states: np.ndarray
     measured: np.ndarray
-    guess: Belief
+    initial: Belief
 
 
 class Found(NamedTuple):
@@ -51,15 +52,15 @@ class Found(NamedTuple):
 Filter = Callable[[FunctionObservation, LinearMotion, Run], Found]
 
 
-def place(x: np.ndarray, ends: tuple[int, ...]) -> np.ndarray:
-    """(2 k,) where links end [m], one after the other, of a state (9,)."""
+def link_ends(x: np.ndarray, ends: tuple[int, ...]) -> np.ndarray:
+    """Return (2 k,) the ends of links [m] at a state (9,)."""
     angles, lengths = np.cumsum(x[:3]), x[6:]
     steps = lengths[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return np.cumsum(steps, axis=0)[np.array(ends) - 1].ravel()
 
 
-def slope(x: np.ndarray, ends: tuple[int, ...]) -> np.ndarray:
-    """(2 k, 9) its Jacobian."""
+def link_ends_jacobian(x: np.ndarray, ends: tuple[int, ...]) -> np.ndarray:
+    """Return (2 k, 9) the Jacobian of ``link_ends``."""
     angles, lengths = np.cumsum(x[:3]), x[6:]
     along = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     across = lengths[:, None] * np.stack([-along[:, 1], along[:, 0]], axis=1)
@@ -72,22 +73,26 @@ def slope(x: np.ndarray, ends: tuple[int, ...]) -> np.ndarray:
 
 
 def observe(ends: tuple[int, ...]) -> FunctionObservation:
-    """Where these links end, with noise."""
+    """Return the observation of these links' ends, with noise."""
     names = tuple(f"{('elbow', 'wrist', 'tip')[end - 1]}_{axis}" for end in ends for axis in "xy")
-    return FunctionObservation(names, NOISE, lambda x: place(x, ends), lambda x: slope(x, ends))
+    return FunctionObservation(
+        names, NOISE, lambda x: link_ends(x, ends), lambda x: link_ends_jacobian(x, ends)
+    )
 
 
 def motion() -> LinearMotion:
-    """As the arms move, and as the filters expect."""
+    """Return the motion model of the arms and the filters."""
     return constant_velocity(LAYOUT, dict.fromkeys(JOINTS, RATE_CHANGE), PERIOD)
 
 
 def draw_run(seed: int, ends: tuple[int, ...]) -> Run:
-    """An arm that moves within its limits; joints that would leave them are drawn again."""
+    """Simulate an arm within its limits; joint motions that would leave them are redrawn."""
     rng, step = np.random.default_rng([seed, len(ends)]), motion()
     low, high = -LIMITS.b[::2], LIMITS.b[1::2]
     states = np.zeros((FRAMES, 9))
-    states[:, 6:] = np.clip(USUAL * (1 + SHARE * rng.normal(size=3)), low[3:], high[3:])
+    states[:, 6:] = np.clip(
+        USUAL * (1 + RELATIVE_DEVIATION * rng.normal(size=3)), low[3:], high[3:]
+    )
     for joint in range(3):
         pair = [joint, 3 + joint]
         A, root = (
@@ -101,20 +106,20 @@ def draw_run(seed: int, ends: tuple[int, ...]) -> Run:
             if len(path) == FRAMES and low[joint] <= path[-1][0] <= high[joint]:
                 break
         states[:, pair] = path
-    true = np.array([place(x, ends) for x in states])
+    true = np.array([link_ends(x, ends) for x in states])
     measured = true + NOISE * rng.normal(size=true.shape)
     first = np.clip(states[0, :3] + ANGLE * rng.normal(size=3), low[:3], high[:3])
-    deviations = np.r_[np.full(3, ANGLE), np.full(3, RATE), SHARE * USUAL]
-    guess = Belief(np.r_[first, np.zeros(3), USUAL], np.diag(deviations**2))
-    return Run(states, measured, guess)
+    deviations = np.r_[np.full(3, ANGLE), np.full(3, RATE), RELATIVE_DEVIATION * USUAL]
+    initial = Belief(np.r_[first, np.zeros(3), USUAL], np.diag(deviations**2))
+    return Run(states, measured, initial)
 
 
 def ours(settings: FilterSettings) -> Filter:
-    """The truncated filter."""
+    """Return the truncated filter."""
 
     def follow(observation: FunctionObservation, step: LinearMotion, run: Run) -> Found:
         belief_filter = TruncatedFilter(LAYOUT, observation, LIMITS, step, settings)
-        state, beliefs = belief_filter.start(run.guess), []
+        state, beliefs = belief_filter.start(run.initial), []
         for t, y in enumerate(run.measured):
             state = belief_filter.update(belief_filter.predict(state) if t else state, y)
             beliefs.append(state.best)
@@ -126,11 +131,11 @@ def ours(settings: FilterSettings) -> Filter:
 
 
 def clipped_ekf(observation: FunctionObservation, step: LinearMotion, run: Run) -> Found:
-    """What one writes without a library: the mean is moved inside the limits."""
+    """An extended Kalman filter whose mean is clipped to the limits."""
     low, high = np.full(9, -np.inf), np.full(9, np.inf)
     limited = LAYOUT.indices(LIMITS.columns)
     low[limited], high[limited] = -LIMITS.b[::2], LIMITS.b[1::2]
-    x, P, R = run.guess.mean, run.guess.covariance, np.diag(observation.variances)
+    x, P, R = run.initial.mean, run.initial.covariance, np.diag(observation.variances)
     means, covariances = [], []
     for t, y in enumerate(run.measured):
         if t:
@@ -144,8 +149,8 @@ def clipped_ekf(observation: FunctionObservation, step: LinearMotion, run: Run) 
     return Found(np.array(means), np.array(covariances))
 
 
-def judge(found: Found, run: Run) -> tuple[float, float, float]:
-    """Mean squares: of angles [deg^2] and of lengths at the end [mm^2]; NEES of a degree."""
+def evaluate(found: Found, run: Run) -> tuple[float, float, float]:
+    """Return mean squares of angle errors [deg^2] and final length errors [mm^2], and NEES / 9."""
     error = found.means - run.states
     nees = np.einsum(
         "ti,ti->t", error, np.linalg.solve(found.covariances, error[..., None])[..., 0]
@@ -163,20 +168,20 @@ FILTERS: dict[str, Filter] = {
 
 
 def measure(follow: Filter, ends: tuple[int, ...], seeds: range) -> tuple[float, ...]:
-    """Angle RMS [deg], length error at the end, RMS [mm], NEES of a degree, time an update [ms]."""
+    """Return RMS of angles [deg] and final lengths [mm], NEES per unknown, and ms per update."""
     runs, observation, step = [draw_run(seed, ends) for seed in seeds], observe(ends), motion()
     begun = time.perf_counter()
     found = [follow(observation, step, run) for run in runs]
     cost = 1e3 * (time.perf_counter() - begun) / (len(runs) * FRAMES)
-    squares = np.mean([judge(one, run) for one, run in zip(found, runs, strict=True)], axis=0)
+    squares = np.mean([evaluate(one, run) for one, run in zip(found, runs, strict=True)], axis=0)
     return float(squares[0] ** 0.5), float(squares[1] ** 0.5), float(squares[2]), cost
 
 
 def rows(seeds: range) -> Iterator[tuple[str, ...]]:
-    """Each filter's figures, of both cases."""
+    """Yield each filter's figures for both observations."""
     for name, follow in FILTERS.items():
         cells = [name]
-        for ends in SEEN.values():
+        for ends in OBSERVED.values():
             angle, length, nees, cost = measure(follow, ends, seeds)
             cells += [f"{angle:.1f}", f"{length:.1f}", f"{nees:.2f}", f"{cost:.2f}"]
         yield tuple(cells)
@@ -185,6 +190,6 @@ def rows(seeds: range) -> Iterator[tuple[str, ...]]:
 if __name__ == "__main__":
     first, arms = (int(word) for word in [*sys.argv[1:], *["0", str(ARMS)][len(sys.argv) - 1 :]])
     seeds = range(first, first + arms)
-    figures = ("deg", "mm", "NEES", "ms") * len(SEEN)
-    title = f"Angles, lengths at the end, NEES of a degree of freedom: {' | '.join(SEEN)} seen"
+    figures = ("deg", "mm", "NEES", "ms") * len(OBSERVED)
+    title = f"Angles, lengths at the end, NEES of a degree of freedom: {' | '.join(OBSERVED)} seen"
     print_table(f"{title}; seeds {first} to {seeds[-1]}", ("filter", *figures), rows(seeds))

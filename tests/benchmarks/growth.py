@@ -1,7 +1,7 @@
-"""How the cost of one step of the fit grows (``python -m tests.benchmarks.growth``).
+"""Benchmark of how the cost of one step of the fit grows (``python -m tests.benchmarks.growth``).
 
-A chain of limbs is fitted to silhouettes of itself: contours are compared in all frames and
-cameras, and the normal equations solved once. One thing grows at a time.
+A chain of limbs is fitted to its own silhouettes: contours are compared in all frames and cameras,
+and the normal equations are solved once. One quantity grows at a time.
 """
 
 import math
@@ -30,13 +30,14 @@ GROWING = {
     "pixels": (1e5, 1e6, 1e7),
     "frames": (1, 10, 100, 1000),
 }
-"""What grows; the others are as of ``measure_step``. Triangles are those of all nodes."""
+"""Values of each quantity; the others have the defaults of ``measure_step``. Triangles are those of
+all nodes."""
 
 
 def measure_step(
     cameras: int = 2, joints: int = 6, triangles: float = 1e3, pixels: float = 1e5, frames: int = 1
 ) -> float:
-    """The time of one step [s]."""
+    """Return the CPU time of one step [s]."""
     columns = max(4, round(math.sqrt(0.5 * triangles / (joints + 1))))
     limb, links = limb_mesh(columns, columns + 1), joints + 1
     seen_as = '<visual><geometry><sphere radius="0.05"/></geometry></visual>'
@@ -68,10 +69,10 @@ def measure_step(
 
 
 def growth_rows() -> Iterator[tuple[str, ...]]:
-    """Of each that grows: its values, the times of a step [ms] and the exponent."""
+    """Yield for each growing quantity: its values, times per step [ms] and the exponent."""
     for name, values in GROWING.items():
         times = [measure_step(**{name: value}) for value in values]
-        # Of the second half: what does not grow weighs less there.
+        # The exponent is taken at the end, where constant costs matter less.
         last = [math.log(one[-1] / one[-2]) for one in (values, times)]
         yield (
             name,

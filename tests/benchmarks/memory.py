@@ -1,4 +1,4 @@
-"""The memory that commands take on the project's own data (`make bench`)."""
+"""Benchmark of the memory of commands on the project's own data (`make bench`)."""
 
 import os
 import subprocess
@@ -10,7 +10,7 @@ from pathlib import Path
 from tests.benchmarks.tables import print_table
 
 LIMIT_MIB = 1536
-"""No command takes more on the project's own data [MiB]."""
+"""Maximum memory of a command on the project's own data [MiB]."""
 
 COMMANDS = (
     "demo --out demo",
@@ -22,22 +22,22 @@ COMMANDS = (
     "reproduce date --frames 60",
     "walk --simulate --no-browser --seconds 20 --speed 0",
 )
-"""Command lines that need no data but the project's own, in a folder for their results."""
+"""Command lines that need only the project's own data; results go to the current folder."""
 
 
 def measure_memory(
     words: Sequence[str], folder: Path, program: Sequence[str] = ("-m", "drake_pose.commands.main")
 ) -> tuple[int, float, float]:
-    """Runs a command in a process of its own: its exit status, peak memory [MiB], CPU seconds.
+    """Run a command in a child process; return its exit status, peak memory [MiB] and CPU time [s].
 
-    The memory is the most that it had, or one of its workers; Linux never counts less than what the
-    process that measures had, so that this one should have little.
+    The memory is the maximum over the process and its workers. Linux never reports less than the
+    measuring process had, so that process should be small.
     """
     quiet = subprocess.DEVNULL
     process = subprocess.Popen(
         [sys.executable, *program, *words], stdin=quiet, stdout=quiet, stderr=quiet, cwd=folder
     )
-    # Of this child alone, and of the workers that it waited for.
+    # Usage of this child only, and of the workers that it waited for.
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     # macOS counts bytes, Linux kibibytes.

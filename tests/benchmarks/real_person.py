@@ -1,7 +1,8 @@
 """Date's search on a real person: python -m tests.benchmarks.real_person SCENE MODEL OUT.
 
-SCENE has masks and joint_centres.csv, whose head, wrists and ankles stand for the skin that masks
-do not show; MODEL is a person of their lengths (urdf/person/make_person.py). OUT gets a picture.
+SCENE has masks and joint_centres.csv, whose head, wrists and ankles replace the skin features that
+masks do not show; MODEL is a person with the same lengths (urdf/person/make_person.py). OUT is the
+folder of the resulting image.
 """
 
 import csv
@@ -22,13 +23,13 @@ from drake_pose.silhouette.pictures.scenes import load_scene
 
 ENDS = ("left_wrist", "right_wrist", "left_ankle", "right_ankle")
 MIDDLES = ("left_elbow", "right_elbow", "left_knee", "right_knee")
-# By whether elbows and knees are searched.
+# Colours without and with a search for elbows and knees.
 COLOURS = {False: (220, 60, 40), True: (40, 110, 230)}
 SHOWN = "0020"
 
 
 def skeleton_of(path):
-    """The skeleton of a person whose limbs end at wrists and ankles, the head at its joints."""
+    """Return the skeleton of a person whose limbs end at wrists and ankles."""
     model = load_model(path, check=False)
     skeleton, names = load_skeleton(model), load_landmarks(model.path)
     q = np.zeros(len(skeleton.lower))
@@ -61,30 +62,30 @@ def main(folder, model, out):
         waists = {"paper's": None, "true": 0.5 * (at["left_hip"] + at["right_hip"])}
         masks = [scene.read(camera.name, name) for camera in cameras]
         drawn = [np.where(one[..., None], (255,) * 3, (120,) * 3).astype(np.uint8) for one in masks]
-        for way in ((waist, search) for waist in waists for search in COLOURS):
-            if way not in states:
-                # Upright, facing as the shoulders say.
-                across, states[way] = (
+        for method in ((waist, search) for waist in waists for search in COLOURS):
+            if method not in states:
+                # Start upright, facing the direction given by the shoulders.
+                across, states[method] = (
                     at["left_shoulder"] - at["right_shoulder"],
                     np.zeros(len(skeleton.lower)),
                 )
-                states[way][skeleton.head_angles[0]] = np.arctan2(-across[0], across[1])
-            seen = (features, None, cameras, masks)
-            states[way], limbs = estimate_pose(
-                skeleton, states[way], *seen, search=way[1], waist=waists[way[0]]
+                states[method][skeleton.head_angles[0]] = np.arctan2(-across[0], across[1])
+            evidence = (features, None, cameras, masks)
+            states[method], limbs = estimate_pose(
+                skeleton, states[method], *evidence, search=method[1], waist=waists[method[0]]
             )
             found = np.array([limbs[limb][1] for limb in LIMBS])
-            errors[way].append(np.linalg.norm(found - [at[one] for one in MIDDLES], axis=1))
-            for camera, picture in zip(cameras, drawn, strict=True) if way[0] == "true" else ():
+            errors[method].append(np.linalg.norm(found - [at[one] for one in MIDDLES], axis=1))
+            for camera, picture in zip(cameras, drawn, strict=True) if method[0] == "true" else ():
                 lines = [np.rint(camera.project(one)[0]).astype(np.int32) for one in limbs.values()]
-                cv2.polylines(picture, lines, False, COLOURS[way[1]], 7)
+                cv2.polylines(picture, lines, False, COLOURS[method[1]], 7)
         if name == SHOWN:
             save_figure(
                 draw_panels([[one] for one in drawn], list(scene.cameras)), out / "limbs.png"
             )
-    for way, rows in errors.items():
+    for method, rows in errors.items():
         elbows, knees = 1e3 * np.nanmean(np.reshape(rows, (-1, 2, 2)), axis=(0, 2))
-        print(json.dumps({"way": way, "elbows_mm": round(elbows), "knees_mm": round(knees)}))
+        print(json.dumps({"method": method, "elbows_mm": round(elbows), "knees_mm": round(knees)}))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Benchmark of registrations: whether cameras are found without a guess, how well, and how fast.
+"""Benchmark of registrations without an initial guess: success, errors and time.
 
 Run as ``python -m tests.benchmarks.registration [DATA] [--cases N]``; DATA is a folder with the
 scenes ``arm_two_views``, ``arm_one_view`` and ``franka_one_view``, N the number of simulated cases
-for each arm that is there; where none is, of an arm of boxes.
+per arm. Without any arm in DATA an arm of boxes is used.
 """
 
 import argparse
@@ -36,14 +36,14 @@ from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.benchmarks.tables import print_table
 
 _SEED, _FRAMES = 13_000, 5
-# A camera is found that is off by less [mm, deg].
+# Maximum errors of a camera that counts as found [mm, deg].
 _FOUND = (20.0, 2.0)
 _WIDTH, _HEIGHT, _FOCAL, _DISTANCE = 640, 480, 600.0, (1.0, 1.7)
 _MIDDLE, _MIDDLE_SD = np.array([0.0, 0.0, 0.35]), 0.1
-# A silhouette of fewer pixels is of an arm that is hardly in the picture: another pose is drawn,
-# and after so many such poses another camera.
+# Minimum size of a silhouette [pixel]; smaller ones are redrawn in another pose, and after this
+# many of them with another camera.
 _LEAST_PIXELS, _TRIES = 3000, 30
-# By how much a model and a lens are off: zeros [rad], lengths, focal length, and centre [pixel].
+# Standard deviations of errors: joint offsets [rad], link scales, focal length, centre [pixel].
 _ZERO_SD, _LENGTH_SD, _FOCAL_SD, _CENTER_SD = np.radians(0.3), 0.01, 0.01, 3.0
 _MOST_MORPHED, _HOLES, _HOLE_RADII = 2, 0.03, (3, 9)
 _LBR, _PANDA = "arm_two_views/med7/med7.urdf", "franka_one_view/panda/panda.urdf"
@@ -55,7 +55,7 @@ _RECORDED = (
     ("franka_one_view", _PANDA, "joint_angles", ()),
     ("franka_one_view", _PANDA, "joint_angles_fitted", ()),
 )
-# Of the arm of boxes each: its axis, the box's sides and length [m].
+# The arm of boxes: each joint's axis, its box's sides and length [m].
 _BOXES = (
     ("0 0 1", 0.16, 0.11, 0.2),
     ("0 1 0", 0.11, 0.1, 0.35),
@@ -66,8 +66,13 @@ _BOXES = (
 
 
 class CameraOutcome(NamedTuple):
-    """Of one registration: how far off [mm, deg], how many of the six 95 % intervals hold the
-    truth, whether just the wrong frames were named, and the processor's seconds.
+    """Result of one registration.
+
+    Attributes:
+        millimetres, degrees: position and orientation error.
+        inside: number of the pose's six coordinates inside their 95 % intervals.
+        named: whether exactly the wrong frames are reported as outliers.
+        seconds: CPU time [s].
     """
 
     millimetres: float
@@ -78,12 +83,12 @@ class CameraOutcome(NamedTuple):
 
     @property
     def found(self) -> bool:
-        """Whether it is the camera's pose and no other that looks alike."""
+        """Whether the true pose was found, and not another one with similar silhouettes."""
         return self.millimetres < _FOUND[0] and self.degrees < _FOUND[1]
 
 
 def load_arms(data: Path | None) -> dict[str, RegistrationBody]:
-    """Arms that are there: scenes', the xArm7's; else one of boxes."""
+    """Return the arms that exist: those of scenes and the xArm7; else one of boxes."""
     places = {} if data is None else {"LBR Med 7": data / _LBR, "Franka Panda": data / _PANDA}
     with suppress(PackageNotFoundError):
         places["xArm7"] = Path(str(distribution("example-robot-data").locate_file(_XARM)))
@@ -93,7 +98,7 @@ def load_arms(data: Path | None) -> dict[str, RegistrationBody]:
 
 
 def write_box_arm(path: Path) -> Path:
-    """Writes an arm of five boxes; returns its file."""
+    """Write the model file of an arm of five boxes, and return its path."""
     parts, parent, height = ['<robot name="boxes"><link name="world"/>'], "world", 0.0
     for k, (axis, width, depth, length) in enumerate(_BOXES):
         parts.append(
@@ -109,14 +114,14 @@ def write_box_arm(path: Path) -> Path:
 
 
 def load_arm(path: Path) -> RegistrationBody:
-    """An arm that stands in the world as its model file has it."""
+    """Return an arm fixed in the world as in its model file."""
     return RegistrationBody(make_tree(load_model(path, check=False), EstimateSettings(), None))
 
 
 def draw_arm(
     body: RegistrationBody, count: int, rng: np.random.Generator
 ) -> tuple[PinholeCamera, list[PosedFrame]]:
-    """An arm in random poses, before a camera from any side, turned anyhow; masks are exact."""
+    """Render exact masks of an arm in random poses, for a random camera."""
     while True:
         camera = _random_camera(rng)
         renderer, frames = LabelRenderer(body.tree.model, camera), []
@@ -130,7 +135,7 @@ def draw_arm(
 
 
 def random_values(body: RegistrationBody, rng: np.random.Generator) -> Array:
-    """Positions (m,) inside the joints' limits; those that have none turn all around."""
+    """Return positions (m,) inside the joints' limits, or a full turn without limits."""
     lower, upper = body.kinematics.lower, body.kinematics.upper
     return rng.uniform(
         np.where(np.isfinite(lower), lower, -np.pi), np.where(np.isfinite(upper), upper, np.pi)
@@ -150,7 +155,7 @@ def _random_camera(rng: np.random.Generator) -> PinholeCamera:
 
 
 def damaged(mask: Mask, rng: np.random.Generator) -> Mask:
-    """A mask eroded or dilated by up to two pixels, with holes of 3 % of its area."""
+    """Return a mask eroded or dilated by up to two pixels, with holes of 3 % of its area."""
     size = int(rng.integers(-_MOST_MORPHED, _MOST_MORPHED + 1))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(size) + 1,) * 2)
     drawn = (cv2.dilate if size > 0 else cv2.erode)(mask.astype(np.uint8), disc)
@@ -163,19 +168,21 @@ def damaged(mask: Mask, rng: np.random.Generator) -> Mask:
 
 
 def measure_camera(
-    body: RegistrationBody, seed: int, worn: bool, misfit: bool = False
+    body: RegistrationBody, seed: int, damaged_case: bool, model_errors: bool = False
 ) -> CameraOutcome:
-    """Draws an arm and finds its camera.
+    """Simulate an arm and find its camera.
 
     Args:
-        worn: masks are damaged, one frame's positions wrong.
-        misfit: zeros, lengths of links and the lens are a little off that the search is told.
+        body: the arm.
+        seed: seed of the poses and the camera.
+        damaged_case: damage the masks, and make one frame's positions wrong.
+        model_errors: give joints, link scales and lens small errors.
     """
     rng = np.random.default_rng(seed)
-    true = _with_other_lengths(body, rng) if misfit else body
+    true = _with_other_lengths(body, rng) if model_errors else body
     camera, frames = draw_arm(true, _FRAMES, rng)
     wrong: tuple[str, ...] = ()
-    if misfit:
+    if model_errors:
         zeros = rng.normal(0.0, _ZERO_SD, len(body.kinematics.names)) * body.kinematics.is_angle
         frames = [replace(one, values=one.values + zeros) for one in frames]
         fit_slope, (x, y) = np.exp(rng.normal(0.0, _FOCAL_SD)), rng.normal(0.0, _CENTER_SD, 2)
@@ -183,7 +190,7 @@ def measure_camera(
             camera, focal_x=camera.focal_x * fit_slope, focal_y=camera.focal_y * fit_slope,
             center_x=camera.center_x + x, center_y=camera.center_y + y,
         )  # fmt: skip
-    if worn:
+    if damaged_case:
         frames = [replace(frame, mask=damaged(frame.mask, rng)) for frame in frames]
         k = int(rng.integers(len(frames)))
         wrong = (frames[k].name,)
@@ -201,7 +208,7 @@ def measure_camera(
 
 
 def _with_other_lengths(body: RegistrationBody, rng: np.random.Generator) -> RegistrationBody:
-    """The arm whose links are a little longer or shorter."""
+    """Return the arm with slightly different link lengths."""
     tree, settings = body.tree, EstimateSettings()
     by = {link: rng.normal(0.0, _LENGTH_SD) for link in scalable_links(tree)}
     shifts = {one.joint: (by[one.link] * one.p_L).tolist() for one in carried_joints(tree)}
@@ -209,25 +216,27 @@ def _with_other_lengths(body: RegistrationBody, rng: np.random.Generator) -> Reg
 
 
 def pose_error(X_WC: Array, true: Array) -> Array:
-    """(6,) by what rotation vector [rad] and shift [m] in the world a pose (4, 4) is off."""
+    """Return (6,) the rotation vector [rad] and translation [m] from a pose to the true one."""
     turn = Rotation.from_matrix(true[:3, :3] @ X_WC[:3, :3].T).as_rotvec()
     return np.concatenate([turn, true[:3, 3] - X_WC[:3, 3]])
 
 
 def _sizes(error: Array) -> tuple[float, float]:
-    """How long a pose error (6,) is [mm, deg]."""
+    """Return the norms of a pose error (6,) [mm, deg]."""
     return 1e3 * float(np.linalg.norm(error[3:])), float(np.degrees(np.linalg.norm(error[:3])))
 
 
 def _camera_rows(arms: dict[str, RegistrationBody], cases: int) -> Iterator[list[str]]:
-    """Simulated cameras, for each arm and all together."""
-    for worn, misfit, masks in (
+    """Yield results of simulated cameras, for each arm and all together."""
+    for damaged_case, model_errors, masks in (
         (False, False, "exact"),
         (True, False, "damaged, one frame wrong"),
         (False, True, "exact, model and lens off"),
     ):
         own = {
-            name: [measure_camera(body, _SEED + k, worn, misfit) for k in range(cases)]
+            name: [
+                measure_camera(body, _SEED + k, damaged_case, model_errors) for k in range(cases)
+            ]
             for name, body in arms.items()
         }
         for name, outcomes in {**own, "all": [*chain(*own.values())]}.items():
@@ -245,7 +254,7 @@ def _camera_rows(arms: dict[str, RegistrationBody], cases: int) -> Iterator[list
 
 
 def _recorded_rows(data: Path) -> Iterator[list[str]]:
-    """Recorded arms that are there: all cameras' poses are withheld; some are in the file."""
+    """Yield results of recorded arms; the cameras' poses, if known, are withheld."""
     for name, arm, joints, cameras in _RECORDED:
         scene, model = data / name, data / arm
         if not (scene.is_dir() and model.is_file()):
@@ -270,7 +279,7 @@ def _recorded_rows(data: Path) -> Iterator[list[str]]:
 
 
 def main() -> None:
-    """Print whether cameras are found here, how well and how fast."""
+    """Print success, errors and times of registrations."""
     parser = argparse.ArgumentParser(description="Where cameras stand: errors and times.")
     parser.add_argument("data", nargs="?", type=Path, help="a folder of recorded scenes")
     parser.add_argument("--cases", type=int, default=2, help="simulated cases for each arm")

@@ -1,4 +1,4 @@
-"""Simulated episodes of arms in rooms, drawn by Drake."""
+"""Simulated episodes of arms in rooms, rendered by Drake."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +30,7 @@ from drake_pose.body import ArticulatedModel
 from drake_pose.camera.models import PinholeCamera
 
 LOG_HZ = 50.0
-"""Rows of a joint log a second."""
+"""Rows of a joint log per second."""
 
 _PICTURES, _RATE_HZ = 60, 10.0
 _WIDTH, _HEIGHT, _FOCAL, _DISTANCE = 640, 480, 600.0, (1.1, 1.7)
@@ -40,9 +40,14 @@ _NOISE = 4.0
 
 @dataclass(frozen=True, eq=False)
 class SimulatedEpisode:
-    """Pictures (f, H, W, 3) at times (f,) [s], and a joint log: times (n,), positions (n, nq).
+    """Images of an arm, and a joint log.
 
-    camera: where it truly stands.
+    Attributes:
+        pictures: (f, H, W, 3) images.
+        times: (f,) their times [s].
+        log_times: (n,) times of the joint log [s].
+        positions: (n, nq) joint positions [rad or m].
+        camera: the true camera.
     """
 
     pictures: NDArray[np.uint8]
@@ -53,7 +58,7 @@ class SimulatedEpisode:
 
 
 class Room:
-    """An arm in a room of textured walls, beside a box as large as a person that moves about."""
+    """An arm in a room with textured walls, and a moving box of a person's size."""
 
     def __init__(
         self, model: ArticulatedModel, folder: Path, seed: int, grey: bool, behind: float
@@ -65,7 +70,7 @@ class Room:
         source = self._plant.RegisterAsSourceForSceneGraph(self._scene_graph)
         model.add_to(self._plant, self._scene_graph)
         self._robot = ModelInstanceIndex(self._plant.num_model_instances() - 1)
-        # With six faces each drawn once: floor, ceiling and four walls.
+        # Floor, ceiling and four walls.
         for k, (place, size) in enumerate(
             [((0, 0, -0.06), (8, 8, 0.1)), ((0, 0, 3.0), (8, 8, 0.1)), ((4, 0, 1.5), (0.1, 8, 3)),
              ((-4, 0, 1.5), (0.1, 8, 3)), ((0, 4, 1.5), (8, 0.1, 3)), ((0, -4, 1.5), (8, 0.1, 3))]
@@ -107,7 +112,7 @@ class Room:
         self._scene_graph.RegisterAnchoredGeometry(source, geometry)
 
     def picture(self, q: Array, person: Array, camera: PinholeCamera) -> NDArray[np.uint8]:
-        """(H, W, 3) the arm at its positions, the box at x, y and an angle."""
+        """Return an image (H, W, 3) of the arm at q, and the box at (x, y, angle)."""
         plant, context = self._plant, self._context
         plant.SetPositions(context, self._robot, q)
         plant.SetPositions(context, self._person, person)
@@ -128,7 +133,7 @@ class Room:
 
 
 def _texture(rng: np.random.Generator, grey: bool) -> NDArray[np.uint8]:
-    """A picture of patches and stripes, as rooms have."""
+    """Return a random texture of patches and stripes."""
     picture = np.zeros((512, 512, 3), np.float32)
     for cells, weight in ((4, 0.5), (16, 0.3), (64, 0.2)):
         patches = rng.uniform(0, 255, (cells, cells, 3)).astype(np.float32)
@@ -143,7 +148,7 @@ def _texture(rng: np.random.Generator, grey: bool) -> NDArray[np.uint8]:
 
 
 def _lights(rng: np.random.Generator) -> RenderEngineVtkParams:
-    """Lamps above, and light from all sides."""
+    """Return lights from above and from the sides."""
     lights = [
         LightParameter(type="directional", direction=direction, frame="world", intensity=strength)
         for direction, strength in (
@@ -155,7 +160,7 @@ def _lights(rng: np.random.Generator) -> RenderEngineVtkParams:
 
 
 def _around(rng: np.random.Generator, height: float) -> Array:
-    """A point on the unit circle at a height."""
+    """Return a random point on the unit circle at a height."""
     angle = rng.uniform(0.0, 2.0 * np.pi)
     return np.array([np.cos(angle), np.sin(angle), height])
 
@@ -195,10 +200,10 @@ def simulate(
     walk = rng.uniform(1.0, 2.2, (3, 1)) * np.column_stack([np.cos(angles), np.sin(angles)])
     pictures = []
     for t, q in zip(times, at(times + late), strict=True):
-        share = t / times[-1] * 2.0
-        k = min(int(share), 1)
-        place = walk[k] + (share - k) * (walk[k + 1] - walk[k])
-        picture = room.picture(q, [place[0], place[1], share], camera)
+        progress = t / times[-1] * 2.0
+        k = min(int(progress), 1)
+        place = walk[k] + (progress - k) * (walk[k + 1] - walk[k])
+        picture = room.picture(q, [place[0], place[1], progress], camera)
         noisy = picture + rng.normal(0.0, _NOISE, picture.shape)
         pictures.append(np.clip(noisy, 0, 255).astype(np.uint8))
     return SimulatedEpisode(np.array(pictures), times, log_times, at(log_times), camera)

@@ -1,4 +1,4 @@
-"""Benchmark: SilhouetteCamera against RgbdSensor's label image, in one diagram (`make bench`)."""
+"""Benchmark: SilhouetteCamera against RgbdSensor's label image in one diagram (`make bench`)."""
 
 import tempfile
 import time
@@ -31,8 +31,12 @@ _LINK = """
 
 
 class CameraFigures(NamedTuple):
-    """The mean CPU time of an image of SilhouetteCamera and of RgbdSensor [s], poses of the bodies
-    included, and the pixels whose labels differ, over the body's pixels.
+    """Comparison of both cameras.
+
+    Attributes:
+        ours, drakes: mean CPU time per image of SilhouetteCamera and RgbdSensor, including poses
+            [s].
+        worst, mean: fraction of the body's pixels with different labels.
     """
 
     ours: float
@@ -42,7 +46,7 @@ class CameraFigures(NamedTuple):
 
 
 def arm_model(folder: Path) -> ParsedModel:
-    """An arm of 15 links of 480 triangles, 13 cm long, 12 cm apart; its files lie in a folder."""
+    """Return an arm of 15 links of 480 triangles, 13 cm long and 12 cm apart."""
     mesh = write_limb(folder, limb_mesh(16, 16))
     parents = ["world", *(f"link_{k}" for k in range(ARM_LINKS))]
     links = [
@@ -57,7 +61,7 @@ def arm_model(folder: Path) -> ParsedModel:
 
 
 def measure_camera(model: ParsedModel, camera: PinholeCamera, poses: int = 100) -> CameraFigures:
-    """Compares labels and CPU time of both cameras over random poses, bent by up to 0.7 rad."""
+    """Compare labels and CPU time of both cameras in random poses, bent by up to 0.7 rad."""
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
     model.add_to(plant, scene_graph)
@@ -111,7 +115,7 @@ def _rows(folder: Path) -> Iterator[tuple[str, ...]]:
 
 
 def main() -> None:
-    """Print what a label image of 640 x 480 pixels costs with and without a renderer."""
+    """Print the cost of a label image of 640 x 480 pixels with and without a renderer."""
     title = "A label image, 640 x 480 pixels, CPU time (least of 5, mean of 100 poses)"
     headings = (
         *("body", "links", "triangles", "SilhouetteCamera", "RgbdSensor", "ratio"),

@@ -1,4 +1,4 @@
-"""Benchmarks: ratios measured in one process (`make bench`)."""
+"""Benchmarks of ratios measured in one process (`make bench`)."""
 
 import resource
 import tempfile
@@ -29,7 +29,7 @@ from drake_pose.systems.images import picture_to_colour_image
 from tests.benchmarks.tables import print_table
 from tests.silhouette.agreement import measure_agreement
 
-# Kameda's: 2.26 pixels a centimetre; a limb of his.
+# Kameda's scale of 2.26 pixels per centimetre, and a limb of his body.
 _SIDE, _SCALE = 700, 226.0
 _RADIUS, _LENGTH = 0.088, 0.44
 _CANDIDATES, _IMAGES = 1000, 30
@@ -37,8 +37,12 @@ _CAMERAS, _FRAMES = (4, 8, 16), 12
 
 
 class KernelFigures(NamedTuple):
-    """Of one segment, its triangles, and the time to score one candidate against two sets and of
-    one Drake label image [us].
+    """Times for one segment.
+
+    Attributes:
+        triangles: number of triangles.
+        kernel_microseconds: time to score one candidate against two sets.
+        label_image_microseconds: time of one Drake label image.
     """
 
     triangles: int
@@ -47,9 +51,9 @@ class KernelFigures(NamedTuple):
 
 
 def measure_kernel(columns: int = 14, rows: int = 16, seed: int = 0) -> KernelFigures:
-    """Times the span kernel against Drake label images of the same limb in the same poses.
+    """Time the span kernel against Drake label images of the same limb in the same poses.
 
-    The limb is 44 cm by 17.6 cm, in a picture of 700 x 700 pixels at Kameda's scale (100 x 40
+    The limb measures 44 cm by 17.6 cm, in an image of 700 x 700 pixels at Kameda's scale (100 x 40
     pixels); 14 x 16 give 420 triangles, 72 x 71 give 10,080.
     """
     limb = limb_mesh(columns, rows)
@@ -74,21 +78,21 @@ def measure_kernel(columns: int = 14, rows: int = 16, seed: int = 0) -> KernelFi
 
 
 def limb_mesh(columns: int, rows: int) -> trimesh.Trimesh:
-    """A closed ellipsoid of 2 columns (rows - 1) triangles."""
+    """Return a closed ellipsoid of 2 columns (rows - 1) triangles."""
     polar = np.pi * np.arange(rows + 1) / rows
     profile = np.column_stack([_RADIUS * np.sin(polar), -0.5 * _LENGTH * np.cos(polar)])
     return trimesh.creation.revolve(profile, sections=columns)
 
 
 def write_limb(folder: Path, limb: trimesh.Trimesh) -> Path:
-    """Writes a limb as an OBJ file with normals, which Drake's VTK engine insists on."""
+    """Write a limb as an OBJ file with normals, which Drake's VTK engine requires."""
     path = folder / "limb.obj"
     limb.export(path, include_normals=True)
     return path
 
 
 def fastest(function: Callable[[], object], repeats: int) -> float:
-    """Returns the shortest processor time of a call [s], after one that warms up."""
+    """Return the minimum CPU time of a call [s], after one call to warm up."""
     function()
     times = []
     for _ in range(repeats):
@@ -99,9 +103,9 @@ def fastest(function: Callable[[], object], repeats: int) -> float:
 
 
 def measure_cost(cameras: int, size: tuple[int, int] = (640, 480), seed: int = 0) -> np.ndarray:
-    """Processor time of region and edge, and of the pose (2,), a frame [ms], the medians.
+    """Return the median CPU times (2,) of region and edge, and of the pose, per frame [ms].
 
-    A person walks before this many cameras, the face camera included, and is known at first.
+    A person walks in front of the cameras (including the face camera), from a known initial pose.
     """
     studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]))
     motion = make_motion(studio.skeleton, 4 * FEWEST_FRAMES, seed)
@@ -123,7 +127,7 @@ def _kernel_rows() -> Iterator[tuple[str, ...]]:
 
 
 def _agreement_rows() -> Iterator[tuple[str, ...]]:
-    """The span kernel against Drake's label images, 200 random poses of each bundled body."""
+    """Compare the span kernel with label images, in 200 random poses of each bundled body."""
     parallel = experiment_camera()
     centre = parallel.center_x, parallel.center_y
     pinhole = PinholeCamera("front", _SIDE, _SIDE, 1130.0, 1130.0, *centre, parallel.X_WC)
@@ -143,7 +147,7 @@ def _cost_rows() -> Iterator[tuple[str, ...]]:
 
 
 def main() -> None:
-    """Print what kernel, agreement with Drake, Date's capture and experiment A come to here."""
+    """Print times of the kernel and the papers' methods, and the agreement with Drake."""
     headings: tuple[str, ...] = ("triangles", "kernel, a candidate", "Drake label image", "ratio")
     print_table("One segment, 700 x 700 pixels, one core", headings, _kernel_rows())
     title = "XOR of the kernel's masks and Drake's, 200 random poses"

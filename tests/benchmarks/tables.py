@@ -1,4 +1,4 @@
-"""How benchmarks show their figures."""
+"""Print the tables of benchmarks."""
 
 import os
 from collections.abc import Iterable, Sequence
@@ -8,7 +8,7 @@ from rich.table import Table
 
 
 def print_table(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print a table whose first column is left-aligned, the others right."""
+    """Print a table with its first column left-aligned and the others right-aligned."""
     table = Table(title=title)
     for k, heading in enumerate(headings):
         table.add_column(heading, justify="right" if k else "left")

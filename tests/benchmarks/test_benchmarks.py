@@ -1,4 +1,4 @@
-"""What benchmarks draw, damage and measure."""
+"""What benchmarks render, damage and measure."""
 
 import os
 
@@ -26,12 +26,12 @@ def test_damage_moves_the_edge_by_two_pixels_at_most_and_cuts_holes():
         rows, columns = np.nonzero(drawn)
         width, height = np.ptp(columns) + 1, np.ptp(rows) + 1
         sizes.add(width - 180)
-        # Holes of 3 %; the last one may cut more. What is dilated has round corners.
+        # Holes of 3 %, slightly more with the last one; dilated masks have round corners.
         assert 0.92 < np.count_nonzero(drawn) / (width * height) < 0.972
     assert sizes == {-4, -2, 0, 2, 4}
 
 
-def test_pose_errors_are_those_that_were_made():
+def test_pose_errors_are_recovered():
     true, turn = np.eye(4), Rotation.from_rotvec([0.01, -0.02, 0.03])
     true[:3, :3] = Rotation.from_euler("xyz", [0.3, 1.0, -2.0]).as_matrix()
     found = true.copy()
@@ -53,16 +53,16 @@ def test_a_simulated_camera_is_found(tmp_path):
 def test_memory_is_that_of_the_process(tmp_path):
     for size in (200, 500):
         floor = psutil.Process(os.getpid()).memory_info().rss // MIB
-        # Filled, because pages that nobody wrote take none.
+        # Filled, because unwritten pages take no memory.
         program = ("-c", f"import sys; b = b'x' * ({floor + size} * {MIB}); sys.exit(3)")
         status, peak, _ = memory.measure_memory(["word"], tmp_path, program)
         assert peak == pytest.approx(floor + size, abs=40)
         assert status == 3
 
 
-def test_every_command_of_the_benchmark_is_one():
+def test_commands_of_the_benchmark_exist():
     for line in memory.COMMANDS:
-        # Parses without running it; an option that is none raises.
+        # Parse without running; an unknown option raises.
         app.parse_args(line.split(), exit_on_error=False, print_error=False)
 
 

@@ -80,8 +80,8 @@ class RootRotation:
         """Return rotations about one to three different axes, each within limits.
 
         Args:
-            ranges_deg: (axis letter, lower, upper) [deg] in order of rotation, for example ``[("y",
-                -180, 180), ("z", -10, 10)]``. Each axis is rotated by the preceding ones.
+            ranges_deg: (axis letter, lower, upper) [deg] in order of rotation, for example
+                ``[("y", -180, 180), ("z", -10, 10)]``. Each axis is rotated by the preceding ones.
             rotation: R_W0 (3, 3); None: the identity.
             interval_deg: sampling interval [deg]; None: the search's own interval.
 
@@ -166,16 +166,16 @@ def even_rotations(interval: float) -> Array:
     """Return rotation vectors (n, 3) [rad] about ``interval`` [rad] apart, sorted by angle.
 
     The rotations are Rz(azimuth) Ry(polar) Rz(spin - azimuth). Directions lie on circles of
-    latitude, spins are multiples of the interval, and the identity is the first sample.
+    latitude, spins are evenly spaced, and the identity is the first sample.
     """
     from scipy.spatial.transform import Rotation  # Slow to import.
 
     angles = []
-    turns = _full_turn(2.0 * math.pi / interval)
+    spins = _full_turn(2.0 * math.pi / interval)
     circles = max(1, round(math.pi / interval))
     for polar in np.linspace(0.0, math.pi, circles + 1):
         for azimuth in _full_turn(2.0 * math.pi * math.sin(polar) / interval):
-            angles += [(azimuth, polar, turn - azimuth) for turn in turns]
+            angles += [(azimuth, polar, spin - azimuth) for spin in spins]
     vectors = np.asarray(Rotation.from_euler("ZYZ", np.array(angles)).as_rotvec())
     order = np.argsort(np.round(np.linalg.norm(vectors, axis=1), 9), kind="stable")
     return vectors[order]

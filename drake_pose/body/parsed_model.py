@@ -155,7 +155,7 @@ _FULL_TURN = 2.0 * np.pi
 _ROUNDING = 1e-9
 
 
-def turns_around(lower: Array, upper: Array, periodic: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def covers_full_turn(lower: Array, upper: Array, periodic: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return (k,) which periodic positions have limits (k,) [rad] of a full turn or more."""
     return np.asarray(periodic & (upper - lower >= _FULL_TURN - _ROUNDING))
 
@@ -238,7 +238,7 @@ def describe_positions(
         "upper": upper,
         "default_positions": defaults,
         "periodic": periodic,
-        "turns_freely": free,
+        "is_unlimited_angle": free,
         "couplings": couplings,
     }
     return attributes, warnings
@@ -279,7 +279,7 @@ def _intersect_limits(
     Args:
         couplings: couplings whose leaders follow no other position.
         names: the position names, for messages.
-        arrays: lower, upper, periodic and turns_freely of ``ParsedModel``, changed in place.
+        arrays: lower, upper, periodic and is_unlimited_angle of ``ParsedModel``, changed in place.
     """
     lower, upper, periodic, free = arrays
     warnings = []
@@ -377,7 +377,7 @@ class ParsedModel:
         default_positions: Drake's default positions, moved inside the limits.
         periodic: whether the position is an angle with the same pose after a full turn, which all
             angles but those of screws are.
-        turns_freely: whether the position is an angle without limits, or with limits so wide that
+        is_unlimited_angle: whether the position is an angle without limits, or with limits so wide that
             they are ignored.
         couplings: positions that follow others; no leader follows another position.
         plant: a finalized MultibodyPlant, from which contexts are made; do not change it.
@@ -395,7 +395,7 @@ class ParsedModel:
     upper: Array
     default_positions: Array
     periodic: NDArray[np.bool_]
-    turns_freely: NDArray[np.bool_]
+    is_unlimited_angle: NDArray[np.bool_]
     couplings: tuple[Coupling, ...]
     path: Path
     name: str

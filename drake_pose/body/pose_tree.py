@@ -24,7 +24,7 @@ from drake_pose.arrays import Array
 from drake_pose.body.link_graph import JointMap, PlantKinematics, chain_transforms
 from drake_pose.body.meshes import TriangleMesh
 from drake_pose.body.node_skin import NodeSkin
-from drake_pose.body.parsed_model import ParsedModel, one_turn, turns_around
+from drake_pose.body.parsed_model import ParsedModel, covers_full_turn, one_turn
 from drake_pose.body.plant_source import Coupling
 from drake_pose.body.root import BasePose, RootRotation, even_rotations
 from drake_pose.errors import SettingsError, UnknownNameError
@@ -84,7 +84,7 @@ class NodePlacement:
         defaults: (k,) default values [rad or m].
         is_angle: (k,) bool, whether a value is an angle; else a length.
         periodic: (k,) bool, whether the value is an angle with the same pose after a full turn.
-        turns_freely: (k,) bool, whether the value is an angle without limits that is not held.
+        is_unlimited_angle: (k,) bool, whether the value is an angle without limits that is not held.
         follows: for each position of the steps: its index in q, the parent's value that it follows,
             multiplier and offset; (): the node has values of its own.
     """
@@ -97,7 +97,7 @@ class NodePlacement:
     defaults: Array
     is_angle: NDArray[np.bool_]
     periodic: NDArray[np.bool_]
-    turns_freely: NDArray[np.bool_]
+    is_unlimited_angle: NDArray[np.bool_]
     follows: tuple[Coupling, ...] = ()
 
 
@@ -126,7 +126,7 @@ def place_node(
     upper = np.where(is_held, values, model.upper[index])
     defaults = np.where(is_held, values, model.default_positions[index])
     is_angle = np.array([model.position_kinds[i] != "length" for i in index], dtype=np.bool_)
-    free = model.turns_freely[index] & (lower < upper)
+    free = model.is_unlimited_angle[index] & (lower < upper)
     periodic = model.periodic[index]
     properties = (lower, upper, defaults, is_angle, periodic, free)
     return NodePlacement(X_PA, None, steps, *properties, follows)
@@ -260,23 +260,23 @@ class PoseTree:
 
         An angle that can take every direction is searched over the turn about its default.
         """
-        given, around = self.placements[node], self.turns_around(node)
-        low, high = one_turn(given.lower, given.upper, given.defaults)
-        return np.where(around, low, given.lower), np.where(around, high, given.upper)
+        placement, around = self.placements[node], self.covers_full_turn(node)
+        low, high = one_turn(placement.lower, placement.upper, placement.defaults)
+        return np.where(around, low, placement.lower), np.where(around, high, placement.upper)
 
     def value_limits(self, node: int) -> tuple[Array, Array]:
         """Return the limits (k,), (k,) of a node's values [rad or m].
 
         They are equal for a held value and infinite for an angle without limits.
         """
-        given = self.placements[node]
-        lower = np.where(given.turns_freely, -np.inf, given.lower)
-        return lower, np.where(given.turns_freely, np.inf, given.upper)
+        placement = self.placements[node]
+        lower = np.where(placement.is_unlimited_angle, -np.inf, placement.lower)
+        return lower, np.where(placement.is_unlimited_angle, np.inf, placement.upper)
 
-    def turns_around(self, node: int) -> NDArray[np.bool_]:
+    def covers_full_turn(self, node: int) -> NDArray[np.bool_]:
         """Return (k,) which of a node's values are angles that can take every direction."""
-        given = self.placements[node]
-        return turns_around(given.lower, given.upper, given.periodic)
+        placement = self.placements[node]
+        return covers_full_turn(placement.lower, placement.upper, placement.periodic)
 
     def relative_transforms(self, node: int, values: Array) -> Array:
         """Return X_PN (n, 4, 4), the node's poses in its parent or in the world.

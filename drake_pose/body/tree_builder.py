@@ -77,7 +77,7 @@ def build_pose_tree(
     for index, value in held_values.items():
         lower, upper = model.lower[index], model.upper[index]
         inside = lower - rounding <= value <= upper + rounding
-        if not inside and not model.turns_freely[index]:
+        if not inside and not model.is_unlimited_angle[index]:
             raise SettingsError(
                 f"joint '{model.position_names[index]}' is held at {value:g}, outside its limits, "
                 f"{lower:g} to {upper:g} [rad or m]"

@@ -70,7 +70,7 @@ class TreeKinematics:
         lower, upper: (m,) limits [rad or m]; equal where a value is held, infinite where an angle
             can take every direction.
         is_angle: (m,) whether the value is an angle [rad]; else a length [m].
-        turns_around: (m,) whether the value is an angle that can take every direction.
+        covers_full_turn: (m,) whether the value is an angle that can take every direction.
         parameters: (e,) index of the value that causes each motion: first each value's own motion,
             then those of joints that follow a value.
         packed: the tree as ``find_motions`` takes it.
@@ -96,9 +96,11 @@ class TreeKinematics:
         bounds = [tree.value_bounds(i) for i in range(len(counts))]
         lower, upper = np.hstack([np.zeros((2, 0)), *bounds])
         self._middle = 0.5 * (lower + upper)
-        self.turns_around = np.concatenate([tree.turns_around(i) for i in range(len(counts))])
-        self.lower = np.where(self.turns_around, -np.inf, lower)
-        self.upper = np.where(self.turns_around, np.inf, upper)
+        self.covers_full_turn = np.concatenate(
+            [tree.covers_full_turn(i) for i in range(len(counts))]
+        )
+        self.lower = np.where(self.covers_full_turn, -np.inf, lower)
+        self.upper = np.where(self.covers_full_turn, np.inf, upper)
         self.is_angle = np.concatenate([placement.is_angle for placement in tree.placements])
         self.packed = _pack_tree(tree, firsts)
         # (nodes, e + 4) which nodes each motion moves; last the root's translation and scale.
@@ -128,7 +130,7 @@ class TreeKinematics:
         Only angles that can take every direction are moved. ``near``: (m,) [rad or m]; None: the
         middle of the turn that is searched, which is the turn about the default positions.
         """
-        return nearest_turn(values, self._middle if near is None else near, self.turns_around)
+        return nearest_turn(values, self._middle if near is None else near, self.covers_full_turn)
 
     def within_limits(self, values: np.ndarray) -> np.ndarray:
         """Return values (m,) of the same pose, with angles moved by full turns into their limits.
@@ -140,15 +142,15 @@ class TreeKinematics:
         full = 2.0 * math.pi
         above = np.maximum(np.ceil((values - upper) / full), 0.0)
         below = np.maximum(np.ceil((lower - values) / full), 0.0)
-        return np.where(self.turns_around, values - full * (above - below), values)
+        return np.where(self.covers_full_turn, values - full * (above - below), values)
 
     def reach(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return limits (m,), (m,) around a pose [rad or m].
 
         An angle that can take every direction has half a turn either side of its value.
         """
-        lower = np.where(self.turns_around, values - math.pi, self.lower)
-        return lower, np.where(self.turns_around, values + math.pi, self.upper)
+        lower = np.where(self.covers_full_turn, values - math.pi, self.lower)
+        return lower, np.where(self.covers_full_turn, values + math.pi, self.upper)
 
     def poses(self, values: np.ndarray) -> np.ndarray:
         """Return X_WN (nodes, 4, 4) at values (m,) [rad or m]."""

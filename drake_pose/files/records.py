@@ -222,7 +222,7 @@ def measured_positions(model: ArticulatedModel, records: Sequence[FrameRecord]) 
     errors = [[record.joint_errors.get(name, np.nan) for name in names] for record in records]
     measured = q - np.array(errors).reshape(q.shape) / user_units(model)
     # Errors are differences to the nearest turn, so that the result may lie beyond the limits.
-    limited = model.periodic & ~model.turns_freely & np.isfinite(model.upper - model.lower)
+    limited = model.periodic & ~model.is_unlimited_angle & np.isfinite(model.upper - model.lower)
     middle = 0.5 * np.add(model.lower, model.upper, where=limited, out=np.zeros(len(names)))
     return nearest_turn(measured, middle, limited)
 
@@ -272,8 +272,8 @@ def record_deviations(model: ArticulatedModel, q: Array, deviations: Array) -> J
     # Of a normal distribution, 95 % lie within 1.96 standard deviations.
     half = 1.96 * np.where(np.isfinite(deviations), deviations, np.inf)
     # A position that turns freely has no limits, only a period.
-    lower = np.where(model.turns_freely, q - math.pi, model.lower)
-    upper = np.where(model.turns_freely, q + math.pi, model.upper)
+    lower = np.where(model.is_unlimited_angle, q - math.pi, model.lower)
+    upper = np.where(model.is_unlimited_angle, q + math.pi, model.upper)
     low, high = np.maximum(q - half, lower), np.minimum(q + half, upper)
     determined = 2.0 * half < 0.5 * (model.upper - model.lower)
     unit = user_units(model)

@@ -104,7 +104,7 @@ class BodyState:
     def _joint_prior(self) -> JointPrior:
         kinematics = self._kinematics
         lower, upper = kinematics.lower, kinematics.upper
-        limited = kinematics.is_angle & ~kinematics.turns_around & (lower < upper)
+        limited = kinematics.is_angle & ~kinematics.covers_full_turn & (lower < upper)
         if self.tree.placements[0].rotation is not None:
             # The root's rotation is not a joint.
             limited &= kinematics.value_nodes > 0

@@ -177,7 +177,7 @@ def from_model(model: ParsedModel) -> Inequalities:
     be empty.
     """
     meet = np.abs(model.upper - model.lower - 2.0 * np.pi) < 1e-9
-    full_turn = model.turns_freely | (model.periodic & meet)
+    full_turn = model.is_unlimited_angle | (model.periodic & meet)
     lower = np.where(full_turn, -np.inf, model.lower)
     upper = np.where(full_turn, np.inf, model.upper)
     return from_bounds(model.position_names, lower, upper)

@@ -194,7 +194,7 @@ class FittedSequence:
     def estimates(self, frame: int) -> tuple[JointEstimate, ...]:
         """Return the estimate of each of the tree's values in a frame, with 95 % intervals."""
         kinematics = self.body.kinematics
-        count, around = len(kinematics.names), kinematics.turns_around
+        count, around = len(kinematics.names), kinematics.covers_full_turn
         values = self.fitted.parameters[frame, :count]
         half = 1.96 * SEQUENCE.interval_factor * self.deviations[frame, :count]
         half = np.where(around, np.minimum(half, np.pi), half)

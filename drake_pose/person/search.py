@@ -190,7 +190,7 @@ class BodyPlan:
             )
         self.landmarks = landmarks_of_nodes(tree, landmarks)
         self.trunk = self._node("neck")
-        free = np.flatnonzero(kinematics.turns_around)
+        free = np.flatnonzero(kinematics.covers_full_turn)
         self.heading = int(free[0]) if len(free) else None
 
     def trunk_middle(self, X_WN: Array) -> Array:

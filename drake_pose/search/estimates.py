@@ -81,21 +81,21 @@ class JointEstimate:
             not determine the value, and ``low`` and ``high`` are the extremes that were found.
         low, high: ends of the interval [rad or m]. For an angle that turns around they may lie
             beyond the limits by full turns.
-        turns_around: whether the value is an angle that can make a full turn.
+        covers_full_turn: whether the value is an angle that can make a full turn.
     """
 
     name: str
     determined: bool
     low: float
     high: float
-    turns_around: bool = False
+    covers_full_turn: bool = False
 
     def holds(self, value: float, margin: float = 1e-9) -> bool:
         """Return whether a value [rad or m] lies in the interval, up to full turns of an angle.
 
         ``margin``: the interval is widened by this on both sides [rad or m].
         """
-        if self.turns_around:
+        if self.covers_full_turn:
             value -= 2.0 * math.pi * round((value - 0.5 * (self.low + self.high)) / (2.0 * math.pi))
         return self.low - margin <= value <= self.high + margin
 
@@ -108,7 +108,7 @@ class JointEstimate:
             other: the interval at an earlier time.
             moved: change of the value since then [rad or m].
         """
-        if self.turns_around:
+        if self.covers_full_turn:
             middle = 0.5 * (self.low + self.high - other.low - other.high) - moved
             moved += 2.0 * math.pi * round(middle / (2.0 * math.pi))
         return replace(
@@ -132,7 +132,7 @@ def joint_estimates(
     return tuple(
         JointEstimate(name, bool(known), float(least), float(most), bool(around))
         for name, known, least, most, around in zip(
-            kinematics.names, determined, low, high, kinematics.turns_around, strict=True
+            kinematics.names, determined, low, high, kinematics.covers_full_turn, strict=True
         )
     )
 

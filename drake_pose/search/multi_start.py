@@ -284,7 +284,7 @@ class _MultiStartRun:
 
         ``pool``: poses refined by all stages but the final; ``rounds``: as in ``search``.
         """
-        settings, turns = self._settings, self._kinematics.turns_around
+        settings, turns = self._settings, self._kinematics.covers_full_turn
         pool = self._explore(pool, rounds)
         refined = self._finish(pool)
         unexplained = self._unexplained_views(refined[0].values)
@@ -319,7 +319,7 @@ class _MultiStartRun:
                 least = min((one.cost for one in others), default=math.inf)
                 if self._several and least > settings.improvement * pool[0].cost:
                     break
-            pool = distinct([*pool, *found], self._survivors, self._kinematics.turns_around)
+            pool = distinct([*pool, *found], self._survivors, self._kinematics.covers_full_turn)
         return pool
 
     def _finish(self, pool: Sequence[FittedPose]) -> list[FittedPose]:
@@ -379,7 +379,7 @@ class _MultiStartRun:
         for group, count in ((flipped, settings.flipped), (tried, settings.alternatives)):
             costs = map_ordered(lambda one: self._fit.cost(one, stage), group)
             scored = [FittedPose(*pair) for pair in zip(group, costs, strict=True)]
-            best += distinct(scored, count, kinematics.turns_around, 0.5 * settings.interval)
+            best += distinct(scored, count, kinematics.covers_full_turn, 0.5 * settings.interval)
         starts = [one.values for one in best]
         if self._several:
             return refine_best(self._fit, starts, settings.alternative_passes, self._proceed)

@@ -65,7 +65,7 @@ def estimate_joints(
     reports = []
     for i, node in enumerate(sampled.tree.nodes):
         lower, upper = sampled.tree.value_bounds(i)
-        around = sampled.tree.turns_around(i)
+        around = sampled.tree.covers_full_turn(i)
         steps = grid_steps(sampled.values[i])
         for k, name in enumerate(node.value_names):
             values = np.unique(np.round(sampled.values[i][samples[i], k], 12))
@@ -102,7 +102,9 @@ def cluster_samples(sampled: SampledTree, node: int, samples: np.ndarray) -> np.
     scaled = np.where(np.isfinite(steps), grid[samples] / steps, 0.0)
     rotation = sampled.tree.placements[node].rotation
     # Opposite rotation vectors of half a turn are the same rotation.
-    around = sampled.tree.turns_around(node) | (rotation is not None and rotation.kind == "free")
+    around = sampled.tree.covers_full_turn(node) | (
+        rotation is not None and rotation.kind == "free"
+    )
     turns = np.where(around, 2.0 * np.pi / steps, 0.0)
     scaled = np.where(turns > 0.0, np.mod(scaled, np.where(turns > 0.0, turns, 1.0)), scaled)
     tree = cKDTree(scaled - np.where(turns > 0.0, 0.0, scaled.min(axis=0)), boxsize=turns)

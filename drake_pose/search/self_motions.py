@@ -157,7 +157,7 @@ def _inside(
     """
     values = kinematics.nearest_turns(values)
     for index in changed:
-        if kinematics.turns_around[index]:
+        if kinematics.covers_full_turn[index]:
             continue
         lower, upper = kinematics.lower[index], kinematics.upper[index]
         full = 2.0 * math.pi

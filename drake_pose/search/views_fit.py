@@ -192,7 +192,7 @@ def refine_best(
             return fit.refine(start[1], stages) if start[0] == 0 or proceed() else None
 
         found = [one for one in map_ordered(refined, enumerate(values)) if one is not None]
-        kept = distinct(found, count, fit.kinematics.turns_around)
+        kept = distinct(found, count, fit.kinematics.covers_full_turn)
         values = [pose.values for pose in kept]
     return kept
 
@@ -200,21 +200,22 @@ def refine_best(
 def distinct(
     poses: Sequence[FittedPose],
     count: int,
-    turns_around: np.ndarray | bool = False,
+    covers_full_turn: np.ndarray | bool = False,
     apart: float = 0.05,
 ) -> list[FittedPose]:
     """Return the best distinct poses, sorted by cost.
 
     Args:
         count: greatest number of poses that are returned.
-        turns_around: (m,) whether each value is an angle that is the same after a full turn.
+        covers_full_turn: (m,) whether each value is an angle that is the same after a full turn.
         apart: a pose is distinct if some value differs by more than this from that of every better
             pose [rad or m].
     """
     chosen: list[FittedPose] = []
     for pose in sorted(poses, key=lambda one: one.cost):
         gaps = (
-            nearest_turn(pose.values, other.values, turns_around) - other.values for other in chosen
+            nearest_turn(pose.values, other.values, covers_full_turn) - other.values
+            for other in chosen
         )
         if all(np.abs(gap).max(initial=0.0) > apart for gap in gaps):
             chosen.append(pose)

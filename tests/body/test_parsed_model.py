@@ -38,7 +38,7 @@ def one_joint(tmp_path, limits, kind="revolute", given=None, mount="fixed"):
 def test_limits_wider_than_four_turns_are_ignored(tmp_path, limits, kind):
     model = one_joint(tmp_path, limits, kind)
     np.testing.assert_allclose([model.lower[0], model.upper[0]], [-math.pi, math.pi])
-    assert model.turns_freely[0]
+    assert model.is_unlimited_angle[0]
     about_joint = [warning for warning in model.warnings if "joint 'j'" in warning]
     assert len(about_joint) == (limits is not None)
     if limits is not None:
@@ -55,7 +55,7 @@ def test_limits_wider_than_four_turns_are_ignored(tmp_path, limits, kind):
 @pytest.mark.parametrize("high", [3.1, math.pi, FULL, 2.0 * FULL])
 def test_one_turn_is_searched_of_limits_of_several_turns(tmp_path, high):
     model = one_joint(tmp_path, f'lower="{-high}" upper="{high}"')
-    assert not model.turns_freely[0]
+    assert not model.is_unlimited_angle[0]
     assert not model.warnings
     np.testing.assert_allclose([model.lower[0], model.upper[0]], [-high, high])
     tree = model.pose_tree()
@@ -63,8 +63,8 @@ def test_one_turn_is_searched_of_limits_of_several_turns(tmp_path, high):
     np.testing.assert_allclose(np.ravel(tree.value_limits(node)), [-high, high])
     searched = min(high, math.pi)
     np.testing.assert_allclose(np.ravel(tree.value_bounds(node)), [-searched, searched])
-    assert tree.turns_around(node).all() == around
-    assert not model.pose_tree(held={"j": 0.3}).turns_around(node).any()
+    assert tree.covers_full_turn(node).all() == around
+    assert not model.pose_tree(held={"j": 0.3}).covers_full_turn(node).any()
     kinematics = TreeKinematics(tree)
     reach = np.inf if around else high
     assert (kinematics.lower[0], kinematics.upper[0]) == (-reach, reach)
@@ -95,7 +95,7 @@ def test_searched_turn_is_inside_limits_about_the_default(tmp_path):
 
 def test_given_limits_replace_those_of_the_file(tmp_path):
     model = one_joint(tmp_path, None, "continuous", {"j": (-500.0, 500.0)})
-    assert model.turns_freely[0]
+    assert model.is_unlimited_angle[0]
     assert "joint 'j'" in model.warnings[0]
     model = one_joint(tmp_path, 'lower="-1e16" upper="1e16"', given={"j": (-0.5, 0.25)})
     assert not model.warnings
@@ -138,7 +138,7 @@ def test_screw_is_not_periodic(tmp_path):
     tree = model.pose_tree()
     node = next(i for i, one in enumerate(tree.nodes) if "screw" in one.value_names)
     column = tree.nodes[node].value_names.index("screw")
-    assert not tree.turns_around(node)[column]
+    assert not tree.covers_full_turn(node)[column]
     grid = tree.grid(
         node, 1.0, {name: 10.0 for name in tree.nodes[node].value_names if name != "screw"}
     )

@@ -88,7 +88,7 @@ def test_model_from_plant_equals_model_from_file(tmp_path):
         plant.Finalize()
         made = ArticulatedModel.from_plant(plant, scene_graph, instances)
         assert made.position_names == read.position_names
-        for field in ("lower", "upper", "default_positions", "turns_freely"):
+        for field in ("lower", "upper", "default_positions", "is_unlimited_angle"):
             assert np.array_equal(getattr(made, field), getattr(read, field))
         assert made.link_meshes.keys() == read.link_meshes.keys()
         for name, mesh in made.link_meshes.items():

@@ -57,7 +57,7 @@ def tree(tmp_path_factory):
 @pytest.mark.parametrize("around", [0.0, TURN, -2.0 * TURN])
 def test_a_widened_interval_contains_both(around):
     """The other interval is shifted by the motion; full turns of an angle make no difference."""
-    now = JointEstimate("a", True, 1.0, 1.4, turns_around=around != 0.0)
+    now = JointEstimate("a", True, 1.0, 1.4, covers_full_turn=around != 0.0)
     then = replace(now, low=0.4 + around, high=0.9 + around, determined=False)
     both = now.widened(then, 0.2)
     assert (both.low, both.high) == pytest.approx((0.6, 1.4))

@@ -377,8 +377,8 @@ class ParsedModel:
         default_positions: Drake's default positions, moved inside the limits.
         periodic: whether the position is an angle with the same pose after a full turn, which all
             angles but those of screws are.
-        is_unlimited_angle: whether the position is an angle without limits, or with limits so wide that
-            they are ignored.
+        is_unlimited_angle: whether the position is an angle without limits, or with limits so wide
+            that they are ignored.
         couplings: positions that follow others; no leader follows another position.
         plant: a finalized MultibodyPlant, from which contexts are made; do not change it.
         scene_graph: the SceneGraph with the plant's geometry.

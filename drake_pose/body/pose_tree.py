@@ -84,7 +84,7 @@ class NodePlacement:
         defaults: (k,) default values [rad or m].
         is_angle: (k,) bool, whether a value is an angle; else a length.
         periodic: (k,) bool, whether the value is an angle with the same pose after a full turn.
-        is_unlimited_angle: (k,) bool, whether the value is an angle without limits that is not held.
+        is_unlimited_angle: (k,) bool, whether the value is an angle without limits, and not held.
         follows: for each position of the steps: its index in q, the parent's value that it follows,
             multiplier and offset; (): the node has values of its own.
     """

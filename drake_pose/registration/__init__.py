@@ -1,1 +1,1 @@
-"""Where cameras stand, told by silhouettes of a body whose joint positions are known."""
+"""Registration of cameras from silhouettes or pictures of a body at known joint positions."""

@@ -12,7 +12,7 @@ from drake_pose.body import ArticulatedModel
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import MaskError
-from drake_pose.jobs.registration.diagnosis import say_off
+from drake_pose.jobs.registration.words import describe_error
 from drake_pose.registration.diagnosis import (
     diagnose_frames,
     explained_frames,
@@ -216,8 +216,8 @@ class TestAuditFrames:
         assert (first.kind, first.name) == ("focal", "focal lengths")
         assert first.shift == pytest.approx(-0.04, abs=0.006)
         size = f"{-100.0 * first.shift:.1f} +- {100.0 * first.shift_sd:.1f}"
-        assert say_off(first, "off").startswith("the focal lengths")
-        assert say_off(first, "off").endswith(f"are {size} percent too long")
+        assert describe_error(first, "off").startswith("the focal lengths")
+        assert describe_error(first, "off").endswith(f"are {size} percent too long")
         aside = [replace(one, center_x=one.center_x + 5.0) for one in cameras]
         found = audit(model, body, poses, poses, cameras, aside)
         assert [one.kind for one in found.common] == ["center"]
@@ -240,6 +240,6 @@ def test_masks_of_another_size_and_empty_ones_are_refused(body, poses, cameras) 
 @pytest.mark.parametrize(("shift", "word"), [(0.05, "later"), (-0.05, "earlier")])
 def test_a_clock_that_is_off_is_told_in_milliseconds(shift, word):
     off = Finding("clock", "left", 0.0, shift, 0.0, 0.004, 1.0, 0.0)
-    assert f"camera 'left': its pictures show the joints of 50 +- 4 ms {word} by" in say_off(
+    assert f"camera 'left': its pictures show the joints of 50 +- 4 ms {word} by" in describe_error(
         off, "off"
     )

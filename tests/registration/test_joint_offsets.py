@@ -9,7 +9,7 @@ import pytest
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.jobs.registration.diagnosis import say_likely_offsets
+from drake_pose.jobs.registration.diagnosis import likely_offset_warnings
 from drake_pose.registration.joint_offsets import calibrate_joints
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import CameraSearch, RegisteredCamera
@@ -122,7 +122,7 @@ def test_an_offset_that_was_not_asked_for_shows_in_what_frames_have_in_common(
     zeros[body.kinematics.names.index("elbow_turn")] = np.radians(degrees)
     frames = misread(see(model, body, camera, 6, 4), zeros)
     found = CameraSearch(body).refine(camera, frames)
-    texts = say_likely_offsets(body, found, frames)
+    texts = likely_offset_warnings(body, found, frames)
     if abs(degrees) < 1.0:
         assert not texts
         return

@@ -1,1 +1,1 @@
-"""`drake-pose register`: where cameras stand, from masks of a robot at known joint positions."""
+"""`drake-pose register` and `drake-pose audit`: camera poses from a robot at known positions."""

@@ -25,10 +25,7 @@ from drake_pose.jobs.registration.audit_page import write_audit_page
 from drake_pose.jobs.registration.diagnosis import (
     compare_camera,
     compare_clock,
-    say_common_finding,
-    say_frame,
-    say_lost,
-    shift_unit,
+    lost_frames_warning,
 )
 from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs
 from drake_pose.jobs.registration.large_errors import SceneComparison
@@ -40,6 +37,11 @@ from drake_pose.jobs.registration.result import (
     write_overlays,
 )
 from drake_pose.jobs.registration.settings import AuditSettings
+from drake_pose.jobs.registration.words import (
+    describe_common_finding,
+    describe_frame_finding,
+    shift_unit,
+)
 from drake_pose.registration.diagnosis import DIAGNOSIS
 from drake_pose.registration.findings import Diagnosis, Finding
 from drake_pose.registration.picture_registration import (
@@ -227,7 +229,7 @@ def _find_cameras(
             names[known] = name, frame.name
             frames.append(MultiViewFrame(known, frame.values, {name: frame.mask}))
         if lost:
-            warnings.append(say_lost(name, lost, recording.names))
+            warnings.append(lost_frames_warning(name, lost, recording.names))
     far = {one.name for one in findings if one.kind == "camera"}
     looked = replace(
         inputs,
@@ -298,9 +300,14 @@ def _write_result(
 
 def _describe_contradictions(found: Diagnosis) -> list[dict[str, Any]]:
     """What contradicts the rest, worst first: joints, cameras and the base, then frames."""
-    told = [(one, one.kind, one.name, say_common_finding(one)) for one in found.common]
+    told = [(one, one.kind, one.name, describe_common_finding(one)) for one in found.common]
     told += [
-        (one.finding, "frame", one.frame, f"frame '{one.frame}': {say_frame(one, one.finding)}")
+        (
+            one.finding,
+            "frame",
+            one.frame,
+            f"frame '{one.frame}': {describe_frame_finding(one, one.finding)}",
+        )
         for one in sorted(found.frames, key=lambda one: -one.pixels)
         if one.finding is not None and one.finding not in found.common
     ]

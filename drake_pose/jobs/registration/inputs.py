@@ -1,4 +1,4 @@
-"""What a registration or an audit needs, read and checked before any work begins."""
+"""Read and check all inputs of a registration or an audit before any work begins."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -54,28 +54,28 @@ from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, Scene, load_scene
 
 @dataclass(frozen=True)
 class RegistrationInputs:
-    """What is registered or audited: a robot at known joint positions, and what cameras see.
+    """Inputs of a registration or an audit: a robot at known joint positions, cameras, and masks.
 
     Args:
-        scene: the recorded scene, or an episode's cameras and frames; cameras whose X_WC is missing
-            stand at the world's origin.
+        scene: the recorded scene, or an episode's cameras and frames; cameras without X_WC are at
+            the world's origin.
         model: the robot.
-        tree: its pose tree in the world, or in the frame of the link on which cameras ride.
-        positions: of the joints in each frame.
-        joints: the table of these, cameras: the camera file, where they were given.
-        warnings: what the user should know of all this.
-        held: the cameras whose place is known.
-        searched: the cameras that are to be found, or looked at in an episode.
-        given: those of them whose X_WC is given, as they are given.
-        assumed: names of those whose focal length is unknown; they have a usual one.
-        left_out: cameras without X_WC that are not to be found.
-        recordings: an episode's pictures beside the joints, by camera; empty for a scene of masks.
-        wanted: names of the frames that are audited.
-        frames: what the cameras see, where it was read already.
-        seen: the tree's nodes that the masks show; None: all.
-        standing: the object that the cameras see from their link, if it is not the robot. Until it
-            is found it is at the world's origin in the tree.
-        zeros, lengths: the joints and links whose zeros and lengths are to be found.
+        tree: its pose tree in the world, or in the frame of the link that carries the cameras.
+        positions: joint positions in each frame.
+        joints, cameras: the given table of positions and the given camera file, if any.
+        warnings: for the user.
+        known_cameras: cameras with known poses.
+        searched_cameras: cameras to be registered; all cameras of an episode.
+        given_cameras: those of them with an X_WC, at that pose.
+        assumed_focal: names of cameras with an unknown focal length, which have a usual one.
+        left_out: names of cameras without X_WC that are not to be registered.
+        recordings: an episode's pictures with the joint log, by camera; empty for masks.
+        audited_frames: names of the frames to be audited.
+        frames: frames that have been read.
+        visible_nodes: names of the tree's nodes that masks show; None: all.
+        target: the calibration target of cameras on a link; at the world's origin in the tree until
+            its pose is estimated. None: the masks show the robot.
+        offset_joints, scaled_links: the joints and links whose offsets and scales are estimated.
     """
 
     scene: Scene
@@ -95,16 +95,16 @@ class RegistrationInputs:
     frames: tuple[MultiViewFrame, ...] = ()
     visible_nodes: tuple[str, ...] | None = None
     target: CalibrationTarget | None = None
-    zeros: tuple[str, ...] = ()
-    lengths: tuple[str, ...] = ()
+    offset_joints: tuple[str, ...] = ()
+    scaled_links: tuple[str, ...] = ()
 
     @property
     def camera_file(self) -> Path:
-        """What says what is known of the cameras."""
+        """The camera file that was used."""
         return self.cameras or self.scene.path / CAMERA_FILE
 
     def read(self, frame: str) -> MultiViewFrame:
-        """A frame's positions, and the held cameras' masks but for those that show nothing."""
+        """Return a frame with the known cameras' masks that are not empty."""
         if frame in self._known:
             return self._known[frame]
         names = [one.name for one in self.known_cameras if (one.name, frame) in self.scene.masks]
@@ -117,11 +117,11 @@ class RegistrationInputs:
         return {one.name: one for one in self.frames}
 
     def of(self, camera: str) -> list[PosedFrame]:
-        """What a camera sees."""
+        """Return the frames of a camera."""
         return [one.of(camera) for one in self.frames if camera in one.masks]
 
     def with_values(self, values: Iterable[Array]) -> tuple[MultiViewFrame, ...]:
-        """The frames at other values (m,) of the tree."""
+        """Return the frames at other values (m,) of the tree."""
         frames = zip(self.frames, values, strict=True)
         return tuple(replace(one, values=own) for one, own in frames)
 
@@ -135,40 +135,41 @@ def read_mask_of(
     most: float = 0.5,
     most_of_edge: float = 0.75,
 ) -> Mask:
-    """A camera's mask of a frame.
+    """Read a camera's mask of a frame.
 
-    most, most_of_edge: shares of the picture and of its edge, both of which no body fills.
+    most, most_of_edge: no body fills more than these fractions of both the picture and its edge.
 
-    Raises MaskError: it cannot be read, shows nothing and must not, or is inverted.
+    Raises MaskError: the mask cannot be read, is empty and must not be, or is inverted.
     """
     mask = scene.read(camera, frame, may_be_empty=may_be_empty)
     edge = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
-    if edge.mean() > most_of_edge and (share := float(mask.mean())) > most:
+    if edge.mean() > most_of_edge and (fraction := float(mask.mean())) > most:
         raise MaskError(
-            f"{scene.masks[camera, frame]}: white fills {100.0 * share:.0f} % of the picture and "
-            "its edge: the mask seems to be inverted; the body must be white in it, all else black"
+            f"{scene.masks[camera, frame]}: white fills {100.0 * fraction:.0f} % of the picture "
+            "and its edge: the mask seems to be inverted; the body must be white, all else black"
         )
     return mask
 
 
 def uses_pictures(path: Path, settings: AuditSettings) -> bool:
-    """Whether a scene is looked at as an episode: it is one, or is said to be."""
+    """Return whether a scene is used as an episode: it is one, or the settings say so."""
     return settings.pictures or is_episode(path, settings)
 
 
 def read_inputs(
     scene: Path, model: Path, joints: Path | None, cameras: Path | None, settings: AuditSettings
 ) -> RegistrationInputs:
-    """Reads and checks everything, by its settings for a registration or for an audit.
+    """Read and check all inputs.
 
     Args:
-        scene: a scene of masks, or an episode, whose pictures are read when they are asked for.
+        scene: a scene of masks, or an episode, whose pictures are read later.
         model: the robot's model file.
-        joints: a table of joint positions; None: the recording's own. Without one, those of a scene
-            of masks are estimated from known cameras for a registration.
+        joints: a table of joint positions; None: the recording's own. If a scene of masks has none,
+            a registration estimates the positions from the known cameras.
         cameras: a camera file in place of the scene's or episode's own.
+        settings: of a registration or of an audit.
 
-    Raises DrakePoseError: names the file, camera, frame, column or joint at fault.
+    Raises DrakePoseError: names the wrong file, camera, frame, column or joint.
     """
     if uses_pictures(scene, settings):
         return _read_episode(scene, model, joints, cameras, settings)
@@ -190,8 +191,8 @@ def read_inputs(
     )
     if found.scale_unknown:
         raise SceneError(
-            f"{scene}: has no cameras.yaml; an audit needs to know where the cameras are: "
-            "drake-pose register finds that"
+            f"{scene}: has no cameras.yaml; an audit needs the poses of the cameras: drake-pose "
+            "register estimates them"
         )
     held = tuple(found.cameras.values())
     tree = make_tree(robot, EstimateSettings(hold=settings.hold))
@@ -199,8 +200,8 @@ def read_inputs(
     warnings = [*found.warnings, *robot.warnings, *positions.warnings]
     if positions.are_one_pose(positions.of(frame, held[0].name) for frame in frames):
         warnings.append(
-            "all frames show the robot in one pose, to a degree: errors of a joint's zero and of a "
-            "camera that are the same in all frames can hardly be told apart"
+            "all frames show the robot in one pose, to a degree: common errors of joints and of "
+            "cameras can hardly be distinguished"
         )
     return RegistrationInputs(
         found, robot, tree, positions, joints, cameras, tuple(warnings), held, audited_frames=frames
@@ -208,13 +209,13 @@ def read_inputs(
 
 
 def _own_joints(scene: Path, robot: ArticulatedModel, settings: AuditSettings) -> Path | None:
-    """A scene's own table of joint positions, if it has one of all the robot's joints."""
+    """Return the scene's own table of joint positions, if it has all joints of the robot."""
     path = scene / JOINT_TABLE
     if not path.is_file():
         return None
     try:
         known = {*read_measured_positions(path, robot.position_names).names}
-    except UnknownNameError:  # It is another model's.
+    except UnknownNameError:  # The table belongs to another model.
         return None
     tree = make_tree(robot, EstimateSettings(hold=settings.hold))
     held = {robot.position_names[index] for index in tree.held}
@@ -224,12 +225,12 @@ def _own_joints(scene: Path, robot: ArticulatedModel, settings: AuditSettings) -
 def _read_episode(
     path: Path, model: Path, joints: Path | None, cameras: Path | None, settings: AuditSettings
 ) -> RegistrationInputs:
-    """What an episode holds; its frames are seen while cameras are found."""
+    """Read an episode; its pictures are read while cameras are registered."""
     episode = open_episode(path, joints=joints, episode=settings.episode)
     if episode.joints is None:
         raise SceneError(
             f"{path}: holds no joint positions, and none are given (--joints FILE): pictures alone "
-            "do not tell where a robot stands"
+            "do not determine a robot's pose"
         )
     robot, target = load_model(model, package_paths=settings.packages), None
     if isinstance(settings, RegistrationSettings):
@@ -241,7 +242,7 @@ def _read_episode(
     warnings = [*episode.warnings, *robot.warnings, *mapped.warnings]
     if mapped.unposed:
         warnings.append(
-            f"these parts are not used, as a joint that moves them is not logged: "
+            "these parts are not used, as a joint that moves them is not logged: "
             f"{', '.join(mapped.unposed)}; hold joints that do not move (--hold NAME=VALUE, [deg "
             "or m])"
         )
@@ -267,12 +268,12 @@ def _read_episode(
                 "(drake-pose masks), or leave it out"
                 + ("; with --target FILE pictures are enough" if name == "on" else "")
             )
-    zeros, lengths = _select_parameters(robot, kinematics, settings)
-    return replace(inputs, zeros=zeros, lengths=lengths)
+    joint_names, link_names = _select_parameters(robot, kinematics, settings)
+    return replace(inputs, offset_joints=joint_names, scaled_links=link_names)
 
 
 def _known_camera(one: EpisodeCamera) -> PinholeCamera:
-    """What is known of a camera; one without a focal length is 0.95 as long as its pictures."""
+    """Return an episode's camera; an unknown focal length is 0.95 of the pictures' width."""
     if one.camera is not None:
         return replace(one.camera, name=one.name)
     focal, centre = 0.95 * one.width, (0.5 * (one.width - 1), 0.5 * (one.height - 1))
@@ -282,7 +283,7 @@ def _known_camera(one: EpisodeCamera) -> PinholeCamera:
 def _recording(
     camera: EpisodeCamera, mapped: TreeLog, default: Array, settings: AuditSettings
 ) -> Recording:
-    """A camera's pictures beside the joints; pictures of frames that are not asked for are out."""
+    """Return the pictures of a camera's selected frames, with the joint log."""
     kept = kept_pictures(camera, settings)
 
     def values_at(offset: float | Array) -> Array:
@@ -290,7 +291,7 @@ def _recording(
         values[:, mapped.asked] = rows_of(mapped.log, camera, kept, np.asarray(offset))
         return values
 
-    # Some dozens of pictures are looked at, again and again.
+    # A search reads the same few dozen pictures repeatedly.
     @lru_cache(64)
     def read(k: int) -> Picture:
         return camera.read(int(kept[k]))
@@ -303,13 +304,13 @@ def _recording(
 def _read_target(
     model: ArticulatedModel, settings: RegistrationSettings
 ) -> CalibrationTarget | None:
-    """The object that cameras on a link see, before the robot; None: they see the robot."""
+    """Return the calibration target, before the robot; None: the cameras see the robot."""
     if settings.target is None:
         return None
     if settings.on is None:
         raise SettingsError(
-            f"{settings.target} stands still, as a camera does that rides on no link, so its masks "
-            "tell nothing of the robot's world: name the link that the camera rides on (--on LINK)"
+            f"{settings.target} and a camera that rides on no link both stand still, so masks of "
+            "the target do not relate the camera to the robot: name the camera's link (--on LINK)"
         )
     other = load_model(settings.target, package_paths=settings.packages)
     held = make_tree(model, EstimateSettings(hold=settings.hold)).held
@@ -324,11 +325,11 @@ def _read_masks(
     cameras: Path | None,
     settings: RegistrationSettings,
 ) -> RegistrationInputs:
-    """A scene of masks; joints that no table tells are estimated from known cameras."""
+    """Read a scene of masks; missing joint positions are estimated from the known cameras."""
     if cameras is None and not (path / CAMERA_FILE).exists():
         raise SceneError(
-            f"{path}: has no {CAMERA_FILE}; a camera is found whose size and focal length a camera "
-            "file says (--cameras FILE)"
+            f"{path}: has no {CAMERA_FILE}; a registration needs a camera file with picture size "
+            "and focal length (--cameras FILE)"
         )
     file = load_camera_file(cameras or path / CAMERA_FILE)
     scene = check_scene(load_scene(path, file.cameras))
@@ -338,18 +339,18 @@ def _read_masks(
     if joints is not None and target is None:
         table = read_measured_positions(joints, robot.position_names)
     if joints is None or (table is not None and table.is_estimate):
-        # Only measured joint positions tell these.
+        # Estimated positions would absorb these parameters.
         for name in ("zeros", "lengths", "focal", "on", "suggest"):
             if getattr(settings, name):
                 raise SettingsError(
-                    f"--{name} needs measured joint positions (--joints FILE): those that are "
-                    "estimated follow what it asks for"
+                    f"--{name} needs measured joint positions (--joints FILE): estimated ones "
+                    "would absorb what it asks for"
                 )
     if table is not None and table.bases:
         robot, table = put_on_base(robot, table)
-    tree, seen = make_registration_tree(robot, settings, target)
+    tree, visible = make_registration_tree(robot, settings, target)
     kinematics = TreeKinematics(tree)
-    zeros, lengths = _select_parameters(robot, kinematics, settings)
+    joint_names, link_names = _select_parameters(robot, kinematics, settings)
     if joints is None:
         asked = EstimateSettings(
             frames=frames, every=settings.every, hold=settings.hold, packages=settings.packages
@@ -362,31 +363,33 @@ def _read_masks(
     left_out = tuple(name for name in unplaced if name not in found)
     warnings = [*scene.warnings, *robot.warnings, *positions.warnings]
     warnings += [
-        f"camera '{name}' has no X_WC and is not to be found, or has no masks in masks/{name}: it "
-        "is left out of the camera file that is written"
+        f"camera '{name}' has no X_WC and is not to be registered, or has no masks in "
+        f"masks/{name}: it is left out of the camera file that is written"
         for name in left_out
     ]
     inputs = RegistrationInputs(
         scene, robot, tree, positions, joints, cameras, (), held, searched,
         tuple(one for one in searched if one.name not in unplaced and settings.on is None),
-        left_out=left_out, visible_nodes=seen, target=target, zeros=zeros, lengths=lengths,
+        left_out=left_out, visible_nodes=visible, target=target, offset_joints=joint_names,
+        scaled_links=link_names,
     )  # fmt: skip
     inputs = replace(inputs, frames=_read_frames(inputs, frames))
-    if zeros or lengths or settings.focal:
-        require_frame_count(sum(len(inputs.of(name)) for name in found), len(zeros), len(lengths))
-    return replace(inputs, warnings=(*warnings, *_say_poses(inputs)))
+    if joint_names or link_names or settings.focal:
+        count = sum(len(inputs.of(name)) for name in found)
+        require_frame_count(count, len(joint_names), len(link_names))
+    return replace(inputs, warnings=(*warnings, *_pose_warnings(inputs)))
 
 
 def _select_cameras(
     scene: Scene, file: CameraFile, settings: RegistrationSettings
 ) -> tuple[tuple[PinholeCamera, ...], tuple[PinholeCamera, ...]]:
-    """The cameras that are to be found, and the others whose place is known."""
+    """Return the cameras to be registered, and the cameras with known poses."""
     path, wanted = scene.path / CAMERA_FILE, settings.cameras
     unplaced = {*file.unplaced, *file.links}
     for name, link in file.links.items():
         if link != settings.on:
             raise SceneError(
-                f"{path}: camera '{name}' rides on link '{link}': find it with --on {link}, or "
+                f"{path}: camera '{name}' rides on link '{link}': register it with --on {link}, or "
                 "take it out of the file"
             )
     for name in wanted:
@@ -394,8 +397,8 @@ def _select_cameras(
             raise UnknownNameError("camera", name, file.cameras, str(scene.path))
     if not wanted and not unplaced:
         raise SceneError(
-            f"{path}: every camera has an X_WC; name those that are to be found anew: --camera "
-            f"{next(iter(file.cameras))}"
+            f"{path}: every camera has an X_WC; name those that are to be registered anew: "
+            f"--camera {next(iter(file.cameras))}"
         )
     with_masks = {name for name, _ in scene.masks}
     searched, held = [], []
@@ -404,8 +407,8 @@ def _select_cameras(
         if not isinstance(camera, PinholeCamera):
             if is_wanted:
                 raise CameraError(
-                    f"{path}: camera '{name}' is a parallel camera, whose distance no picture "
-                    "tells; a camera that is to be found needs a focal length (projection: pinhole)"
+                    f"{path}: camera '{name}' is a parallel camera, whose distance is not "
+                    "observable; a registration needs a focal length (projection: pinhole)"
                 )
         elif is_wanted:
             for focal, side in ((camera.focal_x, camera.width), (camera.focal_y, camera.height)):
@@ -427,9 +430,9 @@ def make_registration_tree(
     settings: RegistrationSettings,
     target: CalibrationTarget | None = None,
 ) -> tuple[PoseTree, tuple[str, ...] | None]:
-    """The pose tree, and which of its nodes the masks show; None: all.
+    """Return the pose tree, and the names of its nodes that masks show; None: all.
 
-    From a link on which a camera rides, the masks show what no joint moves.
+    A camera on a link sees the robot's static base, or the target.
     """
     if target is not None:
         return target.tree(np.eye(4)), (TARGET,)
@@ -440,8 +443,8 @@ def make_registration_tree(
     base = [node.name for node in tree.nodes if node.parent < 0 and not node.value_names]
     if not base:
         raise SettingsError(
-            f"{model.path}: no link that is seen stands still, so a camera on link '{link}' sees "
-            "nothing that tells where it is; the robot's base needs visual geometry"
+            f"{model.path}: no visible link stands still, so the pose of a camera on link '{link}' "
+            "is not observable; the robot's base needs visual geometry"
         )
     held = {model.position_names[index]: value for index, value in tree.held.items()}
     moved = model.pose_tree(
@@ -455,7 +458,7 @@ def make_registration_tree(
 def _select_parameters(
     model: ArticulatedModel, kinematics: TreeKinematics, settings: RegistrationSettings
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The joints and links whose zeros and lengths are to be found."""
+    """Return the joints and links whose offsets and scales are to be estimated."""
     zeros, lengths = settings.zeros, settings.lengths
     if ALL in zeros:
         free = np.flatnonzero(kinematics.lower < kinematics.upper)
@@ -465,8 +468,8 @@ def _select_parameters(
     require_parameters(kinematics.tree, zeros, lengths)
     if settings.lengths and not model.changes_shape:
         raise SettingsError(
-            f"{model.path}: lengths of links are found of URDF models alone, whose joints' origins "
-            "they move; convert the model, or leave --lengths out"
+            f"{model.path}: link lengths are estimated of URDF models only; convert the model, or "
+            "leave --lengths out"
         )
     return zeros, lengths
 
@@ -474,22 +477,23 @@ def _select_parameters(
 def _read_frames(
     inputs: RegistrationInputs, wanted: Sequence[str], most: int = 12
 ) -> tuple[MultiViewFrame, ...]:
-    """What cameras see; a bad mask of one that is to be found is refused.
+    """Read the searched cameras' frames, with the known cameras' masks of the same frames.
 
-    Of cameras that are held there is what can be compared with them. With positions that were
-    estimated, cameras are found from `most` frames at most: what the model lacks is the same in all
-    of them, so more add little.
+    With estimated positions at most `most` frames are used: the model's errors are the same in all
+    of them, so more frames add little.
+
+    Raises MaskError: a searched camera's mask is bad.
     """
     scene, positions = inputs.scene, inputs.positions
     names, estimated = [one.name for one in inputs.searched_cameras], positions.is_estimate
     if estimated:
-        asked = select_frames(scene.frames, wanted, str(scene.path))
-        known = [frame for frame in asked if positions.has(frame)]
+        candidates = select_frames(scene.frames, wanted, str(scene.path))
+        known = [frame for frame in candidates if positions.has(frame)]
         for name in names:
             if not any((name, frame) in scene.masks for frame in known):
                 raise SceneError(
                     f"{scene.path}: camera '{name}' has no mask of a frame in which the cameras "
-                    "whose X_WC is known tell the body's pose; give masks of the same moments"
+                    "with an X_WC determine the body's pose; give synchronised masks"
                 )
         seen = [frame for frame in known if any((name, frame) in scene.masks for name in names)]
         chosen = np.linspace(0, len(seen) - 1, most).round().astype(int)
@@ -504,7 +508,7 @@ def _read_frames(
                 masks[camera] = read_mask_of(scene, camera, frame, may_be_empty=estimated)
             except MaskError as error:
                 raise MaskError(
-                    f"{error} (camera '{camera}', frame '{frame}'); mend it, or leave the frame "
+                    f"{error} (camera '{camera}', frame '{frame}'); correct it, or leave the frame "
                     "out (--frame)"
                 ) from error
         masks = {camera: mask for camera, mask in masks.items() if mask.any()}
@@ -521,29 +525,28 @@ def _read_frames(
     if estimated and not any(c.name in one.masks for c in inputs.known_cameras for one in found):
         raise SceneError(
             f"{scene.path}: the joint positions were estimated, so they are fitted together with "
-            "the cameras, but no camera with an X_WC has a mask of those frames: leave X_WC of the "
-            "cameras by which they were estimated in the camera file"
+            "the cameras, but no camera with an X_WC has a mask of those frames: keep the X_WC of "
+            "the cameras by which they were estimated in the camera file"
         )
     return tuple(found)
 
 
-def _say_poses(inputs: RegistrationInputs) -> list[str]:
-    """What of the body, and how it moves, a user should know.
+def _pose_warnings(inputs: RegistrationInputs) -> list[str]:
+    """Return warnings about the body's surface and its motion.
 
-    Raises RegistrationError: the link before an object does not turn enough.
+    Raises RegistrationError: the link that carries the cameras rotates too little.
     """
     texts, estimated = list[str](), inputs.positions.is_estimate
     if estimated and not missing_for_person(inputs.model):
         texts.append(
-            "a person's clothes and hair are not the model's surface, which turns a camera about "
-            "the person: on a real recording cameras were off by up to three of their standard "
-            "deviations"
+            "a person's clothes and hair are missing in the model, which turns a camera about the "
+            "person: on a real recording cameras were off by up to three standard deviations"
         )
     for camera in inputs.searched_cameras:
         frames = inputs.of(camera.name)
         if inputs.target is not None:
             require_rotation(camera.name, inputs.target, frames)
-        # Estimated poses differ that do so by more times what measured ones do.
+        # Estimated positions scatter more than measured ones.
         rows, times = (one.values for one in frames), 5.0 if estimated else 1.0
         if not inputs.positions.are_one_pose(rows, times):
             continue
@@ -553,13 +556,13 @@ def _say_poses(inputs: RegistrationInputs) -> list[str]:
         elif estimated:
             what = f"the body stands still in all {len(frames)} frames"
         why = (
-            "what its surface lacks pulls the camera to one side unnoticed, about the body above "
-            "all, and no frame can be found to contradict the others; take frames in which it "
-            "turns, moves its limbs and walks about"
+            "errors of the model's surface shift the camera unnoticed, above all about the body, "
+            "and outlier frames cannot be found; take frames in which the body turns, moves its "
+            "limbs and walks about"
             if estimated
-            else "errors of that mask and of the joints' zeros cannot be told from a camera "
-            "elsewhere, no frame can be found to contradict the others, and a mirrored pose may "
-            "look alike; take five or more poses that differ much"
+            else "errors of the mask and of joint offsets cannot be distinguished from another "
+            "camera pose, outlier frames cannot be found, and a mirrored pose may look the same; "
+            "take five or more poses that differ much"
         )
         texts.append(f"camera '{camera.name}': {what}: {why}")
     return texts

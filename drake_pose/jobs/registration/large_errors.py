@@ -201,7 +201,7 @@ class SceneComparison:
             frames = [one if one.finding else replace(one, finding=wrong) for one in found.frames]
             found = replace(found, frames=tuple(frames))
         common = (*findings, *moved, *found.common)
-        warnings = (*now.warnings, *self._say_masks(now))
+        warnings = (*now.warnings, *self._mask_warnings(now))
         # Where outlines do not fit, what would be noticed is not told by how they would move.
         shares = now.joint_inlier_ratios
         enough = LARGE.min_joint_inlier_ratio * max(shares.values(), default=0.0)
@@ -278,7 +278,7 @@ class SceneComparison:
                 placed[camera.name] = found, off
         return placed
 
-    def _say_masks(
+    def _mask_warnings(
         self, now: SceneFit, more: float = 0.08, more_in_one: float = 0.15, less: float = 0.25
     ) -> list[str]:
         """What masks show beside the robot, and lack of it, in frames that agree otherwise.

@@ -1,4 +1,4 @@
-"""How a scene may be meant otherwise than it is given: conventions, exchanges, mirrors, lenses."""
+"""Common mistakes in scenes, as corrections: conventions, exchanges, mirrors, focal lengths."""
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -36,12 +36,14 @@ def scene_corrections(
         2.0,
     ),
 ) -> Iterator[Correction]:
-    """What else may be meant by a scene whose cameras stand somewhere: what users get wrong.
+    """Yield corrections of mistakes that users make.
 
     Args:
-        values: (m,) joint positions of each frame, frames: their names.
-        pairs: number of pairs that are exchanged.
-        factors: of focal lengths.
+        cameras: the cameras at their given poses.
+        values: (m,) joint positions of each frame.
+        frames: names of the frames.
+        pairs: maximum number of camera pairs that are exchanged.
+        factors: factors of focal lengths.
     """
     for text, change in _conventions():
         for group in _groups(cameras):
@@ -77,7 +79,7 @@ def scene_corrections(
 def focal_correction(
     cameras: Sequence[Camera], group: Collection[str], text: str, factor: float
 ) -> Correction:
-    """Cameras of a group, or all where it is empty, with focal lengths that are a factor longer."""
+    """Return focal lengths of a group's cameras, of all if it is empty, times a factor."""
     changed = [
         replace(one, focal_x=factor * one.focal_x, focal_y=factor * one.focal_y)
         if isinstance(one, PinholeCamera) and (not group or one.name in group)
@@ -88,12 +90,14 @@ def focal_correction(
 
 
 def _groups(cameras: Sequence[Camera]) -> list[tuple[str, ...]]:
-    """The names of all cameras, and of each."""
+    """Return the names of all cameras together, and of each."""
     names = tuple(one.name for one in cameras)
     return [names, *((name,) for name in names if len(names) > 1)]
 
 
 def _mirrored(group: Collection[str]) -> Callable[[MultiViewFrame], MultiViewFrame]:
+    """Return a function that mirrors the masks of a group's cameras left to right."""
+
     def change(frame: MultiViewFrame) -> MultiViewFrame:
         masks = {
             name: np.ascontiguousarray(mask[:, ::-1]) if name in group else mask
@@ -105,11 +109,12 @@ def _mirrored(group: Collection[str]) -> Callable[[MultiViewFrame], MultiViewFra
 
 
 def _with_row(rows: Mapping[str, Array], frame: MultiViewFrame) -> MultiViewFrame:
+    """Return a frame with the joint positions of another row."""
     return replace(frame, values=rows[frame.name])
 
 
 def _conventions() -> Iterator[tuple[str, Callable[[Array], Array]]]:
-    """Other meanings of the matrix of a camera's pose: a text, and X_WC from what was given."""
+    """Yield other meanings of a camera's pose: words, and a function that returns X_WC (4, 4)."""
     axes = {
         "": np.eye(3),
         "that of ROS' camera_link (x forward, y left, z up)":
@@ -117,7 +122,7 @@ def _conventions() -> Iterator[tuple[str, Callable[[Array], Array]]]:
         "in the convention of OpenGL (x right, y up, z back)": np.diag([1.0, -1.0, -1.0]),
     }  # fmt: skip
 
-    def meant(unit: float, inverse: bool, R: Array, X: Array) -> Array:
+    def convert(unit: float, inverse: bool, R: Array, X: Array) -> Array:
         scaled = X * np.array([1.0, 1.0, 1.0, unit])
         scaled[3, 3] = 1.0
         found = np.array(np.linalg.inv(scaled) if inverse else scaled)
@@ -131,14 +136,14 @@ def _conventions() -> Iterator[tuple[str, Callable[[Array], Array]]]:
                 words = [one for one in (of_place, of_axes, of_unit) if one]
                 if words:
                     text = f"seems to be {', and '.join(words)}"
-                    yield text, partial(meant, unit, is_inverse, R)
+                    yield text, partial(convert, unit, is_inverse, R)
 
-    def turned(change: Callable[[Array], Array], X: Array) -> Array:
+    def change_rotation(change: Callable[[Array], Array], X: Array) -> Array:
         X = X.copy()
         X[:3, :3] = change(X[:3, :3])
         return X
 
-    yield "seems to hold the inverse of its rotation", partial(turned, np.transpose)
+    yield "seems to hold the inverse of its rotation", partial(change_rotation, np.transpose)
 
     def reordered(given: str, meant_by: str, R: Array) -> Array:
         angles = Rotation.from_matrix(R).as_euler(given)
@@ -146,7 +151,7 @@ def _conventions() -> Iterator[tuple[str, Callable[[Array], Array]]]:
 
     for orders in ("xyz", "XYZ"), ("XYZ", "xyz"):
         text = "seems to be made of Euler angles in another order"
-        yield text, partial(turned, partial(reordered, *orders))
+        yield text, partial(change_rotation, partial(reordered, *orders))
     for degrees in (90, 180, 270):
         R_turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
 

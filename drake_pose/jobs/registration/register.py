@@ -1,4 +1,4 @@
-"""A scene and joint positions in, the cameras' poses out."""
+"""Register the cameras of a scene or an episode."""
 
 import os
 import time
@@ -21,15 +21,15 @@ from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.registration.diagnosis import (
     Search,
     check_focal_length,
+    common_outlier_warnings,
+    known_camera_warnings,
+    likely_offset_warnings,
+    lost_frames_warning,
+    outlier_warnings,
+    parameter_warnings,
     require_determined,
     require_explained,
-    say_common,
-    say_held,
-    say_likely_offsets,
-    say_lost,
-    say_object,
-    say_outliers,
-    say_zeros,
+    target_warnings,
 )
 from drake_pose.jobs.registration.inputs import (
     RegistrationInputs,
@@ -43,7 +43,7 @@ from drake_pose.jobs.registration.result import (
     describe_parameters,
     describe_pictures,
     describe_run,
-    say_pictures,
+    picture_warnings,
     write_result,
 )
 from drake_pose.jobs.registration.settings import RegistrationSettings
@@ -82,12 +82,14 @@ OnCamera = Callable[[int], None]
 
 @dataclass(frozen=True, eq=False)
 class SceneRegistration:
-    """Where a scene's cameras stand.
+    """The registered cameras of a scene.
 
     Args:
-        cameras: all cameras of the scene whose pose is known now, in its order.
-        registered: those that were found, with how well they fit, by name.
-        summary: what summary.json holds.
+        cameras: all cameras of the scene with a known pose, in the scene's order.
+        registered: the registered cameras by name, with how well they fit.
+        summary: contents of summary.json.
+        warnings: for the user.
+        folder: the result's folder; None: nothing was written.
     """
 
     cameras: Mapping[str, Camera]
@@ -109,22 +111,24 @@ def register_scene(
     overlay: bool = True,
     on_camera: OnCamera | None = None,
 ) -> SceneRegistration:
-    """Finds where a scene's or an episode's cameras stand; no guess is needed.
+    """Estimate the poses of a scene's or an episode's cameras, without an initial guess.
 
     Args:
-        scene: the folder with cameras.yaml, in which X_WC may be missing, and masks; or an episode
-            of pictures, or a file of one, as ``open_episode`` takes it.
-        model: the robot's model file. It stands in the world as the file has it.
-        joints: joint positions by frame, or of an episode by time (CSV) [rad or m]. None: an
-            episode's own; in a scene they are estimated from the cameras whose X_WC is known, and
-            fitted together with those that are found.
-        out: folder for the result, new or empty; None writes nothing.
+        scene: a folder with masks and cameras.yaml, in which X_WC may be missing; or an episode of
+            pictures, see ``open_episode``.
+        model: the robot's model file, with the robot placed in the world as in the file.
+        joints: joint positions by frame, or by time for an episode (CSV) [rad or m]. None: an
+            episode's own; in a scene they are estimated from the cameras with known X_WC, and
+            fitted together with the registered ones.
+        out: folder for the result, new or empty; None: nothing is written.
+        settings: what is registered, and how.
         cameras: a camera file in place of the scene's or episode's own.
+        overlay: whether overlays are drawn.
         on_camera: called after each camera.
 
     Raises:
         RegistrationError: no pose of a camera explains its masks. Nothing is written then.
-        DrakePoseError: names the file, camera, frame or joint at fault.
+        DrakePoseError: names the wrong file, camera, frame or joint.
     """
     settings = settings or RegistrationSettings()
     table, own, folder = (None if one is None else Path(one) for one in (joints, cameras, out))
@@ -136,7 +140,7 @@ def register_scene(
         start = time.perf_counter()
         if work.inputs.positions.is_estimate:
             work.refit_poses()
-        urdf = work.find_zeros(folder) if work.has_constants else None
+        urdf = work.fit_constants(folder) if work.has_constants else None
         work.evaluate()
         described = work.describe((time.perf_counter() - start) / len(work.registered))
     placed = {
@@ -146,7 +150,7 @@ def register_scene(
     }
     seconds = sum(one["seconds"] for one in described.values())
     summary = {
-        # A single camera's part stands at the top as well.
+        # A single camera's part is also at the top level.
         **(next(iter(described.values())) if len(described) == 1 else {}),
         **describe_run(inputs, settings, work.warnings, seconds),
         "cameras": described,
@@ -159,14 +163,15 @@ def register_scene(
 
 
 class _Registration:
-    """A registration under way.
+    """State of a registration.
 
     Attributes:
-        inputs, body: as they are known by now.
-        registered, seconds, suggestions: of the cameras that were found, by name.
-        parameters: what the summary says of zeros and lengths.
-        pictures: of cameras that were found in these, by name, with what was found in them.
-        seen: by camera and frame, pictures in which masks of a target were found.
+        inputs, body: updated after each step.
+        warnings: for the user.
+        registered, seconds, suggestions: results by camera.
+        parameters: the summary's part on joint offsets and link scales.
+        pictures: registrations from pictures, by camera.
+        target_pictures: by camera and frame, pictures in which the target was found.
     """
 
     def __init__(
@@ -176,32 +181,34 @@ class _Registration:
         self.body = RegistrationBody(
             inputs.tree, inputs.visible_nodes, radius_scales=inputs.positions.radius_scales
         )
-        self._held = [one for one in inputs.known_cameras if isinstance(one, PinholeCamera)]
+        self._known_cameras = [
+            one for one in inputs.known_cameras if isinstance(one, PinholeCamera)
+        ]
         self.warnings = list(inputs.warnings)
         self.registered = dict[str, RegisteredCamera]()
         self.seconds = dict[str, float]()
         self.suggestions = dict[str, dict[str, Any] | None]()
         self.parameters: dict[str, Any] = {"zeros": {}, "lengths": {}}
         self.pictures = dict[str, PictureRegistration]()
-        self.seen = dict[str, dict[str, Picture]]()
-        self._zeros = np.zeros(len(self.body.kinematics.names))
+        self.target_pictures = dict[str, dict[str, Picture]]()
+        self._joint_offsets = np.zeros(len(self.body.kinematics.names))
 
     @property
     def shown(self) -> dict[str, dict[str, Picture]]:
-        """Pictures by camera and frame, of cameras that were found in these."""
-        return self.seen | {name: one.pictures for name, one in self.pictures.items()}
+        """Pictures by camera and frame, of cameras registered from pictures."""
+        return self.target_pictures | {name: one.pictures for name, one in self.pictures.items()}
 
     @property
     def has_constants(self) -> bool:
-        """Whether there is more to find in all frames together."""
-        asked = self._settings
-        # Cameras that see one object are found one after another, but it stands in one place.
+        """Whether constants common to all frames are to be fitted."""
+        settings = self._settings
+        # Cameras that see one target are first registered separately; it has one pose.
         several = self.inputs.target is not None and len(self.registered) > 1
-        focal = asked.focal and not self.pictures
-        return bool(asked.zeros or asked.lengths or focal or several)
+        focal = settings.focal and not self.pictures
+        return bool(settings.zeros or settings.lengths or focal or several)
 
     def find(self) -> None:
-        """Finds each camera by itself, in masks or in pictures.
+        """Register each camera by itself, from masks or from pictures.
 
         Raises:
             CameraError: a camera's focal length is unknown.
@@ -209,8 +216,8 @@ class _Registration:
         """
         inputs = self.inputs
         if not inputs.recordings:
-            for camera in self._held:
-                self.warnings += say_held(self.body, camera, inputs.of(camera.name))
+            for camera in self._known_cameras:
+                self.warnings += known_camera_warnings(self.body, camera, inputs.of(camera.name))
             self._find_each()
         elif inputs.target is not None:
             self._find_target(inputs.target)
@@ -220,7 +227,7 @@ class _Registration:
                 name, start = camera.name, time.perf_counter()
                 focal = self._settings.focal or name in inputs.assumed_focal
                 one = register_pictures(
-                    self.body, camera, inputs.recordings[name], focal, inputs.zeros
+                    self.body, camera, inputs.recordings[name], focal, inputs.offset_joints
                 )
                 frames += [
                     MultiViewFrame(
@@ -230,18 +237,18 @@ class _Registration:
                     for frame in one.frames
                 ]  # fmt: skip
                 self.pictures[name] = one
-                self.warnings += say_pictures(one, name in inputs.assumed_focal)
+                self.warnings += picture_warnings(one, name in inputs.assumed_focal)
                 self._note(one.found, start)
             self.inputs = replace(inputs, frames=tuple(frames))
 
     def _find_each(self) -> None:
-        """Finds each camera by itself.
+        """Register each camera from its masks.
 
-        An object whose place is not known is found with the first camera, and then stands there.
+        The pose of a calibration target is estimated with the first camera, and then known.
 
         Raises RegistrationError: no pose of a camera explains its masks.
         """
-        inputs, target, seen = self.inputs, self.inputs.target, None
+        inputs, target, target_pose = self.inputs, self.inputs.target, None
         search: Search = CameraSearch(self.body) if target is None else TargetSearch(target)
         measured = not inputs.positions.is_estimate
         for camera in inputs.searched_cameras:
@@ -251,83 +258,86 @@ class _Registration:
                 require_explained(search, found, frames)
             if target is not None:
                 if found.target is not None:
-                    seen, self.body = found.target, target.body(found.target.X_WT)
+                    target_pose, self.body = found.target, target.body(found.target.X_WT)
                     search = CameraSearch(self.body)
-                    self.warnings += say_object(seen)
-                found = replace(found, target=seen)
+                    self.warnings += target_warnings(target_pose)
+                found = replace(found, target=target_pose)
             self._note(found, start)
         self.inputs = replace(inputs, tree=self.body.tree)
 
     def _note(self, found: RegisteredCamera, start: float) -> None:
-        """Keeps a camera that was found, since a moment by time.perf_counter()."""
+        """Store a registered camera; start: when its search began, by time.perf_counter()."""
         name, settings = found.camera.name, self._settings
         self.registered[name], self.suggestions[name] = found, None
         if settings.suggest and len(found.alternatives):
-            # Joint positions that would tell its poses apart.
+            # Suggest joint positions that distinguish its poses.
             poses = [found.camera.X_WC, *found.alternatives]
-            told = suggest_pose(self.body, found.camera, poses, settings.keep_out)
-            if told is None:
+            suggested = suggest_pose(self.body, found.camera, poses, settings.keep_out)
+            if suggested is None:
                 self.warnings.append(
-                    f"camera '{name}': of random joint positions none is seen from all its poses "
-                    "and touches nothing: no picture is suggested; is --keep-out too large?"
+                    f"camera '{name}': no random joint positions are visible from all its poses "
+                    "and free of collisions: no picture is suggested; is --keep-out too large?"
                 )
             else:
-                values = zip(self.body.kinematics.names, told[0].tolist(), strict=True)
+                values = zip(self.body.kinematics.names, suggested[0].tolist(), strict=True)
                 positions = {k: one for k, one in values if k not in TARGET_POSITIONS}
-                self.suggestions[name] = {"positions": positions, "difference": told[1]}
+                self.suggestions[name] = {"positions": positions, "difference": suggested[1]}
         self.seconds[name] = time.perf_counter() - start
         if self._on_camera is not None:
             self._on_camera(len(self.registered))
 
     def _find_target(self, target: CalibrationTarget, most: int = 24) -> None:
-        """Finds masks of an object in some pictures from a link, and each camera in these."""
+        """Find the target in some pictures of each camera, and register the cameras from these."""
         inputs, frames, start = self.inputs, list[MultiViewFrame](), time.perf_counter()
         body = target.body(np.eye(4))
         for camera in inputs.searched_cameras:
             name = camera.name
             if name in inputs.assumed_focal:
                 raise CameraError(
-                    f"camera '{name}': its focal length is unknown, without which pictures of a "
-                    "target do not tell how far away it is; calibrate it"
+                    f"camera '{name}': its focal length is unknown, but pictures of a target "
+                    "determine a distance only with it; calibrate the camera"
                 )
             recording = inputs.recordings[name]
             rows, _ = choose_pictures(body, camera, recording, most)
             seen = find_target_frames(target, camera, posed_pictures(recording, rows, 0.0))
-            self.seen[name] = {one.name: recording.picture(one.name) for one in seen}
+            self.target_pictures[name] = {one.name: recording.picture(one.name) for one in seen}
             frames += [MultiViewFrame(one.name, one.values, {name: one.mask}) for one in seen]
-            lost = [recording.names[k] for k in rows if recording.names[k] not in self.seen[name]]
+            found_names = self.target_pictures[name]
+            lost = [recording.names[k] for k in rows if recording.names[k] not in found_names]
             if lost:
-                self.warnings.append(say_lost(name, lost, recording.names, "target"))
+                self.warnings.append(lost_frames_warning(name, lost, recording.names, "target"))
         self.inputs = replace(inputs, frames=tuple(frames))
         seconds = time.perf_counter() - start
         self._find_each()
         for name, found in self.registered.items():
-            require_detections(name, len(found.frames) - len(found.outliers), len(self.seen[name]))
+            inlier_count = len(found.frames) - len(found.outliers)
+            require_detections(name, inlier_count, len(self.target_pictures[name]))
             self.seconds[name] += seconds / len(self.registered)
 
     def evaluate(self, shown: int = 20) -> None:
-        """Says what a user should know of the cameras with all that was found.
+        """Evaluate all frames with the final cameras, and warn of what looks wrong.
 
-        shown: number of pictures of each camera that are kept of those that contradict.
+        shown: maximum number of outlier pictures of each camera that are kept.
 
-        Raises RegistrationError: a focal length is wrong, and with it a camera's distance; or its
-            frames do not tell where it is on a link.
+        Raises RegistrationError: a focal length is wrong, and with it the camera's distance; or the
+            frames do not determine a camera's pose on its link.
         """
         inputs, body, frames = self.inputs, self.body.with_tree(self.inputs.tree), []
-        # All pictures of cameras that were found in some of them.
+        # All pictures of cameras that were registered from some of them.
         for name, one in self.pictures.items():
             recording, found = one.recording, self.registered[name]
             seen, misfits, lost = evaluate_pictures(
-                body, replace(one, joint_offsets=self._zeros), found
+                body, replace(one, joint_offsets=self._joint_offsets), found
             )
-            frames += [MultiViewFrame(k.name, k.values + self._zeros, {name: k.mask}) for k in seen]
+            offsets = self._joint_offsets
+            frames += [MultiViewFrame(k.name, k.values + offsets, {name: k.mask}) for k in seen]
             found = self.registered[name] = replace(found, frames=misfits)
             errors = {k.frame: k.E_total for k in found.frames}
             wanted = (*found.outliers[:shown], *compared_frames(errors))
             pictures = {k: recording.picture(k) for k in wanted}
             self.pictures[name] = replace(one, pictures={**one.pictures, **pictures})
             if lost:
-                self.warnings.append(say_lost(name, lost, recording.names))
+                self.warnings.append(lost_frames_warning(name, lost, recording.names))
         if frames:
             inputs = self.inputs = replace(inputs, frames=tuple(frames))
         for name, found in self.registered.items():
@@ -337,32 +347,36 @@ class _Registration:
             focal_found = picture is not None and picture.focal_deviation
             fitted, own = found, inputs.of(name)
             if picture is not None:
-                # By the pictures that it was fitted to.
+                # Checks use the pictures of the fit.
                 fitted = replace(found, frames=picture.found.frames)
-                own = [replace(k, values=k.values + self._zeros) for k in picture.frames]
+                own = [replace(k, values=k.values + self._joint_offsets) for k in picture.frames]
             if not (inputs.positions.is_estimate or self._settings.zeros):
-                self.warnings += say_likely_offsets(body, fitted, own)
+                self.warnings += likely_offset_warnings(body, fitted, own)
             if not (inputs.positions.is_estimate or self._settings.focal or focal_found):
                 covariance, texts = check_focal_length(body, fitted, own)
                 self.warnings += texts
                 found = self.registered[name] = replace(found, covariance=covariance)
-            self.warnings += say_outliers(found, picture is not None or name in self.seen)
-        self.warnings += say_common(self.registered.values(), from_pictures=bool(self.pictures))
+            self.warnings += outlier_warnings(
+                found, picture is not None or name in self.target_pictures
+            )
+        self.warnings += common_outlier_warnings(
+            self.registered.values(), from_pictures=bool(self.pictures)
+        )
 
     def describe(self, more: float) -> dict[str, dict[str, Any]]:
-        """The cameras' parts of the summary, each of which took so long more [s]."""
-        on, told = self._settings.on, self.suggestions
+        """Return the cameras' parts of the summary; more: further seconds for each camera."""
+        on, suggestions = self._settings.on, self.suggestions
         return {
             name: self.parameters
-            | describe_camera(one, self.seconds[name] + more, told[name], on)
-            | describe_pictures(self.pictures.get(name), name in self.seen)
+            | describe_camera(one, self.seconds[name] + more, suggestions[name], on)
+            | describe_pictures(self.pictures.get(name), name in self.target_pictures)
             for name, one in self.registered.items()
         }
 
     def refit_poses(self) -> None:
-        """Cameras, frames' estimated positions and body, fitted to what all cameras see.
+        """Fit cameras, estimated positions and the body's shape together (bundle adjustment).
 
-        Positions that were estimated are off, and so the cameras that were found by them.
+        Cameras registered with estimated positions inherit their errors.
 
         Raises RegistrationError: no pose of a camera explains its masks.
         """
@@ -372,7 +386,7 @@ class _Registration:
         for one in inputs.frames:
             own = {c: m for c, m in one.masks.items() if one.name not in wrong.get(c, ())}
             frames.append(replace(one, masks=own))
-        cameras = [*self._held, *(found.camera for found in registered.values())]
+        cameras = [*self._known_cameras, *(found.camera for found in registered.values())]
         shape: tuple[Any, ...] = (np.zeros(len(self.body.kinematics.names), np.bool_),)
         if not missing_for_person(inputs.model):
             shape = (shape_values(inputs.tree), *shape_parts(inputs.tree))
@@ -384,59 +398,60 @@ class _Registration:
         radius_scales = radius_scales * (1.0 if known is None else known)
         self.body = RegistrationBody(inputs.tree, inputs.visible_nodes, radius_scales=radius_scales)
         for camera, covariance in zip(adjusted, covariances, strict=True):
-            self._found_again(self.body.kinematics, camera, covariance)
+            self._update(self.body.kinematics, camera, covariance)
             found = self.registered[camera.name]
             require_explained(CameraSearch(self.body), found, self.inputs.of(camera.name))
 
-    def find_zeros(self, folder: Path | None) -> bytes | None:
-        """Zeros of joints, lengths of links and focal lengths, fitted with the cameras.
+    def fit_constants(self, folder: Path | None) -> bytes | None:
+        """Fit joint offsets, link scales and focal lengths together with the cameras.
 
         Returns:
-            the corrected URDF for a folder; None where nothing is significant, or the model is no
-            URDF.
+            the corrected URDF for a result folder; None if no parameter is significant, or the
+            model is no URDF.
 
         Raises:
-            RegistrationError: fewer frames than zeros and lengths.
+            RegistrationError: there are fewer frames than parameters.
         """
         inputs, names, cameras = self.inputs, self.body.kinematics.names, self.registered
         found = calibrate_joints(
             self.body, list(cameras.values()), [inputs.of(name) for name in cameras],
-            inputs.zeros, self._settings.focal, links=inputs.lengths,
-            start=self._zeros_in_pictures(), still_factor=2.5 if self.pictures else 1.0,
+            inputs.offset_joints, self._settings.focal, links=inputs.scaled_links,
+            start=self._offsets_in_pictures(), still_factor=2.5 if self.pictures else 1.0,
         )  # fmt: skip
         self.parameters = describe_parameters(found, self.body.kinematics)
-        self.warnings += say_zeros(found)
+        self.warnings += parameter_warnings(found)
         offsets = {one.name: one.value for one in found.offsets}
-        self._zeros = np.array([offsets.get(name, 0.0) for name in names])
+        self._joint_offsets = np.array([offsets.get(name, 0.0) for name in names])
         model, tree, target = inputs.model, inputs.tree, inputs.target
-        seen = next(iter(cameras.values())).target
+        target_pose = next(iter(cameras.values())).target
         shifts = joint_shifts(tree, found.link_scales)
-        # The file keeps what chance may explain; the cameras were fitted with all.
+        # The URDF gets significant parameters only; the cameras were fitted with all.
         zeros = {one.name: one.value for one in found.offsets if one.significant}
         written = joint_shifts(tree, [one for one in found.link_scales if one.significant])
         if shifts:
             model = model.reshaped(joint_shifts=shifts)
-        if target is not None and seen is not None:
+        if target is not None and target_pose is not None:
             target = target.before(model)
-            seen = target.moved_pose(seen, found.object_values, found.object_covariance)
-            tree = target.tree(seen.X_WT)
+            by, by_covariance = found.object_values, found.object_covariance
+            target_pose = target.moved_pose(target_pose, by, by_covariance)
+            tree = target.tree(target_pose.X_WT)
         elif shifts:
             tree, _ = make_registration_tree(model, self._settings)
-        values = [one.values + self._zeros for one in inputs.frames]
+        values = [one.values + self._joint_offsets for one in inputs.frames]
         self.inputs = replace(inputs, model=model, tree=tree, frames=inputs.with_values(values))
         kinematics = TreeKinematics(tree)
-        judged = zip(found.inlier_ratios, found.is_inlier, strict=True)
-        told = zip(found.cameras, found.covariances, judged, strict=True)
-        for camera, covariance, (ratios, is_inlier) in told:
+        evaluated = zip(found.inlier_ratios, found.is_inlier, strict=True)
+        fitted = zip(found.cameras, found.covariances, evaluated, strict=True)
+        for camera, covariance, (ratios, is_inlier) in fitted:
             before = self.registered[camera.name]
             rows = zip(before.frames, ratios.tolist(), is_inlier.tolist(), strict=True)
             again = [replace(one, inlier_ratio=ratio, is_inlier=own) for one, ratio, own in rows]
             self.registered[camera.name] = replace(before, frames=tuple(again))
-            self._found_again(kinematics, camera, covariance, seen)
+            self._update(kinematics, camera, covariance, target_pose)
         path = inputs.model.path
         if folder is None or not inputs.model.changes_shape or not (zeros or written):
             return None
-        # With zeros and lengths in its joints' origins; its meshes as seen from the folder.
+        # Offsets and scales change the joints' origins; mesh paths become relative to the folder.
         text = path.read_text(encoding="utf-8")
         root = ElementTree.fromstring(reshaped(text, joint_offsets=zeros, joint_shifts=written))
         for mesh in root.iter("mesh"):
@@ -445,33 +460,33 @@ class _Registration:
                 mesh.set("filename", os.path.relpath(path.parent / name, folder))
         return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
 
-    def _zeros_in_pictures(self) -> dict[str, float]:
-        """Mean joint offsets that cameras were found with in their pictures [rad or m]."""
+    def _offsets_in_pictures(self) -> dict[str, float]:
+        """Return the mean joint offsets from registrations in pictures, by name [rad or m]."""
         if not self.pictures:
             return {}
         found = np.mean([one.joint_offsets for one in self.pictures.values()], axis=0)
         return dict(zip(self.body.kinematics.names, found.tolist(), strict=True))
 
-    def _found_again(
+    def _update(
         self,
         kinematics: TreeKinematics,
         camera: PinholeCamera,
         covariance: Array,
-        seen: TargetPose | None = None,
+        target_pose: TargetPose | None = None,
     ) -> None:
-        """A camera where it was found now, with its frames' misfits; which agree is known."""
+        """Update a camera's pose, and its frames' misfits; inliers stay as they are."""
         before = self.registered[camera.name]
         frames = PosedFrames(kinematics, self.body.full, camera, self.inputs.of(camera.name))
         found = overlap_areas(frames, camera.X_CW[None], np.inf)[0]
         misfits = zip(before.frames, E_total(found), intersection_over_union(found), strict=True)
         again = [replace(one, E_total=float(off), iou=float(iou)) for one, off, iou in misfits]
         self.registered[camera.name] = replace(
-            before, camera=camera, covariance=covariance, frames=tuple(again), target=seen
+            before, camera=camera, covariance=covariance, frames=tuple(again), target=target_pose
         )
 
 
-def joint_shifts(tree: PoseTree, lengths: Sequence[KinematicParameter]) -> dict[str, list[float]]:
-    """By how much joints stand elsewhere on their links (3,), by name [m]; empty: none does."""
-    longer = {one.name: one.value for one in lengths if one.value}
+def joint_shifts(tree: PoseTree, scales: Sequence[KinematicParameter]) -> dict[str, list[float]]:
+    """Return the shifts (3,) of the joints that scaled links carry, by joint [m]."""
+    longer = {one.name: one.value for one in scales if one.value}
     offsets = carried_joints(tree, longer)
     return {one.joint: (longer[one.link] * one.p_L).tolist() for one in offsets}

@@ -25,9 +25,9 @@ from drake_pose.files.records import describe_job, file_digest, versions
 from drake_pose.files.replay import Pictures, import_rerun, make_recording
 from drake_pose.files.report_page import new_plot, overlay_picture, page_template, plot_uri
 from drake_pose.files.settings import percent
-from drake_pose.jobs.registration.diagnosis import say_drift, say_reading
 from drake_pose.jobs.registration.inputs import RegistrationInputs
 from drake_pose.jobs.registration.settings import AuditSettings
+from drake_pose.jobs.registration.words import describe_drift, describe_reading
 from drake_pose.registration.joint_offsets import JointCalibration, KinematicParameter
 from drake_pose.registration.picture_registration import PictureRegistration
 from drake_pose.registration.posed_frames import PosedFrame
@@ -117,7 +117,7 @@ def describe_pictures(one: PictureRegistration | None, found: bool = False) -> d
     }
 
 
-def say_pictures(one: PictureRegistration, assumed: bool) -> list[str]:
+def picture_warnings(one: PictureRegistration, assumed: bool) -> list[str]:
     """What a user should know of a camera that was found in pictures."""
     name, texts = one.found.camera.name, []
     if assumed:
@@ -126,7 +126,7 @@ def say_pictures(one: PictureRegistration, assumed: bool) -> list[str]:
             f"were found (standard deviation {one.focal_deviation * one.found.camera.focal_x:.0f})"
         )
     if one.time_offset is not None and one.time_offset.drift:
-        texts.append(say_drift(name, one.time_offset.drift, one.time_offset.drift_deviation))
+        texts.append(describe_drift(name, one.time_offset.drift, one.time_offset.drift_deviation))
     if one.time_offset is not None and not one.time_offset.determined:
         texts.append(
             f"camera '{name}': its pictures do not tell by how much its clock is off the joints', "
@@ -335,7 +335,7 @@ def parameter_rows(parameters: Mapping[str, Mapping[str, Any]]) -> list[tuple[st
         word = "as good as 0" if within else "not significant at 5 % over all asked for"
         word = "significant" if one["significant"] else f"{word}: not written into the URDF"
         if one["significant"] and unit != "percent":
-            word += f": {say_reading(one[key], one[f'sd_{unit}'], unit)}"
+            word += f": {describe_reading(one[key], one[f'sd_{unit}'], unit)}"
         rows.append((name, value, interval, word))
     return rows
 

@@ -133,7 +133,7 @@ def test_whether_a_camera_s_place_is_given(episode, tmp_path):
     scene, painted = episode
     file = edit_camera(scene / "cameras.yaml", "camera", tmp_path / "cameras.yaml", X_WC=None)
     for own, expected in ((None, {"camera"}), (scene / "cameras.yaml", {"camera"}), (file, set())):
-        assert {one.name for one in read(*episode, None, own).given} == expected
+        assert {one.name for one in read(*episode, None, own).given_cameras} == expected
     with pytest.raises(DrakePoseError, match="no camera has an X_WC that could be audited"):
         audit_scene(scene, painted.path, cameras=file)
 

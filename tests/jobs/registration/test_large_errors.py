@@ -15,7 +15,7 @@ from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import Camera
 from drake_pose.errors import CameraError, MaskError
 from drake_pose.jobs.registration.audit import SceneAudit, audit_scene
-from drake_pose.jobs.registration.diagnosis import last_before_change, say_common
+from drake_pose.jobs.registration.diagnosis import common_outlier_warnings, last_before_change
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import read_mask, write_mask
 from tests.jobs.registration.arm_scenes import JOINTS, ArmScene, write_arm_scene
@@ -261,7 +261,7 @@ def test_cameras_that_rest_on_frames_of_two_moments_are_told_so() -> None:
         ]
         return SimpleNamespace(camera=SimpleNamespace(name=name), frames=frames)
 
-    (said, *_) = say_common([camera("left", "11100"), camera("right", "00011")])
+    (said, *_) = common_outlier_warnings([camera("left", "11100"), camera("right", "00011")])
     assert "'left' and 'right' rest on no common frame: 'left' on 0-2, 'right' on 3-4" in said
-    alike = say_common([camera("left", "11100"), camera("right", "00111")])
+    alike = common_outlier_warnings([camera("left", "11100"), camera("right", "00111")])
     assert not any("no common frame" in text for text in alike)

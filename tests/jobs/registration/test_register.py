@@ -14,7 +14,7 @@ import yaml
 from drake_pose.body import load_model
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
-from drake_pose.jobs.registration.diagnosis import say_common
+from drake_pose.jobs.registration.diagnosis import common_outlier_warnings
 from drake_pose.jobs.registration.register import joint_shifts, register_scene
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.registration.register import CameraSearch, FrameMisfit, RegisteredCamera
@@ -151,13 +151,13 @@ def registered_camera(name: str, frames: dict[str, bool]) -> RegisteredCamera:
 def test_cameras_tell_together_whose_fault_a_frame_is() -> None:
     left = registered_camera("left", {"0000": True, "0001": False, "0002": False, "0003": False})
     right = registered_camera("right", {"0000": True, "0001": False, "0002": True})
-    common, alone = say_common([left, right])
-    assert "frames 0001 contradict the others in all cameras" in common
+    common, alone = common_outlier_warnings([left, right])
+    assert "frames 0001 are outliers in all cameras" in common
     assert "joint positions are not those of the pictures" in common
-    assert "frames 0002 contradict the others in camera 'left'" in alone
+    assert "frames 0002 are outliers in camera 'left'" in alone
     assert "masks are not" in alone
     # One camera alone cannot tell.
-    assert say_common([left]) == []
+    assert common_outlier_warnings([left]) == []
 
 
 def body_poses(path: Path, q: np.ndarray, names: tuple[str, ...]) -> dict[str, np.ndarray]:

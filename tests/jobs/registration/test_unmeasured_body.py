@@ -96,7 +96,7 @@ class TestRefused:
     def test_nothing_is_known(self, own_arm: ArmScene, out: Path) -> None:
         own_arm.edit_cameras("right", X_WC=None)
         result = run_command(own_arm.register(out, with_joints=False))
-        assert_refused(result, "neither a camera's place nor", "X_WC of one camera", "--joints")
+        assert_refused(result, "neither a camera's pose nor", "X_WC of one camera", "--joints")
         assert not out.exists()
 
     def test_a_person_before_one_known_camera(self, arm_scene: ArmScene, out: Path) -> None:

@@ -150,7 +150,9 @@ def _match(
 
     Returns:
         For the n assigned points: feature (n,), side (n,), slope (n, 2), offset (n,) and weight
-            (n,), where offset = slope @ (the two unknowns of the feature).
+            (n,), where offset = slope @ (the two unknowns of the feature). A line's unknowns are its
+            shift along the normal [pixel] and the tangent of its rotation, a tip's its displacement
+            [pixel].
     """
     line, side = np.nonzero(rough.sides)
     sign, uv = 1.0 - 2.0 * side, edge.uv
@@ -161,12 +163,12 @@ def _match(
     facing = sign[:, None] * (normal[line] @ edge.normals.T)
     fraction = position / np.maximum(size[line], 1e-9)[:, None]
     beside = uv + (sign[:, None] * (MATCHING.beside - outside))[..., None] * normal[line, None]
-    can = (
+    is_candidate = (
         (np.abs(outside) < gate)
         & (facing > MATCHING.facing)
         & (np.abs(fraction - 0.5) < 0.5 - MATCHING.end)
     )
-    can &= _is_empty(rough.drawn, beside)
+    is_candidate &= _is_empty(rough.drawn, beside)
     ends, widths = rough.ends[rough.tips, 1], rough.widths[rough.tips]
     radial = uv - ends[:, None]
     distance = np.linalg.norm(radial, axis=2)
@@ -177,7 +179,7 @@ def _match(
     round_tip &= np.einsum("tnk,nk->tn", radial, edge.normals) > MATCHING.facing_tip
     round_tip &= np.einsum("tnk,tk->tn", radial, along[rough.tips]) > 0.1
     cost = np.abs(np.vstack([outside, beyond]))
-    cost[~np.vstack([can, round_tip])] = np.inf
+    cost[~np.vstack([is_candidate, round_tip])] = np.inf
     nearest = np.argmin(cost, axis=0)
     points = np.flatnonzero(np.isfinite(cost[nearest, np.arange(len(uv))]))
     own = nearest[points]

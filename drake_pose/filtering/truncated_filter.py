@@ -442,7 +442,7 @@ class TruncatedFilter:
     ) -> list[Branch]:
         """Update a hypothesis from its prediction, and from each mirrored prediction.
 
-        ``numbers`` numbers the mirrored hypotheses of this step.
+        ``numbers`` counts the mirrored hypotheses of this step.
         """
         own = replace(hypothesis, repeated=None)
         iterations = self.settings.iterations

@@ -98,7 +98,7 @@ def build_camera_rig(
     else:
         source = builder.AddNamedSystem("true_positions", TrajectorySource(true_positions))
     add_posed_plant(builder, scene_graph, model, source.get_output_port(), "geometry_pose")
-    # 16-bit depth images in millimetres reach 65 m.
+    # Within the range of 16-bit depth images in millimetres, which is 65 m.
     ranges = {name: (camera.near, 60.0) for name, camera in cameras.items()}
     parameters = RenderEngineVtkParams(default_clear_color=np.array([0.55, 0.58, 0.62]))
     sensors = add_sensors(builder, scene_graph, cameras, ranges, parameters)

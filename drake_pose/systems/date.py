@@ -275,12 +275,12 @@ class FeatureFinder(PortedSystem):
         found = self.add_output("found", None, self._find)
 
         def places(context: Context) -> Array:
-            what = found.Eval(context)
-            return np.full(size, np.nan) if what is None else what.positions.ravel()
+            measured = found.Eval(context)
+            return np.full(size, np.nan) if measured is None else measured.positions.ravel()
 
         def support(context: Context) -> Array:
-            what = found.Eval(context)
-            return np.zeros(len(FEATURES)) if what is None else what.support
+            measured = found.Eval(context)
+            return np.zeros(len(FEATURES)) if measured is None else measured.support
 
         self.add_output("features", size, places)
         self.add_output("support", len(FEATURES), support)
@@ -455,10 +455,10 @@ class PaperPoseEstimator(MemorySystem):
         ]
         if features is not None:
             checked.append(("features", features, (len(FEATURES), 3)))
-        for what, values, shape in checked:
+        for kind, values, shape in checked:
             if np.shape(values) != shape or not np.isfinite(values).all():
                 raise SettingsError(
-                    f"the person's {what} must be {shape} finite numbers, not {values}"
+                    f"the person's {kind} must be {shape} finite numbers, not {values}"
                 )
         self.set_vectors(context.get_mutable_discrete_state(), self._restarted(q, features))
 
@@ -521,8 +521,7 @@ def build_paper_capture(
 ) -> StagedDiagram[PaperPoseEstimator]:
     """Build a diagram that captures a person: images, the paper's stages, the pose, and the avatar.
 
-    Its output ports are those of ``PaperPoseEstimator``, ``person_view_<camera>``, if the setup has
-    what they need ``face_direction``, ``recognised_positions`` and ``similarity``, and if the
+    Its output ports are those of ``PaperPoseEstimator``, ``person_view_<camera>``, if the setup has what they need ``face_direction``, ``recognised_positions`` and ``similarity``, and if the
     source has it ``time``. The source's input ports are exported under their names.
 
     Args:

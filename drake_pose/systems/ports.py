@@ -34,20 +34,20 @@ from drake_pose.errors import SettingsError
 T = TypeVar("T")
 
 
-def require_period(whose: str, period: float) -> None:
+def require_period(owner: str, period: float) -> None:
     """Raise SettingsError unless a period [s] is positive and finite."""
     if not 0.0 < period < math.inf:
-        raise SettingsError(f"the {whose}'s period must be positive, not {period}")
+        raise SettingsError(f"the {owner}'s period must be positive, not {period}")
 
 
-def require_distinct_cameras(cameras: Sequence[Camera], fewest: int, said: str) -> None:
+def require_distinct_cameras(cameras: Sequence[Camera], fewest: int, message: str) -> None:
     """Raise SettingsError if there are fewer than ``fewest`` cameras or two have the same name.
 
-    ``said`` begins the message.
+    ``message`` is the error's, followed by the names.
     """
     names = [camera.name for camera in cameras]
     if len(names) < fewest or len(set(names)) != len(names):
-        raise SettingsError(f"{said}: {names}")
+        raise SettingsError(f"{message}: {names}")
 
 
 def require_time_forward(system: LeafSystem, context: Context, last: float) -> None:
@@ -90,7 +90,7 @@ def evaluate(port: OutputPort, context: Context) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class StagedDiagram(Generic[T]):
-    """A diagram with an estimator, whose computation can be timed by stages.
+    """A diagram with an estimator, owner computation can be timed by stages.
 
     Args:
         stages: output ports by stage, in the order of computation.
@@ -201,7 +201,7 @@ class ImmutableValue:
 
 
 class BeliefSystem(PortedSystem, Generic[T]):
-    """A system whose state is one abstract value, the belief, replaced by a periodic update.
+    """A system owner state is one abstract value, the belief, replaced by a periodic update.
 
     The update is unrestricted, as abstract state requires.
     """
@@ -240,7 +240,7 @@ class BeliefSystem(PortedSystem, Generic[T]):
 
 
 class MemorySystem(PortedSystem):
-    """A system whose state is named vectors, replaced by a periodic update.
+    """A system owner state is named vectors, replaced by a periodic update.
 
     The update is discrete: it sees the results of unrestricted updates at the same time.
     """

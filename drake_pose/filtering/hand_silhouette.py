@@ -150,9 +150,9 @@ def _match(
 
     Returns:
         For the n assigned points: feature (n,), side (n,), slope (n, 2), offset (n,) and weight
-            (n,), where offset = slope @ (the two unknowns of the feature). A line's unknowns are its
-            shift along the normal [pixel] and the tangent of its rotation, a tip's its displacement
-            [pixel].
+            (n,), where offset = slope @ (the two unknowns of the feature). A line's unknowns are
+            its shift along the normal [pixel] and the tangent of its rotation, a tip's are its
+            displacement [pixel].
     """
     line, side = np.nonzero(rough.sides)
     sign, uv = 1.0 - 2.0 * side, edge.uv

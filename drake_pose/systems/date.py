@@ -521,8 +521,9 @@ def build_paper_capture(
 ) -> StagedDiagram[PaperPoseEstimator]:
     """Build a diagram that captures a person: images, the paper's stages, the pose, and the avatar.
 
-    Its output ports are those of ``PaperPoseEstimator``, ``person_view_<camera>``, if the setup has what they need ``face_direction``, ``recognised_positions`` and ``similarity``, and if the
-    source has it ``time``. The source's input ports are exported under their names.
+    Its output ports are those of ``PaperPoseEstimator``, ``person_view_<camera>``, if the setup
+    allows them ``face_direction``, ``recognised_positions`` and ``similarity``, and if the source
+    has it ``time``. The source's input ports are exported under their names.
 
     Args:
         setup: constants of the capture. Without a registered pose, the person's initial pose must

@@ -28,13 +28,13 @@ def random_state(seed):
 
 @pytest.fixture(scope="module")
 def right_hand():
-    """The bundled right hand: its model, and what is read of it."""
+    """The model of the bundled right hand, and its HandModel."""
     model = load_model(bundled_model("hand").with_name("right_hand.urdf"), check=False)
     return model, read_hand(model)
 
 
 def five_fingers(hand, seed):
-    """A state of a hand of five fingers, of the model's sizes."""
+    """Return a random state of a five-finger hand with the model's sizes."""
     generator, layout = np.random.default_rng(seed), hand.layout
     x = np.zeros(len(layout))
     quaternion = generator.normal(size=4)
@@ -46,7 +46,7 @@ def five_fingers(hand, seed):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_jacobian_against_central_differences(seed, right_hand):
+def test_jacobian_equals_central_differences(seed, right_hand):
     own = HandObservation(hand=right_hand[1])
     for observation, x in (
         (OBSERVATION, random_state(seed)),
@@ -64,8 +64,8 @@ def test_jacobian_against_central_differences(seed, right_hand):
             np.testing.assert_allclose(H[defined, e], numeric[defined], rtol=1e-5, atol=3e-4)
 
 
-def test_five_fingers_are_where_drake_has_them(right_hand):
-    """Joints of the bundled hand at the angles of a state, and tips a radius before their end."""
+def test_projected_joints_equal_drakes_kinematics(right_hand):
+    """For the joints of the bundled five-finger hand, and tips one radius before their end."""
     model, hand = right_hand
     plant, context = model.plant, model.plant.CreateDefaultContext()
     observation, fingers = HandObservation(hand=hand), len(hand.fingers)
@@ -88,12 +88,12 @@ def test_five_fingers_are_where_drake_has_them(right_hand):
             for (name, p), point in zip(ends, points, strict=True):
                 frame = plant.GetFrameByName(name)
                 p_P = plant.CalcPointsPositions(context, frame, p, palm)[:, 0]
-                # The palm's y leads to the fingers, its z out of it.
+                # In the palm's link y points to the fingers and z out of the palm.
                 expected = x[:2] + 1000.0 * (M @ p_P[[1, 2, 0]])[:2]
                 np.testing.assert_allclose(point, expected, atol=1e-6)
 
 
-def test_a_palm_fills_a_good_part_of_its_mesh_and_nothing_else(right_hand):
+def test_palm_lies_in_its_mesh_and_has_half_its_volume(right_hand):
     model, hand = right_hand
     mesh = ConvexHull(model.link_meshes["palm"].vertices[:, [1, 2, 0]])
     sizes = [hand.sizes[name] for name in ("palm_height", "palm_thickness", "palm_width")]
@@ -104,8 +104,8 @@ def test_a_palm_fills_a_good_part_of_its_mesh_and_nothing_else(right_hand):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_points_are_where_drake_has_them(seed):
-    """Joints and tips of the plant of urdf/two_finger_hand, which stands at a state's positions."""
+def test_two_finger_points_equal_drakes_kinematics(seed):
+    """For joints and tips of urdf/two_finger_hand at a state's positions."""
     model = load_model(bundled_model("two_finger_hand"), check=False)
     plant, context = model.plant, model.plant.CreateDefaultContext()
     x = random_state(seed)
@@ -119,7 +119,7 @@ def test_points_are_where_drake_has_them(seed):
     np.testing.assert_allclose(h[2:18].reshape(-1, 2), expected, atol=1e-9)
 
 
-def test_lines_pass_through_their_points():
+def test_lines_pass_through_their_end_points():
     x = random_state(1)
     h, _ = OBSERVATION.predict(x)
     points = OBSERVATION.drawing(x)
@@ -131,7 +131,7 @@ def test_lines_pass_through_their_points():
                 assert normal @ point == pytest.approx(rho, abs=1e-9)
 
 
-def test_the_palms_edges_are_the_outermost():
+def test_palm_edges_are_its_outermost_points():
     for seed in range(20):
         x = random_state(seed)
         points, (M, _) = OBSERVATION.drawing(x), scaled_rotation(x[2:6])
@@ -145,21 +145,21 @@ def test_the_palms_edges_are_the_outermost():
         assert (points[12:] @ M[:2, 0]).max() == pytest.approx((pixels @ M[:2, 0]).max())
 
 
-def test_a_segment_towards_the_camera_has_no_axis():
+def test_segments_along_the_optical_axis_have_no_line():
     x = np.zeros(len(HAND_STATE))
     x[2] = 1.0
     x[28:34] = 0.04
     x[34:] = 0.06, 0.08, 0.02
-    # Turned about the image's vertical by 90 degrees: the hand points along the depth.
+    # Rotated by 90 degrees about the image's vertical: the hand points along the optical axis.
     x[2:6] = np.sqrt(0.5), 0, np.sqrt(0.5), 0
     h, _ = OBSERVATION.predict(x)
     assert np.isnan(h[18:30]).all()
     assert np.isfinite(h[:18]).all()
 
 
-def test_the_mirrored_prediction_looks_the_same_and_changes_one_angle():
+def test_mirrored_state_projects_alike_and_changes_one_angle():
     x = np.zeros(len(HAND_STATE))
-    # The plane of flexion is seen from its edge: flexion turns the finger out of the image.
+    # The image plane is perpendicular to the flexion plane: flexion moves fingers in depth.
     x[2:6] = np.sqrt(0.5), np.sqrt(0.5), 0, 0
     x[8:14] = 0.3, 0.2, 0.2, 0.3, 0.2, 0.2
     x[28:34] = 0.06, 0.04, 0.035, 0.06, 0.04, 0.035
@@ -188,8 +188,8 @@ def test_the_mirrored_prediction_looks_the_same_and_changes_one_angle():
         ([joint("bend", "revolute", "palm", "one")], "link 'one' has no vertex -3 to 3 mm"),
     ],
 )
-def test_what_is_no_hand_is_refused(tmp_path, joints, message):
-    """Whose palm floats, as do links that no joint holds."""
+def test_models_without_a_hand_are_refused(tmp_path, joints, message):
+    """The palm floats, as links without a joint do."""
     text = urdf(*(link(name) for name in ("palm", "one")), link("unseen", ""), *joints)
     model = load_model(write(tmp_path, text), check=False)
     with pytest.raises(ModelError, match=message):
@@ -198,6 +198,6 @@ def test_what_is_no_hand_is_refused(tmp_path, joints, message):
         read_hand(model, "paw")
 
 
-def test_a_noise_of_zero_is_refused():
+def test_zero_noise_is_refused():
     with pytest.raises(SettingsError, match="angle_deviation"):
         HandObservation(angle_deviation=0.0)

@@ -1,4 +1,4 @@
-"""A system by itself on the bench: what it is given, its updates, and what it says."""
+"""A helper that gives a system inputs, updates it and reads its outputs."""
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -6,7 +6,7 @@ from pydrake.systems.analysis import Simulator
 
 
 class Bench:
-    """A system or diagram with a context; what is given at its ports stays given."""
+    """A system or diagram with a context; inputs stay fixed until they are given again."""
 
     def __init__(self, system, context=None):
         self.system = system
@@ -14,7 +14,7 @@ class Bench:
         self._simulator = None
 
     def give(self, **inputs):
-        """Fixes inputs by name; anything but an array of numbers is an abstract value."""
+        """Fix inputs by name; values other than arrays and lists are abstract."""
         for name, value in inputs.items():
             if not isinstance(value, np.ndarray | list):
                 value = AbstractValue.Make(value)
@@ -22,7 +22,7 @@ class Bench:
         return self
 
     def update(self, at=None, /, **inputs):
-        """Inputs, then an update by force, at a time."""
+        """Fix inputs, and force an update at a time [s]."""
         self.give(**inputs)
         if at is not None:
             self.context.SetTime(at)
@@ -30,7 +30,7 @@ class Bench:
         return self
 
     def advance(self, until, /, **inputs):
-        """Inputs, then a simulation up to a time."""
+        """Fix inputs, and simulate up to a time [s]."""
         self.give(**inputs)
         if self._simulator is None:
             self._simulator = Simulator(self.system, self.context)
@@ -39,6 +39,6 @@ class Bench:
         return self
 
     def __getitem__(self, name):
-        """What an output says; numbers as a copy."""
+        """Return an output's value, vectors as a copy."""
         value = self.system.GetOutputPort(name).Eval(self.context)
         return np.array(value) if isinstance(value, np.ndarray) else value

@@ -1,4 +1,4 @@
-"""The rig in Drake: its pictures against the span kernel and the cameras' own projection."""
+"""The camera rig, compared with the label renderer."""
 
 import cv2
 import numpy as np
@@ -22,7 +22,7 @@ def standing(person):
     return q
 
 
-def test_masks_are_those_of_the_label_renderer(person, standing, tmp_path):
+def test_masks_equal_the_label_renderers(person, standing, tmp_path):
     save_cameras(tmp_path / "cameras.yaml", circle_of_cameras(3, size=SIZE))
     cameras = load_cameras(tmp_path / "cameras.yaml")
     rig = build_camera_rig(person, cameras)
@@ -38,7 +38,7 @@ def test_masks_are_those_of_the_label_renderer(person, standing, tmp_path):
         assert np.ptp(picture[~near], axis=0).max() <= 1  # The background has one colour.
 
 
-def test_trajectory_moves_the_body(person, standing):
+def test_a_trajectory_moves_the_body(person, standing):
     moved = standing.copy()
     moved[person.position_index("position_y")] += 0.5
     path = PiecewisePolynomial.FirstOrderHold([0.0, 1.0], np.column_stack([standing, moved]))
@@ -50,7 +50,7 @@ def test_trajectory_moves_the_body(person, standing):
     assert abs(last - first) > 5
 
 
-def test_unknown_camera_and_no_camera(person):
+def test_unknown_and_missing_cameras_are_refused(person):
     rig = build_camera_rig(person, circle_of_cameras(1, size=SIZE, face_camera=False))
     with pytest.raises(UnknownNameError, match="camera_9"):
         rig.picture(rig.diagram.CreateDefaultContext(), "camera_9")

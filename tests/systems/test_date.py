@@ -1,4 +1,4 @@
-"""The paper's stages as systems and their ready diagram, before a person that Drake renders."""
+"""The paper's stages as systems, and their diagram, with a person that Drake renders."""
 
 import numpy as np
 import pytest
@@ -50,7 +50,7 @@ def setup(studio):
 
 @pytest.fixture(scope="module")
 def film(studio):
-    """Positions of a person who shows the registered pose, then moves; and the pictures."""
+    """Positions of a person who shows the registered pose and then moves, and the pictures."""
     start = studio.posed(left_upper_arm_z=80, right_upper_arm_z=-80)
     goal = studio.posed(
         left_upper_arm_x=-50, left_upper_arm_z=30, left_forearm_x=-50, right_upper_arm_z=-50,
@@ -66,7 +66,7 @@ def backgrounds(studio):
 
 
 class Run(Bench):
-    """The diagram, frame by frame, in a context of its own."""
+    """The diagram in a context of its own, run frame by frame."""
 
     def __init__(self, capture):
         super().__init__(capture.diagram)
@@ -82,7 +82,7 @@ class Run(Bench):
 
 
 class Core:
-    """The same by the plain functions alone, one after the other."""
+    """The same computation by plain functions."""
 
     def __init__(self, setup):
         self.setup, self.q, self.features = setup, None, None
@@ -117,20 +117,20 @@ class Core:
 
 
 class TestPaperCapture:
-    def test_diagram_is_the_core_bit_for_bit_and_near_the_truth(self, setup, film):
+    def test_diagram_equals_the_plain_functions_and_is_near_the_truth(self, setup, film):
         capture = build_paper_capture(setup, period=PERIOD)
         assert list(capture.stages) == ["region", "skin", "recognition", "features", "face"]
         run, core = Run(capture), Core(setup)
         path, pictures = film
         last = len(pictures)
-        # In the end the registered pose is shown again, which overwrites whatever was believed.
+        # At the end the registered pose is shown again, which replaces the estimate.
         for k, shots in enumerate([*pictures, pictures[0]]):
             if k == last:
                 limbs = run["limb_points"].reshape(4, 3, 3)
                 assert (run["last_support"] > 0).all()
             shots = dict(shots)
             if k in (4, 5):
-                # Two cameras stop, and return.
+                # Two cameras stop and return.
                 shots["camera_2"] = shots[FACE_CAMERA] = None
             np.testing.assert_array_equal(run.step(shots), core.step(shots))
             for stage in capture.stages:
@@ -143,17 +143,19 @@ class TestPaperCapture:
         errors = np.linalg.norm(limbs - true, axis=2).max(axis=0)
         assert (errors < [0.06, 0.10, 0.04]).all()
 
-    def test_nobody_known_yet_and_all_cameras_gone(self, studio, setup, film):
+    def test_an_unknown_person_gives_nan_and_missing_images_keep_the_pose(
+        self, studio, setup, film
+    ):
         run = Run(build_paper_capture(setup, period=PERIOD))
         _, pictures = film
         assert np.isnan(run.step(pictures[-1])).all()
         known = run.step(pictures[0])
         silent = run.step(dict.fromkeys(studio.cameras))
-        # Head, hands and feet stay where they were.
+        # Head, hands and feet do not move.
         np.testing.assert_allclose(silent[:3], known[:3], atol=1e-3)
         assert not run["last_support"].any()
 
-    def test_images_that_are_not_fresh_are_passed_over(self, setup, film):
+    def test_images_that_are_not_fresh_are_ignored(self, setup, film):
         _, pictures = film
         run = Run(build_paper_capture(setup, period=PERIOD))
         estimator = run.system.GetSubsystemByName("pose")
@@ -165,7 +167,7 @@ class TestPaperCapture:
         fresh.FixValue(own, [1.0])
         assert np.abs(run.step(pictures[2]) - known).max() > 0.05
 
-    def test_simulated_rig_and_avatar(self, studio):
+    def test_a_simulated_rig_moves_the_avatar(self, studio):
         registered = studio.registered
         end = np.array(registered.q)
         end[studio.model.position_index("left_upper_arm_z")] = np.radians(20.0)
@@ -186,12 +188,12 @@ class TestPaperCapture:
         view = capture.diagram.GetOutputPort("person_view_camera_2").Eval(simulator.get_context())
         assert view.region.any()
 
-    def test_rig_without_a_camera_is_refused(self, studio, setup):
+    def test_a_rig_without_a_camera_is_refused(self, studio, setup):
         rig = build_camera_rig(studio.model, {"camera_0": studio.ring["camera_0"]})
         with pytest.raises(SettingsError, match=r"color_image_camera_1.*it has: color_image_cam"):
             build_paper_capture(setup, rig.diagram)
 
-    def test_arguments_are_checked(self, setup):
+    def test_invalid_arguments_are_refused(self, setup):
         with pytest.raises(SettingsError, match="period"):
             PaperPoseEstimator(setup, 0.0)
         estimator = PaperPoseEstimator(setup, PERIOD)
@@ -202,31 +204,31 @@ class TestPaperCapture:
 
 
 def evaluated(system, port="person_view", **values):
-    """The value of a system's output at given inputs."""
+    """Return a system's output at given inputs."""
     return Bench(system).give(**values)[port]
 
 
 class TestColourImages:
-    def test_there_and_back(self):
+    def test_pictures_survive_a_round_trip(self):
         picture = np.random.default_rng(0).integers(0, 255, (4, 6, 3)).astype(np.uint8)
         image = picture_to_colour_image(picture)
         assert (image.width(), image.height()) == (6, 4)
         np.testing.assert_array_equal(image.at(5, 3), [*picture[3, 5], 255])
         np.testing.assert_array_equal(colour_image_to_picture(image), picture)
 
-    def test_nothing_to_show(self):
+    def test_no_picture_is_an_image_without_pixels(self):
         assert colour_image_to_picture(picture_to_colour_image(None)).shape == (0, 0, 3)
 
 
 class TestHorizontalImage:
-    def test_person_by_background_or_by_mask(self, studio, backgrounds):
+    def test_the_region_comes_from_the_background_or_the_mask(self, studio, backgrounds):
         camera, q = studio.ring["camera_1"], studio.posed(left_upper_arm_z=60)
         picture, mask = studio.picture(q, camera.name), studio.mask(q, camera.name)
         image = picture_to_colour_image(picture)
         by_background = HorizontalImage(camera, backgrounds[camera.name])
         view = evaluated(by_background, color_image=image)
         assert (view.region & mask).sum() / (view.region | mask).sum() > 0.93
-        # Head, hands and feet: five patches at most, some of them hidden.
+        # Head, hands and feet are at most five blobs; some may be hidden.
         assert 2 <= len(view.blobs.areas) <= 5
         label = mask_to_label_image(mask)
         given = evaluated(HorizontalImage(camera), color_image=image, label_image=label)
@@ -235,7 +237,7 @@ class TestHorizontalImage:
         np.testing.assert_array_equal(region, mask)
         assert given.contour is not None
 
-    def test_camera_that_stopped(self, studio, backgrounds):
+    def test_a_stopped_camera_gives_none(self, studio, backgrounds):
         system = HorizontalImage(studio.ring["camera_1"], backgrounds["camera_1"])
         assert evaluated(system) is None
         assert evaluated(system, color_image=picture_to_colour_image(None)) is None

@@ -17,7 +17,7 @@ from drake_pose.systems.person import PersonTracker, build_silhouette_capture
 from tests.person.persons_in_view import posed, see, stepping
 from tests.systems.bench import Bench
 
-# Who is followed walks; in this frame another one comes into view, and stays.
+# Index of the frame in which another person appears; the tracked one walks.
 OTHER_COMES = 5
 
 
@@ -38,7 +38,7 @@ def renderers(person, cameras):
 
 @pytest.fixture(scope="module")
 def views(cameras):
-    """The inputs that masks by camera make."""
+    """Return a function that makes the tracker's inputs from masks by camera."""
 
     def views(masks):
         return {
@@ -51,7 +51,7 @@ def views(cameras):
     return views
 
 
-def test_moving_person_is_followed_and_shown(person, cameras):
+def test_a_moving_person_is_tracked_and_shown(person, cameras):
     start = posed(person, left_upper_arm_z=40, right_upper_arm_z=-40)
     end = posed(
         person, left_upper_arm_z=53, right_upper_arm_z=-40, left_thigh_x=-13, left_shin_x=13
@@ -75,7 +75,9 @@ def test_moving_person_is_followed_and_shown(person, cameras):
 
 
 @pytest.mark.slow
-def test_person_is_lost_kept_in_mind_and_found_again(person, cameras, tracker, renderers, views):
+def test_a_lost_person_keeps_the_last_positions_and_is_found_again(
+    person, cameras, tracker, renderers, views
+):
     run = Bench(PersonTracker(tracker, list(cameras.values()), 0.1))
 
     def show(x, time, blind=()):
@@ -95,14 +97,14 @@ def test_person_is_lost_kept_in_mind_and_found_again(person, cameras, tracker, r
     assert found[0] == pytest.approx(0.0, abs=0.02)
     assert ratio[0] > 0.8
     assert seen.tolist() == [1, 1, 1, 1]
-    # The same time stamp: nothing new, whatever the pictures show.
+    # Pictures with the same time stamp are not new.
     np.testing.assert_array_equal(show(0.0, 1.0, none)[0], found)
     lost, kept, ratio, seen = show(0.0, 1.1, none)
     assert np.isnan(lost).all()
     np.testing.assert_array_equal(kept, last)
     assert not ratio.any()
     assert not seen.any()
-    # Back, a step away, and one camera is blind: the search goes on for some frames.
+    # The person is back a step away, and one camera is covered: the search takes some frames.
     for time in (1.4, 1.5, 1.6, 1.7):
         found, _, _, seen = show(0.15, time, none[:1])
     assert found[0] == pytest.approx(0.15, abs=0.03)
@@ -121,7 +123,7 @@ def alone(person, cameras, poses):
 
 @pytest.fixture(scope="module")
 def watch(cameras, tracker, views):
-    """What comes out for masks (T,), by port: (T, n)."""
+    """Return a function that maps masks (T,) to outputs (T, n) by port."""
     names = ("estimated_positions", "others", "deviations", "visible")
 
     def watch(frames):
@@ -136,7 +138,7 @@ def watch(cameras, tracker, views):
 
 
 class Walking(PersonPoseTracker):
-    """Finds the person a step further in every frame, and notes what step was expected."""
+    """Finds the person one step further in each frame, and records the expected step."""
 
     def follow(self, last, seen):
         self.expected.append(last.step[0])
@@ -144,8 +146,8 @@ class Walking(PersonPoseTracker):
         return TrackState(last.values + step, step, 0.9, 0.9)
 
 
-def test_a_motion_goes_on_for_as_long_as_no_picture_came(person, cameras, views, alone):
-    """But not for more than three frames; pictures with the same stamp, or none, are no news."""
+def test_motion_continues_through_skipped_frames(person, cameras, views, alone):
+    """For at most three frames; pictures with the same time stamp, or NaN, are not new."""
     tracker = Walking(ContourFit(person.pose_tree()))
     tracker.expected, seen = [], views(alone[0])
     run = Bench(PersonTracker(tracker, cameras, 0.1))
@@ -162,7 +164,7 @@ def test_a_motion_goes_on_for_as_long_as_no_picture_came(person, cameras, views,
 
 
 @pytest.mark.slow
-def test_the_one_is_followed_as_if_alone(person, cameras, watch, poses, alone):
+def test_another_person_hardly_changes_the_estimate(person, cameras, watch, poses, alone):
     other = [stepping(person, 0.2 * k, 0.7, 1.4 - 0.02 * k) for k in range(12)]
     frames = see(person, cameras, np.array(other))
     both = [
@@ -181,19 +183,19 @@ def test_the_one_is_followed_as_if_alone(person, cameras, watch, poses, alone):
     assert places.max() < 0.02
 
 
-def test_deviations_tell_how_sure_each_position_is(watch, poses, alone):
+def test_deviations_match_the_errors(watch, poses, alone):
     nobody = {name: np.zeros_like(mask) for name, mask in alone[0].items()}
     found = watch([nobody, *alone[:5], nobody])
     assert np.isnan(found["deviations"][[0, -1]]).all()
     off = np.abs(found["estimated_positions"][1:-1] - poses[:5])
     known = found["deviations"][1:-1]
     assert (known > 0.0).all()
-    # Of normal errors 95 % are less than 1.96 deviations.
+    # 95 % of normal errors are below 1.96 standard deviations.
     assert np.mean(off < 1.96 * known) > 0.8
     assert np.median(off / known) > 0.02
 
 
-def test_arguments_are_checked(cameras, tracker):
+def test_invalid_arguments_are_refused(cameras, tracker):
     several = list(cameras.values())
     with pytest.raises(SettingsError, match="two or more"):
         PersonTracker(tracker, several[:1], 0.1)
@@ -203,7 +205,7 @@ def test_arguments_are_checked(cameras, tracker):
         PersonTracker(tracker, several, 0.1, color_cameras=["elsewhere"])
 
 
-def test_a_person_who_is_set_is_followed_by_colour_images(person, cameras, tracker, renderers):
+def test_a_person_who_is_set_is_tracked_by_colour_images(person, cameras, tracker, renderers):
     system = PersonTracker(
         tracker, list(cameras.values()), 0.1, with_deviations=True, color_cameras=list(cameras)
     )
@@ -232,7 +234,7 @@ def test_a_person_who_is_set_is_followed_by_colour_images(person, cameras, track
     for lost in (False, True):
         if lost:
             assert np.isnan(show(q, light=0.0)).all()
-        # The last poses are still there to be shown.
+        # The last positions are kept.
         for pose, one in zip(run["body_poses"], body_poses(person.plant, found), strict=True):
             assert pose.IsNearlyEqualTo(one, 1e-9)
     assert show(q)[x] == pytest.approx(0.06, abs=0.01)

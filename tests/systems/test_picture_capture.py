@@ -21,7 +21,7 @@ CAMERAS = circle_of_cameras(3, size=SIZE, face_camera=False)
 
 
 class Recording(FrameSource):
-    """A source that holds its pictures: each tells by its value which one it is."""
+    """A source of recorded pictures, whose values are their indices."""
 
     def __init__(self, camera, times, masks=False, kind="video"):
         background = None if masks else "empty"
@@ -51,7 +51,7 @@ class Recording(FrameSource):
 
 
 def play(capture, names, end=10.0):
-    """By period in which there is something new: its time, and what each camera shows."""
+    """Return the time and each camera's picture for each update with new frames."""
     simulator = Simulator(capture)
     found = []
 
@@ -65,7 +65,7 @@ def play(capture, names, end=10.0):
     return simulator.AdvanceTo(end), found
 
 
-def test_recorded_moments_are_all_shown_and_the_end_is_told():
+def test_all_recorded_frames_are_shown_and_the_end_terminates():
     times = [7.0 + PERIOD * k for k in range(5)]
     sources = {
         "camera_0": Recording("camera_0", times),
@@ -84,7 +84,7 @@ def test_recorded_moments_are_all_shown_and_the_end_is_told():
     assert sources["camera_0"].closed
 
 
-def test_images_are_those_of_the_sources():
+def test_images_equal_the_sources():
     sources = {
         "camera_0": Recording("camera_0", [0.0]),
         "camera_1": Recording("camera_1", [0.0], masks=True),
@@ -96,7 +96,7 @@ def test_images_are_those_of_the_sources():
     assert mask[0].all()
 
 
-def test_camera_that_stops_and_returns_costs_only_its_own_pictures():
+def test_a_camera_that_stops_and_returns_loses_only_its_own_pictures():
     times = [PERIOD * k for k in range(20)]
     sources = {
         "camera_0": Recording("camera_0", times),
@@ -113,9 +113,9 @@ def test_camera_that_stops_and_returns_costs_only_its_own_pictures():
     assert [change.stopped for change in capture.counts()["camera_1"].changes] == [True, False]
 
 
-def test_live_shows_the_newest_moment_only():
+def test_live_capture_shows_only_the_newest_frames():
     sources = {name: Recording(name, [PERIOD * k for k in range(9)]) for name in CAMERAS}
-    # Twice before it begins, then at every look.
+    # Read twice before time 0, then at each update.
     clock = iter([100.0, 100.0, 100.0, 100.0, 100.35, 100.36, 101.0, 101.1]).__next__
     capture = PictureCapture(sources, CAMERAS, live=True, clock=clock)
     _, found = play(capture, [f"color_image_{name}" for name in CAMERAS], 0.45)
@@ -124,7 +124,7 @@ def test_live_shows_the_newest_moment_only():
 
 
 class Device(Recording):
-    """A live camera: silent until it is asked for the third time."""
+    """A live camera without pictures in its first reads."""
 
     def __init__(self, camera, clock, silent):
         super().__init__(camera, [], kind="device")
@@ -144,7 +144,7 @@ class Device(Recording):
 
 
 @pytest.mark.parametrize("silent", [3, 1000])
-def test_live_cameras_may_take_their_time_to_open(silent):
+def test_live_cameras_may_open_slowly_or_never(silent):
     clock = {"now": 50.0}
     sources = {
         "camera_0": Device("camera_0", clock, 0),
@@ -159,7 +159,7 @@ def test_live_cameras_may_take_their_time_to_open(silent):
         if capture.frames is not None:
             times.append(capture.frames.time)
     reports = "\n".join(capture.take_reports())
-    # Without the second camera, the first moment waits for it once.
+    # The first frames wait once for the second camera.
     assert times[0] < (2 if silent == 3 else 6) * PERIOD
     if silent == 3:
         assert not reports
@@ -171,7 +171,7 @@ def test_live_cameras_may_take_their_time_to_open(silent):
         assert 100 < len(times) < 130, "it was waited for, but not for ever"
 
 
-def test_what_cannot_be_is_refused():
+def test_invalid_arguments_are_refused():
     with pytest.raises(UnknownNameError, match="stranger"):
         PictureCapture({"stranger": Recording("stranger", [0.0])}, CAMERAS)
     device = {"camera_0": Recording("camera_0", [0.0], kind="device")}
@@ -194,7 +194,7 @@ def rig(person):
 
 
 @pytest.mark.parametrize("kind", ["label", "color"])
-def test_a_sensor_sees_what_drakes_sensors_show(rig, kind):
+def test_a_silhouette_sensor_sees_what_drakes_sensors_show(rig, kind):
     rig, context, camera, background = rig
     sensor = Bench(SilhouetteSensor(camera, background if kind == "color" else None))
     assert sensor["silhouette"] is None
@@ -211,7 +211,7 @@ def test_a_sensor_sees_what_drakes_sensors_show(rig, kind):
     assert len(found.edge.uv) > 20
 
 
-def test_an_empty_mask_and_no_background(rig):
+def test_an_empty_mask_and_a_missing_background(rig):
     mask = np.zeros((120, 160), dtype=bool)
     sensor = Bench(SilhouetteSensor(rig[2])).give(label_image=mask_to_label_image(mask))
     assert not sensor["silhouette"].region.any()

@@ -1,4 +1,4 @@
-"""Forced events do what periodic ones do."""
+"""Forced updates equal periodic ones."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ class Abstract(BeliefSystem[int]):
 
 
 @pytest.mark.parametrize("make", [Counter, Abstract])
-def test_forced_updates_are_the_periodic_one(make):
+def test_forced_updates_equal_periodic_ones(make):
     system = make()
     simulator = Simulator(system)
     context = simulator.get_mutable_context()

@@ -1,4 +1,4 @@
-"""SilhouetteCamera against Drake's RgbdSensor in the same diagram."""
+"""SilhouetteCamera, compared with Drake's RgbdSensor in the same diagram."""
 
 from pathlib import Path
 
@@ -35,7 +35,7 @@ def camera_at(eye: tuple[float, float, float], target: tuple[float, float, float
 
 
 @pytest.mark.parametrize("name", ["arm", "man"])
-def test_labels_are_those_of_an_rgbd_sensor(name: str, tmp_path: Path) -> None:
+def test_labels_equal_an_rgbd_sensors(name: str, tmp_path: Path) -> None:
     if name == "arm":
         model, camera = arm_model(tmp_path), camera_at((2.0, 0.3, 0.6), (0.0, 0.0, 0.6))
     else:
@@ -45,11 +45,11 @@ def test_labels_are_those_of_an_rgbd_sensor(name: str, tmp_path: Path) -> None:
     assert len(model.link_meshes) == 15
     assert figures.worst <= 0.002
     assert figures.mean <= 0.0006
-    # Ten times and more at 640 x 480 with nothing else to do; here only that no renderer is asked.
+    # The speed is measured in tests/benchmarks; this only checks that no renderer is used.
     assert figures.ours < figures.drakes
 
 
-def test_parallel_rays() -> None:
+def test_labels_of_a_parallel_camera_equal_the_label_renderers() -> None:
     model = load_model(bundled_model("man"), check=False)
     camera = ParallelCamera("side", 240, 240, 110.0, 119.5, 119.5, look_at([0, 3, 0], [0, 0, 0]))
     system = SilhouetteCamera(model.plant, model.scene_graph, camera)
@@ -71,7 +71,7 @@ def test_parallel_rays() -> None:
 
 
 def two_balls() -> tuple[MultibodyPlant, SceneGraph, DiagramBuilder]:
-    """A body `carrier` at will, with a ball of its own label behind it, and a ball on the world."""
+    """A free body `carrier` with a ball behind it, and a ball welded to the world."""
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
     inertia = SpatialInertia(1.0, np.zeros(3), UnitInertia.SolidSphere(0.1))
@@ -92,7 +92,7 @@ def two_balls() -> tuple[MultibodyPlant, SceneGraph, DiagramBuilder]:
     return plant, scene_graph, builder
 
 
-def test_a_camera_that_a_body_carries() -> None:
+def test_a_camera_moves_with_its_parent_body() -> None:
     plant, scene_graph, builder = two_balls()
     scene_graph.AddRenderer("vtk", MakeRenderEngineVtk(RenderEngineVtkParams()))
     carrier = plant.GetBodyByName("carrier")
@@ -119,7 +119,7 @@ def test_a_camera_that_a_body_carries() -> None:
     assert system.GetOutputPort("image_time").Eval(ours) == [0.25]
 
 
-def test_what_cannot_be_drawn_is_refused() -> None:
+def test_geometry_that_cannot_be_drawn_is_refused() -> None:
     camera = camera_at((2.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     plant, scene_graph, _ = two_balls()
     with pytest.raises(ModelError, match="registered"):
@@ -137,7 +137,7 @@ def test_what_cannot_be_drawn_is_refused() -> None:
         SilhouetteCamera(plant, scene_graph, camera)
 
 
-def test_poses_that_are_not_known_are_refused() -> None:
+def test_poses_that_are_not_finite_are_refused() -> None:
     plant, scene_graph, _ = two_balls()
     system = SilhouetteCamera(plant, scene_graph, camera_at((2.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
     context = system.CreateDefaultContext()

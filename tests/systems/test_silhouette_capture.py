@@ -1,4 +1,4 @@
-"""The ready diagram of all silhouettes at once against the plain functions, frame by frame."""
+"""The silhouette capture's diagram, compared with plain functions frame by frame."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from drake_pose.systems.images import picture_to_colour_image
 from drake_pose.systems.person import build_silhouette_capture
 from tests.systems.bench import Bench
 
-# A power of two, for times between frames that are all exactly the same.
+# A power of two, so that all times between frames are exactly equal.
 PERIOD = 1.0 / 32.0
 
 
@@ -37,10 +37,10 @@ def path(studio):
     return [studio.posed(left_upper_arm_z=40.0 + 4.0 * k, right_thigh_x=-5.0 * k) for k in range(5)]
 
 
-def test_diagram_is_the_plain_functions_in_turn(studio, cameras, backgrounds, tracker, path):
+def test_diagram_equals_the_plain_functions(studio, cameras, backgrounds, tracker, path):
     capture = build_silhouette_capture(tracker, cameras, backgrounds, PERIOD)
     assert list(capture.stages) == ["region", "edge"]
-    # What costs time is an output only where it is asked for.
+    # Deviations take time and are an output only if asked for.
     assert not capture.diagram.HasOutputPort("deviations")
     run = Bench(capture.diagram)
     simulator = Simulator(capture.diagram, run.context)
@@ -70,7 +70,7 @@ def test_diagram_is_the_plain_functions_in_turn(studio, cameras, backgrounds, tr
     assert np.degrees(positions[elbow] - q[elbow]) == pytest.approx(0.0, abs=3.0)
 
 
-def test_person_said_to_be_lost_has_no_estimated_positions(cameras, backgrounds, tracker, path):
+def test_a_person_set_as_lost_has_no_estimated_positions(cameras, backgrounds, tracker, path):
     capture = build_silhouette_capture(tracker, cameras, backgrounds, PERIOD)
     context = capture.diagram.CreateDefaultContext()
     own = capture.estimator.GetMyMutableContextFromRoot(context)
@@ -84,7 +84,7 @@ def test_person_said_to_be_lost_has_no_estimated_positions(cameras, backgrounds,
     assert capture.estimator.known_person(own).inlier_ratio == 0.1
 
 
-def test_every_camera_needs_a_background(cameras, backgrounds, tracker):
+def test_each_camera_needs_a_background(cameras, backgrounds, tracker):
     last = list(cameras)[-1]
     known = {name: one for name, one in backgrounds.items() if name != last}
     with pytest.raises(SettingsError, match=last):

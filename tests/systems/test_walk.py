@@ -25,7 +25,7 @@ from tests.person.persons_in_view import posed
 from tests.systems.bench import Bench
 
 PERIOD = 1 / 30
-# How far the thigh is lifted on the way through three steps [rad], left positive.
+# Lift of the thigh during three steps [rad], left positive.
 SPOT = [0.8 * math.sin(math.pi * k / 8) for k in range(1, 24)]
 
 
@@ -39,14 +39,14 @@ def standing(person, x=0.0, head_deg=0.0, **degrees):
 
 
 def walked(person, page, stances, seconds_each=1.0, **how):
-    """A walk that shows each stance for a while."""
+    """Return a walk that shows each stance for a time."""
     times = seconds_each * np.arange(len(stances) + 1)
     path = PiecewisePolynomial.ZeroOrderHold(times, np.array([*stances, stances[-1]]).T)
     return Bench(build_walk(person, page, path, np.array([standing(person)]), PERIOD, **how))
 
 
 def run(person, page, stances):
-    """The pose and the command after each stance of a second."""
+    """Return the walker's pose and the command after each stance of 1 s."""
     walk, found = walked(person, page, stances), []
     for k in range(1, len(stances) + 1):
         walk.advance(k - 0.5 * PERIOD)
@@ -54,8 +54,8 @@ def run(person, page, stances):
     return found
 
 
-def test_the_paper_asks_for_steps_on_the_spot(person):
-    """Standing ahead is no command by itself, nor are steps at the place of rest."""
+def test_on_spot_requires_steps_for_a_command(person):
+    """Neither standing ahead nor steps at the rest position alone are a command."""
     walker = Bench(Walker(person, standing(person), PERIOD, on_spot=True))
     simulator = Simulator(walker.system, walker.context)
     frames = [(0.0, 0.0), *[(0.3, 0.0)] * 20, *[(0.3, s) for s in SPOT], *[(0.0, s) for s in SPOT]]
@@ -73,7 +73,7 @@ def test_the_paper_asks_for_steps_on_the_spot(person):
 
 
 def drawn_pose(page, path):
-    """The transform (4, 4) that the browser was sent: MessagePack that ends in sixteen numbers."""
+    """Return the transform (4, 4) sent to the browser: MessagePack that ends in 16 numbers."""
     packed = page._GetPackedTransform(path)[-16 * 9 :]
     return np.array([one[0] for one in struct.iter_unpack(">xd", packed)]).reshape(4, 4).T
 
@@ -93,20 +93,20 @@ def test_gestures_walk_and_turn(person, page):
     np.testing.assert_allclose(ways[3], back, atol=0.06)
     assert page.HasPath("/drake/walker/avatar")
     assert page.HasPath("/drake/place/garden")
-    # Who rests at x = 0.1 m stands where the walker is.
+    # A person at rest at x = 0.1 m is shown at the walker's position.
     X_PR, (x, y, heading) = drawn_pose(page, "/drake/walker"), found[-1][0]
     np.testing.assert_allclose(X_PR @ [0.1, 0.0, 0.0, 1.0], [x, y, 0.0, 1.0], atol=0.06)
     np.testing.assert_allclose(X_PR[:2, 0], [math.cos(heading), math.sin(heading)], atol=0.06)
 
 
-def test_who_was_taken_for_facing_the_wrong_way_turns_the_rest_around(person, page):
-    """The tracker mends itself: no command to turn, and ahead is where the person faces."""
+def test_a_corrected_face_direction_turns_the_rest_stance(person, page):
+    """There is no command to turn, and ahead is where the person faces now."""
     stances = [standing(person, 0.0, 179.0), standing(person), standing(person, 0.4)]
     found = run(person, page, stances)
     assert [tuple(command) for _, command in found] == [(0, 0), (0, 0), (0, 1)]
 
 
-def test_rest_is_where_the_person_stands_still(person, page):
+def test_the_rest_stance_is_where_the_person_stands_still(person, page):
     ways = [standing(person, x) for x in np.linspace(-0.5, 0.0, 30)]
     stances = [*ways, *[standing(person)] * 40, *[standing(person, 0.4)] * 30]
     walk = walked(person, page, stances, PERIOD, settle=1.0)
@@ -119,13 +119,13 @@ def test_rest_is_where_the_person_stands_still(person, page):
 
 
 def press(page, button):
-    """What the browser sends for a button: a map of two texts as MessagePack."""
+    """Send the browser's message for a button: a map of two strings as MessagePack."""
     texts = ["type", "button", "name", button]
     packed = b"".join(bytes([0xA0 + len(text)]) + text.encode() for text in texts)
     page._InjectWebsocketMessage(message=b"\x82" + packed)
 
 
-def test_keys_walk_where_nobody_is_captured(person):
+def test_keys_walk_without_a_captured_person(person):
     page = Meshcat(MeshcatParams(host="localhost"))
     stride = np.array([standing(person, head_deg=d) for d in (5.0, 10.0, 5.0, 0.0)])
     walk = Bench(build_walk(person, page, None, stride, PERIOD))
@@ -138,7 +138,7 @@ def test_keys_walk_where_nobody_is_captured(person):
     assert 0.5 < np.hypot(x - WALK.start[0], y - WALK.start[1]) / WALK.speed < 0.7
     assert 0.5 < heading / WALK.turn_rate < 0.7
     assert y > 0.02
-    # Meanwhile a stride is shown, and brought to its end, which stands.
+    # Meanwhile a stride is shown to its end, where the person stands.
     keys = Bench(WalkKeys(page, stride, PERIOD))
     np.testing.assert_array_equal(keys["positions"], stride[-1])
     press(page, "behind")
@@ -149,7 +149,7 @@ def test_keys_walk_where_nobody_is_captured(person):
         np.testing.assert_array_equal(keys["positions"], stride[k % 4 if k < 20 else -1])
 
 
-def test_who_stands_at_rest_is_where_the_walker_is():
+def test_a_person_at_rest_is_shown_at_the_walkers_pose():
     pose, rest = np.array([3.0, -2.0, 1.1]), np.array([0.4, 9.0, 9.0, 0.5, 0.7])
     X_PR = walker_transform(pose, rest)
     np.testing.assert_allclose(X_PR.multiply([0.5, 0.7, 0.0]), [3.0, -2.0, 0.0], atol=1e-12)
@@ -159,7 +159,7 @@ def test_who_stands_at_rest_is_where_the_walker_is():
 
 @pytest.fixture(scope="module")
 def garden():
-    """By name, of what is drawn in the garden: its shape, and its middle's position."""
+    """Shape and position of each drawn object in the garden, by name."""
     inspector = add_garden(DiagramBuilder()).model_inspector()
     return {
         inspector.GetName(one).rpartition("::")[2]: (
@@ -170,7 +170,7 @@ def garden():
     }
 
 
-def test_what_stops_the_walker_is_where_it_is_drawn_and_the_start_is_free(garden):
+def test_obstacles_equal_the_drawn_objects_and_the_start_is_free(garden):
     obstacles = garden_obstacles()
     assert len(obstacles) == 20
     assert np.abs(obstacles[:, :2]).max() < WALK.half_size
@@ -181,7 +181,7 @@ def test_what_stops_the_walker_is_where_it_is_drawn_and_the_start_is_free(garden
         assert [*place[:2], radius] in obstacles.tolist()
 
 
-def test_nothing_hangs_in_the_air_and_one_can_walk_through_the_gates(garden):
+def test_objects_are_supported_and_gates_are_wide_enough(garden):
     heights = {Box: "height", Cylinder: "length", Sphere: "radius", Ellipsoid: "c"}
     spans = {}
     for name, (shape, p) in garden.items():
@@ -205,7 +205,7 @@ def test_nothing_hangs_in_the_air_and_one_can_walk_through_the_gates(garden):
         assert 2 * WALK.body_radius < gap < top.depth() - 2 * left.radius()
 
 
-def test_the_view_is_from_behind_and_above_and_within_the_walls():
+def test_the_view_is_from_behind_and_above_inside_the_walls():
     rng = np.random.default_rng(1)
     for x, y, heading in rng.uniform(-1.0, 1.0, (200, 3)) * (
         WALK.half_size,
@@ -224,7 +224,7 @@ def test_the_view_is_from_behind_and_above_and_within_the_walls():
             assert 2.0 < np.linalg.norm(back) < 4.0
 
 
-def test_wrong_period_and_body_are_refused(person):
+def test_invalid_periods_and_bodies_are_refused(person):
     q = standing(person)
     with pytest.raises(SettingsError, match="period"):
         Walker(person, q, 0.0)

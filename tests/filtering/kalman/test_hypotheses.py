@@ -26,7 +26,7 @@ def hand():
     return f, observation, sequence
 
 
-def test_a_view_lasts_while_only_noise_changes(hand):
+def test_static_view_continues_while_only_noise_changes(hand):
     _, observation, sequence = hand
     y = sequence.measurements[3]
     noise = np.sqrt(observation.variances)
@@ -39,19 +39,19 @@ def test_a_view_lasts_while_only_noise_changes(hand):
         assert view.count == count
     assert next_view(view, make_measurement(observation, y + 4 * noise), CHANCE).count == 1
     assert next_view(view, make_measurement(observation, y), 0.0).count == 1
-    # The threshold is a probability, whatever is hidden; what was hidden makes a new view.
+    # The threshold is a p-value for any number of measurements; newly visible ones begin a view.
     few = np.where(np.arange(len(y)) < 4, y, np.nan)
     first = next_view(None, make_measurement(observation, few), CHANCE)
     for other, is_new in ((few + 3.5 * noise, False), (few + 9 * noise, True), (y, True)):
         found = next_view(first, make_measurement(observation, other), CHANCE)
         assert found.count == (1 if is_new else 2)
-    # An angle that jumps by a full turn has not changed.
+    # A full turn of an angle is no change.
     turned = y + 2 * np.pi * observation.wraps
     assert next_view(view, make_measurement(observation, turned), CHANCE).count == view.count + 1
 
 
 class Parabola:
-    """h = x^2 / 2 + x: its tangent at 0 leaves out x^2 / 2."""
+    """h = x^2 / 2 + x, whose linearisation error at 0 is x^2 / 2."""
 
     names = ("h",)
     variances = np.array([1e-4])
@@ -64,7 +64,7 @@ class Parabola:
         return []
 
 
-def test_the_curvature_is_the_mean_square_of_what_the_tangent_leaves_out():
+def test_curvature_is_the_mean_square_linearisation_error():
     deviation = 0.3
     belief = Belief(np.zeros(1), np.array([[deviation**2]]))
     draws = np.random.default_rng(0).normal(size=200000) * deviation
@@ -72,8 +72,8 @@ def test_the_curvature_is_the_mean_square_of_what_the_tangent_leaves_out():
     assert measure_curvature(Parabola(), belief) == pytest.approx([expected], rel=0.03)
 
 
-def test_a_thousand_frames_tell_the_sum_of_state_and_offset_and_no_more():
-    """Against the closed form: prior, offset and mean noise as one normal distribution."""
+def test_repeated_frames_determine_only_state_plus_offset():
+    """Compared with the closed form: prior, offset and mean noise as one normal distribution."""
     prior = Belief(np.zeros(1), np.array([[0.09]]))
     repeated = begin_repeated_view(Parabola(), prior, prior, np.zeros(1))
     tangent = anchored_observation(Parabola(), repeated.tangent)
@@ -91,7 +91,7 @@ def test_a_thousand_frames_tell_the_sum_of_state_and_offset_and_no_more():
     assert total == pytest.approx(Parabola.variances[0] / frames, rel=1e-2)
 
 
-def test_the_anchored_jacobian_against_differences(hand):
+def test_anchored_jacobian_equals_central_differences(hand):
     _, observation, sequence = hand
     x = sequence.states[5]
     tangent = anchored_observation(observation, x)
@@ -104,7 +104,7 @@ def test_the_anchored_jacobian_against_differences(hand):
     np.testing.assert_allclose(tangent.predict(np.r_[x, np.zeros(m)])[0], h0)
 
 
-def test_offsets_stay_while_the_state_moves(hand):
+def test_offsets_do_not_change_in_a_step_of_the_motion(hand):
     f, observation, sequence = hand
     guess = f.start(sequence.guess).best
     repeated = begin_repeated_view(observation, guess, guess, guess.mean)
@@ -128,12 +128,12 @@ def total(hypotheses):
 
 
 def gains(hypotheses):
-    """How much heavier each is without the limits: what no weighing among others changes."""
+    """Return log_evidence - log_weight of each hypothesis, which normalisation preserves."""
     return [one.log_evidence - one.log_weight for one in hypotheses]
 
 
 @pytest.mark.parametrize("common", [0.0, -800.0, 800.0])
-def test_weights_add_up_to_one_and_keep_their_ratios(common):
+def test_normalised_weights_sum_to_one_and_keep_their_ratios(common):
     found = normalise([at(0.0, common - 1.0), at(1.0, common + 2.0), at(2.0, common)])
     assert [one.belief.mean[0] for one in found] == [1.0, 2.0, 0.0]
     expected = np.exp([2.0, 0.0, -1.0])
@@ -141,8 +141,8 @@ def test_weights_add_up_to_one_and_keep_their_ratios(common):
     np.testing.assert_allclose(gains(found), -2.0)
 
 
-def test_twins_are_one_with_the_weight_of_both():
-    """Nearer than so many deviations of the heavier in every element."""
+def test_close_hypotheses_merge_and_add_their_weights():
+    """Closer than the distance in all elements, in standard deviations of the heavier one."""
     some = normalise([at(0.0, 0.0, 2.0), at(0.55, -1.0), at(0.65, -2.0), at(0.7, -3.0)])
     kept, rejected = merge_duplicates(some, 0.3, 7)
     assert [one.belief.mean[0] for one in kept] == [0.0, 0.65]
@@ -150,13 +150,13 @@ def test_twins_are_one_with_the_weight_of_both():
     assert total(kept) == pytest.approx(1.0)
     assert kept[0].weight == pytest.approx(some[0].weight + some[1].weight)
     np.testing.assert_allclose(gains(kept), -2.0)
-    # However small a deviation is: .2 of it apart, and .4.
+    # Distances of 0.2 and 0.4 standard deviations, for any standard deviation.
     small = normalise([at(0.0, 0.0, 1e-3), at(0.2e-3, -1.0, 1e-3), at(0.4e-3, -2.0, 1e-3)])
     kept, _ = merge_duplicates(small, 0.3, 7)
     assert [one.belief.mean[0] for one in kept] == [0.0, 0.4e-3]
 
 
-def test_what_is_given_up_is_too_light_or_one_too_many():
+def test_pruned_hypotheses_are_too_light_or_beyond_the_cap():
     some = [at(float(k), -1.5 * k) for k in range(5)]
     weights = [one.weight for one in normalise(some)]
     for cap, smallest, count, reasons in (
@@ -164,7 +164,7 @@ def test_what_is_given_up_is_too_light_or_one_too_many():
         (2, 0.0, 2, ["cap"] * 3),
         (5, 0.5 * (weights[2] + weights[3]), 3, ["weight"] * 2),
         (2, 0.5 * (weights[2] + weights[3]), 2, ["cap", "weight", "weight"]),
-        # The heaviest stays in any case.
+        # The heaviest is always kept.
         (1, 0.99, 1, ["weight"] * 4),
     ):
         kept, rejected = prune(some, cap, smallest, 3)

@@ -1,4 +1,4 @@
-"""A filter for a system of one's own: its laws, against independent filters and Monte Carlo."""
+"""Laws of a filter for a user's system, compared with other filters and Monte Carlo."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ def follow(f, measured, start=START):
 
 
 def draw(generator, observation, frames=20, start=START):
-    """True states from the start and the motion, and what is measured."""
+    """Return true states drawn from the start and the motion, and their measurements."""
     x = start.mean + start.root @ generator.normal(size=3)
     states, root = [], np.linalg.cholesky(STEP.noise + 1e-15 * np.eye(3))
     for t in range(frames):
@@ -56,12 +56,12 @@ def draw(generator, observation, frames=20, start=START):
     return np.array(states), np.array([observation.function(x) for x in states]) + noise
 
 
-def test_without_curves_and_limits_it_is_the_kalman_filter():
-    """Against the solution of all frames at once, by least squares."""
+def test_linear_models_without_limits_give_the_kalman_filter():
+    """Compared with the least-squares solution of all frames at once."""
     _, measured = draw(np.random.default_rng(0), LINEAR)
     measured[5, 0] = np.nan
     found = follow(make(LINEAR), measured)[-1]
-    # Unknown: the first state and each step's noise, all of unit covariance.
+    # Unknowns: the first state and the noise of each step, whitened.
     n, frames = 3, len(measured)
     roots = [START.root, *[np.linalg.cholesky(STEP.noise + 1e-18 * np.eye(3))] * (frames - 1)]
     now, mean, rows, values = np.zeros((n, n * frames)), START.mean, [], []
@@ -79,7 +79,7 @@ def test_without_curves_and_limits_it_is_the_kalman_filter():
     np.testing.assert_allclose(found.covariance, now @ covariance @ now.T, atol=1e-8)
 
 
-def test_stone_soups_motions_are_the_same():
+def test_motion_models_equal_stone_soups():
     linear = pytest.importorskip("stonesoup.models.transition.linear")
     from datetime import timedelta
 
@@ -94,8 +94,8 @@ def test_stone_soups_motions_are_the_same():
 
 
 @pytest.mark.parametrize("linear", [True, False], ids=["linear", "extended"])
-def test_stone_soups_filters_find_the_same(linear):
-    """Its Kalman filter where all is linear, its extended one for a filter of tangents."""
+def test_filters_equal_stone_soups(linear):
+    """Its Kalman filter for linear models, its extended one for linearisation "tangent"."""
     pytest.importorskip("stonesoup", reason="Stone Soup is not installed")
     from datetime import datetime, timedelta
 
@@ -144,8 +144,8 @@ def test_stone_soups_filters_find_the_same(linear):
         np.testing.assert_allclose(belief.covariance, state.covar, atol=1e-8)
 
 
-def test_it_is_as_sure_as_it_is_right():
-    """NEES by Monte Carlo: truths from the belief it begins with, curved beside its width."""
+def test_nees_is_one_for_linearisation_over_the_belief():
+    """By Monte Carlo: true states drawn from the initial belief, with a curved measurement."""
     wide = Belief(START.mean, np.diag([0.6, 0.3, 0.3]) ** 2)
     nees = {"spread": [], "tangent": []}
     for seed in range(120):
@@ -161,7 +161,7 @@ def test_it_is_as_sure_as_it_is_right():
 
 
 def test_defaults_beat_a_clipped_ekf_on_an_arm_of_unknown_lengths():
-    """And stay inside the limits: the benchmark's arm, few runs of it."""
+    """And stay inside the limits, in a few runs of the benchmark's arm."""
     ends, low = (1, 3), []
     ours, plain = (
         filters.measure(filters.FILTERS[name], ends, range(2000, 2006))
@@ -178,18 +178,18 @@ def test_defaults_beat_a_clipped_ekf_on_an_arm_of_unknown_lengths():
     assert min(low) > -1e-9
 
 
-def test_a_prior_moves_the_answer_by_what_it_says():
-    """By the share of the posterior's covariance in the prior's."""
+def test_shifted_prior_moves_the_posterior_by_their_covariance_ratio():
+    """By the posterior's covariance times the inverse of the prior's."""
     y, shift = np.array([1.0, -0.8]), np.array([0.1, -0.2, 0.3])
     f, free = make(LINEAR), []
     for mean in (START.mean, START.mean + shift):
         free.append(f.update(f.start(Belief(mean, START.covariance)), y).best)
-    share = free[0].covariance @ np.linalg.inv(START.covariance)
-    np.testing.assert_allclose(free[1].mean - free[0].mean, share @ shift, atol=1e-10)
+    ratio = free[0].covariance @ np.linalg.inv(START.covariance)
+    np.testing.assert_allclose(free[1].mean - free[0].mean, ratio @ shift, atol=1e-10)
 
 
-def test_a_line_over_a_belief_has_the_mean_and_covariance_of_a_quadratic():
-    """Exactly, against Monte Carlo of correlated elements."""
+def test_linearise_over_is_exact_for_quadratics():
+    """In mean and covariance, compared with Monte Carlo of correlated elements."""
     generator = np.random.default_rng(0)
     C, A = generator.normal(size=(2, 3, 3)), generator.normal(size=(2, 3))
     C += C.transpose(0, 2, 1)
@@ -215,7 +215,7 @@ def test_a_line_over_a_belief_has_the_mean_and_covariance_of_a_quadratic():
     )
 
 
-def test_a_line_over_a_belief_without_width_is_the_tangent():
+def test_linearise_over_a_certain_belief_gives_the_tangent():
     covariance = np.diag([0.04, 0.0, 0.0])
     line = linearise_over(END.predict, Belief(START.mean, covariance), END.wraps)
     np.testing.assert_allclose(line.slope[:, 2], end_slope(START.mean)[:, 2])
@@ -225,7 +225,7 @@ def test_a_line_over_a_belief_without_width_is_the_tangent():
 
 
 @pytest.mark.parametrize("memory", [np.inf, 0.4])
-def test_what_is_predicted_for_a_second_does_not_depend_on_the_period(memory):
+def test_prediction_over_a_second_does_not_depend_on_the_period(memory):
     ends = []
     for count in (1, 10, 200):
         step = constant_velocity(LAYOUT, {"angle": 0.5}, 1.0 / count, memory)
@@ -237,12 +237,12 @@ def test_what_is_predicted_for_a_second_does_not_depend_on_the_period(memory):
         np.testing.assert_allclose(mean, ends[0][0], atol=1e-12)
         np.testing.assert_allclose(P, ends[0][1], atol=1e-12)
     if memory == np.inf:
-        # A rate in one second wanders by its deviation, the angle by this over sqrt(3).
+        # In one second the rate's standard deviation is s, the angle's s / sqrt(3).
         noise = constant_velocity(LAYOUT, {"angle": 0.5}, 1.0).noise
         np.testing.assert_allclose(np.sqrt(np.diag(noise)), [0.5 / np.sqrt(3.0), 0.5, 0.0])
 
 
-def test_a_motion_by_a_function_is_that_of_its_matrix():
+def test_function_motion_equals_linear_motion():
     _, measured = draw(np.random.default_rng(2), END)
     function = FunctionMotion(lambda x: STEP.transition @ x, STEP.noise, STEP.period)
     for linearisation in ("spread", "tangent"):
@@ -254,8 +254,8 @@ def test_a_motion_by_a_function_is_that_of_its_matrix():
         np.testing.assert_allclose(called.covariance, plain.covariance, atol=1e-8)
 
 
-def test_a_motion_that_bends_moves_mean_and_covariance():
-    """A pendulum's step over a wide belief, against Monte Carlo."""
+def test_nonlinear_motion_matches_monte_carlo():
+    """For a pendulum's step over a wide belief."""
 
     def swing(x):
         return np.array([x[0] + 0.3 * x[1], x[1] - 0.3 * 9.8 * np.sin(x[0]) / x[2], x[2]])
@@ -325,13 +325,13 @@ def wrong_slope(x):
         (lambda: constant_velocity(LAYOUT, {"elbow": 1.0}, 0.1), "'elbow'"),
     ],
 )
-def test_what_is_wrong_is_refused_by_name(act, words):
+def test_invalid_arguments_are_refused_by_name(act, words):
     with pytest.raises((SettingsError, UnknownNameError), match=words):
         act()
 
 
-def test_a_right_jacobian_with_angles_and_hidden_numbers_passes():
-    """Also at the jump of an angle, and where a number cannot be seen."""
+def test_correct_jacobians_with_angles_and_nan_pass():
+    """Also where an angle wraps, and where a measurement is NaN."""
 
     def seen(x):
         return np.array([np.arctan2(np.sin(x[0]), np.cos(x[0])), np.nan, x[2]])

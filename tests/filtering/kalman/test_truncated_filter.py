@@ -17,7 +17,7 @@ NAMES = LAYOUT.names  # angle, rate_angle, length
 
 
 class Segment:
-    """A segment seen from the side it swings to: its end at length * (cos, sin) of the angle.
+    """A segment in the image plane, with its end at length * (cos, sin) of the angle.
 
     With ``depth_only`` its end's height alone is seen: length * cos(angle), the same at -angle.
     """
@@ -37,7 +37,7 @@ class Segment:
         return h[: len(self.names)], H[: len(self.names)]
 
     def mirrors(self, belief):
-        """(30): near angle 0 the end's height hardly depends on the angle."""
+        """Return the state with the angle mirrored, if only the height is measured."""
         if not self.depth_only or abs(belief.mean[0]) < 0.02:
             return []
         mirrored = belief.mean.copy()
@@ -71,14 +71,14 @@ TOGETHER = np.array([[0.3, 0.25], [0.25, 0.3]])
 
 @pytest.mark.parametrize("R", [None, TOGETHER], ids=["each by itself", "together"])
 @pytest.mark.parametrize("iterations", [1, 10])
-def test_a_linear_measurement_gives_bayes_rule_in_information_form(iterations, R):
-    """With noise that errs in each part by itself, or together."""
+def test_linear_update_equals_the_information_form(iterations, R):
+    """With independent or correlated noise."""
     noise = np.diag(Linear.variances) if R is None else R
     H, y = Linear.H, np.array([1.0, -2.0])
     for seed in range(5):
         prior, model = random_belief(seed), Linear()
         result = update(prior, make_measurement(model, y, R), iterations)
-        # Where the tangent is the same everywhere, the second one settles it.
+        # For a linear measurement the second iteration changes nothing.
         assert R is not None or model.calls <= 2
         information = np.linalg.inv(prior.covariance) + H.T @ np.linalg.inv(noise) @ H
         told = np.linalg.solve(prior.covariance, prior.mean) + H.T @ np.linalg.solve(noise, y)
@@ -89,7 +89,7 @@ def test_a_linear_measurement_gives_bayes_rule_in_information_form(iterations, R
         assert result.log_likelihood == pytest.approx(expected)
 
 
-def test_what_is_occluded_is_left_out():
+def test_occluded_measurements_are_ignored():
     prior = random_belief(1)
     one = update(prior, make_measurement(Linear(), np.array([1.0, np.nan])))
     assert one.count == 1
@@ -98,7 +98,7 @@ def test_what_is_occluded_is_left_out():
     np.testing.assert_allclose(nothing.belief.mean, prior.mean)
 
 
-def test_iteration_finds_the_posteriors_largest_density():
+def test_iteration_finds_the_posterior_mode():
     model = Segment()
     prior = Belief(np.array([0.2, 0.0, 1.0]), np.diag([1.0, 0.1, 0.3]))
     y = np.array([0.3, 1.1])
@@ -115,13 +115,13 @@ def test_iteration_finds_the_posteriors_largest_density():
         for step in generator.normal(size=(200, 3)) * size:
             assert cost(result.belief.mean + step) > best - 1e-3
     assert cost(update(prior, seen).belief.mean) > best + 10
-    # More noise at first leads there by another way.
+    # Annealing leads to the same mode.
     untempered = update(prior, seen, iterations=20, tempered=False)
     np.testing.assert_allclose(untempered.belief.mean, result.belief.mean, atol=1e-6)
     assert result.distance == pytest.approx(best, rel=1e-3)
 
 
-def test_covariances_stay_positive_definite_when_measurements_are_nearly_exact():
+def test_covariances_stay_positive_definite_for_nearly_exact_measurements():
     model = Segment(deviation=1e-9)
     belief = Belief(np.array([0.2, 0.0, 1.0]), np.diag([1e4, 1e2, 1e4]))
     seen = make_measurement(model, np.array([np.cos(0.3), np.sin(0.3)]))
@@ -140,8 +140,8 @@ def make_filter(model=None, rows=None, noise=None, **settings):
 
 
 @pytest.mark.parametrize("truncation", ["joint", "sequential", "clip"])
-def test_the_estimate_stays_inside_and_none_does_not(truncation):
-    """A segment that swings against its stop: noise would carry the estimate beyond."""
+def test_estimates_stay_inside_the_limits_except_without_truncation(truncation):
+    """A segment swings against its limit; noise would move the estimate beyond."""
     generator = np.random.default_rng(3)
     hand = make_filter(Segment(deviation=0.2), truncation=truncation)
     plain = make_filter(Segment(deviation=0.2), truncation="none")
@@ -157,7 +157,7 @@ def test_the_estimate_stays_inside_and_none_does_not(truncation):
     assert truncation == "clip" or states[0].hypotheses[0].active
 
 
-def test_weights_add_up_and_the_cap_holds():
+def test_weights_sum_to_one_and_the_cap_holds():
     rows = from_bounds(["angle", "length"], [-1.5, 0.9], [1.5, 1.1])
     f = make_filter(Segment(depth_only=True, deviation=0.002), rows, hypothesis_cap=2)
     state = f.start(Belief(np.array([0.3, 0.0, 1.0]), np.diag([0.2, 1e-3, 1e-6])))
@@ -168,13 +168,13 @@ def test_weights_add_up_and_the_cap_holds():
     assert len(state.hypotheses) == 2
     angles = sorted(h.belief.mean[0] for h in state.hypotheses)
     np.testing.assert_allclose(angles, [-0.4, 0.4], atol=0.05)
-    # Which of the two it is, nobody can tell; together they say so.
+    # Both hypotheses are equally likely, so their mixture is wide.
     assert state.overall.deviations()[0] > 0.3 > 5 * state.best.deviations()[0]
     assert make_filter(hypothesis_cap=1).update(state, np.full(2, np.nan)).hypotheses
 
 
-def test_a_mirrored_prediction_beyond_a_limit_dies_of_it():
-    """Section 5: what looks the same at the negative angle lies far beyond the stop at zero."""
+def test_mirrored_hypotheses_beyond_a_limit_are_rejected():
+    """Section 5: the mirrored angle is negative, far beyond the limit at zero."""
     rows = from_bounds(["angle", "length"], [0.0, 0.9], [1.5, 1.1])
     paper = {"truncation": "sequential", "linearisation": "tangent", "iterations": 1}
     f = make_filter(Segment(depth_only=True, deviation=0.002), rows, **paper)
@@ -187,8 +187,8 @@ def test_a_mirrored_prediction_beyond_a_limit_dies_of_it():
     assert state.best.mean[0] == pytest.approx(0.4, abs=0.05)
 
 
-def test_what_limits_say_of_a_constant_is_counted_once():
-    """Nothing is measured: however many steps, the belief about the length stays as it was."""
+def test_limits_of_a_constant_count_once():
+    """Without measurements the belief about the length does not change with the steps."""
     f = make_filter(rows=from_bounds(["length"], [0.9], [1.1]))
     start = Belief(np.array([0.0, 0.0, 1.05]), np.diag([0.1, 0.01, 0.04]))
     state = f.start(start)
@@ -205,24 +205,24 @@ def test_what_limits_say_of_a_constant_is_counted_once():
 
 
 @pytest.mark.parametrize("rank", [1, 3, 5])
-def test_a_product_of_factors_is_a_covariance_and_hardly_another_one(rank):
-    """Also where rounding leaves it no rank to be positive definite by."""
+def test_covariance_from_is_positive_definite_and_equals_the_product(rank):
+    """Also if the product is singular after rounding."""
     factor = np.random.default_rng(rank).normal(size=(5, rank))
     found = covariance_from(factor)
     np.testing.assert_array_equal(found, found.T)
     np.testing.assert_allclose(found, factor @ factor.T, atol=1e-12)
     assert (np.diag(np.linalg.cholesky(found)) > 0.0).all()
-    # And back: a factor of any covariance, semidefinite ones among them.
+    # The inverse: factor_of accepts semidefinite covariances.
     root = factor_of(factor @ factor.T, ())
     np.testing.assert_allclose(root @ root.T, factor @ factor.T, atol=1e-12)
 
 
-def test_transition_and_noise():
+def test_transition_and_process_noise_of_constant_velocity():
     layout = StateLayout(("a", "b"), ("c",))
     x = np.array([1.0, 2, 0.1, 0.2, 5])
     np.testing.assert_allclose(layout.transition() @ x, [1.1, 2.2, 0.1, 0.2, 5])
     U = layout.process_noise({"a": 2.0, "b": 0.0})
-    # An acceleration u over one step moves a by u / 2 and its rate by u.
+    # An acceleration u over one step changes a by u / 2 and its rate by u.
     g = np.array([0.5, 0, 1, 0, 0])
     np.testing.assert_allclose(U, 4 * np.outer(g, g))
 
@@ -261,6 +261,6 @@ def test_transition_and_noise():
         (lambda: make_filter(rows=from_bounds(["elbow"], [0], [1])), "elbow"),
     ],
 )
-def test_bad_input_is_named(make, word):
+def test_invalid_arguments_are_refused_by_name(make, word):
     with pytest.raises((SettingsError, UnknownNameError), match=word):
         make()

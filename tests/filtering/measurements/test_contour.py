@@ -15,7 +15,7 @@ from tests.search.turning import crane
 
 
 def descend(observation, seen, x, steps=5):
-    """Gauss and Newton's steps from a state."""
+    """Make Gauss-Newton steps from a state."""
     moving, distance = len(observation.layout.moving), None
     for k in range(steps):
         measured = observation.measure(seen, x, distance, k)
@@ -27,7 +27,7 @@ def descend(observation, seen, x, steps=5):
     return x, measured
 
 
-def test_it_leads_back_to_the_truth_that_drake_rendered(body):
+def test_measurements_lead_to_the_pose_that_drake_rendered(body):
     camera = front_camera(200, shift=0.2)
     observation = ContourObservation(body.pose_tree(), [camera])
     truth = np.array([0.2, 0.9, -0.6])
@@ -39,7 +39,7 @@ def test_it_leads_back_to_the_truth_that_drake_rendered(body):
         x_true + np.r_[0.12, -0.15, 0.1, np.zeros(3)],
     )
     q, X_WB = observation.positions(x)
-    # Segments of 12 to 24 pixels: a quarter of a pixel is a degree.
+    # Segments have 12 to 24 pixels: a quarter of a pixel is a degree.
     np.testing.assert_allclose(q, truth, atol=np.radians(2.5))
     np.testing.assert_allclose(X_WB, np.eye(4), atol=1e-9)
     assert measured.distance < 0.6
@@ -48,7 +48,7 @@ def test_it_leads_back_to_the_truth_that_drake_rendered(body):
     assert np.count_nonzero(drawn != masks[0]) < 0.02 * np.count_nonzero(masks[0])
 
 
-def test_a_root_that_is_known_elsewhere_and_one_that_is_estimated_there(body):
+def test_known_and_estimated_root_positions_agree(body):
     home, shift = np.array([0.0, 0.05, 0.04]), np.array([0.0, 0.03, -0.02])
     tree, there = body.pose_tree("trunk", root_position=home), home + shift
     camera = front_camera(200, shift=0.2)
@@ -68,8 +68,8 @@ def test_a_root_that_is_known_elsewhere_and_one_that_is_estimated_there(body):
     np.testing.assert_allclose(found[moves.layout.indices(ROOT_SHIFT)][1:], shift[1:], atol=0.004)
 
 
-def test_slopes_agree_with_finite_differences_of_the_contour(body, monkeypatch):
-    """The measured distances change with the state as H says, where nothing is robust."""
+def test_jacobian_equals_finite_differences_of_the_contour(body, monkeypatch):
+    """Of the measured distances, without robust weights."""
     camera = front_camera(400, shift=0.2)
     plain = ContourSettings(spacing=1.0, deviation=30.0)
     monkeypatch.setattr(contour_tracker, "CONTOUR", plain)
@@ -85,7 +85,7 @@ def test_slopes_agree_with_finite_differences_of_the_contour(body, monkeypatch):
             assert np.linalg.norm(measured.y - expected) < 0.4 * np.linalg.norm(measured.y)
 
 
-def test_nothing_seen_and_bad_arguments(body):
+def test_frames_without_evidence_and_invalid_arguments(body):
     camera = front_camera(100)
     observation = ContourObservation(body.pose_tree(), [camera])
     x = observation.state(np.zeros(3))
@@ -102,7 +102,7 @@ def test_nothing_seen_and_bad_arguments(body):
         ContourObservation(body.pose_tree(), [])
 
 
-def test_limits_are_rows_but_of_angles_that_take_every_direction(tmp_path):
+def test_limits_are_inequalities_except_of_angles_that_turn_around(tmp_path):
     angles = {"arm_turn": (4.0, 6.0), "slant": (-np.pi, np.pi), "bend": (-0.4, 0.1)}
     parts = [link("base"), *(link(f"to_{name}") for name in angles)]
     for name, (lower, upper) in angles.items():
@@ -120,8 +120,8 @@ def test_limits_are_rows_but_of_angles_that_take_every_direction(tmp_path):
             assert sorted(told.values()) == pytest.approx(sorted([upper, -lower]))
 
 
-def test_skin_is_drawn_as_it_bends_inside_the_limits(tmp_path):
-    """A full turn more is the same pose; a band that bent by a share of it would not be."""
+def test_skin_is_drawn_with_angles_wrapped_into_the_limits(tmp_path):
+    """A full turn more is the same pose, but would bend a band of skin by a fraction of it."""
     model = load_model(write_limb(tmp_path, text=LIMB_URDF.replace("2.5", "3.2")), check=False)
     camera = near_camera()
     observation = ContourObservation(model.pose_tree(), [camera])
@@ -139,23 +139,23 @@ def model(tmp_path):
     return crane(tmp_path)
 
 
-def test_a_pose_goes_on_in_the_turn_of_the_track(model):
-    """As a search finds it, within half a turn; as a track has counted it, two turns on."""
+def test_unwrapped_angles_are_in_the_turns_of_the_track(model):
+    """A search returns angles within half a turn; the track is two turns further."""
     observation = ContourObservation(model.pose_tree(), [camera("front")])
     names = observation.layout.names
     swing, luff = names.index("swing"), names.index("luff")
     last = observation.state(np.array([13.0, 3.0]))
     found = observation.unwrapped(observation.state(np.array([0.4, -2.0])), last)
     assert found[swing] == pytest.approx(0.4 + 4.0 * np.pi)
-    # Its limits are those of two turns.
+    # Its limits span two turns.
     assert found[luff] == pytest.approx(-2.0 + 2.0 * np.pi)
     assert np.all(found[len(observation.layout.moving) :] == 0.0)
     near = observation.unwrapped(observation.state(np.array([13.1, 3.1])), last)
     np.testing.assert_allclose(near[[swing, luff]], [13.1, 3.1])
 
 
-def test_what_turns_round_is_not_truncated(model, tmp_path):
-    """The filter of states keeps a joint's own limits, but for those that are none."""
+def test_angles_that_turn_around_are_not_truncated(model, tmp_path):
+    """The filter keeps the limits of other joints."""
     assert from_model(model).rows == ("luff >= -6.28319", "luff <= 6.28319")
     observation = ContourObservation(model.pose_tree(), [camera("front")])
     with pytest.warns(UserWarning, match="no joint has a limit"):

@@ -1,4 +1,4 @@
-"""The two-finger hand measured in Drake's silhouettes, of which nothing says the parts."""
+"""The two-finger hand measured in unlabelled silhouettes that Drake renders."""
 
 import math
 
@@ -33,7 +33,7 @@ SEEN = np.r_[HAND_STATE.indices((*SPREADS, *FLEXIONS)), HAND_STATE.indices(LENGT
 
 @pytest.fixture(scope="module")
 def render():
-    """The mask of a state at scale 1, by Drake's renderer."""
+    """Return a function that renders the mask of a state at scale 1 by Drake."""
     model = load_model(bundled_model("two_finger_hand"), check=False)
     model = model.reshaped(link_scales={"palm": (1.0, 1.1, 1.0)})
     X_WC = np.eye(4)
@@ -43,33 +43,33 @@ def render():
 
 
 def hand(t, r_13=35.0, phase=0.0):
-    """A true state at scale 1."""
+    """Return a true state at scale 1."""
     x = true_states(r_13, np.full(6, phase))[t]
     x[2:6] /= np.linalg.norm(x[2:6])
     return x
 
 
 def sure_of(x):
-    """A belief close around a state."""
+    """Return a belief with a small covariance about a state."""
     guess = first_guess(x, np.random.default_rng(0))
     return Belief(x, 1e-6 * guess.covariance)
 
 
 def normalised(found, x):
-    """(39,) errors in deviations, NaN where hidden."""
+    """Return errors (39,) [standard deviations], NaN where hidden."""
     error = wrapped_difference(found.y, OBSERVATION.predict(x)[0], OBSERVATION.wraps)
     return error / np.sqrt(np.maximum(np.diag(found.covariance), 1e-12))
 
 
 @pytest.mark.parametrize("length", [0.025, 0.05])
-def test_segments_of_every_length_have_no_gap(render, length):
+def test_drawn_segments_have_no_gap(render, length):
     x = hand(24)
     x[HAND_STATE.indices(("length_13", "length_23"))] = length
     assert np.mean(SILHOUETTE.draw(x).astype(bool) != render(x)) < 0.005
 
 
 @pytest.mark.parametrize("seed", [0, 3])
-def test_lines_and_tips_are_those_of_the_hand_from_table_2s_guess(render, seed):
+def test_lines_and_tips_equal_the_true_hands_from_table_2s_guess(render, seed):
     x = hand(20 + 10 * seed, 40.0)
     guess = FILTER.start(first_guess(x, np.random.default_rng(seed))).best
     mask = render(x)
@@ -77,14 +77,14 @@ def test_lines_and_tips_are_those_of_the_hand_from_table_2s_guess(render, seed):
     off = normalised(found, x)
     told = off[np.isfinite(off)]
     assert len(told) >= 15
-    # What is told is what the rough pose was matched to in the end.
+    # The measurement is relative to the final rough pose.
     edge, gate = find_edge_points(mask, MATCHING.spacing), SILHOUETTE._unit * MATCHING.gates[-1]
     lines = match_axes(edge, SILHOUETTE._rough(found.rough), gate, CENTER).lines.ravel()
     end = MEASURED.index("scale")
     measured = found.y[end - len(lines) : end]
     shown = np.isfinite(measured)
     np.testing.assert_array_equal(measured[shown], lines[shown])
-    # A segment that points at the camera may be taken for another's end.
+    # A segment that points at the camera may be mistaken for another's end.
     assert np.mean(np.abs(told) < 3) > 0.9
     assert found.difference < 0.045
     assert np.count_nonzero(SILHOUETTE.draw(guess.mean) != mask) > 0.1 * np.count_nonzero(mask)
@@ -92,8 +92,8 @@ def test_lines_and_tips_are_those_of_the_hand_from_table_2s_guess(render, seed):
     np.testing.assert_array_equal(found.y, again.y)
 
 
-def test_noise_is_no_smaller_than_errors_are(render):
-    """Beside the truth, over pictures of many poses; hidden knuckles and the wrist are not told."""
+def test_noise_covers_the_errors(render):
+    """Near the true state, over many poses; hidden knuckles and the wrist are not measured."""
     off = []
     for t in range(0, 55, 3):
         x = hand(t, 35.0, 0.3 * math.sin(t))
@@ -107,8 +107,8 @@ def test_noise_is_no_smaller_than_errors_are(render):
     assert np.nanmax(np.abs(off)) < 4
 
 
-def test_what_another_part_hides_is_not_measured(render):
-    """A finger bent over the palm: its tip and last segment leave no edge."""
+def test_occluded_parts_are_not_measured(render):
+    """The tip and last segment of a finger bent over the palm have no edge."""
     x = hand(24)
     x[HAND_STATE.indices(FLEXIONS[3:])] = np.radians((80.0, 85.0, 80.0))
     x[2:6] = np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0
@@ -118,8 +118,8 @@ def test_what_another_part_hides_is_not_measured(render):
     assert np.isfinite(y[[MEASURED.index(name) for name in ("alpha_11", "alpha_palm_left")]]).all()
 
 
-def test_joints_that_are_drawn_outside_are_told_to_lie_half_a_radius_within(render):
-    """Those of a finger that is not in the picture; across the edge surely, along it hardly."""
+def test_joints_outside_the_silhouette_are_measured_half_a_radius_inside(render):
+    """With a small standard deviation across the edge and a large one along it."""
     x = hand(24)
     mask = render(x)
     bent = x.copy()
@@ -134,13 +134,13 @@ def test_joints_that_are_drawn_outside_are_told_to_lie_half_a_radius_within(rend
         assert mask[v, u]
         point = OBSERVATION.drawing(bent)[(rows[0] - 2) // 2] + CENTER
         way, beyond = point - y[rows] - CENTER, np.linalg.norm(edge.uv - point, axis=1).min()
-        # A radius is 8 mm, about as many pixels.
+        # A radius is 8 mm, about 8 pixels.
         assert np.linalg.norm(way) - beyond == pytest.approx(0.5 * 8.0, abs=0.5)
         block = R[np.ix_(rows, rows)]
         assert way @ block @ way / (way @ way) < 0.02 * np.trace(block)
 
 
-def test_a_hand_that_reaches_out_of_the_picture_is_measured_where_it_shows(render):
+def test_partly_visible_hands_are_measured_where_visible(render):
     x = hand(24)
     for shift in ((0.0, -170.0), (0.0, 200.0), (260.0, 0.0)):
         moved = x.copy()
@@ -148,7 +148,7 @@ def test_a_hand_that_reaches_out_of_the_picture_is_measured_where_it_shows(rende
         assert np.isfinite(SILHOUETTE.measure(render(moved), sure_of(moved)).y).any()
 
 
-def test_nothing_is_measured_in_a_blank_picture_or_one_of_something_else(render):
+def test_blank_and_foreign_silhouettes_measure_nothing(render):
     x = hand(24)
     blank = np.zeros((HEIGHT, WIDTH), dtype=np.bool_)
     other = blank.copy()

@@ -22,7 +22,7 @@ CAMERA = front_camera(200, shift=0.2)
 
 
 def swings(frames, centre, amplitude, generator):
-    """(frames, n) smooth motion about a centre, about one swing in 1.3 s."""
+    """Return a smooth motion (frames, n) about a centre, with a period of about 1.3 s."""
     t = np.arange(frames)[:, None] / 40
     rate = generator.uniform(0.6, 1.4, len(centre))
     phase = generator.uniform(0, 2 * np.pi, len(centre))
@@ -30,7 +30,7 @@ def swings(frames, centre, amplitude, generator):
 
 
 class KnownPoses:
-    """A search that answers with what is true in the frame it is asked in."""
+    """A search that returns the true pose of the current frame."""
 
     def __init__(self, tree, answers):
         self.tree, self.answers, self.frame, self.calls = tree, answers, 0, 0
@@ -44,7 +44,7 @@ class KnownPoses:
 
 
 class CountingSearch:
-    """A search that counts how often it is asked."""
+    """A search that counts its calls."""
 
     def __init__(self, search):
         self.search, self.calls = search, 0
@@ -65,66 +65,66 @@ def test_tracked_after_one_match_and_matched_again_after_a_jump(body):
     follower = MatchAndTrack(search, [CAMERA], PERIOD)
     generator = np.random.default_rng(7)
     first = swings(12, np.array([0.1, 0.4, -0.4]), 0.25, generator)
-    # Cut: the body stands otherwise in the next frame.
+    # A cut: the body has another pose in the next frame.
     second = swings(12, np.array([-0.3, 1.7, -1.7]), 0.25, generator)
     renderer = LabelRenderer(body, CAMERA)
-    followed, errors, asked, held, widths = TrackerState(), [], [], [], []
+    state, errors, asked, held, widths = TrackerState(), [], [], [], []
     for q in np.vstack([first, second]):
-        followed, result = follower.next(followed, [View(CAMERA, renderer.mask(q))])
-        told = follower.with_intervals(followed, result)
-        np.testing.assert_array_equal(told.q, result.q)
-        for joint, value in zip(told.pose_set.joints, q, strict=True):
+        state, result = follower.next(state, [View(CAMERA, renderer.mask(q))])
+        matched = follower.with_intervals(state, result)
+        np.testing.assert_array_equal(matched.q, result.q)
+        for joint, value in zip(matched.pose_set.joints, q, strict=True):
             held.append(joint.holds(value))
             widths.append(joint.high - joint.low)
         errors.append(np.degrees(np.abs(result.q - q)).max())
         asked.append(search.calls)
-        assert followed.matches == search.calls
+        assert state.matches == search.calls
     assert asked[0] == asked[11] == 1
     assert asked[12] == 2
     assert asked[-1] <= 3
-    # Segments of 12 to 24 pixels.
+    # Segments have 12 to 24 pixels.
     assert np.median(errors[:12]) < 3.0
     assert np.median(errors[12:]) < 3.5
     assert result.stopped_by == TRACKED
-    # 95 % are claimed.
+    # The intervals claim 95 %.
     assert np.mean(held) > 0.9
     assert np.median(widths) < np.radians(35.0)
 
 
-def test_the_first_look_of_a_track_is_at_what_the_search_found(body):
-    """Nothing has moved since, whether the search or the caller says where the body is."""
+def test_a_track_starts_in_the_frame_of_its_pose_without_motion(body):
+    """Whether the pose comes from the search or from the caller."""
     search = paper_search(body)
     follower = MatchAndTrack(search, [CAMERA], PERIOD)
     mask = LabelRenderer(body, CAMERA).mask(np.array([0.1, 0.4, -0.4]))
     views, tracker = [View(CAMERA, mask)], follower.tracker
-    begun, _ = follower.next(TrackerState(), views)
-    told = search.search.match(views)
-    for followed, q in (
-        (begun, told.q),
-        (follower.next(TrackerState(), views, start=told.q + 0.02)[0], told.q + 0.02),
+    started, _ = follower.next(TrackerState(), views)
+    matched = search.search.match(views)
+    for state, q in (
+        (started, matched.q),
+        (follower.next(TrackerState(), views, start=matched.q + 0.02)[0], matched.q + 0.02),
     ):
         start = tracker.start(tracker.observation.state(q))
         expected = [tracker.follow(start, [mask], first).state.best for first in (True, False)]
-        found = followed.track.state.best
+        found = state.track.state.best
         np.testing.assert_allclose(found.mean, expected[0].mean)
         np.testing.assert_allclose(found.covariance, expected[0].covariance)
         assert not np.allclose(found.covariance, expected[1].covariance)
 
 
-def test_no_pose_found_is_said_and_asked_again(body):
+def test_a_failed_search_is_reported_and_repeated(body):
     settings = PaperSearchSettings(interval=math.radians(20), outside_limit=0.0)
     search = CountingSearch(PaperSearch(body.pose_tree(), settings))
     follower = MatchAndTrack(search, [CAMERA], PERIOD)
     speck = np.zeros((200, 200), dtype=bool)
     speck[3:5, 3:5] = True
-    followed, result = follower.next(TrackerState(), [View(CAMERA, speck)])
+    state, result = follower.next(TrackerState(), [View(CAMERA, speck)])
     assert not result.found
-    assert followed.track is None
-    followed, _ = follower.next(followed, [View(CAMERA, speck)])
-    assert followed.matches == search.calls == 2
+    assert state.track is None
+    state, _ = follower.next(state, [View(CAMERA, speck)])
+    assert state.matches == search.calls == 2
 
 
-def test_lost_when_the_body_is_elsewhere(body):
+def test_a_track_is_lost_if_the_body_is_elsewhere(body):
     observation = ContourObservation(body.pose_tree(), [CAMERA])
     tracker = ContourTracker(observation, PERIOD)
     track = tracker.start(observation.state(np.array([0.1, 0.5, -0.5])))
@@ -135,15 +135,15 @@ def test_lost_when_the_body_is_elsewhere(body):
     waited = tracker.follow(track, [None])
     assert not waited.lost
     assert waited.measurement is None
-    begun = tracker.follow(track, [None], first=True).state
-    np.testing.assert_array_equal(begun.best.covariance, track.state.best.covariance)
-    # Where nothing was measured contours say nothing of joints.
+    started = tracker.follow(track, [None], first=True).state
+    np.testing.assert_array_equal(started.best.covariance, track.state.best.covariance)
+    # Without a measurement there are no intervals.
     follower, pose = MatchAndTrack(paper_search(body), [CAMERA], PERIOD), object()
     for unmeasured in (None, waited):
         assert follower.with_intervals(TrackerState(unmeasured), pose) is pose
 
 
-def test_bad_settings_and_a_bad_period_are_named(body):
+def test_invalid_settings_and_periods_are_refused_by_name(body):
     for bad in ({"rounds": 0}, {"memory": -1.0}, {"rest_time": math.nan}):
         with pytest.raises(SettingsError, match=next(iter(bad))):
             TrackingSettings(**bad)
@@ -152,7 +152,7 @@ def test_bad_settings_and_a_bad_period_are_named(body):
         ContourTracker(observation, 0.0)
 
 
-def test_rates_fade_within_the_memory_and_change_by_the_acceleration_of_their_kind(body):
+def test_rates_decay_with_memory_and_change_by_their_kinds_acceleration(body):
     tree = body.pose_tree("trunk", root_position=np.zeros(3))
     observation = ContourObservation(tree, [CAMERA], root_moves=True, scale_unknown=True)
     settings = TrackingSettings(
@@ -171,7 +171,7 @@ def test_rates_fade_within_the_memory_and_change_by_the_acceleration_of_their_ki
     np.testing.assert_allclose(belief.mean[len(moving) :], math.exp(-1.0))
 
 
-def test_a_start_is_surer_of_what_moves_less(body):
+def test_smaller_accelerations_give_smaller_initial_rate_deviations(body):
     tree = body.pose_tree("trunk", root_position=np.zeros(3))
     observation = ContourObservation(tree, [CAMERA], root_moves=True)
     calm, wild = (
@@ -187,24 +187,24 @@ def test_a_start_is_surer_of_what_moves_less(body):
     np.testing.assert_allclose(ratio[count:], np.where(turns, 10.0, 1.0))
 
 
-@pytest.mark.parametrize(("share", "asked"), [(0.04, 1), (0.6, 2)])
-def test_a_search_is_asked_where_much_of_the_silhouette_is_not_explained(body, share, asked):
-    """Something else comes into the picture, which no contour of the body is near."""
+@pytest.mark.parametrize(("fraction", "asked"), [(0.04, 1), (0.6, 2)])
+def test_the_search_is_used_if_much_of_the_silhouette_is_unexplained(body, fraction, asked):
+    """Another object appears, far from the body's contour."""
     tree, q = body.pose_tree(), np.array([0.1, 0.5, -0.5])
     mask = LabelRenderer(body, CAMERA).mask(q)
     search = KnownPoses(tree, [(q, np.eye(4), 1.0, None)])
     follower = MatchAndTrack(search, [CAMERA], PERIOD)
-    followed, _ = follower.next(TrackerState(), [View(CAMERA, mask)])
+    state, _ = follower.next(TrackerState(), [View(CAMERA, mask)])
     with_other = mask.copy()
-    with_other[150:, : round(share * mask.sum() / 50)] = True
+    with_other[150:, : round(fraction * mask.sum() / 50)] = True
     assert not (mask[150:] | mask[:, :60].any()).any()
-    follower.next(followed, [View(CAMERA, with_other)])
+    follower.next(state, [View(CAMERA, with_other)])
     assert search.calls == asked
 
 
 @pytest.mark.parametrize(("shift", "angle"), [(0.15, 0.3), (0.2, 0.2)])
-def test_a_track_is_not_late_in_its_second_frame(person, shift, angle):
-    """Nothing tells how fast a body is that was seen once; from then on it moves as it did."""
+def test_a_track_does_not_lag_in_its_second_frame(person, shift, angle):
+    """Although the rates are unknown after the first frame."""
     cameras = list(circle_of_cameras(3, size=(320, 240), face_camera=False).values())
     tracker = make_tracker(person.pose_tree(), cameras, 1.0 / 30.0, TrackingSettings())
     observation, renderers = tracker.observation, [LabelRenderer(person, one) for one in cameras]
@@ -221,27 +221,27 @@ def test_a_track_is_not_late_in_its_second_frame(person, shift, angle):
             q[person.position_index(name)] -= angle
 
 
-def test_colours_alone_are_followed_from_where_the_body_is_said_to_be(body):
-    """Nobody is asked: at first nothing is known; a covered lens loses the track, not the body."""
+def test_tracking_by_colours_alone_starts_from_given_positions(body):
+    """Without a search. A covered lens loses the track, which recovers afterwards."""
     q, search = np.array([0.2, 0.9, -0.6]), KnownPoses(body.pose_tree(), [])
     mask = LabelRenderer(body, CAMERA).mask(q)
     lit = np.where(mask[..., None], (230, 130, 40), (60, 140, 60)).astype(np.uint8)
-    follower, followed = MatchAndTrack(search, [CAMERA], PERIOD), TrackerState()
+    follower, state = MatchAndTrack(search, [CAMERA], PERIOD), TrackerState()
     found = []
     for picture, start in ((lit, None), (lit, q), (lit, None), (0 * lit, None), (lit, q)):
-        followed, pose = follower.next(followed, [], None, {"front": picture}, start)
+        state, pose = follower.next(state, [], None, {"front": picture}, start)
         found.append(pose.found)
         if pose.found:
             np.testing.assert_allclose(pose.q, q, atol=np.radians(3.0))
-            # Contours lie within a pixel of the edge: so much of the body's area, about.
+            # Contours are within a pixel of the edge, which bounds the differing area.
             assert 0.0 < pose.E_total < 0.2
-        assert (followed.track is None) == (len(found) == 1)
+        assert (state.track is None) == (len(found) == 1)
     assert found == [False, True, True, False, True]
-    assert search.calls == followed.matches == 0
+    assert search.calls == state.matches == 0
 
 
-def test_the_first_frame_teaches_colours_also_where_the_searched_pose_fits_best(body):
-    """The second frame has no mask, and the body has moved by several pixels until then."""
+def test_histograms_are_learned_in_the_first_frame_also_from_a_searched_pose(body):
+    """The second frame has no mask, and the body has moved by several pixels."""
     moved = np.array([[0.2, 0.9, -0.6], [0.32, 0.8, -0.7]])
     pose = PoseEstimate(
         True,
@@ -254,29 +254,29 @@ def test_the_first_frame_teaches_colours_also_where_the_searched_pose_fits_best(
     )
     search = KnownPoses(body.pose_tree(), [])
     search.match = lambda views, root_position=None: pose
-    follower, followed = MatchAndTrack(search, [CAMERA], PERIOD), TrackerState()
+    follower, state = MatchAndTrack(search, [CAMERA], PERIOD), TrackerState()
     renderer = LabelRenderer(body, CAMERA)
     for q, has_mask in zip(moved, (True, False), strict=True):
         mask = renderer.mask(q)
         lit = np.where(mask[..., None], (230, 130, 40), (60, 140, 60)).astype(np.uint8)
         views = [View(CAMERA, mask)] if has_mask else []
-        followed, found = follower.next(followed, views, None, {"front": lit})
+        state, found = follower.next(state, views, None, {"front": lit})
         assert found.found
         assert found.stopped_by == ("end" if has_mask else TRACKED)
         np.testing.assert_allclose(found.q, q, atol=np.radians(3.0))
 
 
-def hidden(mask, share):
-    """A mask without its left pixels."""
+def hidden(mask, fraction):
+    """Return a mask without its left pixels."""
     columns = np.nonzero(mask)[1]
     rest = mask.copy()
-    rest[:, : int(np.quantile(columns, share))] = False
+    rest[:, : int(np.quantile(columns, fraction))] = False
     return rest
 
 
-@pytest.mark.parametrize("share", [0.6, 1.0])
-def test_what_no_pose_explains_is_predicted_and_the_truth_stays_near(body, share):
-    """Hidden in part or whole for a quarter of a second; the search has nothing but bad poses."""
+@pytest.mark.parametrize("fraction", [0.6, 1.0])
+def test_unexplained_frames_are_predicted_near_the_truth(body, fraction):
+    """The body is occluded for a quarter of a second, and the search returns bad poses."""
     search = KnownPoses(body.pose_tree(), [])
     wrong = np.array([1.0, -1.2, 1.0])
     answers = {"q": None}
@@ -290,7 +290,7 @@ def test_what_no_pose_explains_is_predicted_and_the_truth_stays_near(body, share
         return PoseEstimate(True, q, np.eye(4), values, float(J), float(area), "end")
 
     search.match = match
-    follower, followed = MatchAndTrack(search, [CAMERA], PERIOD), TrackerState()
+    follower, state = MatchAndTrack(search, [CAMERA], PERIOD), TrackerState()
     poses = swings(30, np.array([0.1, 0.4, -0.4]), 0.4, np.random.default_rng(3))
     renderer, observation = LabelRenderer(body, CAMERA), follower.tracker.observation
     moving = follower.tracker.filter.layout.indices(follower.tracker.filter.layout.moving)
@@ -298,36 +298,36 @@ def test_what_no_pose_explains_is_predicted_and_the_truth_stays_near(body, share
     for k, q in enumerate(poses):
         is_hidden = 10 <= k < 20
         answers["q"] = wrong if is_hidden else q
-        mask = hidden(renderer.mask(q), share if is_hidden else 0.0)
+        mask = hidden(renderer.mask(q), fraction if is_hidden else 0.0)
         views = [View(CAMERA, mask)] if mask.any() else []
-        followed, pose = follower.next(followed, views)
+        state, pose = follower.next(state, views)
         if k < 20 or k > 25:
-            # Of what is seen in part the search is asked once in a while.
+            # A partly visible body is searched once per search_pause.
             assert pose.found == (not is_hidden)
-        state = followed.track.state.best
-        off = np.abs(state.mean - observation.state(q))[moving]
-        assert np.all(off < 3.0 * state.deviations()[moving] + np.radians(3.0)), k
+        belief = state.track.state.best
+        off = np.abs(belief.mean - observation.state(q))[moving]
+        assert np.all(off < 3.0 * belief.deviations()[moving] + np.radians(3.0)), k
         if is_hidden:
-            assert np.all(state.deviations()[moving] > before)
-        before = state.deviations()[moving]
+            assert np.all(belief.deviations()[moving] > before)
+        before = belief.deviations()[moving]
 
 
-def test_measured_positions_are_overruled_by_a_pose_alone_that_explains_the_masks(body):
+def test_only_a_pose_that_explains_the_masks_replaces_measured_positions(body):
     q = np.array([0.1, 0.4, -0.4])
     mask = hidden(LabelRenderer(body, CAMERA).mask(q), 0.6)
     wrong, right = (q + off for off in ([0.9, -1.0, 1.0], [0.0, 0.01, 0.01]))
     search = KnownPoses(body.pose_tree(), [(wrong, np.eye(4), 1.0, None)])
     follower = MatchAndTrack(search, [CAMERA], PERIOD)
-    followed, pose = follower.next(TrackerState(), [View(CAMERA, mask)], start=right)
+    state, pose = follower.next(TrackerState(), [View(CAMERA, mask)], start=right)
     assert search.calls == 1
-    # The search says J = 20 of 100 pixels: that is no explanation, and more than nothing.
+    # The search's J is 20 of 100 pixels: better than before, but no explanation.
     np.testing.assert_allclose(pose.q, right, atol=0.005)
     assert not pose.found
-    assert followed.track.state.best.deviations().min() > 0.0
+    assert state.track.state.best.deviations().min() > 0.0
 
 
-def test_a_search_that_a_time_limit_ended_is_asked_again(body):
-    """And the better pose is taken, although the first one's track is not lost."""
+def test_a_search_that_reached_its_time_limit_is_repeated(body):
+    """Its better pose is used, although the track of the first one is not lost."""
     q = np.array([0.1, 0.4, -0.4])
     views = [View(CAMERA, LabelRenderer(body, CAMERA).mask(q))]
     tree, asked = body.pose_tree(), []
@@ -342,8 +342,8 @@ def test_a_search_that_a_time_limit_ended_is_asked_again(body):
         return PoseEstimate(True, at, np.eye(4), values, J, 100.0, stopped_by)
 
     search.match = match
-    follower, followed = MatchAndTrack(search, [CAMERA], PERIOD), TrackerState()
+    follower, state = MatchAndTrack(search, [CAMERA], PERIOD), TrackerState()
     for _ in range(4):
-        followed, pose = follower.next(followed, views)
+        state, pose = follower.next(state, views)
     assert len(asked) == 2
     np.testing.assert_allclose(pose.q, q, atol=np.radians(2.0))

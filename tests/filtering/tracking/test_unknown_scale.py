@@ -1,4 +1,4 @@
-"""A body seen by a camera whose scale nobody knows, and which drifts."""
+"""A body in a parallel camera whose scale is unknown and drifts."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def tree(body):
 
 
 def drawn(tree, camera, states):
-    """Masks of states, and what a search would say of each."""
+    """Return the masks of states, and the estimate a search would return for each."""
     observation = ContourObservation(tree, [camera], True, True)
     masks, answers = [], []
     for x in states:
@@ -44,7 +44,7 @@ def drawn(tree, camera, states):
 
 
 def moving_states(tree, camera, frames, generator):
-    """Joints swing, the body goes to the right, the scale drifts by 6 %."""
+    """Return states whose joints swing, whose root moves right and whose scale drifts by 6 %."""
     observation = ContourObservation(tree, [camera], True, True)
     layout, t = observation.layout, np.linspace(0.0, 1.0, frames)
     states = np.zeros((frames, len(layout)))
@@ -54,7 +54,7 @@ def moving_states(tree, camera, frames, generator):
     return states
 
 
-def test_a_state_is_a_pose_in_its_own_size_seen_by_a_scaled_camera(tree):
+def test_states_describe_an_unscaled_body_in_a_scaled_camera(tree):
     camera = front_camera(200, shift=0.2)
     observation = ContourObservation(tree, [camera], True, True)
     (x,) = moving_states(tree, camera, 1, np.random.default_rng(3))
@@ -63,11 +63,11 @@ def test_a_state_is_a_pose_in_its_own_size_seen_by_a_scaled_camera(tree):
     np.testing.assert_allclose(again, x, atol=1e-9)
 
 
-def test_the_scale_is_tracked_while_it_drifts_and_found_again_after_a_cut(tree):
+def test_a_drifting_scale_is_tracked_and_found_again_after_a_cut(tree):
     camera = front_camera(240, shift=0.2)
     generator = np.random.default_rng(5)
     first = moving_states(tree, camera, 25, generator)
-    # Cut: the body stands elsewhere, otherwise and larger in the next frame.
+    # A cut: the body has another place, pose and scale in the next frame.
     second = moving_states(tree, camera, 10, generator)
     second[:, :3] += np.array([-0.3, 0.5, 0.3])
     layout = ContourObservation(tree, [camera], True, True).layout
@@ -87,20 +87,20 @@ def test_the_scale_is_tracked_while_it_drifts_and_found_again_after_a_cut(tree):
     assert search.calls == 2
     assert kinds[-1] == TRACKED
     np.testing.assert_allclose(scales, 1.0, atol=0.05)
-    # Segments of 12 to 24 pixels.
+    # Segments have 12 to 24 pixels.
     assert np.median(errors) < 4.0
     assert max(errors) < 8.0
 
 
-def test_joints_that_are_not_seen_come_to_rest_in_the_middle_of_their_limits(tree):
-    """Nothing is seen of an arm that hides; without a rest it stays."""
+def test_unobserved_joints_move_to_the_middle_of_their_limits(tree):
+    """A hidden arm stays where it is without a prior."""
     camera = front_camera(200, shift=0.2)
     moved = {}
     for rest in (0.0, 0.3):
         observation = ContourObservation(tree, [camera], True, True, prior_weight=rest)
         (x,) = moving_states(tree, camera, 1, np.random.default_rng(3))
         mask = observation.draw(x, camera)
-        # The left arm is cut out of the picture.
+        # The left arm is removed from the mask.
         tracker = ContourTracker(observation, PERIOD, SETTINGS)
         empty = np.zeros_like(mask)
         empty[:, : mask.shape[1] // 2 + 6] = mask[:, : mask.shape[1] // 2 + 6]
@@ -111,7 +111,7 @@ def test_joints_that_are_not_seen_come_to_rest_in_the_middle_of_their_limits(tre
     assert moved[0.3] < moved[0.0]
 
 
-def test_a_scale_needs_one_parallel_camera(tree):
+def test_an_unknown_scale_needs_one_parallel_camera(tree):
     (pinhole,) = circle_of_cameras(1, face_camera=False).values()
     for cameras in ([pinhole], [front_camera(), front_camera(name="other")]):
         with pytest.raises(SettingsError, match="parallel"):
@@ -130,7 +130,7 @@ def fitted(tree):
     masks, _ = drawn(tree, camera, states)
     observation = ContourObservation(tree, [camera], True, True, prior_weight=0.1)
     tracker = ContourTracker(observation, PERIOD, AT_REST)
-    # All frames are off alike in each start, and two of the starts end in one explanation.
+    # Each start has a constant error, and two of them converge to the same fit.
     starts = []
     for off in ([0.15, -0.12, 0.1], [-0.1, 0.1, 0.12], [0.0, 2.6, 0.0]):
         start = states.copy()
@@ -139,7 +139,7 @@ def fitted(tree):
     return tree, observation, states, starts, fit_sequence(tracker, masks, starts, PERIOD)
 
 
-def test_all_poses_are_found_and_starts_that_end_alike_are_one_explanation(fitted):
+def test_all_poses_are_found_and_equal_fits_are_merged(fitted):
     _, observation, states, starts, explanations = fitted
     assert len(explanations) == 1
     (found,) = explanations
@@ -152,7 +152,7 @@ def test_all_poses_are_found_and_starts_that_end_alike_are_one_explanation(fitte
     assert np.mean(off < 2.0 * deviations) > 0.9
 
 
-def test_what_an_explanation_says_of_a_frame_is_its_pose_and_its_intervals(fitted):
+def test_a_frames_pose_set_has_the_explanations_pose_and_intervals(fitted):
     tree, observation, states, _, explanations = fitted
     for frame in (0, FRAMES - 1):
         x = observation.state_of(
@@ -178,7 +178,7 @@ def observation(body):
     return ContourObservation(tree, [front_camera(200, shift=0.2)], True, True, prior_weight=0.03)
 
 
-def test_a_tilt_turns_the_root_alone(observation):
+def test_a_tilt_rotates_only_the_root(observation):
     x = np.zeros(len(observation.layout))
     turned = tilted(observation, x, (0.3, -0.2))
     R_WC = observation.cameras[0].X_WC[:3, :3]
@@ -192,7 +192,7 @@ def test_a_tilt_turns_the_root_alone(observation):
     }  # fmt: skip
 
 
-def test_the_true_start_is_among_those_followed_and_not_worse_than_what_was_given(observation):
+def test_the_true_start_is_tracked_and_not_worse_than_the_given_one(observation):
     camera = observation.cameras[0]
     moving = len(observation.layout.moving)
     truth = []

@@ -28,9 +28,9 @@ def hand():
     return load_model(HAND)
 
 
-def test_every_limit_of_the_hand_is_a_pair_of_rows_named_after_its_joint(hand):
+def test_each_joint_limit_of_the_hand_gives_two_named_rows(hand):
     rows = from_model(hand)
-    # The palm floats: its pose has no limits.
+    # The palm floats and has no limits.
     assert hand.position_names[:7] == tuple(f"palm_{c}" for c in ("qw", "qx", "qy", "qz", *"xyz"))
     assert len(rows) == 2 * (len(hand.position_names) - 7)
     inside = np.r_[np.zeros(7), 0.5 * (hand.lower[7:] + hand.upper[7:])]
@@ -44,10 +44,10 @@ def test_every_limit_of_the_hand_is_a_pair_of_rows_named_after_its_joint(hand):
         assert margins[k] == pytest.approx(-0.01)
 
 
-def test_table_1(hand):
-    """Both bounds of every difference that table 1 couples, and no others."""
+def test_couplings_equal_table_1(hand):
+    """Both bounds of each difference in table 1 of Shimada et al., and no others."""
     rows = model_inequalities(hand)
-    # 10 couplings: 2 flexion pairs and one across, 2 + 2 + 3 of lengths; each two-sided.
+    # 10 two-sided couplings: 3 of flexions (2 pairs, one across), 2 + 2 + 3 of lengths.
     assert len(rows) == 2 * (len(hand.position_names) - 7) + 20
     bounds = {}
     for phi, b in zip(rows.phi, rows.b, strict=True):
@@ -69,7 +69,7 @@ def test_table_1(hand):
         assert bounds[first, second] == pytest.approx({"lower": lower, "upper": upper})
 
 
-def test_a_joint_that_turns_freely_has_no_row_and_a_model_without_any_is_told_of(tmp_path):
+def test_free_joints_have_no_rows_and_models_without_rows_warn(tmp_path):
     parts = [link(name) for name in ("base", "free", "limited")]
     turns = joint("turns", "continuous", "base", "free", limits=None)
     bends = joint("bends", "revolute", "base", "limited", limits='lower="-1" upper="2"')
@@ -81,7 +81,7 @@ def test_a_joint_that_turns_freely_has_no_row_and_a_model_without_any_is_told_of
         assert len(model_inequalities(load_model(file))) == 0
 
 
-def test_the_rows_that_clash_are_named_and_no_others():
+def test_only_the_conflicting_rows_are_named():
     rows = stack(
         [
             from_bounds(["a", "b", "c"], [0, 0, 0], [1, 1, 1]),
@@ -99,7 +99,7 @@ def test_the_rows_that_clash_are_named_and_no_others():
     assert ">= 0" not in message
 
 
-def test_the_inner_point_is_inside_and_no_rows_are_allowed_but_none_without_room():
+def test_inner_point_is_strictly_inside_or_refused():
     with pytest.raises(SettingsError, match="leave no interior"):
         inner_point(from_bounds(["a", "b"], [0, 1], [1, 1]))
     rows = from_bounds(["a", "b"], [0, -np.inf], [1, -5])
@@ -107,7 +107,7 @@ def test_the_inner_point_is_inside_and_no_rows_are_allowed_but_none_without_room
     np.testing.assert_array_equal(inner_point(from_bounds(["a"], [-np.inf], [np.inf])), [0.0])
 
 
-def test_a_larger_state_and_a_smaller_one():
+def test_rows_for_other_columns():
     rows = from_bounds(["a", "b"], [0, 1], [2, 3])
     larger = rows.for_columns(["rate", "b", "a"])
     np.testing.assert_allclose(larger.margins([99, 1.5, 0.5]), rows.margins([0.5, 1.5]))
@@ -132,7 +132,7 @@ def test_a_larger_state_and_a_smaller_one():
         ("3", ["not a couplings file"]),
     ],
 )
-def test_bad_couplings_files_are_named(tmp_path, text, words):
+def test_invalid_couplings_files_are_refused_by_name(tmp_path, text, words):
     file = tmp_path / "bad.couplings.yaml"
     file.write_text(text)
     with pytest.raises((ModelError, UnknownNameError)) as caught:
@@ -149,7 +149,7 @@ def test_units_of_couplings(tmp_path):
     np.testing.assert_allclose(rows.b, [np.pi / 2])
 
 
-def test_how_joints_are_usually_held_in_units_and_about_what_is_estimated(tmp_path):
+def test_joint_prior_is_read_with_units_and_for_known_columns(tmp_path):
     file = tmp_path / "c.yaml"
     file.write_text(
         "usual: [{name: r, terms: {b: 2, a: -1}, mean: 90, deviation: 45, unit: deg},"
@@ -174,7 +174,7 @@ def test_how_joints_are_usually_held_in_units_and_about_what_is_estimated(tmp_pa
         ("terms: {a: 1}, about: 1, deviation: 2", "not a couplings file"),
     ],
 )
-def test_bad_rows_of_how_joints_are_held_are_named(tmp_path, row, word):
+def test_invalid_joint_priors_are_refused_by_name(tmp_path, row, word):
     file = tmp_path / "bad.couplings.yaml"
     file.write_text(f"usual: [{{name: knuckle, {row}}}]")
     with pytest.raises(ModelError, match=word) as caught:
@@ -182,7 +182,7 @@ def test_bad_rows_of_how_joints_are_held_are_named(tmp_path, row, word):
     assert "bad.couplings.yaml" in str(caught.value)
 
 
-def test_bad_arrays_are_refused():
+def test_invalid_arrays_are_refused():
     with pytest.raises(SettingsError, match=r"'r'.*finite"):
         make_inequalities(["a"], ["r"], [[1.0]], [np.inf])
     with pytest.raises(SettingsError, match=r"'r'.*zero"):
@@ -193,7 +193,7 @@ def test_bad_arrays_are_refused():
         from_bounds(["a"], [2], [1])
 
 
-def test_the_hand_is_what_its_script_writes(tmp_path):
+def test_the_hands_files_equal_its_scripts_output(tmp_path):
     script = HAND.parent / "make_two_finger_hand.py"
     subprocess.run([sys.executable, str(script), "--out", str(tmp_path)], check=True)
     assert {path.name for path in tmp_path.iterdir()} == {

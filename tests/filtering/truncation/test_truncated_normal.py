@@ -25,7 +25,7 @@ METHODS = {"sequential": truncate_sequential, "joint": truncate_joint}
 
 
 def random_problem(seed, n=4, rows=6, reach=1.5):
-    """A normal distribution, and rows around a point up to ``reach`` deviations away."""
+    """Return a belief, and rows about a point up to ``reach`` standard deviations away."""
     generator = np.random.default_rng(seed)
     A = generator.normal(size=(n, n))
     covariance = A @ A.T / n + 0.05 * np.eye(n)
@@ -38,15 +38,15 @@ def random_problem(seed, n=4, rows=6, reach=1.5):
     return make_belief(mean, covariance), rows
 
 
-# 1 - D: against scipy where scipy is good, quadrature, and the tail's series.
+# One dimension: compared with quadrature, the tail's series, and scipy where it is accurate.
 
 
 @pytest.mark.parametrize("c", [-35.0, -8.0, -3.0, -0.5, 0.0, 0.7, 2.0, 5.0])
-def test_one_sided_moments(c):
+def test_one_sided_moments_equal_quadrature(c):
     log_probability, mean, variance = interval_moments(-np.inf, c)
 
     def density(u):
-        # Shifted to the bound, so that the quadrature sees no tiny numbers.
+        # Shifted to the bound, so that the quadrature avoids tiny numbers.
         return math.exp(c * u - 0.5 * u * u)
 
     total = quad(density, 0, np.inf, epsabs=0, epsrel=1e-12)[0]
@@ -63,7 +63,7 @@ def test_one_sided_moments(c):
 def test_far_tails_follow_the_asymptotic_series(c):
     _, mean, variance = interval_moments(-np.inf, c)
     a = -c
-    # Hazard rate of the normal distribution, and 1 - hazard (hazard - a).
+    # Mean (hazard rate) and variance 1 - hazard (hazard - a) of the tail.
     assert a + mean == pytest.approx(-(1 / a - 2 / a**3 + 10 / a**5), rel=1e-6, abs=4e-16 * a)
     assert variance == pytest.approx(1 / a**2 - 6 / a**4 + 50 / a**6, rel=1e-6)
 
@@ -71,7 +71,7 @@ def test_far_tails_follow_the_asymptotic_series(c):
 @pytest.mark.parametrize(
     ("low", "high"), [(-1, 1), (-3, 0.2), (0.5, 0.7), (2, 6), (-8.99, 8.99), (4, np.inf), (-7, -6)]
 )
-def test_two_sided_moments(low, high):
+def test_two_sided_moments_equal_scipys(low, high):
     log_probability, mean, variance = interval_moments(low, high)
     expected_mean, expected_variance = truncnorm.stats(low, high)
     assert mean == pytest.approx(float(expected_mean), rel=1e-9, abs=1e-12)
@@ -81,7 +81,7 @@ def test_two_sided_moments(low, high):
     assert log_probability <= 0
 
 
-def test_a_narrow_interval_is_uniform():
+def test_narrow_intervals_are_uniform():
     for width in (1e-3, 1e-9):
         _, mean, variance = interval_moments(3.0, 3.0 + width)
         assert mean == pytest.approx(3.0 + width / 2, abs=width**2)
@@ -93,8 +93,8 @@ def test_a_narrow_interval_is_uniform():
 
 @pytest.mark.parametrize("c", [-1e7, -1e3, -40.0, -8.0, -1.0, 0.0, 3.0, 40.0])
 @pytest.mark.parametrize("method", METHODS)
-def test_one_row_in_many_dimensions_is_exact(method, c):
-    """Along the row the 1-D moments; the rest is carried along by regression."""
+def test_one_row_is_exact_in_many_dimensions(method, c):
+    """1-D moments along the row, and linear regression for the other directions."""
     belief, _ = random_problem(3)
     phi = np.array([1.0, -2.0, 0.0, 0.5])
     s = math.sqrt(phi @ belief.covariance @ phi)
@@ -115,8 +115,8 @@ def test_one_row_in_many_dimensions_is_exact(method, c):
     assert result.c == pytest.approx([c], rel=1e-14, abs=1e-9)
 
 
-def test_sequential_is_the_papers_formula():
-    """(21) to (29) with the rotations of (21) written out, row by row."""
+def test_sequential_truncation_equals_the_papers_formula():
+    """(21) to (29) with the rotations of (21), row by row."""
     for seed in range(10):
         belief, rows = random_problem(seed)
         q, Q = belief.mean, belief.covariance
@@ -127,7 +127,7 @@ def test_sequential_is_the_papers_formula():
             c = (b - phi @ q) / np.linalg.norm(v)
             if c > 5:
                 continue
-            # R turns v to the first axis.
+            # R rotates v to the first axis.
             basis = np.linalg.qr(np.column_stack([v, np.eye(len(q))]))[0]
             R = basis.T * np.where(np.arange(len(q)) == 0, np.sign(basis[:, 0] @ v), 1.0)[:, None]
             nu = -math.sqrt(2 / math.pi) * math.exp(-c * c / 2) / (1 + math.erf(c / math.sqrt(2)))
@@ -141,7 +141,7 @@ def test_sequential_is_the_papers_formula():
 
 
 def moments_by_grid(belief, rows):
-    """The logarithm of the probability inside, and mean and covariance there, by a fine grid."""
+    """Return log probability, mean and covariance inside the rows, by a fine grid."""
     n = len(belief.mean)
     z, step = np.linspace(-6.0, 6.0, {2: 401, 3: 81}[n], retstep=True)
     z = np.stack(np.meshgrid(*[z] * n), axis=-1).reshape(-1, n)
@@ -153,8 +153,8 @@ def moments_by_grid(belief, rows):
 
 
 @pytest.mark.parametrize(("n", "rows", "within"), [(2, 2, 0.01), (3, 5, 0.1)])
-def test_joint_agrees_with_a_grid_and_better_than_row_by_row(n, rows, within):
-    """Means and covariances in deviations."""
+def test_joint_truncation_is_near_a_grids_and_nearer_than_the_sequential(n, rows, within):
+    """Errors of means and covariances in standard deviations."""
     off = []
     for seed in range(4):
         belief, limits = random_problem(seed, n, rows, reach=2.0)
@@ -170,7 +170,7 @@ def test_joint_agrees_with_a_grid_and_better_than_row_by_row(n, rows, within):
     assert np.median(papers) > 3.0 * np.median(ours)
 
 
-def test_permuting_the_rows_changes_joint_by_nothing_and_sequential_by_something():
+def test_only_sequential_truncation_depends_on_the_order_of_rows():
     moved = []
     for seed in range(10):
         belief, rows = random_problem(seed, n=8, rows=12)
@@ -182,16 +182,16 @@ def test_permuting_the_rows_changes_joint_by_nothing_and_sequential_by_something
         np.testing.assert_array_equal(joint[0].c[order], joint[1].c)
         one, other = (truncate_sequential(belief, r) for r in (rows, shuffled))
         spread = np.sqrt(np.diag(one.covariance))
-        # The sites have settled: begun where they are, they stay.
+        # Converged sites do not change when they are the start.
         again = truncate_joint(belief, rows, start=joint[0].sites)
         np.testing.assert_allclose(again.mean / spread, joint[0].mean / spread, atol=1e-6)
         moved.append(np.abs((one.mean - other.mean) / spread).max())
-    # Reported: the paper's form moves by a good part of a deviation with the order of rows.
+    # The sequential form moves by a considerable part of a standard deviation.
     assert 0.05 < np.median(moved) < 3.0
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_row_that_never_binds_changes_nothing(method):
+def test_distant_rows_change_nothing(method):
     for seed in range(10):
         belief, rows = random_problem(seed)
         far = two_sided(rows.columns, "far", [1, 1, 1, 1], -500, 500)
@@ -202,7 +202,7 @@ def test_a_row_that_never_binds_changes_nothing(method):
         np.testing.assert_array_equal(other.active, np.r_[False, False, one.active])
 
 
-def test_joint_counts_a_row_once_however_often_it_is_given():
+def test_joint_truncation_counts_duplicated_rows_once():
     belief, rows = random_problem(4)
     doubled = make_inequalities(
         rows.columns,
@@ -220,7 +220,7 @@ def test_joint_counts_a_row_once_however_often_it_is_given():
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("reach", [1.0, 40.0, 1e4, 1e7])
-def test_always_finite_definite_and_for_joint_inside(method, reach):
+def test_truncated_beliefs_are_finite_and_definite_and_joint_ones_inside(method, reach):
     for seed in range(25):
         belief, rows = random_problem(seed, n=5, rows=9, reach=reach)
         result = METHODS[method](belief, rows)
@@ -234,7 +234,7 @@ def test_always_finite_definite_and_for_joint_inside(method, reach):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_an_element_without_variance_stays_where_it_is(method):
+def test_elements_without_variance_do_not_move(method):
     covariance = np.diag([1.0, 0.0])
     rows = from_bounds(["a", "b"], [0.5, -1], [2, 1])
     result = METHODS[method](make_belief(np.zeros(2), covariance), rows)
@@ -243,7 +243,7 @@ def test_an_element_without_variance_stays_where_it_is(method):
     assert 0.5 < result.mean[0] < 2
     with pytest.raises(SettingsError, match="'b <= 1'"):
         METHODS[method](make_belief(np.array([0.0, 3.0]), covariance), rows)
-    # What rounding takes it beyond is not beyond, whatever the signs.
+    # Violations by rounding are tolerated for both signs.
     for sign in (1.0, -1.0):
         at = from_bounds(["a", "b"], [0.5, -0.3], [2, 0.3])
         result = METHODS[method](make_belief(np.array([0.0, sign * (0.1 + 0.2)]), covariance), at)
@@ -251,25 +251,25 @@ def test_an_element_without_variance_stays_where_it_is(method):
 
 
 @pytest.mark.parametrize("method", [*METHODS.values(), clip])
-def test_a_belief_about_other_elements_is_refused(method):
+def test_beliefs_of_another_size_are_refused(method):
     with pytest.raises(SettingsError, match="for_columns"):
         method(make_belief([0, 0, 0], np.eye(3)), from_bounds(["a", "b"], [-1, -1], [1, 1]))
 
 
-def test_parallel_rows_that_exclude_each_other_are_named():
+def test_conflicting_parallel_rows_are_named():
     rows = make_inequalities(["a"], ["up", "down"], [[2.0], [-1.0]], [1.0, -3.0])
     with pytest.raises(SettingsError, match="up; down"):
         merge_rows(rows)
 
 
-def test_clipping_moves_the_mean_inside_and_nothing_else():
+def test_clipping_moves_only_the_mean():
     belief, rows = random_problem(7, reach=4.0)
     result = clip(belief, rows)
     assert (rows.margins(result.mean) > -1e-9).all()
     np.testing.assert_array_equal(result.covariance, belief.covariance)
 
 
-def test_no_rows_at_all():
+def test_truncation_without_rows_changes_nothing():
     nothing = from_bounds(["a"], [-np.inf], [np.inf])
     for method in (*METHODS.values(), clip):
         result = method(make_belief([3.0], [[2.0]]), nothing)

@@ -13,7 +13,7 @@ from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.files.test_report_page import Page
-from tests.filtering.tracking.test_colours import painted, room
+from tests.filtering.tracking.test_colours import make_background, painted
 from tests.filtering.tracking.test_match_and_track import swings
 from tests.jobs.scenes import edit_camera, write_joints
 from tests.registration.episodes import painted_episode
@@ -29,7 +29,7 @@ def recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recording")
     model, camera = forked_body(folder), near_camera()
     generator = np.random.default_rng(9)
-    background = room(generator)
+    background = make_background(generator)
     truth = swings(FRAMES, np.array([0.1, 0.9, -0.8]), 0.25, generator)
     scene = folder / "scene"
     (scene / "images" / "front").mkdir(parents=True)

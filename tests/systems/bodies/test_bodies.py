@@ -1,4 +1,4 @@
-"""Bodies that stand as positions say, and positions as messages."""
+"""Bodies posed by positions, and positions as messages."""
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -19,7 +19,7 @@ def test_positions_are_named_in_a_message(body):
         np.testing.assert_allclose(message.joint_position, [0.1, 0.4, -0.4], atol=1e-6)
 
 
-def test_positions_are_held_about_their_time():
+def test_positions_are_held_around_their_time():
     q = np.array([[1.0, -1.0], [2.0, 5.0], [4.0, 0.0]])
     held = held_positions(q, 0.2)
     for k, row in enumerate(q):
@@ -27,7 +27,7 @@ def test_positions_are_held_about_their_time():
             np.testing.assert_array_equal(held.value(0.2 * (k + share)).ravel(), row)
 
 
-def test_bodies_are_where_their_base_is_moved_to(body):
+def test_body_poses_move_with_the_base(body):
     plant, q = body.plant, np.array([0.1, 0.4, -0.4])
     X_WB = RigidTransform([1.0, 2.0, 3.0])
     for pose, moved in zip(body_poses(plant, q), body_poses(plant, q, X_WB), strict=True):

@@ -1,4 +1,4 @@
-"""Skin in diagrams: sensors see it bend, Meshcat is sent it, and the matcher finds the pose."""
+"""Skin in diagrams: sensors and Meshcat show it bent, and the matcher finds the pose."""
 
 from pathlib import Path
 
@@ -29,7 +29,7 @@ def camera() -> ParallelCamera:
 
 
 class _Recorder:
-    """Stands in for Meshcat and keeps what it is sent."""
+    """Replaces Meshcat and records what it is sent."""
 
     def __init__(self) -> None:
         self.meshes: list[tuple[str, np.ndarray, np.ndarray]] = []
@@ -55,7 +55,7 @@ def test_meshcat_is_sent_the_bent_bands(limb: ArticulatedModel, recorded: bool) 
         context.SetTime(time)
         drawer.get_input_port().FixValue(context, positions)
         drawer.ForcedPublish(context)
-    # What did not move is not sent again.
+    # Unchanged positions are not sent again.
     assert len(recorder.meshes) == 4
     for k, expected in enumerate([*skin.vertices(np.zeros(5)), *skin.vertices(q)]):
         path, vertices, faces = recorder.meshes[k]
@@ -70,7 +70,7 @@ def test_meshcat_is_sent_the_bent_bands(limb: ArticulatedModel, recorded: bool) 
 
 
 def test_a_simulated_camera_sees_the_skin(limb: ArticulatedModel) -> None:
-    """The matcher, whose bodies have skin, finds the pose that the sensor saw, with E near 0."""
+    """The matcher, whose bodies have skin, finds the true pose with E_total near 0."""
     search = PaperSearch(
         limb.pose_tree(), PaperSearchSettings(interval=0.6, outside_limit=3.0, candidate_limit=20)
     )
@@ -95,7 +95,7 @@ def test_a_simulated_camera_sees_the_skin(limb: ArticulatedModel) -> None:
         assert meshcat.HasPath(f"visualizer/{name}")
 
 
-def test_models_without_skin_get_no_system(tmp_path: Path) -> None:
+def test_models_without_skin_add_no_system(tmp_path: Path) -> None:
     plain = load_limb(tmp_path, "")
     builder = DiagramBuilder()
     source = builder.AddSystem(ConstantVectorSource(np.zeros(5)))

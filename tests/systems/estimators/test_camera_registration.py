@@ -1,4 +1,4 @@
-"""A camera whose pose nobody told is found in a diagram, and found again after a bump."""
+"""A camera of unknown pose is found in a diagram, and found again after it was moved."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -40,7 +40,7 @@ def online(model: ArticulatedModel) -> OnlineRegistration:
 
 
 class TestCameraRegistration:
-    def test_knows_nothing_at_first(self, online: OnlineRegistration) -> None:
+    def test_no_pose_at_first(self, online: OnlineRegistration) -> None:
         run = Bench(CameraRegistration(online, PERIOD))
         assert run["status"] == [0.0]
         assert np.isnan(run["X_WC"].translation()).all()
@@ -50,7 +50,7 @@ class TestCameraRegistration:
         assert np.isnan(named["mean_iou"])
         assert run.system.registered_camera(run.context) is None
 
-    def test_waits_for_pictures_and_positions(self, online: OnlineRegistration) -> None:
+    def test_ignores_missing_images_and_positions(self, online: OnlineRegistration) -> None:
         system = CameraRegistration(online, PERIOD)
         run = Bench(system).update(measured_positions=np.full(5, np.nan))
         mask = np.zeros((480, 640), dtype=bool)
@@ -62,12 +62,12 @@ class TestCameraRegistration:
         (kept,) = system.belief(run.context).keyframes
         assert kept.name == "1.5 s"
         np.testing.assert_array_equal(kept.mask, mask)
-        # What is known is state of the context.
+        # All state is in the context.
         run.context.SetStateAndParametersFrom(system.CreateDefaultContext())
         assert system.belief(run.context).keyframes == ()
 
-    def test_counts_the_labels_of_a_model_made_of_a_plant(self, online) -> None:
-        """A ground that fills the picture is not the robot's."""
+    def test_uses_the_labels_of_a_model_made_of_a_plant(self, online) -> None:
+        """A ground that fills the image does not belong to the robot."""
         labels = np.full((480, 640, 1), 9, np.int16)
         labels[100:200, 100:200] = 5
         image = mask_to_label_image(labels[..., 0] > 0)
@@ -79,19 +79,19 @@ class TestCameraRegistration:
         run = Bench(system).update(measured_positions=np.zeros(5), label_image=image)
         (kept,) = system.belief(run.context).keyframes
         np.testing.assert_array_equal(kept.mask, labels[..., 0] == 5)
-        # A model of a file does not know them.
+        # A model of a file has no labels.
         with pytest.raises(MaskError, match=r"cover 100% of the image.*labels="):
             Bench(CameraRegistration(online, PERIOD)).update(
                 measured_positions=np.zeros(5), label_image=image
             )
 
-    def test_refuses_a_period_that_is_none(self, online: OnlineRegistration) -> None:
+    def test_refuses_a_period_of_zero(self, online: OnlineRegistration) -> None:
         with pytest.raises(SettingsError, match="period"):
             CameraRegistration(online, 0.0)
 
 
 @pytest.mark.slow
-def test_a_camera_is_found_and_found_again_after_a_bump(
+def test_a_camera_is_found_and_found_again_after_it_was_moved(
     model: ArticulatedModel, online: OnlineRegistration
 ) -> None:
     rng = np.random.default_rng(5)
@@ -113,9 +113,9 @@ def test_a_camera_is_found_and_found_again_after_a_bump(
         assert np.linalg.norm(off[:3]) < np.radians(0.2)
         assert np.linalg.norm(off[3:]) < 3e-3
         covariance = run["covariance"].reshape(6, 6)
-        # 99.9 % of a chi-square distribution with six degrees of freedom.
+        # 99.9 % quantile of a chi-squared distribution with six degrees of freedom.
         assert off @ np.linalg.solve(covariance, off) < 22.5
-        # A covariance that says nothing would hold anything.
+        # A huge covariance would pass this check.
         assert np.sqrt(np.diag(covariance)).max() < 3e-3
         named = dict(zip(REGISTRATION, run["registration"], strict=True))
         assert named["moves"] == moves
@@ -131,6 +131,6 @@ def test_a_camera_is_found_and_found_again_after_a_bump(
     simulator.AdvanceTo(11.9 * PERIOD)
     check(X_WC.GetAsMatrix4(), 1)
     status = built.status_log.FindLog(simulator.get_context()).data()[0]
-    # A log samples just before the update of the same time.
+    # A log samples before the update at the same time.
     np.testing.assert_array_equal(status[1:5], 0.0)
     np.testing.assert_array_equal(status[5:9], 1.0)

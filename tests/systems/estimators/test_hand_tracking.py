@@ -1,4 +1,4 @@
-"""The sensor of a hand's silhouettes."""
+"""HandSensor, compared with its HandSilhouette."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from drake_pose.systems.truncated_ekf import HandSensor
 from tests.systems.bench import Bench
 
 
-def test_the_hand_sensor_measures_the_silhouette_beside_the_prediction():
+def test_the_hand_sensor_measures_near_the_prediction():
     belief_filter = experiment_filter()[0]
     truth = true_states(35.0, np.zeros(6))[24]
     silhouette = HandSilhouette(belief_filter, 480, 400, (239.5, 199.5))

@@ -53,8 +53,8 @@ def pinhole(shift=0.1234):
 
 
 @pytest.mark.parametrize("camera", [pinhole(), front_camera(200, shift=0.1234)])
-def test_simulated_camera_to_estimated_positions(chain, camera):
-    """Drake's own renderer draws the truth; the kernel of the matcher must find it again."""
+def test_poses_rendered_by_drake_are_found(chain, camera):
+    """Drake renders the true pose; the matcher scores with its own kernel."""
     trajectory = PiecewisePolynomial.ZeroOrderHold(
         PERIOD * np.arange(4) - 0.01, np.vstack([TRUTH, TRUTH[-1:]]).T
     )
@@ -63,7 +63,7 @@ def test_simulated_camera_to_estimated_positions(chain, camera):
     simulator.AdvanceTo(3 * PERIOD + 0.01)
     context = simulator.get_context()
     log = built.positions_log.FindLog(context)
-    # The log samples just before each update: the first sample is the default pose.
+    # The log samples before each update: the first sample is the default pose.
     np.testing.assert_allclose(log.sample_times()[:4], PERIOD * np.arange(4))
     np.testing.assert_allclose(log.data().T[1:4], TRUTH, atol=1e-9)
     errors = built.error_log.FindLog(context).data()[0]
@@ -71,8 +71,8 @@ def test_simulated_camera_to_estimated_positions(chain, camera):
     assert (errors[1:4] < 0.02).all()
 
 
-def test_a_body_s_depths_are_those_of_its_whole_motion_and_hardly_more(tmp_path):
-    """Against every depth of what slides towards a camera and back."""
+def test_the_depth_range_covers_the_whole_motion_tightly(tmp_path):
+    """For a body that slides towards a camera and back."""
     model = load_body(
         tmp_path,
         box_link("sled", 10, 10),
@@ -97,7 +97,7 @@ def test_one_camera_of_two_is_enough(chain):
     np.testing.assert_allclose(run["estimated_positions"], truth, atol=1e-9)
 
 
-def test_no_pose_keeps_the_last_estimate_and_says_so(chain):
+def test_without_a_pose_the_last_estimate_is_kept_and_reported(chain):
     search = search_for(chain, outside_limit=0.0)
     run = Bench(SilhouetteMatcher(search, [front_camera()], PERIOD))
     blot = np.zeros((100, 100), dtype=bool)
@@ -109,8 +109,8 @@ def test_no_pose_keeps_the_last_estimate_and_says_so(chain):
     assert np.isinf(run["error"]).all()
 
 
-def test_labels_choose_the_body(chain):
-    """Other things in the label image do not disturb where the body's labels are given."""
+def test_labels_select_the_body(chain):
+    """Other labels in the image are ignored."""
     camera = front_camera(200, shift=0.12)
     labels = LabelRenderer(chain, camera).label_image(TRUTH[0])
     own = {int(label) for label in np.unique(labels)} - {32766}
@@ -134,7 +134,7 @@ def write_scene(folder, model, camera, poses):
 
 
 def test_recorded_masks_with_a_root_position_for_each_frame(tmp_path):
-    """A slider on rails carries a turning box; the rails' place is told frame by frame."""
+    """A slider on rails carries a turning box; the rails' position is given for each frame."""
     model = load_body(
         tmp_path,
         "".join(f'<link name="rail_{i}"/>' for i in range(2)),
@@ -161,7 +161,7 @@ def test_recorded_masks_with_a_root_position_for_each_frame(tmp_path):
         assert run["base_pose"].IsExactlyEqualTo(RigidTransform())
 
 
-def test_mask_player_plays_frame_by_frame(tmp_path, chain):
+def test_the_mask_player_plays_frame_by_frame(tmp_path, chain):
     camera = front_camera()
     scene = write_scene(tmp_path / "scene", chain, camera, TRUTH[:2])
     player = Bench(MaskPlayer(scene, [camera]))
@@ -173,7 +173,7 @@ def test_mask_player_plays_frame_by_frame(tmp_path, chain):
 
 
 @pytest.mark.parametrize("system", [SilhouetteMatcher, SilhouetteTracker])
-def test_bad_settings_are_refused(chain, system):
+def test_invalid_settings_are_refused(chain, system):
     search = search_for(chain)
     with pytest.raises(SettingsError, match="period"):
         system(search, [front_camera()], 0.0)
@@ -183,8 +183,8 @@ def test_bad_settings_are_refused(chain, system):
         system(search, [front_camera(), front_camera()], PERIOD)
 
 
-def test_what_the_answer_is_worth_comes_out(tmp_path):
-    """A lever that turns in depth is seen the same turned towards the camera and away from it."""
+def test_pose_sets_are_output(tmp_path):
+    """A lever has the same silhouette turned towards the camera and away from it."""
     model = load_body(
         tmp_path,
         joint("swing", "revolute", "world", "lever", (-1.0, 1.0), axis="0 1 0"),
@@ -201,7 +201,7 @@ def test_what_the_answer_is_worth_comes_out(tmp_path):
     assert np.isnan(run["mode_positions"][2])
     assert run["determined"] == 0.0
     np.testing.assert_allclose([run["lower"][0], run["upper"][0]], [-0.5, 0.5], atol=1e-9)
-    # An empty image says nothing, and a search that does not examine leaves it open.
+    # NaN without a body in the image, and if the search does not examine its result.
     run.update(label_image=mask_to_label_image(0 * mask > 0))
     assert np.isnan(run["mode_positions"]).all()
     with pytest.raises(SettingsError, match="mode limit"):

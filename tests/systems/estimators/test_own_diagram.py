@@ -1,4 +1,4 @@
-"""The few lines of a user: a finalized plant, RgbdSensors, and the matcher beside them."""
+"""A user's diagram: a finalized plant, RgbdSensors and the matcher."""
 
 import math
 
@@ -23,7 +23,7 @@ X_WC = RigidTransform(front_camera().X_WC)
 
 
 class Station:
-    """A chain before a wall that its cameras see, too."""
+    """A chain before a wall that its cameras also see."""
 
     def __init__(self, folder) -> None:
         self.builder = DiagramBuilder()
@@ -51,7 +51,7 @@ class Station:
 
 
 @pytest.mark.parametrize("system", [SilhouetteMatcher, SilhouetteTracker])
-def test_a_plant_and_its_sensor_are_all_that_is_needed(tmp_path, system):
+def test_a_plant_and_its_sensor_suffice(tmp_path, system):
     station = Station(tmp_path)
     sensor = station.add_sensor("front", "world", X_WC)
     settings = PaperSearchSettings(interval=math.radians(30.0), outside_limit=6.0)
@@ -65,13 +65,13 @@ def test_a_plant_and_its_sensor_are_all_that_is_needed(tmp_path, system):
     simulator.Initialize()
     simulator.get_system().ExecuteForcedEvents(simulator.get_mutable_context())
     own = matcher.GetMyContextFromRoot(simulator.get_context())
-    # The wall has a label, too: it fills the picture.
+    # The wall has a label too, and fills the image.
     assert matcher.GetOutputPort("error").Eval(own)[0] < 0.02
     found = matcher.GetOutputPort("estimated_positions").Eval(own)
     np.testing.assert_allclose(found, TRUTH, atol=math.radians(1.0))
 
 
-def test_cameras_of_a_diagram_are_those_of_its_sensors(tmp_path):
+def test_cameras_from_drake_equal_the_sensors(tmp_path):
     station = Station(tmp_path)
     with pytest.raises(CameraError, match="no RgbdSensor"):
         cameras_from_drake(station.builder)
@@ -84,12 +84,12 @@ def test_cameras_of_a_diagram_are_those_of_its_sensors(tmp_path):
         cameras_from_drake(diagram, ["back"])
     (camera,) = cameras_from_drake(diagram, ["front"]).values()
     assert camera.name == "front"
-    # Drake's middle of a picture: its pixel centres lie at i + 0.5.
+    # The centre of Drake's image, whose pixel centres are at i + 0.5.
     assert (camera.center_x, camera.center_y, camera.focal_x) == (99.0, 99.0, 900.0)
     np.testing.assert_allclose(camera.X_WC, X_WC.GetAsMatrix4(), atol=1e-12)
 
 
-def test_a_tree_in_place_of_a_search_is_refused(tmp_path):
+def test_a_tree_instead_of_a_search_is_refused(tmp_path):
     tree = swinging_chain(tmp_path, 2).pose_tree()
     with pytest.raises(SettingsError, match=r"needs a search, as MultiStartSearch\(tree\)"):
         SilhouetteMatcher(tree, [front_camera()], 0.1)

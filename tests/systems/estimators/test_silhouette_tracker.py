@@ -33,7 +33,7 @@ def search(body):
 
 
 def motion():
-    """(20, 3) positions; a cut after the twelfth."""
+    """Positions (20, 3), with a cut after the twelfth."""
     t = np.arange(20)[:, None] / 40
     swing = 0.25 * np.sin(2 * np.pi * t * np.array([1.0, 1.3, 0.8]) + np.array([0.0, 1.0, 2.0]))
     centre = np.where(t < 12 / 40, [[0.1, 0.4, -0.4]], [[-0.3, 1.7, -1.7]])
@@ -41,13 +41,13 @@ def motion():
 
 
 def played(truth):
-    """A trajectory that holds each of the positions for a frame."""
+    """Return a trajectory that holds each row of positions for a frame."""
     breaks = PERIOD * (np.arange(len(truth) + 1) - 0.3)
     return PiecewisePolynomial.ZeroOrderHold(breaks, np.vstack([truth, truth[-1:]]).T)
 
 
 def followed(built, truth):
-    """Errors and deviations (T, n) of tracked positions, and TRACK by name (T,)."""
+    """Return errors and deviations (T, n) of tracked positions, and TRACK by name (T,)."""
     simulator = Simulator(built.diagram)
     root, rows = simulator.get_mutable_context(), []
     for k in range(len(truth)):
@@ -60,9 +60,9 @@ def followed(built, truth):
     return positions - truth, deviations, dict(zip(TRACK, tracks.T, strict=True))
 
 
-def test_velocities_and_body_poses_are_those_of_the_plant(body, search):
+def test_velocities_and_body_poses_equal_the_plants(body, search):
     camera = front_camera(200, shift=0.2)
-    # Rates that fade, as they do by default, are too small in steady motion.
+    # With the default memory, rates are too small in steady motion.
     settings = TrackingSettings(memory=5.0)
     run = Bench(SilhouetteTracker(search, [camera], PERIOD, tracking=settings))
     renderer = LabelRenderer(body, camera)
@@ -77,14 +77,14 @@ def test_velocities_and_body_poses_are_those_of_the_plant(body, search):
     np.testing.assert_allclose(run["estimated_state"][3:], speed, atol=0.15)
     for pose, expected in zip(poses, renderer.link_poses(found), strict=True):
         np.testing.assert_allclose(pose.GetAsMatrix4(), expected, atol=1e-12)
-    # What is estimated can be looked at: the port fits a camera's.
+    # The port of the estimated body poses connects to a camera.
     seen = Bench(SilhouetteCamera(body.plant, body.scene_graph, camera)).give(body_poses=poses)
     mask = label_image_to_mask(seen["label_image"])
     assert np.count_nonzero(mask != renderer.mask(found)) <= 0.002 * mask.sum()
 
 
-def test_contexts_of_one_tracker_have_labels_and_settings_of_their_own(body, search):
-    """Parameters varied in a context, against systems that were made with them."""
+def test_contexts_have_their_own_labels_and_settings(body, search):
+    """Parameters changed in a context, compared with systems constructed with them."""
     camera = front_camera(200, shift=0.2)
     renderer = LabelRenderer(body, camera)
     stiff = TrackingSettings(angle_acceleration=2.0)
@@ -116,8 +116,8 @@ def test_contexts_of_one_tracker_have_labels_and_settings_of_their_own(body, sea
         wrong.update(label_image=mask_to_label_image(renderer.mask(motion()[0])))
 
 
-def test_a_copied_context_goes_on_as_the_first_did(body, search):
-    """All that the tracker remembers is in the context."""
+def test_a_copied_context_continues_as_the_original(body, search):
+    """All state of the tracker is in the context."""
     camera = front_camera(200, shift=0.2)
     renderer = LabelRenderer(body, camera)
     images = [mask_to_label_image(renderer.mask(q)) for q in motion()[:6]]
@@ -133,7 +133,7 @@ def test_a_copied_context_goes_on_as_the_first_did(body, search):
         np.testing.assert_array_equal(run[name], copy[name])
 
 
-def test_a_covered_lens_loses_the_track_and_a_measured_position_brings_it_back(body, search):
+def test_a_covered_lens_loses_the_track_until_positions_are_measured(body, search):
     camera = front_camera(200, shift=0.2)
     run = Bench(SilhouetteTracker(search, [camera], PERIOD, color_cameras=["front"]))
     mask, truth = LabelRenderer(body, camera).mask(motion()[0]), motion()[0]
@@ -144,11 +144,11 @@ def test_a_covered_lens_loses_the_track_and_a_measured_position_brings_it_back(b
         run.update(color_image=image, measured_positions=measured)
         found.append(run["pose_estimate"].found)
     assert found == [True, False, True]
-    # Nobody asked the search, for which there was no mask.
+    # The search was not used, because there was no mask.
     assert run["track"][TRACK.index("matches")] == 0
 
 
-def test_measured_positions_that_masks_contradict_are_not_believed(body, search):
+def test_measured_positions_that_do_not_fit_the_masks_are_rejected(body, search):
     camera = front_camera(200, shift=0.2)
     run, truth = Bench(SilhouetteTracker(search, [camera], PERIOD)), motion()[0]
     image = mask_to_label_image(LabelRenderer(body, camera).mask(truth))
@@ -157,12 +157,12 @@ def test_measured_positions_that_masks_contradict_are_not_believed(body, search)
     assert run["track"][TRACK.index("matches")] == 1
 
 
-def test_a_color_camera_that_is_none_is_named(search):
+def test_an_unknown_color_camera_is_refused_by_name(search):
     with pytest.raises(UnknownNameError, match=r"side.*front"):
         SilhouetteTracker(search, [front_camera()], PERIOD, color_cameras=["side"])
 
 
-def test_fingers_that_follow_one_another_are_tracked_as_one(tmp_path):
+def test_mimic_joints_are_tracked_together(tmp_path):
     model = gripper(tmp_path, follows=True)
     t = np.arange(12) / 12
     fingers = 0.04 + 0.03 * np.sin(2 * np.pi * t)

@@ -26,7 +26,7 @@ def sequence():
 
 
 def simulate(ekf, measurements, **more):
-    """One update a measurement; outputs after each, by name: (steps, size); and the bench."""
+    """Make an update for each measurement; return outputs (steps, size) by name, and the bench."""
     run, found = Bench(ekf), {name: [] for name in ("estimated_state", "statistics")}
     found["active_limits"] = []
     for t, y in enumerate(measurements):
@@ -36,8 +36,8 @@ def simulate(ekf, measurements, **more):
     return {name: np.array(rows) for name, rows in found.items()}, run
 
 
-def test_in_a_diagram_it_gives_what_the_filter_gives(sequence):
-    """Also where a camera is late, and where a view lasts: its offsets are part of the state."""
+def test_a_diagram_equals_the_filter(sequence):
+    """Also without a measurement, and in static views, whose offsets are part of the state."""
     f, observation = experiment_filter()
     rows = sequence.measurements[:24].copy()
     rows[6:8] = np.nan
@@ -59,7 +59,7 @@ def test_in_a_diagram_it_gives_what_the_filter_gives(sequence):
     assert weights.sum() == pytest.approx(1.0)
     states = run["hypothesis_states"].reshape(4, -1)
     np.testing.assert_array_equal(np.isnan(states).all(axis=1), weights == 0)
-    # Together they have the moments of what is drawn from them.
+    # The overall moments equal those of the mixture of the hypotheses.
     covariances = run["hypothesis_covariances"].reshape(4, len(HAND_STATE), -1)
     second = sum(
         weights[k] * (covariances[k] + np.outer(states[k], states[k]))
@@ -77,35 +77,35 @@ def test_in_a_diagram_it_gives_what_the_filter_gives(sequence):
     assert inside.min() > -1e-9
 
 
-def test_a_loss_is_said_and_a_reset_mends_it(sequence):
-    """A hand that jumps is lost, then started again at the reset state."""
+def test_a_loss_is_reported_and_a_reset_ends_it(sequence):
+    """A hand that jumps is lost, and the filter restarts from the reset state."""
     f, _ = experiment_filter()
     moved = sequence.measurements[:20].copy()
-    # The hand jumps in every frame, which no constant velocity explains.
+    # The hand jumps in each frame, which contradicts a constant velocity.
     moved[8:14, :2] += np.where(np.arange(8, 14) % 2, 150.0, -150.0)[:, None]
     ekf = TruncatedEkf(f, sequence.guess, PERIOD)
     logs, run = simulate(ekf, moved, reset_state=sequence.states)
     lost = logs["statistics"][:, STATISTICS.index("lost")]
-    # Three unlikely ones in a row, by default, make a loss.
+    # By default the track is lost after three consecutive unlikely measurements.
     np.testing.assert_array_equal(lost[:11], [*np.zeros(10), 1])
     assert lost[-1] == 0
     np.testing.assert_allclose(run["estimated_state"][:2], sequence.states[19, :2], atol=3)
 
 
-def test_restart_starts_again_although_nothing_is_lost(sequence):
+def test_restart_works_without_a_loss(sequence):
     f, _ = experiment_filter()
     run, moved = Bench(TruncatedEkf(f, sequence.guess, PERIOD)), sequence.states[0].copy()
     wanted = moved[0]
     for time, restart, x in ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (2.0, 1.0, 100.0)):
-        # The hand moves on at its rate; the reset state is elsewhere.
+        # The hand continues at its rate; the reset state is elsewhere.
         moved[0] = wanted + 100.0 * (time > 0.0)
         run.update(time, restart=np.array([restart]), reset_state=moved)
         assert run["estimated_state"][0] == pytest.approx(wanted + x, abs=10.0)
     assert run["estimated_state"][0] == pytest.approx(wanted + 100.0)
 
 
-def test_a_frame_can_bring_its_own_noise(sequence):
-    """The same measurement, once as sure as the model says and once ten times less."""
+def test_a_measurement_can_have_its_own_noise(sequence):
+    """The same measurement with the model's noise and with ten times larger noise."""
     f, observation = experiment_filter()
     deviations = []
     for factor in (None, 1.0, 100.0):
@@ -124,7 +124,7 @@ ABOUT = Belief(np.array([0.5, 0.0, 1.0]), np.diag([0.2, 0.2, 0.1]) ** 2)
 
 
 def swinging(period=0.1, **settings):
-    """The end of a rod that swings, seen by one camera."""
+    """Return a filter for a swinging rod whose end one camera measures."""
     end = FunctionObservation(
         ("u", "v"), 0.02, lambda x: x[2] * np.array([np.sin(x[0]), -np.cos(x[0])])
     )
@@ -132,8 +132,8 @@ def swinging(period=0.1, **settings):
     return TruncatedFilter(LAYOUT, end, LIMITS, motion, FilterSettings(**settings))
 
 
-def test_a_context_says_how_the_filter_works():
-    """What a parameter sets is what a filter made so does; more hypotheses than ports are none."""
+def test_a_contexts_parameters_set_the_filter():
+    """As in a filter constructed with them; more hypotheses than the ports hold are refused."""
     run, rows = Bench(TruncatedEkf(swinging(), ABOUT)), np.array([[0.5, -0.8], [0.6, -0.7]])
     settings = FilterSettings(linearisation="tangent", iterations=5)
     run.context.get_mutable_abstract_parameter(0).set_value(settings)
@@ -147,7 +147,7 @@ def test_a_context_says_how_the_filter_works():
     assert np.abs(run["covariance"] - plain["covariance"]).max() > 1e-6
     np.testing.assert_array_equal(plain["hypothesis_covariances"][:9], plain["covariance"])
     assert np.isnan(plain["hypothesis_covariances"][9:]).all()
-    # One that nothing but the context makes impatient.
+    # Its patience is set only in the context.
     run.context.get_mutable_numeric_parameter(0).SetFromVector([1.0, 0.5])
     run.update(0.3, measurement=rows[0] + 1.0)
     assert run["statistics"][STATISTICS.index("lost")] == 1
@@ -173,7 +173,7 @@ def test_the_period_is_the_motions():
 
 
 def pendulum(time_step):
-    """A point of 1 kg at 0.8 m below a joint."""
+    """Return a plant with a point mass of 1 kg 0.8 m below a joint."""
     plant = MultibodyPlant(time_step)
     rod = plant.AddRigidBody(
         "rod", SpatialInertia(1.0, [0.0, 0.0, -0.8], UnitInertia(0.64, 0.64, 0.0))
@@ -185,14 +185,14 @@ def pendulum(time_step):
 
 
 @pytest.mark.parametrize("time_step", [0.0, 1e-3])
-def test_a_plants_motion_is_its_differential_equation(time_step):
+def test_plant_motion_integrates_the_differential_equation(time_step):
     motion = plant_motion(pendulum(time_step), LAYOUT, 1e-6 * np.eye(3), 0.1)
     for x in ([0.5, -1.0, 0.3], [2.5, 3.0, 0.3]):
         expected = solve_ivp(
             lambda t, z: [z[1], -9.81 / 0.8 * np.sin(z[0])], (0.0, 0.1), x[:2], rtol=1e-10
         ).y[:, -1]
         found, slope = motion.predict(np.array(x))
-        # A discrete plant steps by 1 ms, which errs by as much.
+        # A discrete plant's steps of 1 ms cause an error of that order.
         np.testing.assert_allclose(found[:2], expected, atol=0.01 if time_step else 1e-5)
         assert found[2] == x[2]
         assert np.isfinite(slope).all()
@@ -204,7 +204,7 @@ def test_a_plants_motion_is_its_differential_equation(time_step):
             plant_motion(pendulum(time_step), LAYOUT, np.eye(3), 0.1005)
 
 
-def test_bad_settings_are_refused(sequence):
+def test_invalid_settings_are_refused(sequence):
     f, _ = experiment_filter()
     with pytest.raises(SettingsError, match="period"):
         TruncatedEkf(f, sequence.guess, 0.0)
@@ -214,7 +214,7 @@ def test_bad_settings_are_refused(sequence):
         TruncatedEkf(f, Belief(np.full(37, np.nan), np.eye(37)), 0.1)
 
 
-def test_time_that_runs_backwards_is_refused(sequence):
+def test_time_running_backwards_is_refused(sequence):
     run = Bench(TruncatedEkf(experiment_filter()[0], sequence.guess, PERIOD))
     run.update(0.0).update(1.0)
     with pytest.raises(SettingsError, match=r"backwards, from 1 s to 0\.5 s"):

@@ -151,18 +151,18 @@ class Backgrounds:
     def sums(self) -> PixelSums:
         """Log-likelihoods for ``explain``."""
         size, count = self.deviations.shape, len(self.colours)
-        total = np.zeros((*size, count), np.float32)
-        more = np.empty((*size, len(self.pictures), count), np.float32)
+        visible = np.zeros((*size, count), np.float32)
+        covered = np.empty((*size, len(self.pictures), count), np.float32)
         edges = np.empty((2, *self.pictures.shape[:3]), np.float32)
         noise = float(self.deviations.min())
         for f, picture in enumerate(self.pictures):
             likeness = [_likeness(picture, one, self.deviations) for one in self.colours]
             stacked = np.stack(likeness, axis=-1)
-            shown = np.log(MODEL.visible_match * stacked + (1.0 - MODEL.visible_match))
-            more[:, :, f] = (
-                np.log(MODEL.covered_match * stacked + (1.0 - MODEL.covered_match)) - shown
+            log_visible = np.log(MODEL.visible_match * stacked + (1.0 - MODEL.visible_match))
+            covered[:, :, f] = (
+                np.log(MODEL.covered_match * stacked + (1.0 - MODEL.covered_match)) - log_visible
             )
-            total += shown
+            visible += log_visible
             u, v = (_largest(np.abs(one)) for one in _slopes(picture))
             # Strength saturates at four standard deviations of the noise. An edge crosses an axis
             # unless the gradient along the other axis is much larger.
@@ -170,7 +170,7 @@ class Backgrounds:
             for k, (across, along) in enumerate(((u, v), (v, u))):
                 own = np.where(along <= 1.7 * across, strength, 0.0)
                 edges[k, f] = cv2.dilate(own, np.ones((3, 3), np.uint8))
-        return PixelSums(total, more, _largest(total), edges - edges.mean())
+        return PixelSums(visible, covered, _largest(visible), edges - edges.mean())
 
     @cached_property
     def max_gain(self) -> float:
@@ -237,7 +237,7 @@ class KnownBackground:
         total, count = np.zeros((height, width, 3), np.float32), np.zeros((height, width))
         on, beside = (np.zeros(COLOURS) for _ in range(2))
         inside, near = ~_grown(~covered, MODEL.margin), _grown(covered, MODEL.margin)
-        small, means = [], []
+        samples, differences = [], []
         for f, (picture, gain) in enumerate(zip(pictures, gains, strict=True)):
             even = apply_gain(picture, gain)
             shown = showing[f].astype(np.uint8)
@@ -249,11 +249,13 @@ class KnownBackground:
             on += np.bincount(numbers[inside[f]], minlength=COLOURS)
             beside += np.bincount(numbers[~near[f]], minlength=COLOURS)
             rows = np.flatnonzero(shows)[::37]
-            small.append((rows, even.reshape(-1, 3)[rows]))
+            samples.append((rows, even.reshape(-1, 3)[rows]))
         colours = (total / np.maximum(count, 1.0)[..., None]).astype(np.float32)
-        means = [_largest(np.abs(own - colours.reshape(-1, 3)[rows])) for rows, own in small]
-        deviation = np.concatenate([*means, np.zeros(1, np.float32)])
-        deviations = _deviations(colours, 1.4826 * float(np.median(deviation)))
+        differences = [
+            _largest(np.abs(own - colours.reshape(-1, 3)[rows])) for rows, own in samples
+        ]
+        noise = np.concatenate([*differences, np.zeros(1, np.float32)])
+        deviations = _deviations(colours, 1.4826 * float(np.median(noise)))
         return KnownBackground(
             colours, deviations, count == 0, _log_frequencies(on), _log_frequencies(beside)
         )
@@ -268,8 +270,10 @@ class KnownBackground:
         even = apply_gain(picture, gain)
         numbers = colour_numbers(np.clip(even, 0.0, 255.0).astype(np.uint8))
         likeness = _likeness(even, self.colours, self.deviations) * np.float32(MODEL.known_factor)
-        shown = np.log(MODEL.visible_match * likeness + (1.0 - MODEL.visible_match))
-        return np.asarray(self.on[numbers] - np.where(self.unseen, self.beside[numbers], shown))
+        log_visible = np.log(MODEL.visible_match * likeness + (1.0 - MODEL.visible_match))
+        return np.asarray(
+            self.on[numbers] - np.where(self.unseen, self.beside[numbers], log_visible)
+        )
 
 
 def foreground_picture(foreground: Floats) -> Picture:

@@ -212,14 +212,14 @@ def add_pictures(
         noise: noise of search lines [pixel].
         pixels: distance between offsets along a line [pixel].
     """
-    placed = compared.placement
+    placement = compared.placement
     packed = pack_cameras(cameras)
-    weights = camera_weights(packed, placed, stage, noise, 1.0)
+    weights = camera_weights(packed, placement, stage, noise, 1.0)
     for c, picture in enumerate(pictures):
         if picture is not None:
             compare_lines(
-                placed.packed, placed.X_WN, (packed[0][c], packed[1][c]), picture, histograms[c],
-                weights[c], pixels, compared.A[c], compared.b[c], compared.sums[c],
+                placement.packed, placement.X_WN, (packed[0][c], packed[1][c]), picture,
+                histograms[c], weights[c], pixels, compared.A[c], compared.b[c], compared.sums[c],
                 compared.bias_terms[c],
             )  # fmt: skip
 
@@ -270,7 +270,7 @@ def part_distances(sums: Array, closest: float = 0.7, shortest: float = 20.0) ->
 
 
 def update_histograms(
-    placed: Placement,
+    placement: Placement,
     cameras: Sequence[Camera],
     pictures: Sequence[Picture | None],
     histograms: Floats,
@@ -279,7 +279,7 @@ def update_histograms(
     """Return colour histograms (cameras, nodes, 3, COLOURS) updated with the images of a frame.
 
     Args:
-        placed: the body at its estimated pose.
+        placement: the body at its estimated pose.
         cameras: the cameras.
         pictures: image of each camera; None: its histograms stay.
         histograms: histograms before the frame.
@@ -293,7 +293,7 @@ def update_histograms(
     for c, picture in enumerate(pictures):
         if picture is not None:
             learn_colours(
-                placed.packed, placed.X_WN, (packed[0][c], packed[1][c]), picture, updated[c],
+                placement.packed, placement.X_WN, (packed[0][c], packed[1][c]), picture, updated[c],
                 LINES.spacing, np.array(LINES.strip_widths), rate, max_residual, 0,
                 np.zeros((0, 0), np.bool_),
             )  # fmt: skip

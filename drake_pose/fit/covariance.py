@@ -150,13 +150,14 @@ def distances_in_masks(
             by = (by * one.size * has_surface)[:, None] * mask[:, None]
             wider.append(one._replace(moves=np.concatenate([one.moves, by], axis=1)))
         pictures = wider
-    of, along, surface_derivatives = _known_directions(outlines, pictures, max_count)
+    indices, along, surface_derivatives = _known_directions(outlines, pictures, max_count)
     count = pictures[0].moves.shape[1]
-    y, X, camera_rows = np.zeros(len(of)), np.zeros((len(of), count)), np.zeros((len(of), 6))
+    y, X = np.zeros(len(indices)), np.zeros((len(indices), count))
+    camera_rows = np.zeros((len(indices), 6))
     information = np.zeros((count, count))
     for c, one in enumerate(pictures):
-        at = np.flatnonzero(of[:, 0] == c)
-        parts = of[at, 1]
+        at = np.flatnonzero(indices[:, 0] == c)
+        parts = indices[at, 1]
         rows = np.einsum("ri,rij->rj", along[at], symmetric(one.A)[parts])
         y[at] = np.einsum("ri,ri->r", along[at], one.b[parts])
         X[at] = np.einsum("rj,rmj->rm", rows, one.moves[parts])
@@ -164,24 +165,24 @@ def distances_in_masks(
         # An image depends on few of the values: only its own frame's and the shared ones.
         own = np.flatnonzero(one.moves.any(axis=(0, 2)))
         moves = one.moves[:, own]
-        active = moves @ symmetric(one.A) @ np.swapaxes(moves, 1, 2)
-        information[np.ix_(own, own)] += active.sum(axis=0)
-    same_picture, same_part = (of[:, None, k] == of[None, :, k] for k in range(2))
-    alike = surface_derivatives @ surface_derivatives.T * same_part
-    view = _views(outlines, pictures)[of[:, 0], of[:, 1]]
+        own_information = moves @ symmetric(one.A) @ np.swapaxes(moves, 1, 2)
+        information[np.ix_(own, own)] += own_information.sum(axis=0)
+    same_picture, same_part = (indices[:, None, k] == indices[None, :, k] for k in range(2))
+    surface = surface_derivatives @ surface_derivatives.T * same_part
+    view = _views(outlines, pictures)[indices[:, 0], indices[:, 1]]
     directions = surface_derivatives / np.linalg.norm(surface_derivatives, axis=1, keepdims=True)
     repeated = directions @ directions.T * same_part * (view[:, None] == view)
-    of_part = of[:, 1, None] == np.arange(len(outlines))
+    of_part = indices[:, 1, None] == np.arange(len(outlines))
     camera = camera_rows @ camera_rows.T * same_picture
     return Distances(
         y=y,
         X=X,
-        effects=np.array([np.eye(len(of)), repeated, alike, alike * same_picture, camera]),
+        effects=np.array([np.eye(len(indices)), repeated, surface, surface * same_picture, camera]),
         information=information,
         surface_derivatives=(of_part[:, :, None] * surface_derivatives[:, None]).reshape(
-            len(of), 12 * len(outlines)
+            len(indices), 12 * len(outlines)
         ),
-        pictures=of[:, 0],
+        pictures=indices[:, 0],
     )
 
 
@@ -205,14 +206,14 @@ def _known_directions(
         eigenvalues, directions = np.linalg.eigh(np.swapaxes(D, 1, 2) @ A[visible] @ D)
         # Directions below unit information are dominated by noise.
         k, j = np.nonzero(eigenvalues >= 1.0)
-        known, turned = eigenvalues[k, j], directions[k, :, j]
-        root = np.sqrt(known)[:, None]
+        curvatures, turned = eigenvalues[k, j], directions[k, :, j]
+        root = np.sqrt(curvatures)[:, None]
         along = np.einsum("rij,rj->ri", D[k], turned) / root
-        found.append((known, np.full(len(k), c), visible[k], along, root * turned))
-    known, picture, part, along, surface_derivatives = (
+        found.append((curvatures, np.full(len(k), c), visible[k], along, root * turned))
+    curvatures, picture, part, along, surface_derivatives = (
         np.concatenate(one) for one in zip(*found, strict=True)
     )
-    best = np.argsort(-known, kind="stable")[:max_count]
+    best = np.argsort(-curvatures, kind="stable")[:max_count]
     return np.column_stack([picture, part])[best], along[best], surface_derivatives[best]
 
 
@@ -225,9 +226,11 @@ def _views(outlines: Sequence[Outline], pictures: Sequence[ComparedMask]) -> Ind
     found = np.tile(np.arange(len(pictures))[:, None], len(outlines))
     for n, outline in enumerate(outlines):
         for c, one in enumerate(pictures if len(outline.vertices) else ()):
-            by = X_CN[: c + 1, n] - X_CN[c, n]
-            still = np.einsum("kij,jl,kil->k", by, outline.moments, by) < (0.5 * one.size) ** 2
-            found[c, n] = found[np.flatnonzero(still)[0], n]
+            moved = X_CN[: c + 1, n] - X_CN[c, n]
+            matches = (
+                np.einsum("kij,jl,kil->k", moved, outline.moments, moved) < (0.5 * one.size) ** 2
+            )
+            found[c, n] = found[np.flatnonzero(matches)[0], n]
     return found
 
 

@@ -62,14 +62,14 @@ class Placement(NamedTuple):
         """Return (nodes, size, 12) affine motions of each node caused by each parameter."""
         motions = np.zeros((len(self.X_WN), size, 12))
         nodes = np.repeat(np.arange(len(self.X_WN)), np.diff(self.starts))
-        # np.add.at is slow, and only the motions of mimic joints need it.
-        is_mimic = self.owners != self.parameters
-        own = nodes[~is_mimic], self.parameters[~is_mimic]
-        motions[own] = self.motions[self.owners[~is_mimic]]
+        # np.add.at is slow; only mimic joints and scales have several motions per parameter.
+        is_shared = self.owners != self.parameters
+        own = nodes[~is_shared], self.parameters[~is_shared]
+        motions[own] = self.motions[self.owners[~is_shared]]
         np.add.at(
             motions,
-            (nodes[is_mimic], self.parameters[is_mimic]),
-            self.motions[self.owners[is_mimic]],
+            (nodes[is_shared], self.parameters[is_shared]),
+            self.motions[self.owners[is_shared]],
         )
         return motions
 

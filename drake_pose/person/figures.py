@@ -430,13 +430,13 @@ class ViewFaults:
     """What was in view and what was not; frames count from 0.
 
     Args:
-        nobody: frames in which fewer than two cameras see the person.
+        no_person: frames in which fewer than two cameras see the person.
         blind: by camera, frames in which it sees no person, but two others do.
         others: by camera, frames in which it sees other persons.
         merged: by camera, frames in which the person and others are one figure.
     """
 
-    nobody: tuple[int, ...] = ()
+    no_person: tuple[int, ...] = ()
     blind: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     others: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     merged: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
@@ -535,5 +535,7 @@ class PersonRecording:
                 ):
                     if applies:
                         kind.setdefault(name, []).append(frame)
-        nobody = sorted(set(range(self._count)) - seen)
-        return ViewFaults(tuple(nobody), *({k: tuple(v) for k, v in one.items()} for one in found))
+        no_person = sorted(set(range(self._count)) - seen)
+        return ViewFaults(
+            tuple(no_person), *({k: tuple(v) for k, v in one.items()} for one in found)
+        )

@@ -31,8 +31,8 @@ from drake_pose.body import ArticulatedModel, ModelSource, package_folder
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.person.date.walking import (
     WALK,
-    follow_command,
-    follow_steps,
+    apply_command,
+    count_steps,
     recognise_command,
     stance_of,
 )
@@ -130,7 +130,7 @@ class Walker(MemorySystem):
         if pressed is not None:
             turn, walk = int(pressed[0]) or turn, int(pressed[1]) or walk
         known["command"] = np.array([turn, walk], dtype=float)
-        known["walker_pose"] = follow_command(
+        known["walker_pose"] = apply_command(
             known["walker_pose"], (turn, walk), self._period, self._obstacles
         )
         return known
@@ -174,7 +174,7 @@ class Walker(MemorySystem):
         last = known["command"].astype(int)
         turn, walk = recognise_command(stance, known["rest"], (last[0], last[1]))
         lift = float(feet[0, 2] - feet[1, 2])
-        known["steps"] = follow_steps(lift, known["steps"], self._period)
+        known["steps"] = count_steps(lift, known["steps"], self._period)
         is_walking = known["steps"][2] >= 2.0 or not self._on_spot
         return turn, walk if is_walking else 0
 

@@ -85,8 +85,8 @@ class TestUncertainty:
 
     def test_unobservable_values_have_the_variance_of_their_limits(self, world):
         values = world.values(**POSE)
-        nobody = pack_views(world.cameras, [NO_EDGE] * len(world.cameras))
-        found = world.deviations(values, nobody)
+        empty = pack_views(world.cameras, [NO_EDGE] * len(world.cameras))
+        found = world.deviations(values, empty)
         kinematics = world.fit.kinematics
         for k, name in enumerate(world.names):
             if kinematics.is_angle[k]:

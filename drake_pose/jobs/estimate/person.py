@@ -237,10 +237,10 @@ def describe_views(views: ViewFaults, frames: Sequence[str]) -> tuple[str, ...]:
         return frame_ranges({frames[k] for own in several for k in own}, frames)
 
     found = []
-    if views.nobody:
+    if views.no_person:
         found.append(
-            f"frame {listed(views.nobody)}: fewer than two cameras see the person, so there is no "
-            "pose; add a camera, or check the masks"
+            f"frame {listed(views.no_person)}: fewer than two cameras see the person, so there is "
+            "no pose; add a camera, or check the masks"
         )
     found += [
         f"camera '{camera}' sees nobody in frame {listed(indices)}, where others see the person, "

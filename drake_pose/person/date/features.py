@@ -71,13 +71,13 @@ class Blobs:
 
 
 def skin_blobs(
-    picture: Picture, region: Mask, colour: SkinColour, smallest: int = 12, most: int = 12
+    picture: Picture, region: Mask, colour: SkinColour, min_area: int = 12, max_count: int = 12
 ) -> Blobs:
     """Find skin-coloured blobs of a picture (H, W, 3) in the person's region (H, W) (3.1.1).
 
     Args:
-        smallest: least area [pixel^2].
-        most: largest number of blobs; the largest blobs are kept.
+        min_area: least area [pixel^2].
+        max_count: largest number of blobs; the largest blobs are kept.
     """
     # The bounding box of an empty region is empty; one pixel keeps OpenCV's functions working.
     left, top, width, height = cv2.boundingRect(np.ascontiguousarray(region).view(np.uint8))
@@ -87,8 +87,8 @@ def skin_blobs(
     inner = (cv2.inRange(chroma, low, (255.0, colour.red[1], colour.blue[1])) > 0) & region[part]
     joined = cv2.morphologyEx(inner.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     count, labels, statistics, middles = cv2.connectedComponentsWithStats(joined, connectivity=8)
-    order = np.argsort(-statistics[1:, cv2.CC_STAT_AREA], kind="stable")[:most] + 1
-    order = order[statistics[order, cv2.CC_STAT_AREA] >= smallest] if count > 1 else order[:0]
+    order = np.argsort(-statistics[1:, cv2.CC_STAT_AREA], kind="stable")[:max_count] + 1
+    order = order[statistics[order, cv2.CC_STAT_AREA] >= min_area] if count > 1 else order[:0]
     mask = np.zeros(region.shape, dtype=bool)
     kept = np.zeros(count, dtype=bool)
     kept[order] = True
@@ -174,8 +174,8 @@ def find_features(
     views: Sequence[PersonView],
     last: Array,
     *,
-    threshold: float = 0.05,
-    dense: float = 0.08,
+    ray_distance: float = 0.05,
+    dense_radius: float = 0.08,
     margin: int = 2,
 ) -> Features:
     """Measure the features' positions in a frame (3.1.2).
@@ -188,11 +188,11 @@ def find_features(
     Args:
         views: of each camera.
         last: (k, 3) the last frame's features [m].
-        threshold: largest distance of two rays of the same skin [m].
-        dense: radius of the densest part of a feature's points [m].
+        ray_distance: largest distance of two rays of the same skin [m].
+        dense_radius: radius of the densest part of a feature's points [m].
         margin: largest distance of a point from a silhouette, along rows or columns [pixel].
     """
-    points = meeting_points(cameras, [view.blobs.centroids for view in views], threshold)
+    points = meeting_points(cameras, [view.blobs.centroids for view in views], ray_distance)
     kept = np.ones(len(points), dtype=bool)
     # Shifts of up to `margin` pixels to either side, and none.
     aside = np.arange(1, margin + 1)
@@ -217,7 +217,7 @@ def find_features(
         if len(owned):
             # The densest part is around the point with most neighbours; ties go to the densest.
             distances = np.linalg.norm(owned[:, None] - owned[None], axis=2)
-            around = distances <= dense
+            around = distances <= dense_radius
             spread = np.where(around, distances, 0.0).sum(axis=1)
             part = owned[around[np.lexsort((spread, -around.sum(axis=1)))[0]]]
             positions[k], support[k] = part.mean(axis=0), len(part)
@@ -415,15 +415,17 @@ def nearest_template(face: Picture, templates: FaceTemplates) -> tuple[int, floa
     return nearest, math.sqrt(residual / len(distances))
 
 
-def find_face(picture: Picture, blobs: Blobs, templates: FaceTemplates, farthest: float) -> Array:
+def find_face(
+    picture: Picture, blobs: Blobs, templates: FaceTemplates, max_residual: float
+) -> Array:
     """Return the direction (2,) of the face in a picture (H, W, 3) [rad]; nan where there is none.
 
-    A face's residual must be at most `farthest` [grey levels].
+    A face's residual must be at most `max_residual` [grey levels].
     """
     face = cut_face(picture, blobs)
     if face is not None:
-        nearest, outside = nearest_template(face, templates)
-        if outside <= farthest:
+        nearest, residual = nearest_template(face, templates)
+        if residual <= max_residual:
             return templates.directions[nearest].copy()
     return np.full(2, np.nan)
 

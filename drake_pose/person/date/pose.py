@@ -27,13 +27,13 @@ class PoseSettings:
     """Step sizes and tolerances of the inverse kinematics and of the circle search.
 
     Args:
-        largest_step: largest change of any angle in a step [rad].
+        max_step: largest change of any angle in a step [rad].
         damping: added to the diagonal of a step's normal equations [m^2].
-        reached: a point at this distance from its target has reached it [m].
-        stalled: the search ends if no angle changes by more than this in a step [rad].
-        steps: largest number of steps.
+        tolerance: a point at this distance from its target has reached it [m].
+        min_step: the search ends if no angle changes by more than this in a step [rad].
+        max_steps: largest number of steps.
         steps_per_turn: number of steps of one arm before the other arm's turn.
-        least_bend: least initial bend of a middle joint; small steps cannot bend a straight limb
+        min_bend: least initial bend of a middle joint; small steps cannot bend a straight limb
             [rad].
         elbow_range: angles on the circle [deg]: from behind over outwards to a little in front.
         knee_range: angles on the circle [deg]: 0 in front, positive outwards, as far as the hip can
@@ -46,13 +46,13 @@ class PoseSettings:
             rest.
     """
 
-    largest_step: float = math.radians(2.0)
+    max_step: float = math.radians(2.0)
     damping: float = 0.05**2
-    reached: float = 1e-3
-    stalled: float = 1e-4
-    steps: int = 100
+    tolerance: float = 1e-3
+    min_step: float = 1e-4
+    max_steps: int = 100
     steps_per_turn: int = 4
-    least_bend: float = math.radians(3.0)
+    min_bend: float = math.radians(3.0)
     elbow_range: tuple[float, float] = (0.0, 120.0)
     knee_range: tuple[float, float] = (-180.0, 175.0)
     circle_step: float = 5.0
@@ -69,7 +69,7 @@ SETTINGS = PoseSettings()
 _TINY = 1e-9
 
 
-def upper_body(skeleton: Skeleton, q: Array, features: Array, *, face_known: bool) -> Array:
+def move_upper_body(skeleton: Skeleton, q: Array, features: Array, *, face_known: bool) -> Array:
     """Move neck base and arms of q (nq,) until the hands are at those of features (5, 3) [m].
 
     The head must be in place already. Each side's chain is head 2, neck base 2, shoulder 3, elbow 1
@@ -80,8 +80,8 @@ def upper_body(skeleton: Skeleton, q: Array, features: Array, *, face_known: boo
     """
     shared = () if face_known else skeleton.head_angles
     for name in LIMBS[:2]:
-        q = _bent(q, skeleton.limbs[name])
-    for _ in range(SETTINGS.steps // SETTINGS.steps_per_turn):
+        q = _with_bent_joint(q, skeleton.limbs[name])
+    for _ in range(SETTINGS.max_steps // SETTINGS.steps_per_turn):
         farthest, moved = 0.0, 0.0
         for name, hand in zip(LIMBS[:2], features[1:3], strict=True):
             limb, before = skeleton.limbs[name], q
@@ -91,7 +91,7 @@ def upper_body(skeleton: Skeleton, q: Array, features: Array, *, face_known: boo
             farthest = max(farthest, distance)
             moved = max(moved, float(np.abs(q - before).max()))
         # One side's turn may have moved the other's hand, so only a round without steps is the end.
-        if moved < SETTINGS.stalled or max(farthest, moved) < SETTINGS.reached:
+        if moved < SETTINGS.min_step or max(farthest, moved) < SETTINGS.tolerance:
             break
     return q
 
@@ -100,12 +100,12 @@ def move_limb(skeleton: Skeleton, q: Array, name: str, target: Array) -> Array:
     """Move a limb of q (nq,) until its end is at a target (3,) [m]; other positions stay."""
     limb = skeleton.limbs[name]
     part = limb.lower_node, limb.end_L
-    return reach(skeleton, _bent(q, limb), limb.positions, part, target)[0]
+    return reach(skeleton, _with_bent_joint(q, limb), limb.positions, part, target)[0]
 
 
-def _bent(q: Array, limb: Limb) -> Array:
-    """Return q with a limb's middle joint bent by `least_bend` or more."""
-    q, least = np.array(q), SETTINGS.least_bend
+def _with_bent_joint(q: Array, limb: Limb) -> Array:
+    """Return q with a limb's middle joint bent by `min_bend` or more."""
+    q, least = np.array(q), SETTINGS.min_bend
     if abs(q[limb.positions[3]]) < least:
         q[limb.positions[3]] = least if limb.upper[3] > -limb.lower[3] else -least
     return q
@@ -117,18 +117,18 @@ def reach(
     index: Indices,
     part: tuple[int, Array],
     target: Array,
-    steps: int = SETTINGS.steps,
+    max_steps: int = SETTINGS.max_steps,
 ) -> tuple[Array, float]:
     """Move positions of q (nq,) in small steps until a point is at the target (3,) [m].
 
     The step is J (J^T J + damping I)^-1 gap, with J (n, 3) the point's derivatives by the n angles
     and gap (3,) the vector to the target. It is scaled so that no angle changes by more than
-    `largest_step`, then clipped to the limits. Damping makes all joints take part.
+    `max_step`, then clipped to the limits. Damping makes all joints take part.
 
     Args:
         index: (n,) indices in q of the angles that may change; they must move the point.
         part: index of a node, and the point (3,) in the node's frame [m].
-        steps: largest number of steps.
+        max_steps: largest number of steps.
 
     Returns:
         (nq,) positions, and the remaining distance [m].
@@ -138,9 +138,9 @@ def reach(
     place = np.zeros(len(q), dtype=np.int64)
     place[order] = np.arange(len(order))
     limits, moved = (skeleton.lower[index], skeleton.upper[index]), np.array(q)
-    numbers = SETTINGS.damping, SETTINGS.largest_step, SETTINGS.reached, SETTINGS.stalled
+    numbers = SETTINGS.damping, SETTINGS.max_step, SETTINGS.tolerance, SETTINGS.min_step
     moved[order], distance = _reach(
-        packed, q[order], place[index], point, limits, target, steps, numbers
+        packed, q[order], place[index], point, limits, target, max_steps, numbers
     )
     return moved, distance
 
@@ -157,7 +157,7 @@ def _reach(
     numbers: tuple[float, float, float, float],
 ) -> tuple[Array, float]:
     """`reach` for the values (m,) of a chain of nodes whose last one carries the point."""
-    damping, largest_step, reached, stalled = numbers
+    damping, max_step, tolerance, min_step = numbers
     n, distance = len(index), np.inf
     tip, J, M = np.empty(3), np.empty((n, 3)), np.empty((3, 4))
     for step in range(steps + 1):
@@ -169,7 +169,7 @@ def _reach(
                 tip[r] += X_WN[-1, r, c] * point[c]
             M[r, r], M[r, 3] = damping, target[r] - tip[r]
         distance = math.sqrt(M[0, 3] ** 2 + M[1, 3] ** 2 + M[2, 3] ** 2)
-        if distance < reached or step == steps:
+        if distance < tolerance or step == steps:
             break
         for k in range(n):
             twist = twists[index[k]]
@@ -181,13 +181,13 @@ def _reach(
                     M[r, c] += J[k, r] * J[k, c]
         eliminate(M)
         changes = J[:, 0] * M[0, 3] + J[:, 1] * M[1, 3] + J[:, 2] * M[2, 3]
-        scale = min(1.0, largest_step / max(1e-12, np.abs(changes).max()))
+        scale = min(1.0, max_step / max(1e-12, np.abs(changes).max()))
         moved = 0.0
         for k in range(n):
             old = values[index[k]]
             new = min(max(old + scale * changes[k], limits[0][k]), limits[1][k])
             moved, values[index[k]] = max(moved, abs(new - old)), new
-        if moved < stalled:
+        if moved < min_step:
             break
     return values, distance
 
@@ -224,7 +224,7 @@ def estimate_pose(
         index = skeleton.head_angles
         q[index] = np.clip(head_angles, skeleton.lower[index], skeleton.upper[index])
     q[skeleton.head_positions] = features[0] - skeleton.head_rotation(q) @ skeleton.face_H
-    q = upper_body(skeleton, q, features, face_known=head_angles is not None)
+    q = move_upper_body(skeleton, q, features, face_known=head_angles is not None)
     # The head's angles may have changed: put its middle back to where it was measured.
     q[skeleton.head_positions] = features[0] - skeleton.head_rotation(q) @ skeleton.face_H
     if waist is None:
@@ -235,7 +235,7 @@ def estimate_pose(
     # waist decides its pose, which also keeps the neck base from drifting from frame to frame.
     _, neck = skeleton.trunk_pose(q)
     across, length = waist - neck, float(np.linalg.norm(skeleton.waist_T))
-    target = neck + across * (length / max(float(np.linalg.norm(across)), SETTINGS.reached))
+    target = neck + across * (length / max(float(np.linalg.norm(across)), SETTINGS.tolerance))
     trunk = skeleton.nodes["trunk"], skeleton.waist_T
     aimed, _ = reach(skeleton, q, skeleton.neck_angles, trunk, target)
     R_aimed, _ = skeleton.trunk_pose(aimed)
@@ -258,13 +258,13 @@ def estimate_pose(
             degrees = np.arange(start, stop + 0.5 * SETTINGS.circle_step, SETTINGS.circle_step)
             middles = joint_circle(limb, joints[0], end, outward, degrees)
             if limb.is_leg:
-                _, beyond = place_limb(limb, R_WT, joints[0], middles, end, last_angles)
+                _, beyond = limb_angles(limb, R_WT, joints[0], middles, end, last_angles)
                 middles = middles[beyond <= np.maximum(SETTINGS.hip_tolerance, beyond.min())]
             samples = rectangles(joints[0], middles, end, limb.half_widths)
             scores = correlation(samples, cameras, regions)
             best = middles[scores >= scores.max() - _TINY]
             joints[1] = best[np.argmin(np.linalg.norm(best - joints[1], axis=1))]
-        angles, _ = place_limb(limb, R_aimed, own_root, joints[1:2], joints[2], last_angles)
+        angles, _ = limb_angles(limb, R_aimed, own_root, joints[1:2], joints[2], last_angles)
         aimed[limb.positions] = np.clip(angles[0], limb.lower, limb.upper)
         # Where limits do not allow both, the end's position matters more than the middle joint's.
         aimed = move_limb(skeleton, aimed, name, joints[2])
@@ -284,7 +284,7 @@ def joint_circle(limb: Limb, root: Array, end: Array, outward: Array, degrees: A
         root, end: (3,) shoulder and hand, or hip and foot [m].
         outward: (3,) from neck base to shoulder, or from waist to hip [m].
     """
-    z, distance = _along(root, end)
+    z, distance = _directions(root, end)
     a, b = limb.lengths
     reached = np.clip(distance, max(abs(a - b), _TINY), a + b)
     along = (a * a - b * b + reached * reached) / (2.0 * reached)
@@ -292,7 +292,7 @@ def joint_circle(limb: Limb, root: Array, end: Array, outward: Array, degrees: A
     level = np.array([outward[0], outward[1], 0.0])
     i = level - (level @ z) * z
     if np.linalg.norm(i) < _TINY:
-        i = _any_across(z[None])[0]
+        i = _perpendicular(z[None])[0]
     i = i / np.linalg.norm(i)
     j = limb.side * np.cross(i, z) * (-1.0 if limb.is_leg else 1.0)
     theta = np.radians(degrees)[:, None]
@@ -335,7 +335,7 @@ def correlation(samples: Array, cameras: Sequence[Camera], regions: Sequence[Mas
     return total / max(1, seers)
 
 
-def place_limb(
+def limb_angles(
     limb: Limb, R_WT: Array, root: Array, middles: Array, end: Array, last: Array
 ) -> tuple[Array, Array]:
     """Return the joint angles that put a limb's joints in given places, for n middle joints.
@@ -351,10 +351,10 @@ def place_limb(
         (n, 4) angles, and (n,) how far the worst of the root's angles exceeds its limits [rad].
     """
     letters = "".join("XYZ"[axis] for axis in limb.axes)
-    towards, distances = _along(root, np.broadcast_to(end, middles.shape))
+    towards, distances = _directions(root, np.broadcast_to(end, middles.shape))
     frames, off_line = _triads(towards, middles - root)
     # A straight limb does not determine its turn about itself, which stays as in the last frame.
-    stretched = off_line * distances < SETTINGS.reached * ((middles - root) ** 2).sum(axis=1)
+    stretched = off_line * distances < SETTINGS.tolerance * ((middles - root) ** 2).sum(axis=1)
     R_last = R_WT @ Rotation.from_euler(letters[:3], last[:3]).as_matrix()
     # The squared distance of root and end is base + swing cos(bend - start). Of its two solutions
     # (n, 2) those are kept that exceed the limits by about the least.
@@ -372,13 +372,14 @@ def place_limb(
     row, option = np.nonzero(excess <= excess.min(axis=1, keepdims=True) + SETTINGS.bend_tolerance)
     bend = bends[row, option]
     end_U = limb.middle_U + Rotation.from_euler(letters[3], bend[:, None]).apply(limb.end_L)
-    towards_U = _along(np.zeros(3), end_U)[0]
+    towards_U = _directions(np.zeros(3), end_U)[0]
     triads_U = _triads(towards_U, np.broadcast_to(limb.middle_U, end_U.shape))[0]
     R_WU = frames[row] @ triads_U.transpose(0, 2, 1)
     if stretched.any():
         is_straight = stretched[row]
         R_WU[is_straight] = (
-            _least_turns(towards_U[is_straight] @ R_last.T, towards[row[is_straight]]) @ R_last
+            _smallest_rotations(towards_U[is_straight] @ R_last.T, towards[row[is_straight]])
+            @ R_last
         )
     # Two sets of the root's angles give the same rotation: take the one nearer to the limits.
     first, second, third = Rotation.from_matrix(R_WT.T @ R_WU).as_euler(letters[:3]).T
@@ -398,7 +399,7 @@ def place_limb(
     return np.column_stack([roots[each, chosen], bends[each, chosen]]), beyonds[each, chosen]
 
 
-def _along(root: Array, ends: Array) -> tuple[Array, Array]:
+def _directions(root: Array, ends: Array) -> tuple[Array, Array]:
     """Return directions (..., 3) and distances (...) [m] from root to ends (..., 3).
 
     The direction is downwards where both points coincide.
@@ -420,19 +421,19 @@ def _triads(x: Array, others: Array) -> tuple[Array, Array]:
     across = others - (others * x).sum(axis=1, keepdims=True) * x
     length = np.sqrt((across**2).sum(axis=1))
     straight = length < _TINY
-    across[straight] = _any_across(x[straight])
+    across[straight] = _perpendicular(x[straight])
     y = across / np.sqrt((across**2).sum(axis=1, keepdims=True))
     return np.stack([x, y, np.cross(x, y)], axis=2), length
 
 
-def _least_turns(starts: Array, ends: Array) -> Array:
+def _smallest_rotations(starts: Array, ends: Array) -> Array:
     """Return the smallest rotations (n, 3, 3) that turn directions (n, 3) to others (n, 3)."""
     quaternions = np.column_stack([np.cross(starts, ends), 1.0 + (starts * ends).sum(axis=1)])
     turned_about = np.sqrt((quaternions**2).sum(axis=1)) < _TINY
-    quaternions[turned_about, :3] = _any_across(starts[turned_about])
+    quaternions[turned_about, :3] = _perpendicular(starts[turned_about])
     return np.asarray(Rotation.from_quat(quaternions).as_matrix())
 
 
-def _any_across(axes: Array) -> Array:
+def _perpendicular(axes: Array) -> Array:
     """Return vectors (n, 3) perpendicular to axes (n, 3), not 0."""
     return np.cross(axes, np.eye(3)[np.argmin(np.abs(axes), axis=1)])

@@ -88,7 +88,7 @@ def recognise_command(stance: Array, rest: Array, last: tuple[int, int]) -> tupl
     return _switch(turned, last[0], *WALK.turn), _switch(ahead, last[1], *WALK.step)
 
 
-def follow_steps(lift: float, steps: Array, seconds: float) -> Array:
+def count_steps(lift: float, steps: Array, seconds: float) -> Array:
     """Count the steps of walking on the spot; a foot that stays lifted is one step.
 
     Args:
@@ -109,7 +109,7 @@ def follow_steps(lift: float, steps: Array, seconds: float) -> Array:
     return np.array([foot, since, count])
 
 
-def follow_command(
+def apply_command(
     pose: Array,
     command: tuple[int, int],
     seconds: float,

@@ -11,11 +11,11 @@ from drake_pose.person.date.pose import (
     correlation,
     estimate_pose,
     joint_circle,
+    limb_angles,
     move_limb,
-    place_limb,
+    move_upper_body,
     reach,
     rectangles,
-    upper_body,
 )
 from drake_pose.person.date.skeleton import FEATURES, LIMBS, load_skeleton
 from tests.body.models import link_poses
@@ -85,7 +85,7 @@ class TestReach:
             right_upper_arm_z=-25, right_forearm_x=-30, neck_base_x=6,
         )  # fmt: skip
         features = skeleton.features(after)
-        found = upper_body(skeleton, before, features, face_known=face_known)
+        found = move_upper_body(skeleton, before, features, face_known=face_known)
         hands = skeleton.features(found)[1:3]
         assert np.linalg.norm(hands - features[1:3], axis=1).max() < 5e-3
         same = found[skeleton.head_angles] == before[skeleton.head_angles]
@@ -152,9 +152,9 @@ class TestCircle:
                 ok = (uv >= 0).all(axis=1) & (uv < [640, 480]).all(axis=1)
                 expected[n] += region[uv[ok, 1], uv[ok, 0]].mean() / 2
         np.testing.assert_allclose(correlation(samples, cameras, regions), expected)
-        nobody = np.zeros((480, 640), bool)
+        empty = np.zeros((480, 640), bool)
         alone = correlation(samples, cameras[:1], regions[:1])
-        np.testing.assert_allclose(correlation(samples, cameras, [regions[0], nobody]), alone)
+        np.testing.assert_allclose(correlation(samples, cameras, [regions[0], empty]), alone)
 
 
 class TestAngles:
@@ -166,7 +166,7 @@ class TestAngles:
         root, R_WT = skeleton.limb_points(q, "left_arm")[0], skeleton.trunk_pose(q)[0]
         across = np.array([0.0, 0.7, -0.2])
         middle = root + across * limb.lengths[0] / sum(limb.lengths)
-        found = place_limb(limb, R_WT, root, middle[None], root + across, last)[0][0]
+        found = limb_angles(limb, R_WT, root, middle[None], root + across, last)[0][0]
         axes = "".join("XYZ"[axis] for axis in limb.axes[:3])
         before, after = Rotation.from_euler(axes, [last[:3], found[:3]])
         old = R_WT @ before.apply(limb.middle_U)
@@ -225,7 +225,7 @@ class TestPose:
             across = (end - root) / np.linalg.norm(end - root)
             turns = Rotation.from_rotvec(np.linspace(0.0, 5.0, 6)[:, None] * across)
             middles = root + turns.apply(middle - root)
-            angles, beyond = place_limb(limb, R_WT, root, middles, end, q[limb.positions])
+            angles, beyond = limb_angles(limb, R_WT, root, middles, end, q[limb.positions])
             assert beyond[0] < 1e-6
             excess = np.abs(angles - np.clip(angles, limb.lower, limb.upper)).max(axis=1)
             np.testing.assert_allclose(beyond, excess, atol=1e-6)

@@ -8,8 +8,8 @@ from drake_pose.person.date.walking import (
     COMMANDS,
     REGISTERED,
     WALK,
-    follow_command,
-    follow_steps,
+    apply_command,
+    count_steps,
     make_gestures,
     offsets_from_rest,
     recognise_command,
@@ -87,7 +87,7 @@ def test_made_gestures_are_recognised(skeleton):
 def spot_walk(lifts, seconds=0.1):
     steps, found = np.zeros(3), []
     for lift in lifts:
-        steps = follow_steps(lift, steps, seconds)
+        steps = count_steps(lift, steps, seconds)
         found.append(bool(steps[2] >= 2.0))
     return found
 
@@ -142,7 +142,7 @@ def test_path_equals_that_of_many_small_steps(command):
         ahead = np.array([math.cos(small[2]), math.sin(small[2])])
         small[:2] += command[1] * WALK.speed * step * ahead
         small[2] += command[0] * WALK.turn_rate * step
-    found = follow_command(pose, command, 1.5, np.empty((0, 3)))
+    found = apply_command(pose, command, 1.5, np.empty((0, 3)))
     np.testing.assert_allclose(found, small, atol=1e-4)
 
 
@@ -150,7 +150,7 @@ def test_walls_and_obstacles_are_not_walked_through():
     pose, obstacles = np.array([-4.0, 0.05, 0.0]), np.array([[0.0, 0.0, 0.5]])
     nearest = math.inf
     for _ in range(400):
-        pose = follow_command(pose, (0, 1), 1 / 30, obstacles, 5.0)
+        pose = apply_command(pose, (0, 1), 1 / 30, obstacles, 5.0)
         nearest = min(nearest, float(np.hypot(*pose[:2])))
     assert nearest == pytest.approx(0.5 + WALK.body_radius, abs=1e-9)
     assert pose[0] == pytest.approx(5.0 - WALK.body_radius)

@@ -257,7 +257,7 @@ class TestOthers:
         recording = PersonRecording(four.cameras, lambda k: masks[k], 5, True)
         assert recording.seen == [0, 3, 4]
         faults = recording.faults()
-        assert faults.nobody == (1, 2)
+        assert faults.no_person == (1, 2)
         assert (faults.blind, faults.others) == ({}, {})
         assert 1.3 < recording.height < 2.1
 

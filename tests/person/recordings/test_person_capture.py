@@ -67,9 +67,9 @@ class TestCapture:
     def test_recordings_without_frames_or_persons_are_refused(
         self, shaped_person, cameras, frames, word
     ):
-        nobody = {name: np.zeros((240, 320), dtype=bool) for name in cameras}
+        empty = {name: np.zeros((240, 320), dtype=bool) for name in cameras}
         with pytest.raises(SettingsError, match=word):
-            capture_person(shaped_person.pose_tree(), cameras, lambda _: nobody, frames)
+            capture_person(shaped_person.pose_tree(), cameras, lambda _: empty, frames)
 
     @pytest.mark.parametrize("frame", ["0025", "0040"], ids=["leg", "turned about"])
     def test_still_of_unknown_proportions_is_not_mistaken_for_another_pose(

@@ -1,4 +1,4 @@
-"""Make the README's pictures with the real program: python tutorials/pictures/make_pictures.py."""
+"""Draw the pages' pictures with the program: python tutorials/pictures/make_pictures.py."""
 
 import os
 
@@ -37,7 +37,7 @@ POSE_DEG = {
 
 
 def colour_image(model: ArticulatedModel, camera: PinholeCamera, q: np.ndarray) -> np.ndarray:
-    """Returns the body (H, W, 3) as Drake's renderer shows it, on white."""
+    """Return the body as Drake's renderer shows it on white (H, W, 3)."""
     scene_graph, plant = SceneGraph(), MultibodyPlant(time_step=0.0)
     source = plant.RegisterAsSourceForSceneGraph(scene_graph)
     model.add_to(plant, scene_graph)
@@ -58,7 +58,7 @@ def colour_image(model: ArticulatedModel, camera: PinholeCamera, q: np.ndarray) 
 
 
 def woman_picture() -> np.ndarray:
-    """Returns the true woman, her silhouette, the estimate and the overlay, side by side."""
+    """Return the true woman, her silhouette, the estimate and the overlay, side by side."""
     X_WC = np.eye(4)
     X_WC[:3, :3] = np.column_stack([[0, 1, 0], [0, 0, -1], [-1, 0, 0]])
     X_WC[:3, 3] = [4.0, 0.0, 0.9]
@@ -88,7 +88,7 @@ def woman_picture() -> np.ndarray:
 
 
 def demo_picture() -> np.ndarray:
-    """Returns the overlay that the demonstration writes."""
+    """Return the overlay that the demonstration writes."""
     with tempfile.TemporaryDirectory() as folder:
         run_demo(Path(folder) / "demo")
         (file,) = Path(folder).glob("demo/overlay/*/*.png")
@@ -96,7 +96,7 @@ def demo_picture() -> np.ndarray:
 
 
 def save(name: str, picture: np.ndarray, height: int) -> None:
-    """Writes a picture (H, W, 3), made smaller to a height [pixel]."""
+    """Write a picture (H, W, 3), scaled to a height [pixel]."""
     width = round(picture.shape[1] * height / picture.shape[0])
     small = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
     cv2.imwrite(str(FOLDER / name), cv2.cvtColor(small, cv2.COLOR_RGB2BGR))

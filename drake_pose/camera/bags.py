@@ -51,11 +51,11 @@ def open_bag(path: Path, joints: JointLog | None) -> Episode:
     Raises:
         SceneError: the bag is unreadable, truncated, or has no images.
     """
-    pictures, states, infos, parents, left_out = _scan(path)
-    warnings = [f"{topic} is left out: {why}" for topic, why in left_out.items() if why != "depths"]
+    pictures, states, infos, parents, ignored = _scan(path)
+    warnings = [f"{topic} is left out: {why}" for topic, why in ignored.items() if why != "depths"]
     if joints is None and states:
-        joints, said = _merge_joints(states)
-        warnings += said
+        joints, merge_warnings = _merge_joints(states)
+        warnings += merge_warnings
     cameras: dict[str, EpisodeCamera] = {}
     # If a camera was recorded twice, prefer the uncompressed topic.
     for topic in sorted(pictures, key=lambda topic: (topic.endswith("/compressed"), topic)):
@@ -70,13 +70,13 @@ def open_bag(path: Path, joints: JointLog | None) -> Episode:
             warnings.append(f"camera '{name}' is left out: {error}")
             continue
         # Follow static frames to the link that carries the camera, and its pose there.
-        frame, link, X_LC, passed = pictures[topic][0][2], None, np.eye(4), set[str]()
-        while frame in parents and frame not in passed:
-            passed.add(frame)
+        frame, link, X_LC, visited = pictures[topic][0][2], None, np.eye(4), set[str]()
+        while frame in parents and frame not in visited:
+            visited.add(frame)
             link, X_LF = parents[frame]
             X_LC, frame = X_LF @ X_LC, link
-        placed = camera.camera and camera.camera.with_pose(X_LC)
-        cameras[name] = replace(camera, name=name, camera=placed, link=link)
+        mounted = camera.camera and camera.camera.with_pose(X_LC)
+        cameras[name] = replace(camera, name=name, camera=mounted, link=link)
     return Episode.checked(path, cameras.values(), joints, warnings)
 
 
@@ -89,7 +89,7 @@ def _scan(path: Path) -> tuple[Any, Any, Any, Any, Any]:
         topics are ignored, by topic.
     """
     pictures, states = defaultdict[str, list[_Row]](list), defaultdict[Any, list[_Row]](list)
-    infos, parents, left_out = {}, {}, {}
+    infos, parents, ignored = {}, {}, {}
     sensors = "Image", "CompressedImage", "JointState", "CameraInfo"
     with _translate_errors(path), _make_reader(path) as reader:
         wanted = [
@@ -117,24 +117,24 @@ def _scan(path: Path) -> tuple[Any, Any, Any, Any, Any]:
             elif kind != "JointState":
                 coding = (message.encoding if kind == "Image" else message.format).lower()
                 if any(one in coding for one in ("16uc1", "32fc1", "compresseddepth")):
-                    left_out[topic] = "depths"
+                    ignored[topic] = "depths"
                 elif kind == "Image" and coding not in _ENCODINGS:
-                    left_out[topic] = f"{coding} is not one of {', '.join(_ENCODINGS)}"
+                    ignored[topic] = f"{coding} is not one of {', '.join(_ENCODINGS)}"
                 else:
                     pictures[topic].append((*stamps, message.header.frame_id.strip("/")))
             elif len(message.name) and len(message.position) == len(message.name):
                 states[topic, tuple(message.name)].append((*stamps, np.array(message.position)))
     if not pictures:
-        found = ", ".join(f"{topic} ({kind})" for topic, kind in (kinds | left_out).items())
-        raise SceneError(f"{path}: has no pictures of cameras; its topics are: {found or 'none'}")
-    return pictures, states, infos, parents, left_out
+        topics = ", ".join(f"{topic} ({kind})" for topic, kind in (kinds | ignored).items())
+        raise SceneError(f"{path}: has no pictures of cameras; its topics are: {topics or 'none'}")
+    return pictures, states, infos, parents, ignored
 
 
 def _make_reader(path: Path) -> Any:
     """Return a reader of a bag; message types that it does not define are the usual ones."""
     types = import_reader("rosbags.typesys", path)
-    known = types.get_typestore(types.Stores.LATEST)
-    return import_reader("rosbags.highlevel", path).AnyReader([path], default_typestore=known)
+    typestore = types.get_typestore(types.Stores.LATEST)
+    return import_reader("rosbags.highlevel", path).AnyReader([path], default_typestore=typestore)
 
 
 @contextmanager

@@ -43,8 +43,8 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
         states = [key for key in features if key == state or key.startswith(f"{state}.")]
         states = [state] if state in states else states
         pictures = [key for key, one in features.items() if one["dtype"] in ("video", "image")]
-        own = [key for key in pictures if features[key]["dtype"] == "image"]
-        file, wanted = _file(path, info, rows, number), ["timestamp", *states, *own]
+        stored = [key for key in pictures if features[key]["dtype"] == "image"]
+        file, wanted = _file(path, info, rows, number), ["timestamp", *states, *stored]
         filters = [("episode_index", "=", number)]
         table = parquet.read_table(file, columns=wanted, filters=filters)
         columns = {key: table[key].to_pylist() for key in wanted}
@@ -59,11 +59,11 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
             joints = JointLog(tuple(names), times[kept], positions[kept])
         cameras = []
         for key in pictures:
-            said = {**features[key], **(features[key].get("info") or {})}
-            if any("is_depth" in field and value is True for field, value in said.items()):
+            metadata = {**features[key], **(features[key].get("info") or {})}
+            if any("is_depth" in field and value is True for field, value in metadata.items()):
                 continue
             name = key.removeprefix("observation.").removeprefix("images.")
-            if key in own:
+            if key in stored:
                 read = _stored_pictures([columns[key][k]["bytes"] for k in kept], file)
                 height, width = read(0).shape[:2]
                 cameras.append(EpisodeCamera(name, width, height, times[kept], None, None, read))
@@ -110,8 +110,8 @@ def _episode_rows(path: Path, info: Mapping[str, Any], parquet: Any) -> _Rows:
     rows: dict[int, dict[str, Any]] = {}
     for file in sorted(path.glob("meta/episodes/*/*.parquet")):
         # Skip the statistics, which are most of the columns.
-        known = parquet.read_schema(file).names
-        used = [name for name in known if name.startswith(("episode_index", "data/", "videos/"))]
+        columns = parquet.read_schema(file).names
+        used = [name for name in columns if name.startswith(("episode_index", "data/", "videos/"))]
         found = parquet.read_table(file, columns=used).to_pylist()
         rows |= {row["episode_index"]: row for row in found}
     return rows
@@ -131,12 +131,12 @@ def _file(path: Path, info: Mapping[str, Any], rows: _Rows, number: int, key: st
 def _choose_episode(path: Path, info: Mapping[str, Any], rows: _Rows, wanted: int | None) -> int:
     """Return the wanted episode, or the only one whose data are present."""
     numbers = list(rows or range(int(info["total_episodes"])))
-    asked = numbers if wanted is None else [one for one in numbers if one == wanted]
-    here = [one for one in asked if _file(path, info, rows, one).is_file()]
-    if len(here) == 1:
-        return here[0]
-    here = [one for one in numbers if _file(path, info, rows, one).is_file()]
-    names = listed([*map(str, here)], 20)
+    candidates = numbers if wanted is None else [one for one in numbers if one == wanted]
+    present = [one for one in candidates if _file(path, info, rows, one).is_file()]
+    if len(present) == 1:
+        return present[0]
+    present = [one for one in numbers if _file(path, info, rows, one).is_file()]
+    names = listed([*map(str, present)], 20)
     if wanted is not None:
         raise UnknownNameError("episode", str(wanted), [names] if names else [], str(path))
     raise SceneError(
@@ -297,13 +297,13 @@ def _picture_times(file: Any, path: Path, serial: str, count: int, warnings: lis
     """Return the times [s] of a video's images; fewer than ``count`` if some are missing."""
     stamps = "observation/timestamp/cameras"
     kinds = ("estimated_capture", "frame_received", "read_end")
-    known = [kind for kind in kinds if f"{stamps}/{serial}_{kind}" in file] or [kinds[0]]
-    read = [_dataset(file, f"{stamps}/{serial}_{kind}", path) for kind in known]
+    available = [kind for kind in kinds if f"{stamps}/{serial}_{kind}" in file] or [kinds[0]]
+    read = [_dataset(file, f"{stamps}/{serial}_{kind}", path) for kind in available]
     times, source = read[0], TRAJECTORY
     beside = path.with_name(f"{path.stem}_timestamps.json")
     if beside.exists():
         # These are reception times: subtract the camera's delay, known from the rows.
-        delay = np.median(read[1] - times) if known[:2] == [*kinds[:2]] else 0.0
+        delay = np.median(read[1] - times) if available[:2] == [*kinds[:2]] else 0.0
         times, source = np.array(json.loads(read_regular(beside))) - delay, beside.name
     if len(times) != count:
         warnings.append(

@@ -224,14 +224,14 @@ def _comparison_warnings(path: Path, camera: EpisodeCamera, joints: JointLog) ->
     """Return warnings about mismatches between a camera's images and the joint log's rows."""
     count, where = len(camera.times), f"camera '{camera.name}'"
     if joints.frames and camera.frames:
-        known, seen = ({*map(frame_key, one.frames)} for one in (joints, camera))
+        logged, pictured = ({*map(frame_key, one.frames)} for one in (joints, camera))
         text = (
-            f"{where}: {len(seen - known)} of {count} pictures have no row in the joint log, and "
-            f"{len(known - seen)} of {len(known)} rows no picture"
+            f"{where}: {len(pictured - logged)} of {count} pictures have no row in the joint log, "
+            f"and {len(logged - pictured)} of {len(logged)} rows no picture"
         )
-        if not known & seen:
+        if not logged & pictured:
             raise SceneError(f"{path}: {text}: frames must have the same names in both")
-        return [text] if known != seen else []
+        return [text] if logged != pictured else []
     if joints.times is None or np.isnan(camera.times).all():
         raise SceneError(
             f"{path}: cannot match the joint log's rows to the pictures of {where}: either rows "

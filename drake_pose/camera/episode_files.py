@@ -83,29 +83,31 @@ def open_folder(path: Path, joints: JointLog | None) -> Episode:
     warnings: list[str] = []
     if joints is None and (path / JOINT_TABLE).exists():
         joints, warnings = read_joint_table(path / JOINT_TABLE)
-    known = CameraFile({}, ())
+    calibration = CameraFile({}, ())
     if (path / CAMERAS).exists():
-        known = load_camera_file(path / CAMERAS, distorted=True)
+        calibration = load_camera_file(path / CAMERAS, distorted=True)
     names = [one.name for one in sorted(path.glob("images/*")) if one.is_dir()]
     names += [one.stem for one in sorted(path.glob("videos/*")) if one.suffix.lower() in VIDEOS]
     cameras = []
-    for name in dict.fromkeys([*known.cameras, *names]):
+    for name in dict.fromkeys([*calibration.cameras, *names]):
         files = find_recorded_files(path, name)
         if isinstance(files, dict):
-            camera, said = _image_camera(name, path / "images" / name, path / "scene.yaml", joints)
+            camera, camera_warnings = _image_camera(
+                name, path / "images" / name, path / "scene.yaml", joints
+            )
         elif files is not None:
             # Frames are named as in a scene.
             video = TimedVideo(files)
             frames = tuple(f"{k:06d}" for k in range(len(video.times)))
-            size, said = (video.width, video.height), video.warnings
+            size, camera_warnings = (video.width, video.height), video.warnings
             camera = EpisodeCamera(name, *size, video.times, None, None, video.read, frames)
         else:
             warnings.append(f"camera '{name}' of {CAMERAS} has no pictures; it is left out")
             continue
-        warnings += said
-        if name not in known.cameras:
+        warnings += camera_warnings
+        if name not in calibration.cameras:
             warnings.append(f"camera '{name}' has no entry in {CAMERAS}: its lens is unknown")
-        cameras.append(add_calibration(camera, known, path / CAMERAS))
+        cameras.append(add_calibration(camera, calibration, path / CAMERAS))
     return Episode.checked(path, cameras, joints, warnings)
 
 
@@ -117,16 +119,16 @@ def _image_camera(
     frames = in_order(files)
     times = np.full(len(frames), np.nan)
     if stamps.is_file():
-        known = read_time_stamps(stamps)
-        if lacking := sorted(known.keys() ^ files.keys()):
+        stamped = read_time_stamps(stamps)
+        if lacking := sorted(stamped.keys() ^ files.keys()):
             warnings.append(
                 f"{stamps}: {len(lacking)} frames have no picture, or no time, and are left out; "
                 f"the first is {lacking[0]}"
             )
-        common = [frame for frame in known if frame in files]
-        kept, late = ascending_indices(np.array([known[frame] for frame in common]), str(stamps))
+        common = [frame for frame in stamped if frame in files]
+        kept, late = ascending_indices(np.array([stamped[frame] for frame in common]), str(stamps))
         frames = tuple(common[k] for k in kept)
-        times, warnings = np.array([known[frame] for frame in frames]), warnings + late
+        times, warnings = np.array([stamped[frame] for frame in frames]), warnings + late
     elif joints is not None and joints.times is not None and joints.frames:
         clock = JointLog(("time",), None, joints.times[:, None], joints.frames)
         times = clock.of_frames(frames)[:, 0]
@@ -173,13 +175,13 @@ def read_sequence(path: Path, sequence: bool = False) -> tuple[bool, float | Non
     return sequence, float(rate)
 
 
-def add_calibration(camera: EpisodeCamera, known: CameraFile, path: Path) -> EpisodeCamera:
+def add_calibration(camera: EpisodeCamera, calibration: CameraFile, path: Path) -> EpisodeCamera:
     """Return a camera with the calibration of the camera file, if it has any.
 
     Raises:
         CameraError: the calibration does not fit the images.
     """
-    found, where = known.cameras.get(camera.name), f"{path}: camera '{camera.name}'"
+    found, where = calibration.cameras.get(camera.name), f"{path}: camera '{camera.name}'"
     if found is None:
         return camera
     if not isinstance(found, PinholeCamera):
@@ -189,7 +191,7 @@ def add_calibration(camera: EpisodeCamera, known: CameraFile, path: Path) -> Epi
             f"{where}: has {found.width} x {found.height} pixels (width x height), but its "
             f"pictures {camera.width} x {camera.height}: give the calibration of these pictures"
         )
-    link, lens = known.links.get(camera.name), known.lenses.get(camera.name)
+    link, lens = calibration.links.get(camera.name), calibration.lenses.get(camera.name)
     return replace(camera, camera=found, link=link, lens=lens)
 
 

@@ -98,11 +98,11 @@ def map_joints(
             f"{', '.join(log.names)}, the joints {', '.join(names)}; give a joint map "
             "(JOINT: {column: COLUMN})"
         )
-    turning = {c: list(names).index(j) for c, j in matched.items()}
-    turning = {column: k for column, k in turning.items() if is_angle[k]}
-    if turning and units is None:
+    revolute = {c: list(names).index(j) for c, j in matched.items()}
+    revolute = {column: k for column, k in revolute.items() if is_angle[k]}
+    if revolute and units is None:
         readings_of = dict(zip(log.names, log.positions.T, strict=True))
-        angles, rows = {column: readings_of[column] for column in turning}, [*turning.values()]
+        angles, rows = {column: readings_of[column] for column in revolute}, [*revolute.values()]
         others = np.array([one for name, one in readings_of.items() if name not in used])
         units, why = _find_unit(angles, others, lower[rows], upper[rows])
         warnings.append(
@@ -110,7 +110,7 @@ def map_joints(
             "the unit (units)"
         )
     scale = UNITS[units or "rad"]
-    columns |= {j: Column(c, scale if c in turning else 1.0) for c, j in matched.items()}
+    columns |= {j: Column(c, scale if c in revolute else 1.0) for c, j in matched.items()}
     positions = np.full((len(log.positions), len(names)), np.nan)
     clipped = np.zeros(positions.shape, dtype=np.bool_)
     for k, joint in enumerate(names):
@@ -118,11 +118,13 @@ def map_joints(
             column = columns[joint]
             readings = log.positions[:, log.names.index(column.name)]
             limits = float(lower[k]), float(upper[k])
-            positions[:, k], clipped[:, k], said = _positions(column, readings, limits, is_angle[k])
-            warnings += [f"joint '{joint}': column '{column.name}' {text}" for text in said]
+            positions[:, k], clipped[:, k], anomalies = _positions(
+                column, readings, limits, is_angle[k]
+            )
+            warnings += [f"joint '{joint}': column '{column.name}' {text}" for text in anomalies]
     missing = tuple(name for name in names if name not in columns)
-    taken = {column.name for column in columns.values()}
-    unused = tuple(name for name in log.names if name not in taken)
+    used_columns = {column.name for column in columns.values()}
+    unused = tuple(name for name in log.names if name not in used_columns)
     if missing:
         warnings.append(
             f"joints that are not logged: {', '.join(missing)}; hold them (--hold) or map columns "
@@ -146,14 +148,14 @@ def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str,
     """
     matched = {name: name for name in logged if name in wanted}
     guesses: dict[str, str] = {}
-    for alike in (lambda a, b: a == b, _is_suffix):
-        left = [name for name in logged if name not in matched]
+    for is_match in (lambda a, b: a == b, _is_suffix):
+        unmatched = [name for name in logged if name not in matched]
         free = [name for name in wanted if name not in matched.values()]
-        pairs = [(a, b) for a in left for b in free if alike(_words(a), _words(b))]
+        pairs = [(a, b) for a in unmatched for b in free if is_match(_words(a), _words(b))]
         for a, b in pairs:
             if sum(a == c for c, _ in pairs) == 1 and sum(b == d for _, d in pairs) == 1:
                 matched[a] = b
-                guesses |= {a: b} if alike is _is_suffix else {}
+                guesses |= {a: b} if is_match is _is_suffix else {}
     numbered = re.compile(r"(\D*?)[_\-. ]?(\d+)")
     series = [name for name in logged if numbered.fullmatch(name)]
     starts = {numbered.sub(r"\1", name) for name in series}
@@ -168,8 +170,8 @@ def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str,
             matched |= guesses
     if not guesses:
         return matched, []
-    taken = ", ".join(f"{a} for {b}" for a, b in guesses.items())
-    return matched, [f"columns of the joint log are matched by similar names: {taken}"]
+    pairings = ", ".join(f"{a} for {b}" for a, b in guesses.items())
+    return matched, [f"columns of the joint log are matched by similar names: {pairings}"]
 
 
 def _words(name: str) -> list[str]:
@@ -214,18 +216,18 @@ def _find_unit(
     """
     low, high = np.maximum(lower, -2.0 * full_turn), np.minimum(upper, 2.0 * full_turn)
     # fmin and fmax ignore missing readings (nan).
-    least, most = (f.reduce(list(readings.values()), axis=1) for f in (np.fmin, np.fmax))
-    off = {k: np.fmax(low - one * least, one * most - high) for k, one in UNITS.items()}
-    worst = {unit: float(np.fmax.reduce(one)) for unit, one in off.items()}
-    reach = np.fmax.reduce(np.abs(others), axis=None)
-    k = int(np.argmax(np.nan_to_num(off["rad"])))
+    minima, maxima = (f.reduce(list(readings.values()), axis=1) for f in (np.fmin, np.fmax))
+    excess = {k: np.fmax(low - one * minima, one * maxima - high) for k, one in UNITS.items()}
+    worst = {unit: float(np.fmax.reduce(one)) for unit, one in excess.items()}
+    largest = np.fmax.reduce(np.abs(others), axis=None)
+    k = int(np.argmax(np.nan_to_num(excess["rad"])))
     column = list(readings)[k]
     reason = (
-        f"are not all within the joints' limits as radians ('{column}' is {least[k]:.4g} to "
-        f"{most[k]:.4g}), and not clearly degrees"
+        f"are not all within the joints' limits as radians ('{column}' is {minima[k]:.4g} to "
+        f"{maxima[k]:.4g}), and not clearly degrees"
     )
     is_named = any(name.endswith(".pos") for name in readings)
-    if is_named or normalised[0] <= reach <= normalised[1]:
+    if is_named or normalised[0] <= largest <= normalised[1]:
         reason = "seem to be normalised to -100 ... 100, as in LeRobot"
     elif worst["rad"] <= slack and worst["deg"] <= 0.0:
         return "rad", "but as degrees they would be within the limits, too"
@@ -259,31 +261,31 @@ def _positions(
         slack: tolerance of the limits [rad; for lengths a fraction of the range].
         at_end: tolerance within which a reading is at an end of its range [fraction of the range].
     """
-    found, said = column.scale * readings + column.offset, list[str]()
+    positions, anomalies = column.scale * readings + column.offset, list[str]()
     clipped = np.zeros(len(readings), dtype=np.bool_)
     if column.ends is not None:
         low, high = sorted(column.ends)
         near = at_end * (high - low)
         clipped = (np.abs(readings - low) <= near) | (np.abs(readings - high) <= near)
         if beyond := int(((readings < low - near) | (readings > high + near)).sum()):
-            said.append(
+            anomalies.append(
                 f"has {beyond} of {len(readings)} readings outside the joint map's range {low:g} "
                 f"... {high:g}"
             )
     lower, upper = limits
     if not math.isfinite(upper - lower):
         # Unwrap: interpolation between readings at +-180 degrees must not pass through 0.
-        is_known = np.isfinite(found)
-        found[is_known] = np.unwrap(found[is_known]) if is_angle else found[is_known]
-        return found, clipped, said
-    off = np.nan_to_num(np.maximum(lower - found, found - upper), nan=-np.inf)
-    row = int(np.argmax(off))
-    if off[row] > (slack if is_angle else slack * (upper - lower)):
-        said.append(
-            f"gives {found[row]:.4g} in row {row}, outside the joint's limits {lower:.4g} to "
+        is_known = np.isfinite(positions)
+        positions[is_known] = np.unwrap(positions[is_known]) if is_angle else positions[is_known]
+        return positions, clipped, anomalies
+    excess = np.nan_to_num(np.maximum(lower - positions, positions - upper), nan=-np.inf)
+    row = int(np.argmax(excess))
+    if excess[row] > (slack if is_angle else slack * (upper - lower)):
+        anomalies.append(
+            f"gives {positions[row]:.4g} in row {row}, outside the joint's limits {lower:.4g} to "
             f"{upper:.4g}: is it the wrong column, offset, sign or unit?"
         )
-    return found, clipped, said
+    return positions, clipped, anomalies
 
 
 def read_joint_map(path: Path) -> dict[str, Column]:

@@ -153,7 +153,7 @@ def _print_estimate(result: SceneEstimate) -> None:
             )
     console.print(table)
     if compared:
-        # Estimate minus truth: a row a joint, a column a frame.
+        # Estimate minus measured position, by joint (rows) and frame (columns).
         few = list(compared)[:8]
         table = Table("joint", "mean", "greatest", *map(escape, few), title="Joint errors")
         for name, errors in result.summary["joint_errors"].items():

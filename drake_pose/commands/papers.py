@@ -200,9 +200,9 @@ def shimada(
             table = shimada_sequences.sequence_table(hands)
             warnings = [hand.warning() for hand in hands]
         elif one.hypotheses:
-            truncation, seen = one.truncation or "sequential", one.observed or "lines"
+            truncation, observed = one.truncation or "sequential", one.observed or "lines"
             hypotheses = shimada.run_hypotheses_experiment(
-                one.runs or 50, one.seed, truncation, seen, count, one.iterations or 1
+                one.runs or 50, one.seed, truncation, observed, count, one.iterations or 1
             )
             figures, table, warnings = hypotheses.as_json(), hypotheses.table(), []
             if one.out is not None and not shimada_pictures.save_hypotheses(hypotheses, one.out):

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class WalkOptions:
-    """What moves the avatar, and how it is shown.
+    """Settings of the walk: the source of the motion, and the page.
 
     Raises:
         SettingsError: options exclude each other.

@@ -51,13 +51,13 @@ def _number_agreement(
 
 
 def draw_overlay(
-    seen: np.ndarray, body: np.ndarray, segments: np.ndarray | None, title: str
+    observed: np.ndarray, body: np.ndarray, segments: np.ndarray | None, title: str
 ) -> np.ndarray:
     """Draw the overlay of one camera and frame, cropped to the body and silhouette.
 
     Args:
-        seen: (H, W) bool silhouette to compare the body with, or (H, W, 3) picture over which the
-            body's contour is drawn.
+        observed: (H, W) bool silhouette to compare the body with, or (H, W, 3) picture over which
+            the body's contour is drawn.
         body: (H, W) bool, the estimated body; all False if no pose was found.
         segments: (H, W) int, index of the segment at each pixel, or None.
         title: text above the picture.
@@ -66,33 +66,35 @@ def draw_overlay(
         (h, w, 3) uint8 RGB over a picture; (h, w) uint8 indices into PALETTE, with a legend, over a
         silhouette. Small pictures are enlarged by an integer.
     """
-    width = max(1, len(seen) // 500)
-    window = _surroundings(body if seen.ndim == 3 else seen | body)
-    seen, body = seen[window], body[window]
+    width = max(1, len(observed) // 500)
+    window = _surroundings(body if observed.ndim == 3 else observed | body)
+    observed, body = observed[window], body[window]
     segments = None if segments is None else segments[window]
-    if seen.ndim == 3:
-        painted = seen.copy()
+    if observed.ndim == 3:
+        painted = observed.copy()
         _draw_contour(painted, body, EXCESS_RGB, width)
         _draw_borders(painted, body, segments, OUTLINE_RGB)
         return _framed(_enlarged(painted), title)
-    picture = _enlarged(_number_agreement(seen, body, segments))
-    shown, both, drawn = (int(np.count_nonzero(one)) for one in (seen, seen & body, body))
-    area = max(1, shown)
+    picture = _enlarged(_number_agreement(observed, body, segments))
+    silhouette, both, drawn = (
+        int(np.count_nonzero(one)) for one in (observed, observed & body, body)
+    )
+    area = max(1, silhouette)
     legend = [
         (_AGREEMENT, f"agreement {100.0 * both / area:.1f} %"),
-        (_MISSING, f"missing {100.0 * (shown - both) / area:.1f} %"),
+        (_MISSING, f"missing {100.0 * (silhouette - both) / area:.1f} %"),
         (_EXCESS, f"excess {100.0 * (drawn - both) / area:.1f} %"),
     ]
     return _framed(picture, title, legend)
 
 
 def draw_shapes(
-    seen: np.ndarray, shapes: Sequence[np.ndarray], names: Sequence[str], title: str
+    observed: np.ndarray, shapes: Sequence[np.ndarray], names: Sequence[str], title: str
 ) -> np.ndarray:
     """Draw the contours of one or two bodies over a silhouette or picture.
 
     Args:
-        seen: (H, W) bool silhouette, or (H, W, 3) picture, which is not cropped.
+        observed: (H, W) bool silhouette, or (H, W, 3) picture, which is not cropped.
         shapes: one or two bodies (H, W) bool.
         names: their names in the legend.
         title: text above the picture.
@@ -101,10 +103,10 @@ def draw_shapes(
         (h, w, 3) uint8 RGB.
     """
     colours, legend = (MISSING_RGB, EXCESS_RGB)[: len(shapes)], []
-    window, picture = (slice(None), slice(None)), seen
-    if seen.ndim == 2:
-        window = _surroundings(np.logical_or.reduce([seen, *shapes]))
-        picture = np.where(seen[..., None], AGREEMENT_RGB, BACKGROUND_RGB)
+    window, picture = (slice(None), slice(None)), observed
+    if observed.ndim == 2:
+        window = _surroundings(np.logical_or.reduce([observed, *shapes]))
+        picture = np.where(observed[..., None], AGREEMENT_RGB, BACKGROUND_RGB)
         legend = [(AGREEMENT_RGB, "silhouette")]
     picture = _enlarged(picture[window])
     for shape, colour in zip(shapes, colours, strict=True):

@@ -105,8 +105,8 @@ class FrameRecord:
 
     def as_json(self) -> dict[str, Any]:
         """Return plain JSON values, without the columns of poses.csv."""
-        told = {k: v for k, v in vars(self).items() if k not in ("frame", "q", "base")}
-        return {"found": self.found, **told}
+        values = {k: v for k, v in vars(self).items() if k not in ("frame", "q", "base")}
+        return {"found": self.found, **values}
 
 
 @dataclass(frozen=True)
@@ -199,8 +199,8 @@ class PoseTable:
             found = math.isfinite(error)
             base = numbers[self._count : -2] if self._with_base and found else None
             own = {"E_total": error if found else None, "seconds": seconds}
-            told = (known or {}).get(frame, own)
-            records.append(FrameRecord.from_json(frame, told, numbers[: self._count], base))
+            values = (known or {}).get(frame, own)
+            records.append(FrameRecord.from_json(frame, values, numbers[: self._count], base))
         return records
 
     def _cells(self, record: FrameRecord) -> list[str]:
@@ -235,16 +235,16 @@ def record_pose_set(pose_set: PoseSet | None, tree: PoseTree) -> dict[str, Any]:
     followers = [one.follower for one in tree.followers]
 
     def record(joints: Sequence[JointEstimate], values: Sequence[float | None]) -> Joints:
-        told = {}
+        estimates = {}
         for joint, value in zip((*joints, *mimic_joints(tree, joints)), values, strict=True):
             unit = 1.0 if kinds.get(joint.name) == "length" else math.degrees(1.0)
-            told[joint.name] = {
+            estimates[joint.name] = {
                 "determined": joint.determined,
                 "low": unit * joint.low,
                 "high": unit * joint.high,
                 "value": None if value is None else unit * value,
             }
-        return told
+        return estimates
 
     modes = [
         record(one.joints, [*np.concatenate(one.node_values).tolist(), *one.q[followers].tolist()])
@@ -294,18 +294,18 @@ def record_modes(model: ArticulatedModel, answers: Sequence[tuple[Array, Array]]
     Args:
         answers: positions (nq,) and deviations (nq,), as in `record_deviations`, best first.
     """
-    told = [record_deviations(model, *one) for one in answers]
-    if len(told) < 2:
-        return {"joints": told[0]}
+    of_modes = [record_deviations(model, *one) for one in answers]
+    if len(of_modes) < 2:
+        return {"joints": of_modes[0]}
     joints = {
         name: {
-            "determined": all(one[name]["determined"] for one in told),
-            "low": min(one[name]["low"] for one in told),
-            "high": max(one[name]["high"] for one in told),
+            "determined": all(one[name]["determined"] for one in of_modes),
+            "low": min(one[name]["low"] for one in of_modes),
+            "high": max(one[name]["high"] for one in of_modes),
             "value": None,
         }
-        for name in told[0]
-        if all(name in one for one in told)
+        for name in of_modes[0]
+        if all(name in one for one in of_modes)
     }
     modes = [
         {
@@ -313,9 +313,9 @@ def record_modes(model: ArticulatedModel, answers: Sequence[tuple[Array, Array]]
             for name, joint in one.items()
             for k in [model.position_index(name)]
         }
-        for (q, _), one in zip(answers, told, strict=True)
+        for (q, _), one in zip(answers, of_modes, strict=True)
     ]
-    return {"joints": joints, "modes": modes, "mode_count": len(told)}
+    return {"joints": joints, "modes": modes, "mode_count": len(of_modes)}
 
 
 def joint_table(records: Iterable[FrameRecord]) -> str:
@@ -343,7 +343,7 @@ def _ends(joint: Mapping[str, Any]) -> tuple[str, str, str]:
     return "yes" if joint["determined"] else "no", f"{joint['low']:.6g}", f"{joint['high']:.6g}"
 
 
-def next_summary(begin: float, period: float = 2.0, share: float = 20.0) -> float:
+def next_summary(begin: float, period: float = 2.0, work_ratio: float = 20.0) -> float:
     """Return the time.monotonic() [s] at which an unfinished job writes its summary again.
 
     These summaries are for jobs that are killed; every other end of a job writes its own.
@@ -351,10 +351,10 @@ def next_summary(begin: float, period: float = 2.0, share: float = 20.0) -> floa
     Args:
         begin: time at which writing of the present summary, now finished, began [s].
         period: minimum time between two summaries [s].
-        share: minimum ratio of the time between two summaries to the time of writing one.
+        work_ratio: minimum ratio of the time between two summaries to the time of writing one.
     """
     now = time.monotonic()
-    return now + max(period, share * (now - begin))
+    return now + max(period, work_ratio * (now - begin))
 
 
 def describe_job(

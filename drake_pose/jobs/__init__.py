@@ -1,1 +1,1 @@
-"""What a command does: estimate, capture, register, audit, masks, batch, walk."""
+"""Jobs of the commands: estimate, capture, register, audit, masks, batch, walk."""

@@ -311,7 +311,9 @@ def _join_chunks(task: Task, settings: EstimateSettings, part: Path) -> None:
             shutil.copytree(chunk / OVERLAY, part / OVERLAY, copy_function=link, dirs_exist_ok=True)
     write_file(part, POSES, "".join([header, *rows]))
     described = describe_job(task.job.scene, task.job.model, settings)
-    known = {one: FrameRecord.from_json(one, told, np.empty(0)) for one, told in records.items()}
+    known = {
+        one: FrameRecord.from_json(one, values, np.empty(0)) for one, values in records.items()
+    }
     write_summary(part, summarize(described, known, False))
 
 

@@ -163,8 +163,8 @@ def require_fit_workers(client: Client, out: Path, timeout: float = 5.0) -> None
         )
     try:
         out.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(prefix=".seen_", dir=out) as seen:
-            file = Path(seen.name).absolute()
+        with tempfile.NamedTemporaryFile(prefix=".seen_", dir=out) as probe:
+            file = Path(probe.name).absolute()
             here, there = worker_facts(file), client.run(worker_facts, file)
     except OSError as error:
         raise ClusterError(f"{out}: cannot be written: {error.strerror}") from error

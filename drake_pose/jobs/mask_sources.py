@@ -128,7 +128,7 @@ class Source:
         known = [] if self.cameras is None else list(self.cameras.cameras)
         listed = [(folder, coco, one) for folder, coco in self.annotated for one in coco.pictures]
         places = {folder or PurePosixPath(one.file).parent for folder, _, one in listed}
-        seen: set[tuple[str, str]] = set()
+        known_frames: set[tuple[str, str]] = set()
         for folder, coco, one in listed:
             file = PurePosixPath(one.file)
             if known:
@@ -142,9 +142,9 @@ class Source:
                     f"{f' of {self.camera_file}: ' + ', '.join(known) if known else ''}; the "
                     "paths must be <camera>/<frame>.png"
                 )
-            if (camera, file.stem) in seen:
+            if (camera, file.stem) in known_frames:
                 raise SceneError(f"{coco.path}: camera '{camera}' has frame {file.stem} twice")
-            seen.add((camera, file.stem))
+            known_frames.add((camera, file.stem))
             yield camera, file.stem, coco, one
 
 

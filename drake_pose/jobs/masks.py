@@ -366,10 +366,10 @@ def _by_box(
     mask, (x, y, w, h) = grab_cut_box(picture, box), box
     part = mask.sum() / (w * h)
     again = []
-    for share in margins:
+    for margin in margins:
         # A larger box may leave no background around it.
         with suppress(SettingsError):
-            other = (x - share * w, y - share * h, w + 2.0 * share * w, h + 2.0 * share * h)
+            other = (x - margin * w, y - margin * h, w + 2.0 * margin * w, h + 2.0 * margin * h)
             again.append(grab_cut_box(picture, other))
     is_good = part == 0.0 or usual[0] <= part <= usual[1]
     warnings = (
@@ -499,10 +499,10 @@ def _doubt_median(
         "body does not stay in one place"
     )
     texts: tuple[str, ...] = (text,) if part > doubtful else ()
-    seen = [mask.astype(np.uint8) for mask in masks if mask.any()]
-    size = math.sqrt(float(np.median([mask.sum() for mask in seen] or [0])))
+    bodies = [mask.astype(np.uint8) for mask in masks if mask.any()]
+    size = math.sqrt(float(np.median([mask.sum() for mask in bodies] or [0])))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * round(radius * size) + 1,) * 2)
-    about = sum((cv2.dilate(mask, disc).astype(np.float32) for mask in seen), np.zeros((1, 1)))
+    about = sum((cv2.dilate(mask, disc).astype(np.float32) for mask in bodies), np.zeros((1, 1)))
     if about.max() > stays * len(masks):
         y, x = np.unravel_index(int(np.argmax(about)), about.shape)
         texts += (
@@ -535,25 +535,29 @@ def _find_by_model(source: Source, settings: MaskSettings) -> Iterator[FoundMask
     body = load_model(settings.model, package_paths=settings.packages)
     kinematics = TreeKinematics(make_tree(body, EstimateSettings(hold=settings.hold)))
     table = read_known_positions(settings.start, kinematics)
-    seen = {
+    recorded = {
         name: {frame: (where, picture) for frame, where, picture in source.read(name)}
         for name in source.names
     }
-    frames = in_order(frame for own in seen.values() for frame in own)
-    starts = [table.of(one, next(name for name in seen if one in seen[name])) for one in frames]
-    pictures = [[own[one][1] if one in own else None for own in seen.values()] for one in frames]
+    frames = in_order(frame for own in recorded.values() for frame in own)
+    starts = [
+        table.of(one, next(name for name in recorded if one in recorded[name])) for one in frames
+    ]
+    pictures = [
+        [own[one][1] if one in own else None for own in recorded.values()] for one in frames
+    ]
     how = PoseAndMaskSettings(angle=math.radians(settings.start_error))
     poses = PoseAndMask(kinematics, cameras, how).run(pictures, starts)
     found, warned = dict(zip(frames, poses, strict=True)), table.warnings
-    for c, (name, own) in enumerate(seen.items()):
+    for c, (name, own) in enumerate(recorded.items()):
         for frame, pose in found.items():
             mask, agreement = pose.masks[c], pose.agreements[c]
             if mask is None:
                 continue
             refusal, warnings = _check_pose(agreement, kinematics.names, pose.deviations)
             where, picture = own[frame]
-            told = (*warned, *warnings)
-            yield FoundMask(name, frame, where, mask, picture, refusal, told, agreement)
+            every_warning = (*warned, *warnings)
+            yield FoundMask(name, frame, where, mask, picture, refusal, every_warning, agreement)
             warned = ()
 
 

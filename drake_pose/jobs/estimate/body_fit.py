@@ -138,8 +138,8 @@ class _BodyFit:
             body, warnings = fitted, (*warnings, text)
         seconds = time.perf_counter() - begin
         self._more["body_fit_seconds"] = round(seconds, 3)
-        share = seconds / len(body.known)
-        known = {k: replace(one, seconds=share) for k, one in body.known.items()}
+        seconds_per_frame = seconds / len(body.known)
+        known = {k: replace(one, seconds=seconds_per_frame) for k, one in body.known.items()}
         started = _StartedSearch(body.search.tree, body.search.settings, body.search.scale_unknown)
         started.first = known[max(known)]
         inputs = replace(

@@ -119,10 +119,10 @@ def estimate_frames(
     Raises:
         SettingsError: a frame has no picture.
     """
-    begun: PoseEstimate | None = None
-    for frame, begun in inputs.known.items():
+    track_start: PoseEstimate | None = None
+    for frame, track_start in inputs.known.items():
         if frame in missing:
-            yield frame, begun
+            yield frame, track_start
     left = [frame for frame in missing if frame not in inputs.known]
     if not left:
         return
@@ -146,7 +146,7 @@ def estimate_frames(
                 raise SettingsError(f"frame '{frame}': the matcher got no picture")
             was_tracked = matching.was_tracked(context)
             if pose.found and pose.pose_set is None and isinstance(search, MultiStartSearch):
-                before = begun if was_tracked else None
+                before = track_start if was_tracked else None
                 if views := _views(inputs.scene, frame):
                     place = (inputs.root_positions or {}).get(frame)
                     pose = search.with_intervals(pose, views, place, before)
@@ -154,7 +154,7 @@ def estimate_frames(
                     # Without masks, the intervals come from the fitted contours.
                     own = matching.with_intervals(context) if was_tracked else pose
                     pose = own.widened(before)
-            begun = begun if was_tracked else pose
+            track_start = track_start if was_tracked else pose
             yield frame, pose
 
 

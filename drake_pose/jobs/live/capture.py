@@ -192,21 +192,21 @@ def _fit_first_frames(
         before, last = last, float(evaluate(time, context)[0])
         if last != before and not np.isnan(last):
             views = {name: evaluate(one.silhouette, context) for name, one in seers.items()}
-            seen = {name: view.region for name, view in views.items() if shows_somebody(view)}
-            if len(seen) >= 2:
-                frames.append(seen)
+            regions = {name: view.region for name, view in views.items() if shows_somebody(view)}
+            if len(regions) >= 2:
+                frames.append(regions)
         return len(frames) >= count
 
     look_until(builder.Build(), sensors, look, on_report)
     # Other people in view are removed from the masks.
     alone = PersonRecording(scene.cameras, lambda k: frames[k], len(frames), True)
-    seen = alone.seen
-    if not seen:
+    visible = alone.seen
+    if not visible:
         raise SettingsError(
             f"{scene.path}: two cameras never saw a person at the same time; stand in view of "
             "them, and compare the pictures with their backgrounds"
         )
-    found = capture_person(tree, scene.cameras, alone.read, seen)
+    found = capture_person(tree, scene.cameras, alone.read, visible)
     return None if found.shape is None else found.shape.known
 
 
@@ -306,12 +306,14 @@ def _best_registered_frame(
                 if (view := diagram.GetOutputPort(f"person_view_{name}").Eval(context)) is not None
             }
             contours = {name: one.contour for name, one in views.items() if one.contour is not None}
-            cameras, seen = [ring[name] for name in contours], list(contours.values())
-            if len(seen) >= 2:
+            cameras, outlines = [ring[name] for name in contours], list(contours.values())
+            if len(outlines) >= 2:
                 if registered is None:
-                    q = place_registered(setup.skeleton, cameras, [middle for _, middle in seen])
+                    q = place_registered(
+                        setup.skeleton, cameras, [middle for _, middle in outlines]
+                    )
                     registered = render_registered_pose(setup.skeleton, q, ring)
-                found = recognise(setup.skeleton, registered, cameras, seen, threshold=0.0)
+                found = recognise(setup.skeleton, registered, cameras, outlines, threshold=0.0)
                 if found is not None and (best is None or found[1] > best[1]):
                     images = {
                         name: evaluate(sensors.GetOutputPort(f"color_image_{name}"), context)
@@ -364,8 +366,8 @@ class _FrameWriter:
             return
         self._time, self._index = now, max(self._index + 1, round(now / self._period))
         name, q = f"{self._index:06d}", self._value(context, "estimated_positions")
-        seen = {camera: port.Eval(context) for camera, port in self._views.items()}
-        masks = {camera: view.region for camera, view in seen.items() if view is not None}
+        views = {camera: port.Eval(context) for camera, port in self._views.items()}
+        masks = {camera: view.region for camera, view in views.items() if view is not None}
         for camera in masks:
             self._seen[camera, name] = Path(self._scene.specifications[camera].location)
         inlier_ratio, others = (

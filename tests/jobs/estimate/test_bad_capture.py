@@ -157,7 +157,7 @@ COLOURS = np.dstack([np.tile(np.arange(160, dtype=np.uint8), (120, 1)), *np.zero
         (in_millimetres, ("X_WC", "metres")),
         (halved, ("a person 3.", "m tall", "focal lengths")),
         (swapped, ("none of", "160 x 120", "120 x 160")),
-        (alone, ("masks are there of camera_1 alone", LACKS)),
+        (alone, ("masks exist only for camera_1", LACKS)),
         (lambda mask: 0 * mask, ("two cameras see no person in any of 2 frames",)),
         (lambda mask: 255 - mask, ("white before a black background",)),
         (lambda _: COLOURS, ("none of 8 masks", "two")),
@@ -188,7 +188,7 @@ def test_warnings_name_frames_without_the_person_and_with_others():
     assert nobody.startswith("frame 3: fewer than two cameras")
     assert "camera 'a' sees nobody in frame 1" in blind
     assert "frame 0-1: somebody else is in view of cameras 'a' and 'b'" in others
-    assert "in camera 'b' both are one silhouette (frame 1)" in others
+    assert "in camera 'b' both share a silhouette (frame 1)" in others
 
 
 @pytest.mark.parametrize(
@@ -196,7 +196,7 @@ def test_warnings_name_frames_without_the_person_and_with_others():
     [
         (("a",), (), "unless the masks of camera 'a' are mirrored"),
         ((), ("a", "b"), "unless the masks of cameras 'a' and 'b' are exchanged"),
-        ((), (), "are cameras.yaml, the folders' names or the masks wrong?"),
+        ((), (), "check cameras.yaml, the folders' names and the masks"),
     ],
 )
 def test_warning_of_mirrored_or_exchanged_masks(mirrored, exchanged, what):
@@ -211,7 +211,7 @@ def test_warning_of_a_moved_or_inconsistent_camera():
     unclear = CameraFault("a", motion, False, ("b",), 0.95)
     first, second = (describe_camera(one, NAMED) for one in (moved, unclear))
     assert first.startswith("camera 'a' has moved since frame 2 after its calibration")
-    assert "5.0 pixels off in its pictures (3.0 to the right, 4.0 up" in first
+    assert "off by 5.0 pixels in its pictures (3.0 to the right, 4.0 up" in first
     assert "left out since frame 2" in first
     assert second.startswith("camera 'a' or 'b' is inconsistent with the others: 50 % of its")
     assert "still used" in second

@@ -77,7 +77,10 @@ SPOILT_SCENES = [
         ("masks/front", r"'\udcfc.png' is not UTF-8 text"),
     ),
     (file("joint_angles.csv", "frame,lift\n0,20\n2,60\n"), ("'lift', frame 2", "in degrees")),
-    (file("joint_angles.csv", "frame,lift\n0,1e308\n"), ("'lift', frame 0", "no joint's position")),
+    (
+        file("joint_angles.csv", "frame,lift\n0,1e308\n"),
+        ("'lift', frame 0", "too large for a joint position"),
+    ),
 ]
 
 

@@ -68,7 +68,7 @@ def test_stages_are_reported(recording: PersonScene, known: list[int]) -> None:
         recording.folder, recording.person.path, replay=False,
         on_stage=lambda stage, done, _: stages.append((stage, done)),
     )  # fmt: skip
-    names = ("reading", "finding and measuring the person", "following")
+    names = ("reading", "finding and measuring the person", "tracking")
     assert stages == [(name, k) for name in names for k in range(1, 1 + FRAMES)]
 
 
@@ -109,7 +109,7 @@ def test_an_equally_good_pose_is_written_and_named_in_a_warning(
 
     monkeypatch.setattr(person, "capture_checked", doubtful)
     _, summary = run_estimate(recording, out)
-    (warning,) = [text for text in summary["warnings"] if "as well" in text]
+    (warning,) = [text for text in summary["warnings"] if "equally well" in text]
     assert "frame 0001" in warning
     assert "left_wrist" in warning
     assert "right" not in warning
@@ -228,6 +228,6 @@ def test_scenes_and_options_unfit_for_the_method_person_are_refused(
     with pytest.raises(ModelError, match=r"left_ankle.*landmarks\.yaml"):
         estimate_scene(recording.folder, hand, out, EstimateSettings(method="person"))
     alone = EstimateSettings(method="person", cameras=("camera_0",))
-    with pytest.raises(SceneError, match="two calibrated cameras"):
+    with pytest.raises(SceneError, match="two or more calibrated cameras"):
         estimate_scene(recording.folder, recording.person.path, out, alone)
     assert not out.exists()

@@ -74,5 +74,5 @@ def test_tables_with_other_separators_are_refused_by_name(
 ) -> None:
     file = tmp_path / "joint_angles.csv"
     file.write_text(f"frame{sign}A1\n0000{sign}0,5\n")
-    with pytest.raises(SceneError, match=f"{name}; columns are separated by commas"):
+    with pytest.raises(SceneError, match=f"{name}; save the table with commas"):
         read_csv(file, SceneError)

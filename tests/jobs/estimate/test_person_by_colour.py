@@ -88,7 +88,7 @@ def test_a_person_with_a_single_mask_is_refused(recording, tmp_path):
     copy = shutil.copytree(scene, tmp_path / "scene")
     (copy / "masks" / "camera_0").mkdir(parents=True)
     shutil.copy(masks / "camera_0" / "0000.png", copy / "masks" / "camera_0" / "0000.png")
-    with pytest.raises(SceneError, match=r"two cameras.*'0000'.*start"):
+    with pytest.raises(SceneError, match=r"'0000'.*fewer than two cameras.*start"):
         estimate_scene(copy, bundled_model("person"))
 
 

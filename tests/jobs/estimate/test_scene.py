@@ -146,7 +146,7 @@ def test_estimates_are_compared_with_measured_positions_of_the_scene(own_scene: 
     (own_scene.folder / "joint_angles.csv").write_text("frame,lift\n1,0.5\n")
     _, summary = run_estimate(own_scene, folder / "another", *held)
     assert summary["joint_errors"] == {}
-    assert "has no row of any frame that is estimated" in summary["warnings"][0]
+    assert "has no row of an estimated frame" in summary["warnings"][0]
 
 
 def jib_positions(scene: TinyScene) -> dict[str, np.ndarray]:
@@ -237,7 +237,7 @@ def test_constraints_that_are_not_enforced_are_warned_of(
     assert len(warnings) == 2
     assert summary["warnings"] == warnings
     page = html.unescape((out / "report.html").read_text())
-    for named, warning in zip(("<mimic>", "where the object stands"), warnings, strict=True):
+    for named, warning in zip(("<mimic>", "place the object in the world"), warnings, strict=True):
         assert named in warning
         assert warning in result.stderr
         assert warning in page

@@ -73,7 +73,7 @@ def test_results_that_cannot_be_played_say_why(tmp_path):
         ("lost", None, 30.0, OutputError, "no person was found"),
         ("good", None, 0.0, SettingsError, "positive"),
         ("good", bundled_model("hand"), 30.0, OutputError, "another model"),
-        ("nothing", None, 30.0, OutputError, "no result"),
+        ("nothing", None, 30.0, OutputError, "not a result folder"),
     ):
         with pytest.raises(error, match=words):
             recorded_player(tmp_path / name, model, rate_hz)

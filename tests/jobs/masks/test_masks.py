@@ -148,7 +148,7 @@ def test_empty_and_full_masks_are_rejected_and_two_objects_warned_of():
     mask = np.zeros((40, 60), bool)
     assert "not found" in refuse_mask(mask)
     assert "fills" in refuse_mask(~mask)
-    assert "background" in doubt_mask(~mask)[0]
+    assert "border" in doubt_mask(~mask)[0]
     mask[5:20, 10:30] = True
     alone = mask.copy()
     assert refuse_mask(mask) == ""

@@ -144,7 +144,7 @@ class TreeKinematics:
         below = np.maximum(np.ceil((lower - values) / full), 0.0)
         return np.where(self.covers_full_turn, values - full * (above - below), values)
 
-    def reach(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def local_limits(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return limits (m,), (m,) around a pose [rad or m].
 
         An angle that can take every direction has half a turn either side of its value.

@@ -453,10 +453,10 @@ def explain(
     for f in range(frames):
         for node in range(X_CN.shape[1]):
             crossings = fill_rows(packed, node, node + 1, X_CN[f], camera, crossings, rows)
-            top, bottom = min(top, rows.reach[0]), max(bottom, rows.reach[1])
+            top, bottom = min(top, rows.row_range[0]), max(bottom, rows.row_range[1])
             # Static nodes use the upper bits.
             bit = one << np.uint64(f + frames if is_static[node] else f)
-            for row in range(rows.reach[0], rows.reach[1]):
+            for row in range(rows.row_range[0], rows.row_range[1]):
                 for k in range(find_spans(row, crossings, rows.counts, rows.changes, rows.spans)):
                     for column in range(rows.spans[k, 0], rows.spans[k, 1]):
                         words[row, column] |= bit

@@ -226,7 +226,7 @@ class BodyPlan:
         values = np.flatnonzero(own & free)
         nodes = np.flatnonzero((moves & own).any(axis=1))
         fractions = qmc.Halton(len(values), scramble=False).random(count)
-        lower, upper = (ends[values] for ends in kinematics.reach(rest))
+        lower, upper = (ends[values] for ends in kinematics.local_limits(rest))
         poses = np.clip(rest[values], lower, upper) * np.ones((count, 1))
         poses[1:] = lower + fractions[1:] * (upper - lower)
         # People stretch their limbs more often than uniformly drawn angles do.

@@ -245,7 +245,7 @@ def describe_modes(
         # Angles of all modes are given in the turn nearest to the first one.
         first = some[0].values
         turns = [kinematics.nearest_turns(one.values, first) - one.values for one in some]
-        lower, upper = kinematics.reach(first)
+        lower, upper = kinematics.local_limits(first)
         low = np.maximum(np.min([one.low for one in some] + np.array(turns), axis=0), lower)
         high = np.minimum(np.max([one.high for one in some] + np.array(turns), axis=0), upper)
         widest = RobustSettings.widest(kinematics.is_angle)
@@ -273,7 +273,7 @@ def covariance_pose_set(
     widths = stdtrit(settings.camera_freedom * image_count, settings.one_sided) * np.sqrt(
         np.diag(covariance)
     )
-    lower, upper = kinematics.reach(values)
+    lower, upper = kinematics.local_limits(values)
     mode = FittedPose(
         values,
         low=np.maximum(values - widths, lower),
@@ -378,12 +378,12 @@ class RobustModes:
                 continue
             values = kinematics.nearest_turns(fitted)
             below, above = mode.values - mode.low, mode.high - mode.values
-            lower, upper = kinematics.reach(mode.values)
+            lower, upper = kinematics.local_limits(mode.values)
             # An interval that ended at a joint's limit may extend further after the flip.
             below = np.where(flip.changed & (mode.low <= lower + 1e-9), math.inf, below)
             above = np.where(flip.changed & (mode.high >= upper - 1e-9), math.inf, above)
             swapped = np.where(flip.mirrored, [above, below], [below, above])
-            lower, upper = kinematics.reach(values)
+            lower, upper = kinematics.local_limits(values)
             low, high = (
                 np.maximum(values - swapped[0], lower),
                 np.minimum(values + swapped[1], upper),
@@ -397,7 +397,7 @@ class RobustModes:
         covariance alone.
         """
         kinematics, settings = self._kinematics, self._settings
-        lower, upper = kinematics.reach(values)
+        lower, upper = kinematics.local_limits(values)
         free = np.flatnonzero(upper > lower)
         residuals = self._fit.distances(values, settings.measure)
         if self._sizes is None:
@@ -448,7 +448,7 @@ class RobustModes:
         longest = settings.longest_steps[0 if self._kinematics.is_angle[index] else 1]
         lower, upper = self._kinematics.lower.copy(), self._kinematics.upper.copy()
         # An angle that turns around is moved by at most half a turn.
-        lower[index], upper[index] = (ends[index] for ends in self._kinematics.reach(values))
+        lower[index], upper[index] = (ends[index] for ends in self._kinematics.local_limits(values))
         step, found, worse = width, [values], 0.0
         while lower[index] < found[-1][index] < upper[index] and self._proceed():
             trial = np.clip(found[-1] + min(step, longest) * along, lower, upper)

@@ -153,12 +153,12 @@ def draw_bits(
         multiply(view.X_CW, X_WN, X_CN[1])
         if bends:
             bend(packed, part, celled.bands[pairs[i, 1]])
-        rows.reach[0], rows.reach[1], rows.reach[2] = rows.counts.shape[0], 0, 0
+        rows.row_range[0], rows.row_range[1], rows.row_range[2] = rows.counts.shape[0], 0, 0
         filled = _walk_cell(celled, X_CN[0], camera, crossings, rows, scratch)
         if filled:
             add_surface(packed, 1, X_CN, camera, crossings, rows)
-        if rows.reach[2] != 0 or not filled:
-            for row in range(rows.reach[0], rows.reach[1]):
+        if rows.row_range[2] != 0 or not filled:
+            for row in range(rows.row_range[0], rows.row_range[1]):
                 rows.counts[row] = 0
             crossings = fill_rows(packed, 0, 2, X_CN, camera, crossings, rows)
         count, spans = _gather_spans(view, crossings, rows, limit, spans, areas[found])
@@ -195,7 +195,7 @@ def _walk_cell(
     Returns:
         Whether the cells are valid at this pose; if not, nothing is written.
     """
-    counts, reach = rows.counts, rows.reach
+    counts, row_range = rows.counts, rows.row_range
     if celled.edges.shape[0] == 0:
         return True
     ball, parallel, cx, cy = celled.packed.balls[0], camera[0] == 1.0, camera[3], camera[4]
@@ -205,7 +205,7 @@ def _walk_cell(
     if not parallel:
         distance = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
         depth = c0 * ball[0] + c1 * ball[1] + c2 * ball[2] + c3
-        if depth - 1.000001 * ball[3] < camera[5] or ball[3] > celled.reach[0] * distance:
+        if depth - 1.000001 * ball[3] < camera[5] or ball[3] > celled.max_sine[0] * distance:
             return False
     cell = find_cell(d0, d1, d2)
     begin, end = celled.cell_starts[cell], celled.cell_starts[cell + 1]
@@ -254,7 +254,7 @@ def _walk_cell(
         firsts[crossing], lasts[crossing] = first, last
         weights[crossing] = weights[k] if down else -weights[k]
         crossing += first < last
-    lowest, highest = reach[0], reach[1]
+    lowest, highest = row_range[0], row_range[1]
     for k in range(crossing):
         u0, v0 = lines[k, 0], lines[k, 1]
         slope = (lines[k, 2] - u0) / (lines[k, 3] - v0)
@@ -267,9 +267,9 @@ def _walk_cell(
             if count < capacity:
                 crossings[row, count] = (pixel << SHIFT) + mark
             else:
-                reach[2] = 1
+                row_range[2] = 1
             counts[row] = count + 1
-    reach[0], reach[1] = lowest, highest
+    row_range[0], row_range[1] = lowest, highest
     return True
 
 
@@ -298,7 +298,7 @@ def _gather_spans(
     first_column, width = window[1], window[3]
     has_margin = margin.shape[0] > 0
     covered, in_margin, total, count = 0, 0, 0, 0
-    for row in range(rows.reach[0], rows.reach[1]):
+    for row in range(rows.row_range[0], rows.row_range[1]):
         number = find_spans(row, crossings, rows.counts, rows.changes, rows.spans)
         if count + number > spans.shape[0]:
             spans = grow_rows(spans, count, 2 * spans.shape[0] + number)
@@ -316,7 +316,7 @@ def _gather_spans(
                 spans[count, 0], spans[count, 1], spans[count, 2] = r, a, b
                 count += 1
         if total - covered > limit:
-            for later in range(row + 1, rows.reach[1]):
+            for later in range(row + 1, rows.row_range[1]):
                 rows.counts[later] = 0
             return -1, spans
     areas[0], areas[1], areas[2] = covered, in_margin, total - covered - in_margin
@@ -476,17 +476,18 @@ def draw_discs(
             p_C[j] = X_CP[j, 3]
             for k in range(3):
                 p_C[j] += X_CP[j, k] * p_PB[k]
-        u, v, reach = camera[1] * p_C[0], camera[2] * p_C[1], max(camera[1], camera[2]) * radius
+        u, v = camera[1] * p_C[0], camera[2] * p_C[1]
+        extent = max(camera[1], camera[2]) * radius
         if camera[0] != 1.0:
             u, v = u / p_C[2], v / p_C[2]
             distance = np.sqrt((p_C**2).sum())
-            reach *= distance / (p_C[2] * (p_C[2] - radius))
+            extent *= distance / (p_C[2] * (p_C[2] - radius))
             if p_C[2] - radius < camera[5]:
-                u, v, reach = 0.0, 0.0, 1e9
-        u, v, reach = u + camera[3] - window[1], v + camera[4] - window[0], reach + 1.0
+                u, v, extent = 0.0, 0.0, 1e9
+        u, v, extent = u + camera[3] - window[1], v + camera[4] - window[0], extent + 1.0
         count = 0
-        for row in range(max(0, math.ceil(v - reach)), min(height, math.floor(v + reach) + 1)):
-            half = np.sqrt(max(0.0, reach * reach - (row - v) ** 2))
+        for row in range(max(0, math.ceil(v - extent)), min(height, math.floor(v + extent) + 1)):
+            half = np.sqrt(max(0.0, extent * extent - (row - v) ** 2))
             a, b = max(0, math.ceil(u - half)), min(width, math.floor(u + half) + 1)
             if a < b:
                 spans[count, 0], spans[count, 1], spans[count, 2] = row, a, b

@@ -329,8 +329,8 @@ class CelledOutline(NamedTuple):
         edges: (e, 5) int32 v0, v1, t0, t1, s1 as packed.
         cell_starts: (cells + 1,) int64 index of each cell's first entry in ``cell_edges``.
         cell_edges: (k,) int32 indices of edges, cell after cell.
-        reach: (1,) sine of the largest angle between the viewing directions of the surface's points
-            and of its ball's centre for which the cells are valid.
+        max_sine: (1,) sine of the largest angle between the viewing directions of the surface's
+            points and of its ball's centre for which the cells are valid.
         packed: the surface, then its band, which kernels deform in place.
         bands: (n, v, 3) vertices of the band at the samples of its node [m]; n = 0 without a band.
     """
@@ -340,7 +340,7 @@ class CelledOutline(NamedTuple):
     edges: np.ndarray
     cell_starts: np.ndarray
     cell_edges: np.ndarray
-    reach: np.ndarray
+    max_sine: np.ndarray
     packed: PackedOutlines
     bands: np.ndarray
 
@@ -368,7 +368,7 @@ def divide_outline(
         edges=np.ascontiguousarray(records, dtype=np.int32),
         cell_starts=starts,
         cell_edges=edges,
-        reach=np.array([math.sin(spread)]),
+        max_sine=np.array([math.sin(spread)]),
         packed=mutable_copy(pack((outline, outline_of_triangles(skin.vertices, skin.triangles)))),
         bands=np.ascontiguousarray(np.zeros((0, 0, 3)) if bands is None else bands),
     )

@@ -32,7 +32,7 @@ class Rows(NamedTuple):
         u, v: (points,) image coordinates of one surface's points [pixel].
         facings: (triangles + 1,) int8 output of ``find_facings``.
         counts: (height,) int32 number of crossings of each row.
-        reach: (3,) int64 first row touched, row after the last one, and whether a row overflowed.
+        row_range: (3,) int64 first row touched, row after the last, and whether a row overflowed.
         changes: (width + 1,) int32 difference array, zero between calls.
         spans: (width + 1, 2) int32 spans [a, b) of one row.
     """
@@ -41,7 +41,7 @@ class Rows(NamedTuple):
     v: np.ndarray
     facings: np.ndarray
     counts: np.ndarray
-    reach: np.ndarray
+    row_range: np.ndarray
     changes: np.ndarray
     spans: np.ndarray
 
@@ -80,7 +80,7 @@ def _walk_edge(
     height: float,
     crossings: np.ndarray,
     counts: np.ndarray,
-    reach: np.ndarray,
+    row_range: np.ndarray,
 ) -> None:
     """Append the crossings of the edge from (ua, va) to (ub, vb) [pixel] to the rows.
 
@@ -97,8 +97,8 @@ def _walk_edge(
     end = math.ceil(min(vb, height))
     if first >= end:
         return
-    reach[0] = min(reach[0], first)
-    reach[1] = max(reach[1], end)
+    row_range[0] = min(row_range[0], first)
+    row_range[1] = max(row_range[1], end)
     capacity = crossings.shape[1]
     columns = int(width)
     slope = (ub - ua) / (vb - va)
@@ -111,7 +111,7 @@ def _walk_edge(
         if count < capacity:
             crossings[row, count] = (pixel << SHIFT) + mark
         else:
-            reach[2] = 1
+            row_range[2] = 1
         counts[row] = count + 1
 
 
@@ -148,7 +148,7 @@ def _clip_near(
             b = (a + 1) % size
             _walk_edge(
                 corners[a, 0], corners[a, 1], corners[b, 0], corners[b, 1], weight,
-                camera[6], camera[7], crossings, rows.counts, rows.reach,
+                camera[6], camera[7], crossings, rows.counts, rows.row_range,
             )  # fmt: skip
 
 
@@ -177,18 +177,18 @@ def add_surface(
     find_facings(packed, node, X_CN, camera, facings)
     if cut:
         _clip_near(packed, node, X_CN, camera, crossings, rows)
-    width, height, counts, reach = camera[6], camera[7], rows.counts, rows.reach
+    width, height, counts, row_range = camera[6], camera[7], rows.counts, rows.row_range
     ordinary_end = packed.ordinary_ends[node]
     for e in range(packed.starts[node, 2], ordinary_end):
         weight = int(facings[edges[2, e]]) - int(facings[edges[3, e]])
         if weight != 0:
             a, b = edges[0, e], edges[1, e]
-            _walk_edge(u[a], v[a], u[b], v[b], weight, width, height, crossings, counts, reach)
+            _walk_edge(u[a], v[a], u[b], v[b], weight, width, height, crossings, counts, row_range)
     for e in range(ordinary_end, packed.starts[node + 1, 2]):
         weight = int(facings[edges[2, e]]) + int(packed.sides[e]) * int(facings[edges[3, e]])
         if weight != 0:
             a, b = edges[0, e], edges[1, e]
-            _walk_edge(u[a], v[a], u[b], v[b], weight, width, height, crossings, counts, reach)
+            _walk_edge(u[a], v[a], u[b], v[b], weight, width, height, crossings, counts, row_range)
 
 
 @compiled
@@ -206,15 +206,15 @@ def fill_rows(
     Returns:
         The crossings, reallocated until every row has room.
     """
-    counts, reach = rows.counts, rows.reach
+    counts, row_range = rows.counts, rows.row_range
     while True:
-        reach[0], reach[1], reach[2] = counts.shape[0], 0, 0
+        row_range[0], row_range[1], row_range[2] = counts.shape[0], 0, 0
         for node in range(first, end):
             add_surface(packed, node, X_CN, camera, crossings, rows)
-        if reach[2] == 0:
+        if row_range[2] == 0:
             return crossings
         max_count = 0
-        for row in range(reach[0], reach[1]):
+        for row in range(row_range[0], row_range[1]):
             max_count = max(max_count, counts[row])
             counts[row] = 0
         crossings = np.empty((counts.shape[0], 2 * max_count), dtype=np.int32)
@@ -315,7 +315,7 @@ def score(
         if parts.shape[0] > 0:
             bend(packed, parts, bands[n])
         crossings = fill_rows(packed, 0, X_CN.shape[1], X_CN[n], camera, crossings, rows)
-        for row in range(rows.reach[0], rows.reach[1]):
+        for row in range(rows.row_range[0], rows.row_range[1]):
             for k in range(find_spans(row, crossings, rows.counts, rows.changes, spans)):
                 a, b = spans[k, 0], spans[k, 1]
                 areas[n, 0] += b - a
@@ -335,10 +335,10 @@ def paint(
     """
     rows, crossings = make_rows(packed, camera)
     crossings = fill_rows(packed, 0, X_CN.shape[0], X_CN, camera, crossings, rows)
-    for row in range(rows.reach[0], rows.reach[1]):
+    for row in range(rows.row_range[0], rows.row_range[1]):
         for k in range(find_spans(row, crossings, rows.counts, rows.changes, rows.spans)):
             mask[row, rows.spans[k, 0] : rows.spans[k, 1]] = value
-    return rows.reach[:2]
+    return rows.row_range[:2]
 
 
 # Binary logarithm of the side [pixel] of tiles, which record where pixels are contested.
@@ -381,7 +381,7 @@ def paint_labels(
     rows, crossings = make_rows(packed, camera)
     for node in range(X_CN.shape[0]):
         crossings = fill_rows(packed, node, node + 1, X_CN, camera, crossings, rows)
-        for row in range(rows.reach[0], rows.reach[1]):
+        for row in range(rows.row_range[0], rows.row_range[1]):
             for k in range(find_spans(row, crossings, rows.counts, rows.changes, rows.spans)):
                 a, b = rows.spans[k, 0], rows.spans[k, 1]
                 _paint_span(image, row, a, b, labels[node], empty, sums, bounds)

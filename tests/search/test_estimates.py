@@ -132,7 +132,7 @@ def test_covariance_gives_student_intervals_within_limits(tree):
         np.testing.assert_array_equal(pose_set.modes[0].q, [7.0, 8.0])
         assert pose_set.modes[0].J == 7.0
     wide = covariance_pose_set(tree, pose, 100.0 * np.eye(2), 1)
-    lower, upper = kinematics.reach(np.array([0.5, 0.2]))
+    lower, upper = kinematics.local_limits(np.array([0.5, 0.2]))
     np.testing.assert_allclose([joint.low for joint in wide.joints], lower)
     np.testing.assert_allclose([joint.high for joint in wide.joints], upper)
 

@@ -19,6 +19,8 @@ from drake_pose.camera.picture_files import decode_colours, import_reader
 from drake_pose.errors import CameraError, DrakePoseError, SceneError
 
 BAGS = (".bag", ".mcap", ".db3")
+"""Suffixes of bags."""
+
 # Bytes per pixel, and OpenCV's conversion to red, green, blue.
 _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "rgb8": (3, None),

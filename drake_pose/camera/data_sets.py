@@ -20,6 +20,7 @@ from drake_pose.regular_files import read_regular, require_regular
 
 INFO = Path("meta", "info.json")
 TRAJECTORY = "trajectory.h5"
+"""Files by which LeRobot data sets and DROID episodes are recognised."""
 
 
 def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Episode:

@@ -30,6 +30,7 @@ from drake_pose.errors import CameraError, SceneError, SettingsError, listed
 from drake_pose.yaml_files import read_yaml
 
 JOINT_TABLE = "joint_angles.csv"
+"""Name of the joint table in a recording's folder."""
 
 
 def read_joint_table(path: Path) -> tuple[JointLog, list[str]]:

@@ -33,8 +33,10 @@ from drake_pose.errors import CameraError, SceneError, SettingsError, listed
 from drake_pose.yaml_files import read_yaml
 
 CAMERAS, SOURCES, TIME_STAMPS = "cameras.yaml", "sources.yaml", "timestamps.csv"
+"""Names of files: calibrated cameras, image sources, and times of a folder's frames."""
 
 Clock = Callable[[], float]
+"""Function that returns the time [s]."""
 
 
 @dataclass(frozen=True)

@@ -149,6 +149,7 @@ class PartColours:
     def _fractions(
         self, outlines: Sequence[Outline], X_WN: Array, views: Iterable[tuple[Camera, Picture]]
     ) -> Array:
+        """Return (nodes,) fraction of each part's pixels with own colours; nan if occluded."""
         counts = np.zeros((2, len(outlines)))
         for camera, picture in views:
             labels = draw_labels(outlines, range(1, 1 + len(outlines)), camera.X_CW @ X_WN, camera)

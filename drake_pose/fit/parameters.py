@@ -229,7 +229,7 @@ def link_scale_name(link: str) -> str:
 
 
 def carried_joints(tree: PoseTree, links: Collection[str] | None = None) -> list[LinkVector]:
-    """Return the robot's joints at a distance from the joint of the link that carries them.
+    """Return the vectors from links' joints to the robot's joints that they carry at a distance.
 
     Args:
         tree: the pose tree.

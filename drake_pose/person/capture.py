@@ -83,10 +83,8 @@ class PersonCapture:
     ) -> None:
         """Store the pose of a frame and its standard deviations, given what was seen."""
         lengths = None if self.shape is None else self.shape.covariance
-        self.q[frame], self.inlier_ratios[frame] = (
-            tracker.positions(state.values),
-            state.inlier_ratio,
-        )
+        self.q[frame] = tracker.positions(state.values)
+        self.inlier_ratios[frame] = state.inlier_ratio
         self.deviations[frame] = tracker.deviations(state.values, seen, lengths)
 
 
@@ -372,10 +370,8 @@ def capture_by_colour(
             state = tracker.start(values)
             if last is not None and not last.is_lost:
                 state = replace(state, step=values - last.values)
-            captured.q[frame], captured.inlier_ratios[frame] = (
-                known.q[index],
-                known.inlier_ratios[index],
-            )
+            captured.q[frame] = known.q[index]
+            captured.inlier_ratios[frame] = known.inlier_ratios[index]
             captured.deviations[frame] = known.deviations[index]
             colours = views.updated_colours(fit, values, masked[frame])
             shown = zip(views.cameras, views.pictures, strict=True)

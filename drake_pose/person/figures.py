@@ -132,10 +132,8 @@ def find_persons(
             return ()
         person = _person(cameras, figures, taken)
         position = person.position[None]
-        if (
-            max(ray_distances(cameras[k], figures[k][0].middle, position)[0] for k in taken)
-            < _MAX_RAY_DISTANCE
-        ):
+        distances = [ray_distances(cameras[k], figures[k][0].middle, position)[0] for k in taken]
+        if max(distances) < _MAX_RAY_DISTANCE:
             return (person,)
     free = [set(range(len(own))) for own in figures]
     middles = [np.array([figure.middle for figure in own]).reshape(-1, 2) for own in figures]

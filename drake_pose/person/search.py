@@ -486,9 +486,8 @@ class PersonSearch:
         tips: list[Array] = []
         for index in np.argsort(-scores):
             tip = limb.samples_T[index, -1]
-            if all(
-                np.linalg.norm(tip - other) > self._settings.distinct_distance for other in tips
-            ):
+            distances = [np.linalg.norm(tip - other) for other in tips]
+            if min(distances, default=math.inf) > self._settings.distinct_distance:
                 tips.append(tip)
                 found.append(values.copy())
                 found[-1][limb.values] = limb.poses[index]

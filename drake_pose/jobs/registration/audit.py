@@ -1,8 +1,8 @@
-"""Which frames, cameras or joints contradict the rest in a scene: read, found, told, written.
+"""Audit a scene or an episode: find errors of joints, cameras, clocks, and outlier frames.
 
-In an episode each camera is found in its pictures as a registration finds it, and its clock; these
-give masks without the given cameras. A given camera that stands far from there is named; frames are
-then compared with the one that was found. One that stands near is compared as a scene's is.
+In an episode each camera is first registered from its pictures, with its clock, which gives masks
+independent of the given camera. A given camera far from its registered pose is a finding, and
+frames are compared with the registered one; otherwise they are compared with the given one.
 """
 
 import math
@@ -62,7 +62,14 @@ OnFrame = Callable[[int], None]
 
 @dataclass(frozen=True, eq=False)
 class SceneAudit:
-    """What contradicts the rest in a scene; summary: what summary.json holds."""
+    """The audit of a scene.
+
+    Args:
+        audit: the diagnosis of all frames.
+        summary: contents of summary.json.
+        warnings: for the user.
+        folder: the result's folder; None: nothing was written.
+    """
 
     audit: Diagnosis
     summary: Mapping[str, Any]
@@ -82,20 +89,22 @@ def audit_scene(
     overlay: bool = True,
     on_frame: OnFrame | None = None,
 ) -> SceneAudit:
-    """Finds which frames, cameras or joints contradict the rest, in time linear in the frames.
+    """Find errors common to all frames, and outlier frames, in time linear in the frames.
 
     Args:
-        scene: the folder with cameras.yaml and masks; or an episode of pictures, in which the
-            robot, and masks of it, are found without the cameras that are audited.
-        model: the robot's model file. It stands in the world as the file has it.
-        joints: joint positions by frame, of an episode by time, too (CSV) [rad or m]. None: the
+        scene: a folder with masks and cameras.yaml; or an episode of pictures, in which the robot
+            and its masks are found without the audited cameras.
+        model: the robot's model file, with the robot placed in the world as in the file.
+        joints: joint positions by frame, or by time for an episode (CSV) [rad or m]. None: the
             recording's own.
-        out: folder for the result, new or empty; None writes nothing.
+        out: folder for the result, new or empty; None: nothing is written.
+        settings: what is audited, and how.
         cameras: a camera file in place of the scene's or episode's own.
+        overlay: whether overlays are drawn.
         on_frame: called after each frame.
 
     Raises:
-        DrakePoseError: names the file, camera, frame or joint at fault.
+        DrakePoseError: names the wrong file, camera, frame or joint.
     """
     settings, begin = settings or AuditSettings(), time.perf_counter()
     table, own, folder = (None if one is None else Path(one) for one in (joints, cameras, out))
@@ -105,20 +114,20 @@ def audit_scene(
         if inputs.recordings:
             given, (inputs, pictures) = inputs, _find_cameras(inputs)
             compared = SceneComparison(inputs, on_frame).run()
-            zeros = [one.name for one in compared.found.common if one.kind == "joint"]
-            if zeros:
-                # Masks were found with these as they are, and lean on them.
-                inputs, pictures = _find_cameras(given, pictures, zeros)
+            offset_joints = [one.name for one in compared.found.common if one.kind == "joint"]
+            if offset_joints:
+                # Masks were segmented with wrong offsets, so they are made again.
+                inputs, pictures = _find_cameras(given, pictures, offset_joints)
                 compared = SceneComparison(inputs).run()
         else:
             compared = SceneComparison(inputs, on_frame).run()
-    found, unseen = compared.found, compared.unseen
+    found, empty = compared.found, compared.empty_frames
     found = replace(found, common=(*pictures.findings, *found.common))
     seconds = time.perf_counter() - begin
-    warnings = [*inputs.warnings, *compared.warnings, *_doubts(inputs, found, unseen)]
+    warnings = [*inputs.warnings, *compared.warnings, *_audit_warnings(inputs, found, empty)]
     names = [camera.name for camera in inputs.known_cameras]
     units = zip(inputs.model.position_names, user_units(inputs.model), strict=True)
-    noticed = {
+    detectable = {
         name: unit * found.minimum_detectable[name]
         for name, unit in units
         if name in found.minimum_detectable
@@ -148,14 +157,14 @@ def audit_scene(
             for name, one in pictures.found.items()
         },
         "minimum_detectable": {
-            k: one if math.isfinite(one) else None for k, one in noticed.items()
+            k: one if math.isfinite(one) else None for k, one in detectable.items()
         },
         "principal_point_px": center and dict(zip(("offset", "sd"), center, strict=True)),
         "error_sizes_px": {
             name: float(getattr(found.sizes, name)) for name in ("surface", "mask", "camera")
         },
         **describe_run(inputs, settings, warnings, seconds),
-        "unseen": list(unseen),
+        "unseen": list(empty),
     }
     if folder is not None:
         _write_result(folder, inputs, found, pictures, overlay, summary)
@@ -164,12 +173,12 @@ def audit_scene(
 
 @dataclass(frozen=True, eq=False)
 class _Pictures:
-    """What was found in an episode's pictures; nothing, of a scene of masks.
+    """Results from an episode's pictures; empty for a scene of masks.
 
     Args:
-        found: by camera.
-        findings: cameras that are far from where their pictures show them, and clocks.
-        names: by frame of the inputs, its camera and its name there.
+        found: registrations by camera.
+        findings: errors of cameras and clocks.
+        names: by frame of the inputs, the camera and the frame's name in it.
     """
 
     found: Mapping[str, PictureRegistration] = field(default_factory=dict)
@@ -180,16 +189,16 @@ class _Pictures:
 def _find_cameras(
     inputs: RegistrationInputs,
     before: _Pictures | None = None,
-    zeros: Sequence[str] = (),
+    offset_joints: Sequence[str] = (),
     near: float = 0.08,
 ) -> tuple[RegistrationInputs, _Pictures]:
-    """Finds each camera of an episode in its pictures, and masks in all of these.
+    """Register each camera of an episode from its pictures, and segment all of them.
 
     Args:
-        before: a look that found the cameras about.
-        zeros: joints whose zeros are not trusted.
-        near: a camera is compared as it is given that shows the body nearer than this to where it
-            is seen [root of the silhouettes' area].
+        before: an earlier result, from which fits start.
+        offset_joints: joints whose offsets are fitted.
+        near: a given camera is used for comparisons if it shows the body at less than this distance
+            from the registered one [square root of the silhouettes' area].
 
     Raises:
         SceneError: no camera has a pose.
@@ -199,28 +208,26 @@ def _find_cameras(
     if not inputs.given_cameras:
         raise SceneError(
             f"{path}: no camera has an X_WC that could be audited; give a camera file "
-            "(--cameras FILE), or find out where they stand: drake-pose register"
+            "(--cameras FILE), or estimate the poses: drake-pose register"
         )
-    alone, body = (
-        len(inputs.given_cameras) == 1,
-        RegistrationBody(inputs.tree, inputs.visible_nodes),
-    )
+    alone = len(inputs.given_cameras) == 1
+    body = RegistrationBody(inputs.tree, inputs.visible_nodes)
     warnings = say_left_out(inputs.recordings, [one.name for one in inputs.given_cameras])
-    held, findings, pictures = list[Camera](), list[Finding](), dict[str, PictureRegistration]()
+    compared, findings = list[Camera](), list[Finding]()
+    pictures = dict[str, PictureRegistration]()
     names, frames = dict[str, tuple[str, str]](), list[MultiViewFrame]()
     for given in inputs.given_cameras:
         name, recording = given.name, inputs.recordings[given.name]
         if before is None:
-            one = register_pictures(body, given, recording, offset_joints=zeros)
+            one = register_pictures(body, given, recording, offset_joints=offset_joints)
         else:
-            one = fit_pictures(
-                body, PictureStart.of(before.found[name]), recording, offset_joints=zeros
-            )
+            start = PictureStart.of(before.found[name])
+            one = fit_pictures(body, start, recording, offset_joints=offset_joints)
         pictures[name] = one
         values = np.array([frame.values + one.joint_offsets for frame in one.frames])
         off = compare_camera(body, given, one.found, values, alone)
         is_near = off.pixels < near * one.fit.fit.views[0].size
-        held.append(given if is_near else one.found.camera)
+        compared.append(given if is_near else one.found.camera)
         findings += [] if is_near or off.p_value > DIAGNOSIS.significance else [off]
         findings += compare_clock(body, one, recording)
         seen, _, lost = evaluate_pictures(body, one, one.found)
@@ -231,41 +238,43 @@ def _find_cameras(
         if lost:
             warnings.append(lost_frames_warning(name, lost, recording.names))
     far = {one.name for one in findings if one.kind == "camera"}
-    looked = replace(
+    updated = replace(
         inputs,
         scene=replace(inputs.scene, frames=tuple(names)),
         warnings=(*inputs.warnings, *warnings),
-        known_cameras=tuple(held),
+        known_cameras=tuple(compared),
         given_cameras=tuple(one for one in inputs.given_cameras if one.name in far),
         audited_frames=tuple(names),
         frames=tuple(frames),
     )
-    return looked, _Pictures(pictures, tuple(findings), names)
+    return updated, _Pictures(pictures, tuple(findings), names)
 
 
-def _doubts(inputs: RegistrationInputs, found: Diagnosis, unseen: Sequence[str]) -> list[str]:
-    """What a user should know of the frames, and of the file of cameras."""
+def _audit_warnings(
+    inputs: RegistrationInputs, found: Diagnosis, empty_frames: Sequence[str]
+) -> list[str]:
+    """Return warnings about the camera file, empty masks, and few inlier frames."""
     warnings = list[str]()
     if found.center is not None:
         (x, y), (x_sd, y_sd) = found.center
         advice = (
-            "does the file have a CameraInfo's numbers? Write pixel_centers: drake beside them"
+            "are these a CameraInfo's numbers? Then add pixel_centers: drake"
             if x < 0.0
-            else "does it say pixel_centers: drake of numbers that count pixel centres at integers?"
+            else "does it say pixel_centers: drake, but count pixel centres at integers?"
         )
         warnings.append(
             f"{inputs.camera_file}: the principal points are off by ({x:.2f}, {y:.2f}) +- "
             f"({x_sd:.2f}, {y_sd:.2f}) pixels, half a pixel: {advice}"
         )
-    if unseen:
-        named = frame_ranges(unseen, inputs.scene.frames)
+    if empty_frames:
+        named = frame_ranges(empty_frames, inputs.scene.frames)
         warnings.append(f"frame {named}: the masks show nothing: there is nothing to compare")
-    count, agreeing = len(found.frames), len(found.frames) - len(found.outliers)
+    count, inliers = len(found.frames), len(found.frames) - len(found.outliers)
     wrong_log = any(one.kind in ("sign", "log") for one in found.common)
-    if 2 * agreeing < count and not wrong_log:
+    if 2 * inliers < count and not wrong_log:
         warnings.append(
-            f"{agreeing} of {count} frames agree with each other: which of them are "
-            "right is told by their being near to what is given, not by their number"
+            f"only {inliers} of {count} frames agree with each other: they count as right because "
+            "they are near the given values, not because of their number"
         )
     return warnings
 
@@ -278,7 +287,7 @@ def _write_result(
     overlay: bool,
     summary: Mapping[str, Any],
 ) -> None:
-    """Summary and page, and the robot at its encoders' positions over what is at fault."""
+    """Write summary, page, overlays of outlier frames, and comparisons of wrong cameras."""
     named, shown = found.outliers if overlay else (), {}
     for frame in named if pictures.names else ():
         camera_name, name = pictures.names[frame]
@@ -288,7 +297,7 @@ def _write_result(
         for one in map(inputs.read, named):
             if name in one.masks:
                 fits = percent(summary["frames"][one.name]["fits"][name])
-                title = f"{name}  frame {one.name}  CONTRADICTS the others  {fits} fits"
+                title = f"{name}  frame {one.name}  OUTLIER  {fits} fits"
                 titled.append((PosedFrame(one.name, one.values, one.masks[name]), title))
         write_overlays(path, inputs.tree, camera, titled, inputs.visible_nodes, shown)
     for given in inputs.given_cameras if overlay else ():
@@ -299,9 +308,9 @@ def _write_result(
 
 
 def _describe_contradictions(found: Diagnosis) -> list[dict[str, Any]]:
-    """What contradicts the rest, worst first: joints, cameras and the base, then frames."""
-    told = [(one, one.kind, one.name, describe_common_finding(one)) for one in found.common]
-    told += [
+    """Return all findings for summary.json: common ones, then frames, largest error first."""
+    rows = [(one, one.kind, one.name, describe_common_finding(one)) for one in found.common]
+    rows += [
         (
             one.finding,
             "frame",
@@ -312,7 +321,7 @@ def _describe_contradictions(found: Diagnosis) -> list[dict[str, Any]]:
         if one.finding is not None and one.finding not in found.common
     ]
     described = []
-    for one, what, name, text in told:
+    for one, what, name, text in rows:
         unit, factor = shift_unit(one.kind)
         described.append(
             {

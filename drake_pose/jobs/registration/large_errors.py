@@ -1,4 +1,4 @@
-"""What is wrong with a whole scene, and by much: looked for, put right, and told with the rest."""
+"""Find and correct large errors of a scene, and diagnose all frames with the corrections."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -42,66 +42,68 @@ from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 
 @dataclass(frozen=True, eq=False)
 class SceneFit:
-    """All frames compared with what is given, or with what that may be meant to be.
+    """All frames fitted with the given scene, or with a corrected one.
 
     Args:
-        cameras: as they are read.
-        corrections: what was put right, in order.
-        fits: of the frames in which a mask shows something, and found: by these.
-        shares: by camera and frame, how much more than the robot a mask shows, and how much of it
-            that lacks.
-        unseen: frames of which no mask shows anything.
-        findings: what was put right, as findings.
-        warnings: what a user should know of them.
+        cameras: the corrected cameras.
+        corrections: the corrections, in order.
+        fit: the fit of single frames.
+        fits: the fitted frames, those with a mask that is not empty.
+        mask_areas: by camera and frame, excess and lack of the mask, see ``mask_excess_and_lack``.
+        empty_frames: names of frames whose masks are all empty.
+        found: the diagnosis of the fitted frames.
+        findings: the corrections as findings.
+        warnings: for the user.
     """
 
     cameras: tuple[Camera, ...]
     corrections: tuple[Correction, ...]
     fit: PerFrameFit
     fits: tuple[FrameFit, ...]
-    shares: Mapping[tuple[str, str], tuple[float, float]]
-    unseen: tuple[str, ...]
+    mask_areas: Mapping[tuple[str, str], tuple[float, float]]
+    empty_frames: tuple[str, ...]
     found: Diagnosis
     findings: tuple[Finding, ...] = ()
     warnings: tuple[str, ...] = ()
 
-    def of(self, frame: MultiViewFrame) -> MultiViewFrame:
-        """A frame as it is read."""
+    def corrected(self, frame: MultiViewFrame) -> MultiViewFrame:
+        """Return a frame with all corrections."""
         return apply_corrections(self.corrections, frame)
 
     def joint_off(self, name: str) -> Finding | None:
-        """What fits say of a joint that is so far off that they should begin anew from there."""
+        """Return a joint's finding if its offset is so large that fits should restart from it."""
         off = [one for one in self.found.common if (one.kind, one.name) == ("joint", name)]
         return next((one for one in off if abs(one.angle) > np.radians(LARGE.restart_angle)), None)
 
     @property
     def focal_off(self) -> Finding | None:
-        """The same of focal lengths."""
+        """The same for focal lengths."""
         off = [one for one in self.found.common if one.kind == "focal"]
         return next((one for one in off if abs(one.shift) > LARGE.restart_focal), None)
 
     @property
     def joint_inlier_ratios(self) -> dict[str, float]:
-        """By joint, what share fits of the outlines of all links that it moves."""
+        """By joint, the inlier ratio of the outlines of all links that it moves."""
         return joint_inlier_ratios(self.fits, self.fit.joints)
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether half of the frames or more contradict the others."""
+        """Whether half of the frames or more are outliers."""
         return 2 * len(self.found.outliers) >= len(self.found.frames)
 
     @property
     def inlier_ratio(self) -> float:
-        """Of all masks, once fitted."""
+        """Mean inlier ratio of all masks with fitted frames."""
         return float(np.mean([v for one in self.fits for v in one.inlier_ratios[1].values()]))
 
 
 class SceneComparison:
-    """Compares a scene with what is given, looks for large errors, and compares again.
+    """Compares a scene with its masks, corrects large errors, and compares again.
 
     Args:
-        sample_size: number of frames that tell how large silhouettes are, and where the body is.
+        inputs: the scene.
         on_frame: called with the number of frames that are done.
+        sample_size: number of frames for the silhouettes' size, and for the search of errors.
     """
 
     def __init__(
@@ -111,21 +113,19 @@ class SceneComparison:
         sample_size: int = 20,
     ) -> None:
         self._inputs, self._on_frame = inputs, on_frame
-        self.body, frames = (
-            RegistrationBody(inputs.tree, inputs.visible_nodes),
-            inputs.audited_frames,
-        )
+        self.body = RegistrationBody(inputs.tree, inputs.visible_nodes)
+        frames = inputs.audited_frames
         sample = [inputs.read(frame) for frame in evenly_spaced(frames, sample_size)]
         self._sample = [one for one in sample if one.masks]
         self._names = frozenset(inputs.audited_frames)
 
     def run(self, most: int = 3) -> SceneFit:
-        """Does it.
+        """Return the scene's final fit and diagnosis.
 
-        most: number of large errors that are put right, one after the other.
+        most: maximum number of large errors that are corrected, one after another.
 
         Raises:
-            CameraError: a camera cannot show the robot where it is said to stand.
+            CameraError: a camera cannot show the robot from its given pose.
             MaskError: no mask shows the body.
         """
         inputs = self._inputs
@@ -137,29 +137,29 @@ class SceneComparison:
                 and (one := self._search(inputs.known_cameras, [])) is not None
             ):
                 raise CameraError(
-                    f"{error}; {one.name}: so the robot is where it is seen"
+                    f"{error}; {one.name}: then the robot is where the masks show it"
                 ) from None
             raise
         given = self._compare(inputs.known_cameras, ())
         now = self._correct(given, most)
         if now.is_doubtful:
-            # What leaves most frames unexplained is no cause.
+            # Corrections that leave most frames unexplained are dropped.
             placed = self._search_cameras(given)
             now = given if placed is None else self._correct(placed, most)
         return self._finish(given if now.is_doubtful else now)
 
     def _correct(self, now: SceneFit, most: int) -> SceneFit:
-        """With as many large errors put right as are found."""
+        """Return the fit with as many large errors corrected as are found, at most `most`."""
         for _ in range(most):
             correction = self._find_correction(now)
             if correction is None:
                 break
             again = self._compare(correction.cameras, (*now.corrections, correction))
-            told = now.joint_off(correction.name) if correction.kind == "offset" else None
+            fitted = now.joint_off(correction.name) if correction.kind == "offset" else None
             if correction.kind == "focal":
-                told = now.focal_off
-            if told is not None and (told.angle + told.shift) * correction.amount > 0.0:
-                now = self._record(now, again, correction, told)
+                fitted = now.focal_off
+            if fitted is not None and (fitted.angle + fitted.shift) * correction.amount > 0.0:
+                now = self._record(now, again, correction, fitted)
                 continue
             if again.inlier_ratio <= now.inlier_ratio:
                 break
@@ -174,53 +174,56 @@ class SceneComparison:
         return now
 
     def _finish(self, now: SceneFit) -> SceneFit:
-        """With links that are not seen, and cameras that moved; frames of a wrong log are wrong."""
+        """Return the fit with findings of corrections, links, motions and masks added."""
         found = now.found
-        rests = {(one.kind, one.name): one for one in found.common}
+        remaining = {(one.kind, one.name): one for one in found.common}
         findings = [
-            _add_remaining(one, rests.pop((one.kind, one.name), None)) for one in now.findings
+            _add_remaining(one, remaining.pop((one.kind, one.name), None)) for one in now.findings
         ]
-        # Where a joint is in each frame is found to the search's step.
+        # A joint searched in each frame is known only to the search's step: drop its fitted offset.
         by_search = {("joint", one.name) for one in now.findings if one.kind == "log"}
-        common = tuple(one for key, one in rests.items() if key not in by_search)
+        common = tuple(one for key, one in remaining.items() if key not in by_search)
         found = replace(found, common=common)
         known = {one.link for one in findings if one.link}
-        for k, share in () if now.is_doubtful else mismatched_links(now.fits):
+        for k, ratio in () if now.is_doubtful else mismatched_links(now.fits):
             node = self.body.tree.nodes[k].name
             if node not in known:
                 text = (
-                    f"{percent(share)} of its outline fit in all frames, and no other positions of "
-                    "its joint do better: is its shape the model's?"
+                    f"{percent(ratio)} of its outline fit in all frames, and other positions of "
+                    "its joint do not improve that: is its shape the model's?"
                 )
-                nothing = Finding("link", node, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, link=node, text=text)
-                findings.append(nothing)
+                shape = Finding("link", node, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, link=node, text=text)
+                findings.append(shape)
         moved, found = self._find_moved(now, found)
         wrong = next((one for one in findings if one.kind in ("sign", "log")), None)
         if wrong is not None:
-            # As it is given no frame is right.
+            # With a wrong column of the log, every frame is an outlier as given.
             frames = [one if one.finding else replace(one, finding=wrong) for one in found.frames]
             found = replace(found, frames=tuple(frames))
         common = (*findings, *moved, *found.common)
         warnings = (*now.warnings, *self._mask_warnings(now))
-        # Where outlines do not fit, what would be noticed is not told by how they would move.
-        shares = now.joint_inlier_ratios
-        enough = LARGE.min_joint_inlier_ratio * max(shares.values(), default=0.0)
-        noticed = {
-            name: least if shares.get(name, 0.0) >= enough else np.inf
+        # The minimum detectable offset is unknown where too little of the outlines fits.
+        ratios = now.joint_inlier_ratios
+        enough = LARGE.min_joint_inlier_ratio * max(ratios.values(), default=0.0)
+        detectable = {
+            name: least if ratios.get(name, 0.0) >= enough else np.inf
             for name, least in found.minimum_detectable.items()
         }
-        found = replace(found, common=common, minimum_detectable=noticed)
+        found = replace(found, common=common, minimum_detectable=detectable)
         return replace(now, found=found, findings=(), warnings=warnings)
 
     def _find_moved(
         self, now: SceneFit, found: Diagnosis, least: int = 2
     ) -> tuple[list[Finding], Diagnosis]:
-        """Whether cameras or the base moved between two frames, and what frames are left then.
+        """Find cameras or a base that moved between two frames.
 
-        They did where the frames that contradict are the last or the first ones of those that the
-        same cameras see, and agree with each other but for a camera or the base.
+        A motion is found if the first or the last ones of the frames of the same cameras are
+        outliers, and agree with each other except for the pose of a camera or the base.
 
-        least: number of frames before and after.
+        least: minimum number of frames before and after.
+
+        Returns:
+            the motions, and the diagnosis with them as the outliers' findings.
         """
         moved, explained = list[Finding](), dict[str, Finding]()
         for cameras in dict.fromkeys(tuple(one.given_ratios) for one in found.frames):
@@ -228,36 +231,36 @@ class SceneComparison:
             if not rows:
                 continue
             again = diagnose_frames(now.fit, [now.fits[k] for k in rows], moved=True)
-            places, agreeing = list(again.common), [*{one.frame for one in again.frames}]
-            if again.outliers or any(one.kind not in ("camera", "base") for one in places):
-                frames = [now.of(self._inputs.read(found.frames[k].frame)) for k in rows]
+            motions, names = list(again.common), [*{one.frame for one in again.frames}]
+            if again.outliers or any(one.kind not in ("camera", "base") for one in motions):
+                frames = [now.corrected(self._inputs.read(found.frames[k].frame)) for k in rows]
                 own = [one for one in now.cameras if one.name in cameras]
-                placed = self._placed(frames, own)
-                places = [off for _, off in placed.values()]
+                placed = self._register(frames, own)
+                motions = [off for _, off in placed.values()]
                 base = base_motion(
                     {one.name: one for one in own}, {k: one for k, (one, _) in placed.items()}
                 )
                 if base is not None and len(placed) == len(cameras):
-                    places = [replace(base, pixels=places[0].pixels)]
-            which = "since then" if found.frames[-1].finding is not None else "until then"
-            for one in places:
+                    motions = [replace(base, pixels=motions[0].pixels)]
+            when = "since then" if found.frames[-1].finding is not None else "until then"
+            for one in motions:
                 finding = replace(
-                    one, kind="moved", text=f"after frame '{last}'; {which}", link=one.kind
+                    one, kind="moved", text=f"after frame '{last}'; {when}", link=one.kind
                 )
                 moved.append(finding)
-                explained.update(dict.fromkeys(agreeing, finding))
-        judged = [
+                explained.update(dict.fromkeys(names, finding))
+        updated = [
             replace(one, finding=explained[one.frame]) if one.frame in explained else one
             for one in found.frames
         ]
-        return moved, replace(found, frames=tuple(judged))
+        return moved, replace(found, frames=tuple(updated))
 
-    def _placed(
+    def _register(
         self, frames: Sequence[MultiViewFrame], cameras: Sequence[Camera], least: int = 3
     ) -> dict[str, tuple[RegisteredCamera, Finding]]:
-        """Where cameras are found that explain frames, and by how much they are elsewhere.
+        """Register cameras from frames, and return those that differ from their given poses.
 
-        least: number of frames of each camera.
+        least: minimum number of frames of each camera.
         """
         search, placed = CameraSearch(self.body), dict[str, tuple[RegisteredCamera, Finding]]()
         for camera in cameras:
@@ -269,8 +272,8 @@ class SceneComparison:
                 found = search.register(camera, own)
             except RegistrationError:
                 continue
-            agreeing = len(found.frames) - len(found.outliers)
-            if explain_misfit(found) is not None or 2 * agreeing <= len(own):
+            inliers = len(found.frames) - len(found.outliers)
+            if explain_misfit(found) is not None or 2 * inliers <= len(own):
                 continue
             values = np.array([one.values for one in own])
             off = compare_camera(self.body, camera, found, values, len(cameras) == 1)
@@ -281,19 +284,19 @@ class SceneComparison:
     def _mask_warnings(
         self, now: SceneFit, more: float = 0.08, more_in_one: float = 0.15, less: float = 0.25
     ) -> list[str]:
-        """What masks show beside the robot, and lack of it, in frames that agree otherwise.
+        """Warn of masks that show more or less than the robot in inlier frames.
 
         Args:
-            more, more_in_one, less: shares of the masks' areas that are said: in half of the frames
-                and more, and in fewer. Real masks of arms show less than .02 more, and lack .15 at
-                most.
+            more, more_in_one, less: minimum fractions of the mask's area, for excess in half of the
+                frames or more, for excess in fewer, and for lack. Real masks of arms have less than
+                0.02 excess, and 0.15 lack at most.
         """
         texts, names, wrong = list[str](), self._inputs.scene.frames, now.found.outliers
         for camera in (one.name for one in now.cameras):
-            own = {frame: two for (name, frame), two in now.shares.items() if name == camera}
+            own = {frame: two for (name, frame), two in now.mask_areas.items() if name == camera}
             black = [frame for frame, two in own.items() if two[0] == 0.0 and two[1] > less]
             shown = {k: two for k, two in own.items() if k not in black and k not in wrong}
-            # What is elsewhere is as much more as it is less.
+            # A misplaced robot causes excess and lack alike; these frames are left out.
             wider = [k for k, (extra, lack) in shown.items() if extra >= more and 3 * lack < extra]
             if 2 * len(wider) < len(shown):
                 wider = [k for k in wider if shown[k][0] >= more_in_one]
@@ -302,59 +305,58 @@ class SceneComparison:
                 (wider, 0, "show {} more than the robot: is it a shadow, another robot, or a part "
                  "that the model lacks?"),
                 (lacking, 1, "lack {} of the robot: is something before it, or a link missing?"),
-                (black, None, "are black, although the robot stands in view"),
+                (black, None, "are black, although the robot is in view"),
             ):  # fmt: skip
                 if frames:
-                    shares = [] if which is None else [own[k][which] for k in frames]
-                    share = percent(float(np.median(shares))) if shares else ""
+                    areas = [] if which is None else [own[k][which] for k in frames]
+                    area = percent(float(np.median(areas))) if areas else ""
                     named = frame_ranges(frames, names)
-                    said = f"the masks of frames {named} {what.format(share)}"
+                    said = f"the masks of frames {named} {what.format(area)}"
                     texts.append(f"camera '{camera}': {said}")
         return texts
 
     def _compare(self, cameras: Sequence[Camera], corrections: tuple[Correction, ...]) -> SceneFit:
-        """Fits all frames as they are read."""
-        inputs, fitted, unseen = self._inputs, list[FrameFit](), list[str]()
-
+        """Fit and diagnose all frames with corrections."""
+        inputs, fitted, empty = self._inputs, list[FrameFit](), list[str]()
         if not self._sample:
             raise MaskError(
                 f"{inputs.scene.path}: no mask shows the body; it must be white in them"
             )
         body, sample = self.body, [apply_corrections(corrections, one) for one in self._sample]
-        shares = dict[tuple[str, str], tuple[float, float]]()
+        mask_areas = dict[tuple[str, str], tuple[float, float]]()
         fit = PerFrameFit(body.kinematics, (body.medium, body.full), cameras, sample)
         for done, name in enumerate(inputs.audited_frames, 1):
-            seen = inputs.read(name)
-            if seen.masks:
-                seen = apply_corrections(corrections, seen)
-                fitted.append(fit.fit(seen))
+            frame = inputs.read(name)
+            if frame.masks:
+                frame = apply_corrections(corrections, frame)
+                fitted.append(fit.fit(frame))
                 for camera in cameras:
-                    mask = seen.masks.get(camera.name)
+                    mask = frame.masks.get(camera.name)
                     if mask is None and (camera.name, name) in inputs.scene.masks:
                         mask = np.zeros((camera.height, camera.width), bool)
                     if mask is not None:
-                        own = mask_excess_and_lack(body, camera, seen.values, mask, fit.size)
-                        shares[camera.name, name] = own
+                        own = mask_excess_and_lack(body, camera, frame.values, mask, fit.size)
+                        mask_areas[camera.name, name] = own
             else:
-                unseen.append(name)
+                empty.append(name)
             if self._on_frame is not None and not corrections:
                 self._on_frame(done)
-        asked = [(_KINDS[one.kind], one.name) for one in corrections if one.kind in _KINDS]
-        found = diagnose_frames(fit, fitted, asked)
+        requested = [(_KINDS[one.kind], one.name) for one in corrections if one.kind in _KINDS]
+        found = diagnose_frames(fit, fitted, requested)
         return SceneFit(
-            tuple(cameras), corrections, fit, tuple(fitted), shares, tuple(unseen), found
+            tuple(cameras), corrections, fit, tuple(fitted), mask_areas, tuple(empty), found
         )
 
     def _find_correction(self, now: SceneFit) -> Correction | None:
-        """What is wrong by much; nothing is looked for where nothing is doubtful."""
-        sample = [now.of(one) for one in self._sample]
+        """Return the correction of a large error; None: nothing is doubtful, or none is found."""
+        sample = [now.corrected(one) for one in self._sample]
         if now.is_doubtful:
             of_scene = not now.corrections
             return self._search(now.cameras, now.fit.joints, LARGE.max_remaining, sample, of_scene)
         off = [name for name in now.fit.joints if now.joint_off(name) is not None]
-        shares = now.joint_inlier_ratios.items()
+        ratios = now.joint_inlier_ratios.items()
         doubted = [
-            name for name, share in shares if share < LARGE.min_joint_inlier_ratio or name in off
+            name for name, ratio in ratios if ratio < LARGE.min_joint_inlier_ratio or name in off
         ]
         if doubted:
             correction = self._search(
@@ -362,7 +364,7 @@ class SceneComparison:
             )
             if correction is not None:
                 return correction
-        # Fits are linear about where they begin.
+        # Fits are linear: they restart from a large offset or focal length that they estimated.
         if off:
             by = next(one.angle for one in now.found.common if one.name == off[0])
             search = LargeErrorSearch(self.body, now.cameras, sample)
@@ -374,10 +376,10 @@ class SceneComparison:
         return focal_correction(now.cameras, group, lens.name, 1.0 + lens.shift)
 
     def _search_cameras(self, now: SceneFit) -> SceneFit | None:
-        """With cameras as they are found in the frames, where these explain what is seen."""
+        """Return the fit with registered cameras, where they differ; None: none does."""
         if self._inputs.recordings:
             return None
-        placed = self._placed([now.of(one) for one in self._sample], now.cameras)
+        placed = self._register([now.corrected(one) for one in self._sample], now.cameras)
         if not placed:
             return None
         cameras = [placed[one.name][0].camera if one.name in placed else one for one in now.cameras]
@@ -393,6 +395,7 @@ class SceneComparison:
         scene: bool = True,
         likely: Collection[str] = (),
     ) -> Correction | None:
+        """Search a large error of the scene, or of some joints; see ``LargeErrorSearch.find``."""
         inputs = self._inputs
         corrections = list[Correction]()
         if scene and not inputs.recordings:
@@ -402,31 +405,28 @@ class SceneComparison:
         return search.find(corrections, joints, left, likely)
 
     def _record(
-        self, before: SceneFit, now: SceneFit, correction: Correction, told: Finding | None = None
+        self, before: SceneFit, now: SceneFit, correction: Correction, fitted: Finding | None = None
     ) -> SceneFit:
-        """With what was put right as a finding; told: of a joint, what fits have said of it."""
-        kind, name, warnings = (
-            _KINDS.get(correction.kind, correction.kind),
-            correction.name,
-            before.warnings,
-        )
+        """Return a fit with a correction recorded as a finding; fitted: an estimate by fits."""
+        kind, name = _KINDS.get(correction.kind, correction.kind), correction.name
+        warnings = before.warnings
         off = Finding(kind, name, 0.0, 0.0, 0.0, 0.0, self._pixels(before, now), 0.0)
         if correction.kind in _KINDS:
             size, of_focal = correction.amount, correction.kind == "focal"
             if not of_focal and self._turns(name):
                 off = replace(off, angle=size, angle_sd=float(np.radians(LARGE.fine_step)))
-                if told is not None and abs(size - told.angle) < 1e-9:
-                    off = told
+                if fitted is not None and abs(size - fitted.angle) < 1e-9:
+                    off = fitted
             else:
                 step = LARGE.reach_focal if of_focal else LARGE.reach_shift
                 off = replace(off, shift=size, shift_sd=step)
-                if told is not None and abs(size - told.shift) < 1e-9:
-                    off = told
+                if fitted is not None and abs(size - fitted.shift) < 1e-9:
+                    off = fitted
         elif kind in ("sign", "log"):
             off = self._differing(off, before, correction)
         else:
-            now_fits, given = percent(now.inlier_ratio), percent(before.inlier_ratio)
-            warnings = (*warnings, f"{name}; so {now_fits} of the contours fit, as given {given}")
+            ratio, given = percent(now.inlier_ratio), percent(before.inlier_ratio)
+            warnings = (*warnings, f"{name}; so {ratio} of the contours fit, as given {given}")
         findings = list(before.findings)
         earlier = [
             one for one in findings if (one.kind, one.name) == (kind, name) == ("joint", name)
@@ -439,13 +439,14 @@ class SceneComparison:
         return replace(now, findings=(*findings, off), warnings=warnings)
 
     def _turns(self, joint: str) -> bool:
+        """Return whether a joint is revolute."""
         kinematics = self.body.kinematics
         return bool(kinematics.is_angle[kinematics.names.index(joint)])
 
     def _differing(self, off: Finding, before: SceneFit, correction: Correction) -> Finding:
-        """How far a joint is from its log, in words and as the largest difference."""
+        """Return a finding with a joint's largest difference from its log, and all in words."""
         j = self.body.kinematics.names.index(correction.name)
-        frames = [before.of(one) for one in self._sample]
+        frames = [before.corrected(one) for one in self._sample]
         logged = np.array([one.values[j] for one in frames])
         by = np.array([correction.apply(one).values[j] for one in frames]) - logged
         turns = self._turns(correction.name)
@@ -462,7 +463,7 @@ class SceneComparison:
         return replace(off, link=self._link(correction.name), text=text, angle=angle, shift=shift)
 
     def _link(self, joint: str) -> str:
-        """The first link that a joint moves."""
+        """Return the first link that a joint moves."""
         tree, kinematics = self.body.tree, self.body.kinematics
         values = kinematics.flatten(tree.default_values())
         moved = values.copy()
@@ -471,10 +472,10 @@ class SceneComparison:
         return next((tree.nodes[k].name for k in np.flatnonzero(off > 1e-9)), "")
 
     def _pixels(self, before: SceneFit, now: SceneFit) -> float:
-        """How far the parts that move are elsewhere in the pictures, root mean square [pixel]."""
+        """Return the root mean square motion of what moves between two fits [pixel]."""
         squares, kinematics = list[Array](), self.body.kinematics
         for frame in self._sample:
-            X = [kinematics.poses(one.of(frame).values) for one in (before, now)]
+            X = [kinematics.poses(one.corrected(frame).values) for one in (before, now)]
             for one, other in zip(before.cameras, now.cameras, strict=True):
                 places = [
                     camera.project(placed_points(self.body.coarse, X_WN))[0]
@@ -488,23 +489,24 @@ class SceneComparison:
 
 
 def _add_remaining(one: Finding, rest: Finding | None) -> Finding:
-    """What the search found and what fits add to it; they tell nothing where no frame agrees."""
+    """Return a searched finding plus the remaining error that fits found."""
     if rest is None:
         return one
     shift = one.shift + rest.shift
     if one.kind == "focal":
         shift = (1.0 + one.shift) * (1.0 + rest.shift) - 1.0
     angle = one.angle + rest.angle
-    told = replace(rest, angle=angle, shift=shift, pixels=one.pixels)
-    return replace(told, p_value=one.p_value, alternatives=one.alternatives)
+    total = replace(rest, angle=angle, shift=shift, pixels=one.pixels)
+    return replace(total, p_value=one.p_value, alternatives=one.alternatives)
 
 
 def changed_after(found: Diagnosis, cameras: Collection[str], least: int) -> tuple[list[int], str]:
-    """Frames that contradict the others before or after a moment, and the last frame before it.
+    """Return the outlier frames before or after a change, and the last frame before the change.
 
     Args:
-        cameras: that see the frames that are looked at.
-        least: number of frames before and after; where they are fewer there is no such moment.
+        found: the diagnosis.
+        cameras: only frames of these cameras are used.
+        least: minimum number of frames before and after; with fewer there is no change.
     """
     own = [k for k, one in enumerate(found.frames) if {*one.given_ratios} == {*cameras}]
     wrong = [found.frames[k].finding is not None for k in own]
@@ -517,9 +519,12 @@ def changed_after(found: Diagnosis, cameras: Collection[str], least: int) -> tup
 def base_motion(
     given: Mapping[str, Camera], placed: Mapping[str, RegisteredCamera], sds: float = 4.0
 ) -> Finding | None:
-    """The motion of the base that several cameras tell alike; None: they tell several ones.
+    """Return the motion of the base that several cameras agree on; None: they differ.
 
-    sds: by how many standard deviations motions may differ, and by a quarter of a degree and 3 mm.
+    Args:
+        given: the cameras at their given poses.
+        placed: the registered cameras.
+        sds: maximum difference of motions in standard deviations, plus 0.25 degrees and 3 mm.
     """
     motions = [given[name].X_WC @ one.camera.X_CW for name, one in placed.items()]
     rotation_sd = max((one.rotation_sd for one in placed.values()), default=0.0)

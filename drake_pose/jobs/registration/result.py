@@ -1,4 +1,4 @@
-"""What a registration writes: the cameras, how sure they are, pictures, a summary, a page."""
+"""Write the results of a registration: cameras, overlays, summary, report and exports."""
 
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -44,13 +44,13 @@ def describe_camera(
     suggestion: dict[str, Any] | None = None,
     link: str | None = None,
 ) -> dict[str, Any]:
-    """A camera's part of summary.json: lengths in m, but for `_mm`; angles in `_deg`.
+    """Return a camera's part of summary.json; lengths in m unless `_mm`, angles in `_deg`.
 
     Args:
         found: the camera.
-        seconds: how long it took [s].
-        suggestion: a pose of the robot that would tell poses apart.
-        link: on which the camera rides, in whose frame its pose is then.
+        seconds: duration of the search [s].
+        suggestion: joint positions that would distinguish alternative poses.
+        link: the link that carries the camera, in whose frame its pose is; None: the world.
     """
     pose, seen, X = "X_WC" if link is None else "X_LC", found.target, found.camera.X_WC
     target = {}
@@ -84,7 +84,7 @@ def describe_camera(
 
 
 def describe_pose(name: str, X: Array, found: RegisteredCamera | TargetPose) -> dict[str, Any]:
-    """A pose (4, 4), and how sure it is."""
+    """Return a pose X (4, 4) by its name, with its standard deviations."""
     return {
         name: X.tolist(),
         "translation_sd_mm": 1e3 * found.translation_sd,
@@ -93,20 +93,20 @@ def describe_pose(name: str, X: Array, found: RegisteredCamera | TargetPose) -> 
 
 
 def describe_pictures(one: PictureRegistration | None, found: bool = False) -> dict[str, Any]:
-    """What summary.json says of a camera that was found in pictures; None: it was in masks.
+    """Return a camera's part of summary.json on pictures; None: it was registered from masks.
 
-    found: whether these were found in pictures.
+    found: whether the masks were segmented from pictures.
     """
     if one is None:
         masks = "found" if found else "given"
         return {"masks": masks, "time_offset_s": None, "time_offset_sd_s": None}
     offset, focal = one.time_offset, one.found.camera.focal_x
-    told = offset if offset is not None and offset.determined else None
+    determined = offset if offset is not None and offset.determined else None
     drifting = offset if offset is not None and offset.drift else None
     return {
         "masks": "found",
-        "time_offset_s": told and told.value,
-        "time_offset_sd_s": told and told.deviation,
+        "time_offset_s": determined and determined.value,
+        "time_offset_sd_s": determined and determined.deviation,
         "time_drift": drifting and drifting.drift,
         "time_drift_sd": drifting and drifting.drift_deviation,
         "time_offset_scores": [] if offset is None else offset.scores.round(4).tolist(),
@@ -118,19 +118,20 @@ def describe_pictures(one: PictureRegistration | None, found: bool = False) -> d
 
 
 def picture_warnings(one: PictureRegistration, assumed: bool) -> list[str]:
-    """What a user should know of a camera that was found in pictures."""
+    """Warn of an assumed focal length, a drifting clock and an unknown time offset."""
     name, texts = one.found.camera.name, []
     if assumed:
         texts.append(
-            f"camera '{name}': no focal length is given: {one.found.camera.focal_x:.0f} pixels "
-            f"were found (standard deviation {one.focal_deviation * one.found.camera.focal_x:.0f})"
+            f"camera '{name}': no focal length is given: it was estimated as "
+            f"{one.found.camera.focal_x:.0f} pixels (standard deviation "
+            f"{one.focal_deviation * one.found.camera.focal_x:.0f})"
         )
     if one.time_offset is not None and one.time_offset.drift:
         texts.append(describe_drift(name, one.time_offset.drift, one.time_offset.drift_deviation))
     if one.time_offset is not None and not one.time_offset.determined:
         texts.append(
-            f"camera '{name}': its pictures do not tell by how much its clock is off the joints', "
-            "as the robot moves too little or too slowly"
+            f"camera '{name}': its pictures do not determine its time offset to the joint log, "
+            "because the robot moves too little or too slowly"
         )
     return texts
 
@@ -138,7 +139,7 @@ def picture_warnings(one: PictureRegistration, assumed: bool) -> list[str]:
 def describe_parameters(
     found: JointCalibration, kinematics: TreeKinematics
 ) -> dict[str, dict[str, Any]]:
-    """Zeros in degrees or mm, lengths in percent, by name; None where it is not determined."""
+    """Return offsets [deg or mm] and scales [%] by name; None if they are not determined."""
 
     def describe(one: KinematicParameter, unit: str, factor: float) -> dict[str, Any]:
         numbers = {"value": one.value, "sd": one.deviation, "low": one.low, "high": one.high}
@@ -160,7 +161,7 @@ def describe_parameters(
 def describe_run(
     inputs: RegistrationInputs, settings: AuditSettings, warnings: Sequence[str], seconds: float
 ) -> dict[str, Any]:
-    """What summary.json says of every run: its files, and how it was made."""
+    """Return the part of summary.json on a run's files, settings and versions."""
     joints = inputs.joints
     job = describe_job(inputs.scene.path, inputs.model.path, settings, inputs.cameras)
     job["sha256"]["joints"] = joints and file_digest(joints)
@@ -184,13 +185,18 @@ def write_result(
     urdf: bytes | None = None,
     pictures: Mapping[str, Mapping[str, Picture]] | None = None,
 ) -> None:
-    """Writes the result folder; the camera file comes last, when all else is there.
+    """Write the result folder; the camera file is written last.
 
     Args:
-        cameras: all that the camera file is to hold.
-        urdf: the robot with the zeros and lengths that were found.
-        pictures: of cameras that were found in these, by camera and frame. The folder is then a
-            scene of the masks that follow from them, at their joint positions.
+        path: the folder.
+        inputs: with the final positions of the frames.
+        cameras: cameras for the camera file.
+        registered: the registered cameras.
+        summary: contents of summary.json.
+        overlay: whether overlays are drawn.
+        urdf: the robot with estimated joint offsets and link scales.
+        pictures: by camera and frame, of cameras registered from pictures. Their masks and joint
+            positions are written, so that the folder is a scene of masks.
 
     Raises:
         OutputError: the folder cannot be written.
@@ -199,7 +205,7 @@ def write_result(
     for name, found in registered.items() if overlay else ():
         titles = [
             f"{name}  frame {one.frame}  E_total {percent(one.E_total)}  IoU {one.iou:.2f}  "
-            f"{'agrees' if one.is_inlier else 'CONTRADICTS the others'}"
+            f"{'agrees' if one.is_inlier else 'OUTLIER'}"
             for one in found.frames
         ]
         own = pictures[name] if pictures else {}
@@ -214,11 +220,11 @@ def write_result(
     names = TreeKinematics(inputs.tree).names
     names = tuple(name for name in names if name not in TARGET_POSITIONS)
     for camera in pictures or ():
-        # Masks of its frames, and joint positions at their moments by its own clock.
+        # Masks of the camera's frames, and joint positions at their times by its own clock.
         rows = [["frame", *names]]
         for frame in inputs.of(camera):
             write_file(path, f"masks/{camera}/{frame.name}.png", encode_mask(frame.mask))
-            # An object's come last, and are 0.
+            # The target's positions are the last ones, and 0.
             rows.append([frame.name, *map(repr, frame.values[: len(names)].tolist())])
         several = f"_{camera}" if len(pictures or ()) > 1 else ""
         write_file(path, f"joint_angles{several}.csv", csv_text(rows))
@@ -251,14 +257,14 @@ def write_overlays(
     tree: PoseTree,
     camera: Camera,
     titled: Iterable[tuple[PosedFrame, str]],
-    seen: Collection[str] | None = None,
+    visible_nodes: Collection[str] | None = None,
     pictures: Mapping[str, Picture] | None = None,
 ) -> None:
-    """Draws the robot over each mask of a camera, or its picture, below a title.
+    """Draw the robot over each mask of a camera, or over its picture, below a title.
 
-    seen: the nodes that are drawn; None: all. pictures: by frame.
+    visible_nodes: names of the nodes that are drawn; None: all. pictures: by frame.
     """
-    draw = body_drawer(tree, seen)
+    draw = body_drawer(tree, visible_nodes)
     for frame, title in titled:
         segments = draw(camera, frame)
         shown: NDArray[Any] = (pictures or {}).get(frame.name, frame.mask)
@@ -274,7 +280,7 @@ def write_comparisons(
     found: RegisteredCamera,
     pictures: Mapping[str, Picture],
 ) -> None:
-    """Draws the robot as a camera that was given would see it, and as the one that was found."""
+    """Draw the robot as seen by a camera at its given pose, and at its registered pose."""
     draw = body_drawer(inputs.tree, inputs.visible_nodes)
     errors = {one.frame: one.E_total for one in found.frames}
     for frame in (one for one in frames if one.name in compared_frames(errors)):
@@ -286,11 +292,14 @@ def write_comparisons(
 
 
 def body_drawer(
-    tree: PoseTree, seen: Collection[str] | None
+    tree: PoseTree, visible_nodes: Collection[str] | None
 ) -> Callable[[Camera, PosedFrame], NDArray[np.intp]]:
-    """What draws a camera's view (H, W) of a frame: which of the nodes is seen, or -1."""
-    kinematics = TreeKinematics(tree)
-    shown = [k for k, node in enumerate(tree.nodes) if seen is None or node.name in seen]
+    """Return a function that draws a frame as the visible node's index (H, W) of each pixel or -1.
+
+    Indices count the drawn nodes: those in `visible_nodes`, or all.
+    """
+    kinematics, names = TreeKinematics(tree), visible_nodes
+    shown = [k for k, node in enumerate(tree.nodes) if names is None or node.name in names]
     outlines = [outline_from_mesh(tree.nodes[k].mesh) for k in shown]
 
     def draw(camera: Camera, frame: PosedFrame) -> NDArray[np.intp]:
@@ -302,37 +311,37 @@ def body_drawer(
 
 
 AS_GIVEN = "overlay_as_given"
-"""The folder of pictures of cameras as given beside those that were found."""
+"""Folder of pictures that compare given and registered camera poses."""
 
-# Number of pictures of each camera: those that fit worst and best, and some between.
+# Number of pictures of each camera in the report, from the worst to the best frame.
 _PICTURES = 6
 PARAMETERS = (
-    ("zeros", "Zeros, to be added to positions", "joint", "zero"),
-    ("lengths", "Lengths, by how much links are longer", "link", "length"),
+    ("zeros", "Joint offsets, to be added to positions", "joint", "offset"),
+    ("lengths", "Link scales, relative changes of length", "link", "change"),
 )
-"""Keys of the summary that hold parameters of the robot: title, what they are of, what they are."""
+"""Keys of parameters in the summary, each with a title, and words for its owner and itself."""
 
-# Standard deviations to either side that a 95 % interval has.
+# Half-width of a 95 % interval in standard deviations.
 _NORMAL = 1.96
 
 
 def parameter_rows(parameters: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    """Zeros or lengths of a camera's part of summary.json as they are shown.
+    """Return rows of a table of joint offsets or link scales, from a camera's part of summary.json.
 
-    Of each the name, the value with its unit, the interval, and what to make of it.
+    Each has the name, the value with its unit, the 95 % interval, and its significance in words.
     """
     rows: list[tuple[str, ...]] = []
     for name, one in parameters.items():
         if not one["determined"]:
-            goes_with = f", goes with {', '.join(one['gauge'])}" if one["gauge"] else ""
-            rows.append((name, "", "", f"not determined{goes_with}"))
+            gauge = f", correlated with {', '.join(one['gauge'])}" if one["gauge"] else ""
+            rows.append((name, "", "", f"not determined{gauge}"))
             continue
         key = next(key for key in one if key.startswith("value_"))
         unit = key.removeprefix("value_")
         value = f"{one[key]:.3f} {'%' if unit == 'percent' else unit}"
         interval = f"{one[f'low_{unit}']:.3f} to {one[f'high_{unit}']:.3f}"
         within = one[f"low_{unit}"] <= 0.0 <= one[f"high_{unit}"]
-        word = "as good as 0" if within else "not significant at 5 % over all asked for"
+        word = "0 is in its interval" if within else "not significant at 5 % over all parameters"
         word = "significant" if one["significant"] else f"{word}: not written into the URDF"
         if one["significant"] and unit != "percent":
             word += f": {describe_reading(one[key], one[f'sd_{unit}'], unit)}"
@@ -341,13 +350,13 @@ def parameter_rows(parameters: Mapping[str, Mapping[str, Any]]) -> list[tuple[st
 
 
 def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
-    """The page report.html, with the overlays in the result's folder."""
-    # Cameras see one robot: its zeros and lengths are the same in all their parts.
+    """Return the page report.html, with the overlays in the result folder."""
+    # The robot's parameters are the same in the parts of all cameras.
     first = next(iter(summary["cameras"].values()))
     pictures, pairs = [], []
     for camera, one in summary["cameras"].items():
-        # From the worst to the best, as far as they were written.
-        errors = {frame: float(told["E_total"]) for frame, told in one["frames"].items()}
+        # Written overlays from the worst to the best.
+        errors = {frame: float(part["E_total"]) for frame, part in one["frames"].items()}
         shown = (
             frame for frame in errors if (folder / OVERLAY / camera / f"{frame}.png").is_file()
         )
@@ -372,7 +381,7 @@ def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
             if first[key]
         ],
         by_pictures=first["masks"] == "found",
-        # A target tells nothing of clocks.
+        # Cameras that see a target have no time offset.
         clocks=first["masks"] == "found" and "time_offset_scores" in first,
         offsets={name: figure and plot_uri(figure) for name, figure in figures},
         normal=_NORMAL,
@@ -405,15 +414,15 @@ def registration_answer(cameras: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def compared_frames(errors: Mapping[str, float]) -> Sequence[str]:
-    """The frames in which a camera as given is shown: the worst and the median one."""
+    """Return the frames whose pictures compare camera poses: the worst and the median one."""
     in_order = sorted(errors, key=lambda frame: -errors[frame])
     return tuple(dict.fromkeys([in_order[0], in_order[len(in_order) // 2]]))
 
 
 def plot_offset(camera: Mapping[str, Any]) -> Figure | None:
-    """What was explained at each offset of a camera's clock that was tried; None: none was.
+    """Plot the scores of scanned time offsets; None: there are none.
 
-    A vertical line is the offset that was found, in its 95 % interval.
+    A vertical line marks the estimated offset, in its 95 % interval.
     """
     tried = np.array(camera.get("time_offset_scores") or ()).reshape(-1, 2)
     if len(tried) < 2:
@@ -429,10 +438,10 @@ def plot_offset(camera: Mapping[str, Any]) -> Figure | None:
 
 
 def check_exports(formats: Collection[str], cameras: Iterable[Camera]) -> None:
-    """Refuses before any work what could not be written after it.
+    """Refuse exports that could not be written, before any work.
 
     Raises:
-        CameraError: a camera that one of the formats does not have.
+        CameraError: a format does not support a camera.
         OutputError: a library is missing.
     """
     if "rerun" in formats:
@@ -448,18 +457,21 @@ def write_exports(
     links: Mapping[str, str],
     pictures: Pictures,
 ) -> None:
-    """Writes files of other programs into a result's folder.
+    """Write exports for other programs into a result folder.
 
     Args:
-        formats: of `ros`, `mujoco`, `drake` and `rerun`.
-        cameras: whose poses are in the world, or in the frames of links.
-        links: on which cameras ride, by camera's name.
+        folder: the result folder.
+        formats: some of `ros`, `mujoco`, `drake` and `rerun`.
+        inputs: the registration's inputs.
+        cameras: cameras with poses in the world, or in the frames of links.
+        links: the link that carries a camera, by camera name.
+        pictures: by camera and frame, for `rerun`.
 
     Raises:
-        OutputError: they cannot be written.
+        OutputError: an export cannot be written.
     """
     cameras = list(cameras)
-    # What ROS calls the world: the link that is fixed at its origin, if any.
+    # ROS' name of the world: the link that is fixed at its origin, if any.
     kinematics, world = TreeKinematics(inputs.tree), "world"
     poses = kinematics.poses(kinematics.flatten(inputs.tree.default_values()))
     for node, X_WN in zip(inputs.tree.nodes, poses, strict=True):
@@ -476,7 +488,7 @@ def write_exports(
 def _texts(
     formats: Collection[str], cameras: list[Camera], world: str, links: Mapping[str, str]
 ) -> dict[str, str]:
-    """Texts by file's name; world: what ROS calls the frame of cameras that ride on no link."""
+    """Return file contents by file name; world: name of the frame of cameras on no link."""
     texts: dict[str, str] = {}
     if "ros" in formats:
         texts |= {f"ros/{camera.name}.yaml": ros_camera_info(camera) for camera in cameras}

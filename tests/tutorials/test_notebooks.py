@@ -57,7 +57,7 @@ def test_source_is_fit_to_be_shared(path: Path) -> None:
     assert not re.search(r"(?<![\w.)/:])/(home|root|tmp|usr|work|Users|opt|var)/", text)
     first_code = code_cells(notebook)[0].source
     assert first_code.index('os.environ["LP_NUM_THREADS"] = "0"') < first_code.index("drake_pose")
-    # Drake's Meshcat listens on all network interfaces unless it is told not to.
+    # By default Drake's Meshcat listens on all network interfaces.
     assert text.count("Meshcat(") == text.count('Meshcat(MeshcatParams(host="localhost"))')
 
 

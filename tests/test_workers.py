@@ -1,3 +1,5 @@
+"""Maps over threads: order, nesting, errors and garbage collection."""
+
 import gc
 import threading
 

@@ -1,3 +1,5 @@
+"""Comparison of written files with committed ones."""
+
 import pytest
 
 from tests.written_files import assert_same_files

@@ -1,3 +1,5 @@
+"""Camera files: written and read back, Drake's, and exports to ROS and MuJoCo."""
+
 import shlex
 import xml.etree.ElementTree as ElementTree
 

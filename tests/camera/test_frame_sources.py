@@ -1,3 +1,5 @@
+"""Image sources: folders, videos, devices, and their specifications."""
+
 import pickle
 import time
 

@@ -1,3 +1,5 @@
+"""Camera models: projections, parameters, and conversion to Drake."""
+
 from dataclasses import replace
 
 import cv2

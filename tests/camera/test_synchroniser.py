@@ -1,3 +1,5 @@
+"""Groups of images by time stamps, against brute force."""
+
 import math
 
 import numpy as np

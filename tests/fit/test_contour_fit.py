@@ -1,3 +1,5 @@
+"""Edge points, matches, weights, and fits of one pose."""
+
 from dataclasses import replace
 
 import numpy as np

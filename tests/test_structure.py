@@ -1,4 +1,4 @@
-"""The rooms and folders of drake_pose, which of them may know which, and that none is too full."""
+"""Structure of drake_pose: permitted imports, and maximum sizes of folders, files and functions."""
 
 import ast
 from functools import cache
@@ -93,6 +93,17 @@ def find_cycles(arrows: dict[str, set[str]]) -> list[set[str]]:
 def test_every_folder_is_a_known_subpackage():
     subpackages = {p.name for p in PACKAGE.iterdir() if p.is_dir() and (p / "__init__.py").exists()}
     assert subpackages == set(SUBPACKAGES)
+
+
+def test_array_types_are_defined_once():
+    def assigned(path):
+        nodes = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.Assign)]
+        return {target.id for node in nodes for target in node.targets if hasattr(target, "id")}
+
+    names = assigned(PACKAGE / "arrays.py")
+    assert {"Array", "Mask", "Picture"} <= names
+    others = {path: names & assigned(path) for path in FILES if path.name != "arrays.py"}
+    assert {path: found for path, found in others.items() if found} == {}
 
 
 def test_no_folder_has_too_many_files():

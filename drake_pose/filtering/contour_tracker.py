@@ -543,11 +543,9 @@ class ContourTracker:
             remaining = observation.measure(
                 evidence, found, measurement.distance, rounds, lost_parts
             )
-        expected = (
-            prediction
-            if remaining is None
-            else self.filter.update(prediction, remaining.y, remaining)
-        )
+        expected = prediction
+        if remaining is not None:
+            expected = self.filter.update(prediction, remaining.y, remaining)
         moved = found - expected.best.mean
         belief = Belief(found, expected.best.covariance + np.outer(moved, moved))
         return replace(self.filter.start(belief), step=state.step)

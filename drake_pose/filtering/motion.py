@@ -45,8 +45,7 @@ class LinearMotion:
 
     Args:
         transition: (n, n) state transition matrix A.
-        noise: (n, n) process noise covariance U.
-        period: duration of a step [s]; None: rates are per step.
+        noise, period: see ``MotionModel``.
     """
 
     transition: Array
@@ -64,8 +63,7 @@ class FunctionMotion:
 
     Args:
         function: maps the state x (n,) to the state (n,) one step later.
-        noise: (n, n) process noise covariance U.
-        period: duration of a step [s]; None: rates are per step.
+        noise, period: see ``MotionModel``.
         jacobian: maps x (n,) to the function's Jacobian (n, n); None: central differences.
     """
 

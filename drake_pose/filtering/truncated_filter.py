@@ -386,15 +386,8 @@ class TruncatedFilter:
         """
         measurement = make_measurement(self.observation, y, variances)
         few = min(self.settings.iterations, self.settings.rough_iterations)
-        rough = update(
-            prediction,
-            measurement,
-            few,
-            start,
-            False,
-            self._limits,
-            remainder_weight=self._remainder_weight,
-        )
+        limits, weight = self._limits, self._remainder_weight
+        rough = update(prediction, measurement, few, start, False, limits, remainder_weight=weight)
         return rough.truncated.mean
 
     def update(

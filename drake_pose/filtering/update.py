@@ -242,9 +242,9 @@ def update(
         first = prediction if truncate is None else truncate(prediction, sites)
         x, range_covariance = first.mean, first.covariance
     # Annealing: a start that fits badly is updated with inflated noise, which is reduced from step
-    # to step. Narrow curved valleys, for example of a known scale, would otherwise stop it.
-    # Steps below ``settled`` standard deviations end it; later steps are halved, as tangents may
-    # make it oscillate.
+    # to step. Narrow curved valleys, for example of a known scale, would otherwise stop it. Steps
+    # below ``settled`` standard deviations end it; later steps are halved, as tangents may make it
+    # oscillate.
     good_fit, cooling, full_steps = 9.0, 6.0, 8
     settled = 0.01 if truncate is None else 0.3
     if not np.isfinite(measurement.y).any():
@@ -292,10 +292,8 @@ def update(
             belief = Belief(mean, 0.5 * (covariance + covariance.T))
         truncated = untruncated(belief) if truncate is None else truncate(belief, sites)
         sites = truncated.sites
-        step, range_covariance = (
-            truncated.mean - x,
-            truncated.covariance if remainder_weight else None,
-        )
+        step = truncated.mean - x
+        range_covariance = truncated.covariance if remainder_weight else None
         size = np.abs(step / np.maximum(belief.deviations(), 1e-12)).max()
         if temperature == 1.0 and size < settled:
             break

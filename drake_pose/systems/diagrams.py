@@ -50,7 +50,7 @@ from drake_pose.systems.ports import (
 )
 from drake_pose.systems.silhouette_matcher import SilhouetteMatcher, SilhouetteTracker
 
-REGISTRATION = ("keyframes", "contradictions", "moves", "mean_iou")
+REGISTRATION = ("keyframes", "outliers", "moves", "mean_iou")
 """Names of the elements of the output port ``registration`` of CameraRegistration."""
 
 

@@ -123,15 +123,13 @@ class PersonTracker(MemorySystem):
         }
         if with_deviations:
             outputs["deviations"] = unknown
-        # usual_ratio: 0 before a person is found; watched: number of frames in which
-        # others are still looked for; elapsed: time between the last two frames [s].
+        # usual_ratio: 0 before a person is found; watched: number of frames in which others are
+        # still looked for; elapsed: time between the last two frames [s].
+        scalars = ("usual_ratio", "troubled_frames", "watched", "elapsed")
         inner = {
             "values": values,
             "step": np.zeros(len(values)),
-            **{
-                name: np.zeros(1)
-                for name in ("usual_ratio", "troubled_frames", "watched", "elapsed")
-            },
+            **{name: np.zeros(1) for name in scalars},
             "colours": np.zeros(int(np.prod(self._colours_shape))),
         }
         self.declare_vectors(outputs | inner, outputs, period)
@@ -175,10 +173,8 @@ class PersonTracker(MemorySystem):
                 learned = colours.updated_colours(self._tracker.fit, last.values)
                 colours = ColourViews(colours.cameras, colours.pictures, learned)
             found, seen = self._tracker.follow_by_colour(last, colours), colours
-            separated, visible = (
-                _SeparatedViews(FrameViews((), ())),
-                {one.name for one in seen.cameras},
-            )
+            separated = _SeparatedViews(FrameViews((), ()))
+            visible = {one.name for one in seen.cameras}
         else:
             found, separated = self._follow(last, separated, known["watched"][0] > 0)
             seen, visible = separated.views, {*separated.views.showing, *separated.merged}
@@ -248,11 +244,11 @@ class PersonTracker(MemorySystem):
 
         Others are looked for at first, while tracking is in trouble, and if ``is_watching``.
         """
-        is_sorted = last is None or last.troubled_frames != 0 or is_watching
-        if is_sorted:
+        is_separated = last is None or last.troubled_frames != 0 or is_watching
+        if is_separated:
             separated = self._without_others(separated.views, last)
         found = self._follow_one(last, separated.views)
-        if not is_sorted and (found is None or found.troubled_frames != 0):
+        if not is_separated and (found is None or found.troubled_frames != 0):
             single = self._without_others(separated.views, last)
             if single.others:
                 return self._follow_one(last, single.views), single

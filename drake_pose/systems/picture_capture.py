@@ -65,7 +65,7 @@ class PictureCapture(PortedSystem):
     Output ports:
         color_image_<camera> (ImageRgba8U): without pixels if the camera has no picture in these
             frames.
-        label_image_<camera> (ImageLabel16I): for a source of masks, instead of ``color_image_<camera>``.
+        label_image_<camera> (ImageLabel16I): instead of it, for a source of masks.
         time (1): time stamp of the frames, counted from the first ones [s]; NaN before them.
         fresh (1): 1 if this update brought new frames, else 0.
 

@@ -28,8 +28,8 @@ class PackedTree(NamedTuple):
     Attributes:
         parents: (n,) index of each node's parent; -1: the world.
         X_PA: (n, 4, 4) constant transforms, with R_W0 of rotated roots included.
-        value_starts: (n + 1,) index of each node's first value. Joints that follow others have
-            values of their own here, behind all values of the tree.
+        value_starts: (n + 1,) index of each node's first value. The kernel's values are those of
+            the tree, followed by those of joints that follow others.
         free: (n,) bool, whether the node's values begin with a rotation vector.
         step_starts: (n + 1,) index of each node's first joint in ``steps``.
         steps: all joints.
@@ -49,12 +49,12 @@ class Motions:
 
     The parameters are the tree's values, then those that ``TreeKinematics.motions`` adds. A point
     p_W of node i moves with motion j by omega x p_W + v + sigma p_W if ``moves[i, j]``, else not at
-    all. Motions are in the order of ``TreeKinematics.parameters``, then the added parameters.
+    all. Motions are in the order of ``TreeKinematics.motion_values``, then the added parameters.
 
     Attributes:
         X_WN: (nodes, 4, 4) poses of the nodes.
-        twists: (m, 7) omega, v, sigma of each motion, in the world and about its origin.
-        moves: (nodes, m) bool, whether the motion moves the node.
+        twists: (k, 7) omega, v, sigma of each motion, in the world and about its origin.
+        moves: (nodes, k) bool, whether the motion moves the node.
     """
 
     X_WN: np.ndarray
@@ -71,8 +71,8 @@ class TreeKinematics:
             can take every direction.
         is_angle: (m,) whether the value is an angle [rad]; else a length [m].
         covers_full_turn: (m,) whether the value is an angle that can take every direction.
-        parameters: (e,) index of the value that causes each motion: first each value's own motion,
-            then those of joints that follow a value.
+        motion_values: (e,) index of the value that causes each motion: first each value's own
+            motion, then those of joints that follow a value.
         packed: the tree as ``find_motions`` takes it.
     """
 
@@ -90,7 +90,7 @@ class TreeKinematics:
             for _, leader, multiplier, offset in placement.follows
         ]
         values, nodes, scale, offset = np.array(followers, dtype=np.float64).reshape(-1, 4).T
-        self.parameters = np.append(np.arange(firsts[-1]), values.astype(np.int64))
+        self.motion_values = np.append(np.arange(firsts[-1]), values.astype(np.int64))
         motion_nodes = np.append(self.value_nodes, nodes.astype(np.int64))
         self._scale, self._offset = scale, offset
         bounds = [tree.value_bounds(i) for i in range(len(counts))]
@@ -104,7 +104,7 @@ class TreeKinematics:
         self.is_angle = np.concatenate([placement.is_angle for placement in tree.placements])
         self.packed = _pack_tree(tree, firsts)
         # (nodes, e + 4) which nodes each motion moves; last the root's translation and scale.
-        moves = np.zeros((len(counts), len(self.parameters) + 4), dtype=np.bool_)
+        moves = np.zeros((len(counts), len(self.motion_values) + 4), dtype=np.bool_)
         for i, node in enumerate(tree.nodes):
             if node.parent >= 0:
                 moves[i] = moves[node.parent]
@@ -161,9 +161,9 @@ class TreeKinematics:
         values = np.ascontiguousarray(values, dtype=np.float64)
         if values.shape != (len(self.names),):
             raise SettingsError(f"{len(self.names)} values expected, got shape {values.shape}")
-        if len(self.parameters) == len(values):
+        if len(self.motion_values) == len(values):
             return find_motions(self.packed, values)
-        followers = self._scale * values[self.parameters[len(values) :]] + self._offset
+        followers = self._scale * values[self.motion_values[len(values) :]] + self._offset
         X_WN, twists = find_motions(self.packed, np.append(values, followers))
         twists[len(values) :] *= self._scale[:, None]
         return X_WN, twists
@@ -182,7 +182,7 @@ class TreeKinematics:
         Raises SettingsError: the number of values is wrong.
         """
         X_WN, value_twists = self._compute(values)
-        count = len(self.parameters)
+        count = len(self.motion_values)
         extra_count = 3 * translation + scale
         twists = np.zeros((count + extra_count, 7))
         twists[:count, :6] = value_twists

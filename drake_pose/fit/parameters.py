@@ -113,7 +113,7 @@ class BodyParameters:
         self.kinematics, self.outlines = kinematics, tuple(outlines)
         self.links = tuple(dict.fromkeys(one.link for one in offsets))
         nodes, count = len(self.outlines), len(kinematics.names) + len(ROOT_NAMES)
-        caused_by = kinematics.parameters
+        caused_by = kinematics.motion_values
         self.groups = np.full(nodes, -1) if groups is None else np.array(groups)
         radius_scales = tuple(f"{RADIUS_SCALE_PREFIX}{name}" for name in radius_scale_names)
         link_scale_names = tuple(link_scale_name(link) for link in self.links)

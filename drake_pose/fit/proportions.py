@@ -54,7 +54,7 @@ class ProportionedBody(BodyParameters):
     def __init__(self, kinematics: TreeKinematics, surfaces: TreeSurfaces) -> None:
         super().__init__(kinematics, surfaces.rigid, surfaces=surfaces)
         nodes, model = kinematics.tree.nodes, kinematics.tree.model
-        if len(kinematics.parameters) > len(kinematics.names):
+        if len(kinematics.motion_values) > len(kinematics.names):
             name = model.position_names[kinematics.tree.followers[0].leader]
             raise ModelError(
                 f"{model.path}: joints mimic '{name}' (<mimic>), and the proportions of such a "

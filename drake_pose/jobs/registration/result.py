@@ -338,8 +338,8 @@ def parameter_rows(parameters: Mapping[str, Mapping[str, Any]]) -> list[tuple[st
             continue
         key = next(key for key in one if key.startswith("value_"))
         unit = key.removeprefix("value_")
-        value = f"{one[key]:.3f} {'%' if unit == 'percent' else unit}"
-        interval = f"{one[f'low_{unit}']:.3f} to {one[f'high_{unit}']:.3f}"
+        value = f"{one[key]:.2f} {'%' if unit == 'percent' else unit}"
+        interval = f"{one[f'low_{unit}']:.2f} to {one[f'high_{unit}']:.2f}"
         within = one[f"low_{unit}"] <= 0.0 <= one[f"high_{unit}"]
         word = "0 is in its interval" if within else "not significant at 5 % over all parameters"
         word = "significant" if one["significant"] else f"{word}: not written into the URDF"

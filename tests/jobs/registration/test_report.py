@@ -79,14 +79,14 @@ def test_zeros_and_lengths_are_shown_with_what_to_make_of_them(tmp_path):
         ),
     )
     for row in (
-        "elbow</td><td>3.000 deg</td><td>2.800 to 3.200</td><td>significant: reads 3.00 +- 0.10 "
+        "elbow</td><td>3.00 deg</td><td>2.80 to 3.20</td><td>significant: reads 3.00 +- 0.10 "
         "degrees too low",
-        "rail</td><td>0.100 mm</td><td>-0.300 to 0.500</td><td>0 is in its interval: "
+        "rail</td><td>0.10 mm</td><td>-0.30 to 0.50</td><td>0 is in its interval: "
         "not written into the URDF",
-        "wrist</td><td>0.100 mm</td><td>0.050 to 0.500</td><td>not significant at 5 % "
+        "wrist</td><td>0.10 mm</td><td>0.05 to 0.50</td><td>not significant at 5 % "
         "over all parameters: not written into the URDF",
         "base</td><td></td><td></td><td>not determined, correlated with target_x",
-        "shoulder</td><td>2.900 %</td><td>1.900 to 3.900</td><td>significant<",
+        "shoulder</td><td>2.90 %</td><td>1.90 to 3.90</td><td>significant<",
     ):
         assert f"<td>{row}" in page
 

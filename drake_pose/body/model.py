@@ -97,9 +97,8 @@ class ArticulatedModel(ParsedModel):
             scene_graph: the SceneGraph that holds the plant's geometry.
             model_instances: the instances whose bodies are drawn; None: all.
 
-        Raises:
-            ModelError: the plant is not finalized or not registered, no chosen body has visual
-                geometry, or its joints or geometry cannot be used.
+        Raises ModelError: the plant is not finalized or not registered, no chosen body has visual
+        geometry, or its joints or geometry cannot be used.
         """
         name = plant.get_name() or "the plant"
         if not isinstance(plant, MultibodyPlant) or not plant.is_finalized():

@@ -292,8 +292,7 @@ class FileFinder:
     def resolve(self, name: str, file: Path, what: str) -> Path:
         """Return the absolute path of a file or folder that a model file names.
 
-        Args:
-            what: what the name stands for, for messages.
+        ``what``: what the name stands for, for messages.
 
         Raises ModelError: the package is unknown, or the file does not exist or is not local.
         """

@@ -331,8 +331,7 @@ class PoseTree:
     def positions_from(self, values: Sequence[Array]) -> tuple[Array, Array]:
         """Return the plant's positions that put every link where the tree puts it.
 
-        Args:
-            values: each node's values (k_i,) [rad or m].
+        ``values``: each node's values (k_i,) [rad or m].
 
         Returns:
             q (nq,), and X_WB (4, 4), the pose of the plant's world frame B in the world W. X_WB is

@@ -124,8 +124,7 @@ def describe_unreadable(
 ) -> tuple[str, ...]:
     """Return one warning per camera about unreadable masks.
 
-    Args:
-        refused: reasons by (camera, frame).
+    ``refused``: reasons by (camera, frame).
     """
     found = []
     for camera in dict.fromkeys(name for name, _ in refused):

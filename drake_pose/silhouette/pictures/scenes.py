@@ -363,8 +363,7 @@ def find_masks(
 
     Hidden files are ignored. Frames of equal number are the same, with or without leading zeros.
 
-    Args:
-        cameras: names of the cameras.
+    ``cameras``: names of the cameras.
 
     Returns:
         Mask files by (camera, frame); folders that belong to no camera; warnings about unused

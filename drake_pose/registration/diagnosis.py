@@ -257,9 +257,9 @@ class _Diagnoser:
         sizes = []
         for k in range(groups):
             masks = [one for i in spread[k::groups] for one in self._frames[i].compared_masks]
-            seen = self._distances(masks)
+            distances = self._distances(masks)
             is_angle = np.append(self._fit.is_angle, np.zeros(len(masks), bool))
-            sizes.append(estimate_sizes(seen, is_angle, min_camera=0.0)[:5])
+            sizes.append(estimate_sizes(distances, is_angle, min_camera=0.0)[:5])
         return ErrorSizes(*np.median(np.array(sizes), axis=0).tolist())
 
     def _distances(self, masks: Sequence[ComparedMask]) -> Distances:
@@ -273,22 +273,28 @@ class _Diagnoser:
             return self._empty._replace(lengths=fitted.outline_lengths, freedom=known)
         if fitted.name not in self._known_distances:
             self._known_distances[fitted.name] = self._distances(fitted.compared_masks)
-        seen = self._known_distances[fitted.name]
-        own, biases = np.split(seen.X, [len(self._fit.names)], axis=1)
+        distances = self._known_distances[fitted.name]
+        own, biases = np.split(distances.X, [len(self._fit.names)], axis=1)
         X = own * self._fit.deviations
-        V = distances_covariance(seen, sizes) + bias_sd**2 * biases @ biases.T
-        PX, Py = np.split(np.linalg.solve(V, np.column_stack([X, seen.y])), [-1], axis=1)
-        N, h = X.T @ PX, PX.T @ seen.y
+        V = distances_covariance(distances, sizes) + bias_sd**2 * biases @ biases.T
+        PX, Py = np.split(np.linalg.solve(V, np.column_stack([X, distances.y])), [-1], axis=1)
+        N, h = X.T @ PX, PX.T @ distances.y
         T, rank = _statistic(h, N)
-        residual = max(float(seen.y @ Py[:, 0]) - T, 0.0)
-        freedom = known + len(seen.y) - rank
+        residual = max(float(distances.y @ Py[:, 0]) - T, 0.0)
+        freedom = known + len(distances.y) - rank
         scale = max((known + residual) / freedom, 1.0)
         outlines = self._empty.outlines.copy()
         for one in fitted.compared_masks:
             moves = one.moves * self._fit.deviations[:, None]
             outlines += moves @ one.A @ np.swapaxes(moves, 1, 2)
         return _Information(
-            N, h, PX.T @ seen.surface_derivatives, outlines, fitted.outline_lengths, scale, freedom
+            N,
+            h,
+            PX.T @ distances.surface_derivatives,
+            outlines,
+            fitted.outline_lengths,
+            scale,
+            freedom,
         )
 
     def _sum(self, kept: Mask) -> _Information:

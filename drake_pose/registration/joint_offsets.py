@@ -163,7 +163,7 @@ def calibrate_joints(
     """
     require_parameters(body.tree, joints, links)
     require_frame_count(sum(len(one) for one in frames), len(joints), len(links))
-    seen = [
+    views = [
         PosedFrames(body.kinematics, body.full, one.camera, each)
         for one, each in zip(cameras, frames, strict=True)
     ]
@@ -177,7 +177,7 @@ def calibrate_joints(
     while kept != sought:
         sought = kept
         names = [*target_positions, *sought]
-        fit = SharedFit(seen, X_CW, names, offsets=offsets, camera_unknowns=per_camera)
+        fit = SharedFit(views, X_CW, names, offsets=offsets, camera_unknowns=per_camera)
         begin = fit.start
         begin.shared[:] = [(start or {}).get(name, 0.0) for name in fit.names]
         if sought == requested:
@@ -212,7 +212,7 @@ def calibrate_joints(
     }
     ratios = fit.inlier_ratios(found)
     require_fit_kept(float(ratios.mean()), before)
-    deviations = np.sqrt(np.diag(covariance))[: len(seen) * fit.per_camera]
+    deviations = np.sqrt(np.diag(covariance))[: len(views) * fit.per_camera]
     first = len(fit.names) - len(fit.constants)
     target_rows = slice(first, first + len(target_positions))
     return JointCalibration(
@@ -220,11 +220,11 @@ def calibrate_joints(
         tuple(replace(parameters[link_scale_name(link)], name=link) for link in links),
         tuple(fit.cameras(found)),
         fit.camera_covariances(found, covariance),
-        deviations[fit.per_camera - 1 :: fit.per_camera] if focal else np.zeros(len(seen)),
+        deviations[fit.per_camera - 1 :: fit.per_camera] if focal else np.zeros(len(views)),
         found.shared[target_rows],
         covariance[target_rows, target_rows],
-        tuple(ratios[fit.rows == c] for c in range(len(seen))),
-        tuple(fit.inliers(ratios)[fit.rows == c] for c in range(len(seen))),
+        tuple(ratios[fit.rows == c] for c in range(len(views))),
+        tuple(fit.inliers(ratios)[fit.rows == c] for c in range(len(views))),
     )
 
 

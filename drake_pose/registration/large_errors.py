@@ -240,9 +240,9 @@ class LargeErrorSearch:
             middle = 0.5 * (low + high)
             off = np.abs((grid - middle + np.pi) % (2.0 * np.pi) - np.pi)
             inside = off <= 0.5 * (high - low) + step
-        seen = grid[np.argmin(np.where(inside, profile, np.inf), axis=1)]
-        exact = np.array(map_ordered(lambda k: compare(k, seen[k] + beside), range(len(frames))))
-        off = seen + beside[np.argmin(exact, axis=1)] - q
+        visible = grid[np.argmin(np.where(inside, profile, np.inf), axis=1)]
+        exact = np.array(map_ordered(lambda k: compare(k, visible[k] + beside), range(len(frames))))
+        off = visible + beside[np.argmin(exact, axis=1)] - q
         if angle:
             # Differences are angles: wrap them about their circular mean.
             middle = np.angle(np.exp(1j * off).mean())
@@ -310,13 +310,13 @@ def mask_excess_and_lack(
     """
     small = downscaled(camera, min(1.0, LARGE.side / size))
     scale = small.width / camera.width
-    seen = np.diff(reduced_sums(mask, small), axis=1).astype(np.uint8)
+    shown = np.diff(reduced_sums(mask, small), axis=1).astype(np.uint8)
     drawn = draw_mask(body.medium, camera.X_CW @ body.kinematics.poses(values), small)
     side = 2 * max(1, round(band * scale)) + 1
     ball = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    wide, wide_seen = (cv2.dilate(one.astype(np.uint8), ball) for one in (drawn, seen))
-    area = float(seen.sum()) or (scale * size) ** 2
-    more, less = (seen > wide).sum(), (drawn > wide_seen).sum()
+    wide, wide_shown = (cv2.dilate(one.astype(np.uint8), ball) for one in (drawn, shown))
+    area = float(shown.sum()) or (scale * size) ** 2
+    more, less = (shown > wide).sum(), (drawn > wide_shown).sum()
     return float(more) / area, float(less) / area
 
 

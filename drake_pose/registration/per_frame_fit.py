@@ -148,7 +148,7 @@ class PerFrameFit:
         sums = zip(self.camera_names, compared.sums, strict=True)
         return {name: inlier_ratio_of(one) for name, one in sums if name in frame.masks}
 
-    def with_boundary_biases(self, seen: Observation, theta: Array) -> Array:
+    def with_boundary_biases(self, observation: Observation, theta: Array) -> Array:
         """Return all parameters (n,) with the cheapest boundary bias of each mask [pixel].
 
         The cost is evaluated at biases from -3 to 3 pixels and interpolated by a parabola.
@@ -159,7 +159,7 @@ class PerFrameFit:
         for k, beside in ((1, None), (2, None), (3, None), (0, 1), (4, 3)):
             if beside is None or (np.argmin(costs, axis=0) == beside).any():
                 found[-count:] = biases[k]
-                compared, _ = self._simplified.compare(seen, found, SHARED.inlier_stage)
+                compared, _ = self._simplified.compare(observation, found, SHARED.inlier_stage)
                 costs[k] = compared.sums[:, :, Sum.COST].sum(axis=1)
         best = np.clip(np.argmin(costs, axis=0), 1, len(biases) - 2)
         low, middle, high = (np.choose(best + k, costs) for k in (-1, 0, 1))

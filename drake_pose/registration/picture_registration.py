@@ -583,9 +583,9 @@ def evaluate_pictures(
         )
         named = [each for each in map_ordered(segment, pictures) if each is not None]
         lost += [name for name, frame in named if frame is None]
-        seen = [frame for _, frame in named if frame is not None]
-        if seen:
-            full = PosedFrames(body.kinematics, body.full, camera, seen)
+        posed_frames = [frame for _, frame in named if frame is not None]
+        if posed_frames:
+            full = PosedFrames(body.kinematics, body.full, camera, posed_frames)
             fit = SharedFit([full], [camera.X_CW], fit_biases=False)
             ratios = fit.inlier_ratios(fit.start)
             misfits += [
@@ -595,6 +595,6 @@ def evaluate_pictures(
             # Log-odds are dropped to save memory.
             frames += [
                 replace(frame, values=frame.values - one.joint_offsets, foreground=None, rates=None)
-                for frame in seen
+                for frame in posed_frames
             ]
     return tuple(frames), tuple(misfits), tuple(lost)

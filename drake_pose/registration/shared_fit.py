@@ -189,8 +189,8 @@ class SharedFit:
         included: Mask | None = None,
     ) -> SharedValues:
         """Fit all unknowns to the included masks (rows,), from a start."""
-        seen, at, expected, included = self._at(start or self.start, included)
-        found = self.problem.solve(seen, rounds, at, expected=expected)
+        observations, at, expected, included = self._at(start or self.start, included)
+        found = self.problem.solve(observations, rounds, at, expected=expected)
         biases = np.zeros(len(self.rows))
         biases[included] = found.own.sum(axis=1)
         return SharedValues(found.shared, biases)
@@ -208,8 +208,8 @@ class SharedFit:
         self, at: SharedValues, step: AnnealingStage, included: Mask | None = None
     ) -> Equations:
         """Return the normal equations of the included masks (rows,), own unknowns first."""
-        seen, unknowns, expected, _ = self._at(at, included)
-        return self.problem.equations(seen, unknowns, step, expected)
+        observations, unknowns, expected, _ = self._at(at, included)
+        return self.problem.equations(observations, unknowns, step, expected)
 
     def cost_curvature(
         self, found: SharedValues, by: Array, step: AnnealingStage, included: Mask | None = None
@@ -266,18 +266,20 @@ class SharedFit:
         Returns:
             two (u, u) parts: from contour errors, and from nuisance parameters and calibrations.
         """
-        seen = self._distances_with_nuisances(found, SHARED.final_stage, included)
-        is_angle = np.zeros(seen.X.shape[1], bool)
-        sizes = estimate_sizes(seen, is_angle, 0.0, SHARED.prior_deviation)
-        nuisance, seen = nuisance_covariance(seen, sizes, is_angle)
-        covariance = values_covariance(seen, sizes, np.arange(len(is_angle)), is_angle)
-        covariance *= scatter_factor(seen, sizes, len(self.names))
+        distances = self._distances_with_nuisances(found, SHARED.final_stage, included)
+        is_angle = np.zeros(distances.X.shape[1], bool)
+        sizes = estimate_sizes(distances, is_angle, 0.0, SHARED.prior_deviation)
+        nuisance, distances = nuisance_covariance(distances, sizes, is_angle)
+        covariance = values_covariance(distances, sizes, np.arange(len(is_angle)), is_angle)
+        covariance *= scatter_factor(distances, sizes, len(self.names))
         # Wrong intrinsics are the same in all frames, and the pose absorbs them without residuals.
         # So a calibration is trusted to a pixel at best where surfaces are seen to err. Repeated
         # noise of a static part may be an error of its surface: none of it counts as noise here.
-        seen = self._distances_with_nuisances(found, SHARED.inlier_stage, included)
-        seen = seen._replace(effects=seen.effects[[0, 0, 2, 3, 4]])
-        sizes = estimate_sizes(seen, np.zeros(seen.X.shape[1], bool), 0.0, SHARED.prior_deviation)
+        distances = self._distances_with_nuisances(found, SHARED.inlier_stage, included)
+        distances = distances._replace(effects=distances.effects[[0, 0, 2, 3, 4]])
+        sizes = estimate_sizes(
+            distances, np.zeros(distances.X.shape[1], bool), 0.0, SHARED.prior_deviation
+        )
         pixels = min(1.0, (sizes.surface**2 + sizes.mask**2) / 0.2**2)
         for c, (one, camera) in enumerate(zip(self.views, self.cameras(found), strict=True)):
             depth = float(camera.X_CW[2, :3] @ one.middle + camera.X_CW[2, 3])
@@ -304,15 +306,15 @@ class SharedFit:
         Returns:
             value and standard deviation by joint [rad or m], highest score first.
         """
-        seen = self._distances_with_nuisances(found, SHARED.inlier_stage, included)
-        angles = np.zeros(seen.X.shape[1], bool)
-        sizes = estimate_sizes(seen, angles, 0.0, SHARED.prior_deviation)
-        values, deviations = score_nuisances(seen, sizes)
+        distances = self._distances_with_nuisances(found, SHARED.inlier_stage, included)
+        angles = np.zeros(distances.X.shape[1], bool)
+        sizes = estimate_sizes(distances, angles, 0.0, SHARED.prior_deviation)
+        values, deviations = score_nuisances(distances, sizes)
         units = self._offset_units
         # In the order of the first group of nuisances.
         known = {*self.names, *TARGET_POSITIONS}
         names = [one for one in self._nuisance_fit.names if one in units and one not in known]
-        if not seen.nuisances or seen.nuisances[0].shape[1] != len(names):
+        if not distances.nuisances or distances.nuisances[0].shape[1] != len(names):
             return {}
         scored = zip(names, values, deviations, strict=False)
         likely = {
@@ -367,8 +369,13 @@ class SharedFit:
         """Return the included observations, their unknowns, the prior means, and which masks."""
         included = np.ones(len(self.rows), bool) if included is None else included
         own = self._own(at)[included]
-        seen = [self._observations[k] for k in np.flatnonzero(included)]
-        return seen, (own, at.shared), (np.zeros_like(own), np.zeros(len(self.names))), included
+        observations = [self._observations[k] for k in np.flatnonzero(included)]
+        return (
+            observations,
+            (own, at.shared),
+            (np.zeros_like(own), np.zeros(len(self.names))),
+            included,
+        )
 
     def _own(self, at: SharedValues) -> Array:
         """Return the own unknowns (rows, cameras): each mask's bias in its camera's column."""
@@ -385,9 +392,9 @@ class SharedFit:
         self, at: SharedValues, step: AnnealingStage, included: Mask | None = None
     ) -> Distances:
         """Return the distances in the included masks, by shared unknowns, then boundary biases."""
-        seen, _, _, included = self._at(at, included)
-        pictures = self.problem.compared_masks(seen, self._parameters(at)[included], step)
-        return distances_in_masks(self.problem.body.outlines, pictures, with_bias=True)
+        observations, _, _, included = self._at(at, included)
+        masks = self.problem.compared_masks(observations, self._parameters(at)[included], step)
+        return distances_in_masks(self.problem.body.outlines, masks, with_bias=True)
 
     def _distances_with_nuisances(
         self, found: SharedValues, step: AnnealingStage, included: Mask | None
@@ -467,26 +474,26 @@ def pose_covariance(X_CW: Array, motions: Array, covariance: Array) -> Array:
     return np.asarray(J @ covariance @ J.T)
 
 
-def scatter_factor(seen: Distances, sizes: ErrorSizes, shared: int) -> float:
+def scatter_factor(distances: Distances, sizes: ErrorSizes, shared: int) -> float:
     """Return the factor, at least 1, by which frames scatter more than the error sizes predict.
 
     Each frame's distances are projected onto the directions that inform about the shared values,
     after removal of its boundary bias. There their covariance is known, and the weighted sum of
     squared residuals over the degrees of freedom estimates the factor of the variances.
 
-    shared: number of shared values, the first columns of ``seen.X``.
+    shared: number of shared values, the first columns of ``distances.X``.
     """
-    V = distances_covariance(seen, sizes)
+    V = distances_covariance(distances, sizes)
     designs, targets = [], []
-    for picture in np.unique(seen.pictures):
-        rows = np.flatnonzero(seen.pictures == picture)
-        X, biases = np.split(seen.X[rows], [shared], axis=1)
+    for picture in np.unique(distances.pictures):
+        rows = np.flatnonzero(distances.pictures == picture)
+        X, biases = np.split(distances.X[rows], [shared], axis=1)
         X = X - biases @ np.linalg.pinv(biases) @ X
         U, singular, _ = np.linalg.svd(X, full_matrices=False)
         U = U[:, singular > 1e-3 * singular.max()]
         L = np.linalg.cholesky(U.T @ V[np.ix_(rows, rows)] @ U)
         designs.append(np.linalg.solve(L, U.T @ X))
-        targets.append(np.linalg.solve(L, U.T @ seen.y[rows]))
+        targets.append(np.linalg.solve(L, U.T @ distances.y[rows]))
     if not designs:
         return 1.0
     design, target = np.concatenate(designs), np.concatenate(targets)
@@ -557,7 +564,7 @@ def adjust_bundle(
         pixels=size,
     )  # fmt: skip
     held = np.where(free | is_length, 0.0, values)
-    seen = [
+    observations = [
         Observation(frame.edges(cameras, size / 150.0), row)
         for frame, row in zip(frames, held, strict=True)
     ]
@@ -569,16 +576,16 @@ def adjust_bundle(
     # The finest scale at which 0.7 of the contours fit: the model's surface is no more exact.
     for scale in (0.04, 0.03, 0.02, 0.01, 0.005):
         rounds.append(AnnealingStage(scale, 0.015, 6))
-        tried = fit.solve(seen, rounds, now, expected=start)
+        tried = fit.solve(observations, rounds, now, expected=start)
         if found and tried.inlier_ratios[tried.inlier_ratios > 0.0].mean() < 0.7:
             break
         found, now, rounds = tried, (tried.own, tried.shared), []
     assert found is not None
     # Covariances use a few frames and at most 1000 distances: errors of the surface are the same in
     # all frames. They are measured at a scale at which none of the contours are outliers.
-    some = np.unique(np.linspace(0, len(seen) - 1, covariance_frames).round().astype(int))
+    some = np.unique(np.linspace(0, len(observations) - 1, covariance_frames).round().astype(int))
     coarse = AnnealingStage(0.08, 0.015)
-    masks = fit.compared_masks([seen[k] for k in some], found.parameters[some], coarse)
+    masks = fit.compared_masks([observations[k] for k in some], found.parameters[some], coarse)
     distances = distances_in_masks(body.outlines, masks, 1000)
     turns = [name.split(".")[-1] in CAMERA_NAMES[:3] for name in fit.names[fit.own_count :]]
     is_angle = np.concatenate([np.tile(kinematics.is_angle[free], len(some)), turns])

@@ -230,8 +230,8 @@ def _find_cameras(
         compared.append(given if is_near else one.found.camera)
         findings += [] if is_near or off.p_value > DIAGNOSIS.significance else [off]
         findings += compare_clock(body, one, recording)
-        seen, _, lost = evaluate_pictures(body, one, one.found)
-        for frame in seen:
+        segmented, _, lost = evaluate_pictures(body, one, one.found)
+        for frame in segmented:
             known = frame.name if alone else f"{name}-{frame.name}"
             names[known] = name, frame.name
             frames.append(MultiViewFrame(known, frame.values, {name: frame.mask}))

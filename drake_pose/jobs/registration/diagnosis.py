@@ -223,8 +223,8 @@ def check_focal_length(
     some = evenly_spaced(counted, most)
     if len(some) < 2:
         return found.covariance, []
-    seen = PosedFrames(body.kinematics, body.full, given, some)
-    fit = SharedFit([seen], [given.X_CW], camera_unknowns=len(POSE_NAMES) + 1)
+    posed = PosedFrames(body.kinematics, body.full, given, some)
+    fit = SharedFit([posed], [given.X_CW], camera_unknowns=len(POSE_NAMES) + 1)
     camera = fit.cameras(fit.fit((*SEARCH.fine, *SEARCH.last)))[0]
     if abs(math.log(camera.focal_x / given.focal_x)) < 0.6 * off_by:
         return found.covariance, []
@@ -332,8 +332,8 @@ def likely_offset_warnings(
     some = evenly_spaced([one for one in frames if one.name in names], 24)
     if not some:
         return []
-    seen = PosedFrames(body.kinematics, body.full, found.camera, some, LAST_SPACING)
-    fit = SharedFit([seen], [found.camera.X_CW])
+    posed = PosedFrames(body.kinematics, body.full, found.camera, some, LAST_SPACING)
+    fit = SharedFit([posed], [found.camera.X_CW])
     every = np.ones(len(some), bool)
     likely = fit.likely_offsets(fit.fit(SHARED.stages_with_constants[-1:], fit.start, every), every)
     turns = dict(zip(body.kinematics.names, body.kinematics.is_angle, strict=True))

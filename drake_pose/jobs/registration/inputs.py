@@ -109,8 +109,8 @@ class RegistrationInputs:
             return self._known[frame]
         names = [one.name for one in self.known_cameras if (one.name, frame) in self.scene.masks]
         masks = {name: read_mask_of(self.scene, name, frame, may_be_empty=True) for name in names}
-        seen = {name: mask for name, mask in masks.items() if mask.any()}
-        return MultiViewFrame(frame, self.positions.of(frame, next(iter(masks), "")), seen)
+        visible = {name: mask for name, mask in masks.items() if mask.any()}
+        return MultiViewFrame(frame, self.positions.of(frame, next(iter(masks), "")), visible)
 
     @cached_property
     def _known(self) -> dict[str, MultiViewFrame]:
@@ -459,19 +459,19 @@ def _select_parameters(
     model: ArticulatedModel, kinematics: TreeKinematics, settings: RegistrationSettings
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the joints and links whose offsets and scales are to be estimated."""
-    zeros, lengths = settings.zeros, settings.lengths
-    if ALL in zeros:
+    joints, links = settings.zeros, settings.lengths
+    if ALL in joints:
         free = np.flatnonzero(kinematics.lower < kinematics.upper)
-        zeros = tuple(kinematics.names[k] for k in free)
-    if ALL in lengths:
-        lengths = scalable_links(kinematics.tree)
-    require_parameters(kinematics.tree, zeros, lengths)
+        joints = tuple(kinematics.names[k] for k in free)
+    if ALL in links:
+        links = scalable_links(kinematics.tree)
+    require_parameters(kinematics.tree, joints, links)
     if settings.lengths and not model.changes_shape:
         raise SettingsError(
             f"{model.path}: link lengths are estimated of URDF models only; convert the model, or "
             "leave --lengths out"
         )
-    return zeros, lengths
+    return joints, links
 
 
 def _read_frames(
@@ -495,9 +495,9 @@ def _read_frames(
                     f"{scene.path}: camera '{name}' has no mask of a frame in which the cameras "
                     "with an X_WC determine the body's pose; give synchronised masks"
                 )
-        seen = [frame for frame in known if any((name, frame) in scene.masks for name in names)]
-        chosen = np.linspace(0, len(seen) - 1, most).round().astype(int)
-        wanted = tuple(dict.fromkeys(seen[k] for k in chosen))
+        usable = [frame for frame in known if any((name, frame) in scene.masks for name in names)]
+        chosen = np.linspace(0, len(usable) - 1, most).round().astype(int)
+        wanted = tuple(dict.fromkeys(usable[k] for k in chosen))
     shown = {name: scene.of_cameras([name]).frames_with_files(wanted) for name in names}
     found = []
     for frame in select_frames(scene.frames, wanted, str(scene.path)):

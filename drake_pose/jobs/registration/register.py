@@ -299,9 +299,11 @@ class _Registration:
                 )
             recording = inputs.recordings[name]
             rows, _ = choose_pictures(body, camera, recording, most)
-            seen = find_target_frames(target, camera, posed_pictures(recording, rows, 0.0))
-            self.target_pictures[name] = {one.name: recording.picture(one.name) for one in seen}
-            frames += [MultiViewFrame(one.name, one.values, {name: one.mask}) for one in seen]
+            segmented = find_target_frames(target, camera, posed_pictures(recording, rows, 0.0))
+            self.target_pictures[name] = {
+                one.name: recording.picture(one.name) for one in segmented
+            }
+            frames += [MultiViewFrame(one.name, one.values, {name: one.mask}) for one in segmented]
             found_names = self.target_pictures[name]
             lost = [recording.names[k] for k in rows if recording.names[k] not in found_names]
             if lost:
@@ -326,11 +328,13 @@ class _Registration:
         # All pictures of cameras that were registered from some of them.
         for name, one in self.pictures.items():
             recording, found = one.recording, self.registered[name]
-            seen, misfits, lost = evaluate_pictures(
+            segmented, misfits, lost = evaluate_pictures(
                 body, replace(one, joint_offsets=self._joint_offsets), found
             )
             offsets = self._joint_offsets
-            frames += [MultiViewFrame(k.name, k.values + offsets, {name: k.mask}) for k in seen]
+            frames += [
+                MultiViewFrame(k.name, k.values + offsets, {name: k.mask}) for k in segmented
+            ]
             found = self.registered[name] = replace(found, frames=misfits)
             errors = {k.frame: k.E_total for k in found.frames}
             wanted = (*found.outliers[:shown], *compared_frames(errors))
@@ -426,8 +430,8 @@ class _Registration:
         target_pose = next(iter(cameras.values())).target
         shifts = joint_shifts(tree, found.link_scales)
         # The URDF gets significant parameters only; the cameras were fitted with all.
-        zeros = {one.name: one.value for one in found.offsets if one.significant}
-        written = joint_shifts(tree, [one for one in found.link_scales if one.significant])
+        offsets_in_file = {one.name: one.value for one in found.offsets if one.significant}
+        shifts_in_file = joint_shifts(tree, [one for one in found.link_scales if one.significant])
         if shifts:
             model = model.reshaped(joint_shifts=shifts)
         if target is not None and target_pose is not None:
@@ -449,11 +453,17 @@ class _Registration:
             self.registered[camera.name] = replace(before, frames=tuple(again))
             self._update(kinematics, camera, covariance, target_pose)
         path = inputs.model.path
-        if folder is None or not inputs.model.changes_shape or not (zeros or written):
+        if (
+            folder is None
+            or not inputs.model.changes_shape
+            or not (offsets_in_file or shifts_in_file)
+        ):
             return None
         # Offsets and scales change the joints' origins; mesh paths become relative to the folder.
         text = path.read_text(encoding="utf-8")
-        root = ElementTree.fromstring(reshaped(text, joint_offsets=zeros, joint_shifts=written))
+        root = ElementTree.fromstring(
+            reshaped(text, joint_offsets=offsets_in_file, joint_shifts=shifts_in_file)
+        )
         for mesh in root.iter("mesh"):
             name = mesh.get("filename", "")
             if "://" not in name:

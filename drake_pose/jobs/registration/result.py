@@ -52,15 +52,17 @@ def describe_camera(
         suggestion: joint positions that would distinguish alternative poses.
         link: the link that carries the camera, in whose frame its pose is; None: the world.
     """
-    pose, seen, X = "X_WC" if link is None else "X_LC", found.target, found.camera.X_WC
+    pose, target_pose, X = "X_WC" if link is None else "X_LC", found.target, found.camera.X_WC
     target = {}
-    if seen is not None:
+    if target_pose is not None:
         target = {
-            **describe_pose("X_WT", seen.X_WT, seen),
-            "modes": [{"X_WT": one.tolist()} for one in (seen.X_WT, *seen.alternatives)],
-            "determined": not len(seen.symmetry_axes),
-            "covariance": seen.covariance.tolist(),
-            "round_about": seen.symmetry_axes.tolist(),
+            **describe_pose("X_WT", target_pose.X_WT, target_pose),
+            "modes": [
+                {"X_WT": one.tolist()} for one in (target_pose.X_WT, *target_pose.alternatives)
+            ],
+            "determined": not len(target_pose.symmetry_axes),
+            "covariance": target_pose.covariance.tolist(),
+            "round_about": target_pose.symmetry_axes.tolist(),
         }
     return {
         **({} if link is None else {"link": link}),

@@ -204,11 +204,11 @@ def _read_camera(
     beside = f"{base.rpartition('/')[0]}/camera_info"
     info, camera, lens = infos.get(beside, infos.get(f"{base}/camera_info")), None, None
     if info is None or not np.any(_field(info, "k")):
-        warnings.append(f"{topic}: no calibration in {beside}: its lens is unknown")
+        warnings.append(f"{topic}: no calibration in {beside}: its lens is unknown; calibrate it")
     elif (info.width, info.height) != (width, height):
         warnings.append(
             f"{topic}: its calibration is for {info.width} x {info.height} pixels, but its images "
-            f"have {width} x {height}: its lens is unknown"
+            f"have {width} x {height}: its lens is unknown; calibrate it"
         )
     else:
         lens = _lens(info, is_rectified="rect" in base.rpartition("/")[2], where=topic)

@@ -144,7 +144,12 @@ class Episode:
         for name, camera in found.items():
             warnings += _gap_warnings(camera.times, f"camera '{name}'", "picture")
         if joints is None:
-            return cls(path, found, None, (*warnings, f"{path}: has no joint positions"))
+            return cls(
+                path,
+                found,
+                None,
+                (*warnings, f"{path}: has no joint positions; give a table of them (--joints)"),
+            )
         if not joints.positions.size:
             raise SceneError(f"{path}: the joint log has no row, or no joint")
         is_number = np.isfinite(joints.positions)

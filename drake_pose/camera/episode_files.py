@@ -107,7 +107,9 @@ def open_folder(path: Path, joints: JointLog | None) -> Episode:
             continue
         warnings += camera_warnings
         if name not in calibration.cameras:
-            warnings.append(f"camera '{name}' has no entry in {CAMERAS}: its lens is unknown")
+            warnings.append(
+                f"camera '{name}' has no entry in {CAMERAS}: its lens is unknown; calibrate it"
+            )
         cameras.append(add_calibration(camera, calibration, path / CAMERAS))
     return Episode.checked(path, cameras, joints, warnings)
 

@@ -268,13 +268,14 @@ def _audit_warnings(
         )
     if empty_frames:
         named = frame_ranges(empty_frames, inputs.scene.frames)
-        warnings.append(f"frame {named}: the masks show nothing: there is nothing to compare")
+        warnings.append(f"frame {named}: the masks are empty, so nothing is compared; check them")
     count, inliers = len(found.frames), len(found.frames) - len(found.outliers)
     wrong_log = any(one.kind in ("sign", "log") for one in found.common)
     if 2 * inliers < count and not wrong_log:
         warnings.append(
             f"only {inliers} of {count} frames agree with each other: they count as right because "
-            "they are near the given values, not because of their number"
+            "they are near the given values, not because of their number; check the others' masks "
+            "and joint positions"
         )
     return warnings
 

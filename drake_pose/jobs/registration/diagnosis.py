@@ -484,7 +484,8 @@ def common_outlier_warnings(
     if positions:
         texts.append(
             f"frames {frame_ranges(positions, frames)} are outliers in all cameras that see them: "
-            "their joint positions are not those of the pictures"
+            "their joint positions are not those of the pictures; correct them, or leave these "
+            "frames out"
         )
     texts += [
         f"frames {frame_ranges(wrong, frames)} are outliers in camera '{name}', but not in another "

@@ -201,7 +201,7 @@ def read_inputs(
     if positions.are_one_pose(positions.of(frame, held[0].name) for frame in frames):
         warnings.append(
             "all frames show the robot in one pose, to a degree: common errors of joints and of "
-            "cameras can hardly be distinguished"
+            "cameras can hardly be distinguished; add frames with other joint positions"
         )
     return RegistrationInputs(
         found, robot, tree, positions, joints, cameras, tuple(warnings), held, audited_frames=frames
@@ -364,7 +364,8 @@ def _read_masks(
     warnings = [*scene.warnings, *robot.warnings, *positions.warnings]
     warnings += [
         f"camera '{name}' has no X_WC and is not to be registered, or has no masks in "
-        f"masks/{name}: it is left out of the camera file that is written"
+        f"masks/{name}: it is left out of the written camera file; add its masks, or name it "
+        "(--camera)"
         for name in left_out
     ]
     inputs = RegistrationInputs(

@@ -126,14 +126,15 @@ def picture_warnings(one: PictureRegistration, assumed: bool) -> list[str]:
         texts.append(
             f"camera '{name}': no focal length is given: it was estimated as "
             f"{one.found.camera.focal_x:.0f} pixels (standard deviation "
-            f"{one.focal_deviation * one.found.camera.focal_x:.0f})"
+            f"{one.focal_deviation * one.found.camera.focal_x:.0f}); give it in the camera file if "
+            "it is known"
         )
     if one.time_offset is not None and one.time_offset.drift:
         texts.append(describe_drift(name, one.time_offset.drift, one.time_offset.drift_deviation))
     if one.time_offset is not None and not one.time_offset.determined:
         texts.append(
             f"camera '{name}': its pictures do not determine its time offset to the joint log, "
-            "because the robot moves too little or too slowly"
+            "because the robot moves too little or too slowly; add a faster motion"
         )
     return texts
 

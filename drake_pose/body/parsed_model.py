@@ -316,6 +316,8 @@ def _search_limits(
 
     Limits more than four turns apart (a hundred turns for a screw, a kilometre for a slide) count
     as no limits. An angle without limits is searched over one turn about its default.
+
+    Raises ModelError: limits are NaN or crossed, an angle's are one-sided, or a screw's too wide.
     """
     kind = joint.type_name()
     is_length, is_screw = _KINDS[kind][index] == "length", kind == "screw"

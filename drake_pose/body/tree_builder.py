@@ -1,4 +1,9 @@
-"""Construction of a PoseTree: choice of its root, removal of undrawn links, joint inversion."""
+"""Construction of a PoseTree from a model's link graph.
+
+Starting at the root, each link group with geometry becomes a node. Groups without geometry are
+skipped, or kept as empty nodes where several branches meet. Joints that are traversed towards the
+plant's world are inverted. Branches whose joints all follow another branch's are attached to it.
+"""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,3 +1,5 @@
+"""Loading of models: positions, mesh formats, replaced meshes, checks and reports."""
+
 import json
 import logging
 

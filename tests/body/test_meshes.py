@@ -1,3 +1,5 @@
+"""Reading of STL and DAE files, and writing of OBJ files."""
+
 import re
 import struct
 

@@ -1,3 +1,5 @@
+"""Pose trees against Drake's plant, sampling grids, and root rotations."""
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,3 +1,5 @@
+"""Compiled kinematics against the pose tree and finite differences."""
+
 import numpy as np
 import pytest
 

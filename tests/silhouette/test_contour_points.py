@@ -1,3 +1,5 @@
+"""Contour points against brute force and known shapes."""
+
 import numpy as np
 import pytest
 

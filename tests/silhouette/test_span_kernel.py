@@ -1,3 +1,5 @@
+"""Masks, areas and labels of the span kernel against ray casting."""
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

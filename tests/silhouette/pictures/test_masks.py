@@ -1,3 +1,5 @@
+"""Mask files, label images and agreement between masks."""
+
 import struct
 import subprocess
 import sys

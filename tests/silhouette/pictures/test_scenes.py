@@ -1,3 +1,5 @@
+"""Reading of scene folders."""
+
 from dataclasses import replace
 
 import cv2

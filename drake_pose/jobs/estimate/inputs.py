@@ -232,7 +232,7 @@ class EstimateInputs:
         names = [name for name in self.scene.cameras if (name, frame) in self.scene.images]
         return {name: self.scene.read_image(name, frame) for name in names}
 
-    def finish(
+    def record_frame(
         self,
         frame: str,
         pose: PoseEstimate,

@@ -262,7 +262,7 @@ def cameras_of(
     return PlacedCameras(chosen, frozenset(given.cameras) - {*given.unplaced, *given.links})
 
 
-def say_left_out(names: Iterable[str], placed: Collection[str]) -> list[str]:
+def left_out_warnings(names: Iterable[str], placed: Collection[str]) -> list[str]:
     """Return a warning for each camera that is not used because its pose is unknown."""
     return [
         f"camera '{name}' has no X_WC and is left out; drake-pose register finds its pose"
@@ -399,7 +399,7 @@ def read_episode_scene(
     return Scene(
         path, {name: one.camera for name, one in known.items() if one.camera is not None}, frames,
         {}, True, rate, images=images, readers=readers, times=times, joints=episode.joints,
-        warnings=(*episode.warnings, *say_left_out([one.name for one in chosen], placed)),
+        warnings=(*episode.warnings, *left_out_warnings([one.name for one in chosen], placed)),
     )  # fmt: skip
 
 

@@ -84,7 +84,7 @@ def follow_person(
         nodes = [np.array(own) for own in zip(*values, strict=True)]
         for index, X_WN in enumerate(captured.tree.node_poses_batch(nodes)):
             own = X_WN, read(index), reader, float(distances[index])
-            yield _finish(inputs, captured, index, *own, seconds, overlay)
+            yield _record_frame(inputs, captured, index, *own, seconds, overlay)
         unread = describe_unreadable(reader.refused, inputs.scene.frames)
         doubts = describe_alternatives(captured, inputs.frames)
         result.warnings += (*unread, *faults, *doubts)
@@ -172,7 +172,7 @@ class _Reader:
             self.on_stage(what, done, of)
 
 
-def _finish(
+def _record_frame(
     inputs: EstimateInputs,
     captured: PersonCapture,
     index: int,
@@ -215,7 +215,7 @@ def _finish(
     pose = PoseEstimate(found, q, np.eye(4), (), wrong, area, stopped_by=FOLLOWED, seconds=seconds)
     answers = ((q, captured.deviations[index]), *captured.alternatives.get(index, ()))
     known = record_modes(inputs.model, answers if found else answers[:1])
-    return inputs.finish(
+    return inputs.record_frame(
         frame, pose, masks, parts, shown, share=float(captured.inlier_ratios[index]), **known
     )
 

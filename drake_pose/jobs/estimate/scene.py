@@ -189,7 +189,7 @@ def match_frames(
         known = record_pose_set(pose.pose_set, search.tree) or {
             "joints": record_deviations(model, pose.q, nothing)
         }
-        yield inputs.finish(
+        yield inputs.record_frame(
             frame, pose, masks, parts, shown, **more, **known, runs=pose.runs,
             outside_limit=pose.outside_limit, explained=pose.explained,
         )  # fmt: skip

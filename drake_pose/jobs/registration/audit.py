@@ -20,7 +20,7 @@ from drake_pose.errors import SceneError
 from drake_pose.files.folder import write_summary, writes_folder
 from drake_pose.files.records import mask_digests, user_units
 from drake_pose.files.settings import percent
-from drake_pose.jobs.estimate.measurements import say_left_out
+from drake_pose.jobs.estimate.measurements import left_out_warnings
 from drake_pose.jobs.registration.audit_page import write_audit_page
 from drake_pose.jobs.registration.diagnosis import (
     compare_camera,
@@ -212,7 +212,7 @@ def _find_cameras(
         )
     alone = len(inputs.given_cameras) == 1
     body = RegistrationBody(inputs.tree, inputs.visible_nodes)
-    warnings = say_left_out(inputs.recordings, [one.name for one in inputs.given_cameras])
+    warnings = left_out_warnings(inputs.recordings, [one.name for one in inputs.given_cameras])
     compared, findings = list[Camera](), list[Finding]()
     pictures = dict[str, PictureRegistration]()
     names, frames = dict[str, tuple[str, str]](), list[MultiViewFrame]()

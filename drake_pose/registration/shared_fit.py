@@ -10,7 +10,7 @@ offsets, link scales and lens errors that are not fitted are nuisance parameters
 sizes enlarge the covariance.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -19,7 +19,7 @@ import numpy as np
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.body import TARGET_POSITIONS
-from drake_pose.body.tree_kinematics import LinkVector, TreeKinematics
+from drake_pose.body.tree_kinematics import LinkVector
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.fit.covariance import (
     Distances,
@@ -36,14 +36,12 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage, Equations, StepSe
 from drake_pose.fit.parameters import (
     CAMERA_NAMES,
     POSE_NAMES,
-    RADIUS_SCALE_PREFIX,
     BodyParameters,
     carried_joints,
     link_scale_name,
 )
 from drake_pose.fit.problem import TIME_OFFSET, Problem, Unknowns, parameter_names
-from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrames, common_size, middle_of
-from drake_pose.silhouette.outline import Outline
+from drake_pose.registration.posed_frames import PosedFrames
 from drake_pose.workers import map_ordered
 
 
@@ -502,102 +500,3 @@ def scatter_factor(distances: Distances, sizes: ErrorSizes, shared: int) -> floa
     scale = (SHARED.prior_freedom + float(off @ off)) / (SHARED.prior_freedom + len(off) - rank)
     # A scatter below the prediction is chance and does not reduce the variances.
     return max(scale, 1.0)
-
-
-def adjust_bundle(
-    kinematics: TreeKinematics,
-    outlines: Sequence[Outline],
-    cameras: Sequence[PinholeCamera],
-    unknown: Collection[str],
-    frames: Sequence[MultiViewFrame],
-    is_length: Mask,
-    parts: Sequence[str] = (),
-    groups: Sequence[int] | None = None,
-    covariance_frames: int = 4,
-) -> tuple[list[PinholeCamera], Array, Array, Array]:
-    """Fit unknown cameras, all poses and the body's shape to all silhouettes (bundle adjustment).
-
-    Cameras registered with estimated joint positions inherit their errors. So cameras, positions,
-    lengths and radius scales are fitted together; cameras with known poses fix the world frame.
-
-    Args:
-        outlines: a surface for each node.
-        cameras: all cameras; the unknown ones near their poses.
-        unknown: names of the cameras whose poses are unknown.
-        frames: the masks, with approximate values of the body.
-        is_length: (m,) which of the pose tree's values are lengths, the same in all frames.
-        parts: names of the parts that have a radius scale, a factor of the width across y.
-        groups: (nodes,) index of each node's part, or -1; None: no parts.
-        covariance_frames: number of frames from which covariances are estimated.
-
-    Returns:
-        the c unknown cameras at their poses; their (c, 6, 6) covariances, see ``RegisteredCamera``;
-        the values (frames, m) [rad or m]; and the radius scales (nodes,).
-
-    Raises:
-        MaskError: a mask's size differs from its camera's, or no mask shows the body.
-    """
-    values, size = np.array([frame.values for frame in frames]), common_size(cameras, frames)
-    body = BodyParameters(kinematics, outlines, groups, parts)
-    free = (kinematics.lower < kinematics.upper) & ~is_length
-    searched = [k for k, camera in enumerate(cameras) if camera.name in unknown]
-    # Prior standard deviations: angles [rad], places and lengths [m], log radius scales.
-    error = SHARED.point_error * np.sqrt(SHARED.error_length)
-    deviations = np.where(is_length, 0.03, 0.5) / error
-    pose, lengths = (
-        Unknowns(
-            np.array(kinematics.names)[included].tolist(), shared, kinematics.lower[included],
-            kinematics.upper[included], deviations[included],
-        )
-        for included, shared in ((free, False), (is_length, True))
-    )  # fmt: skip
-    radius_scales = [name for name in body.names if name.startswith(RADIUS_SCALE_PREFIX)]
-    poses = [f"{cameras[k].name}.{name}" for k in searched for name in POSE_NAMES]
-    unknowns = [
-        pose,
-        lengths,
-        Unknowns(radius_scales, True, deviation=0.15 / error),
-        Unknowns(poses, True),
-    ]
-    fit = Problem(
-        body, cameras, unknowns, pivot=middle_of(kinematics, frames), steps=SHARED.steps,
-        pixels=size,
-    )  # fmt: skip
-    held = np.where(free | is_length, 0.0, values)
-    observations = [
-        Observation(frame.edges(cameras, size / 150.0), row)
-        for frame, row in zip(frames, held, strict=True)
-    ]
-    count = len(lengths.names)
-    shared = np.zeros(len(fit.names) - fit.own_count)
-    shared[:count] = values[0, is_length]
-    start = now = values[:, free], shared
-    found, rounds = None, [AnnealingStage(0.08, 0.02), AnnealingStage(0.06, 0.02, 3)]
-    # The finest scale at which 0.7 of the contours fit: the model's surface is no more exact.
-    for scale in (0.04, 0.03, 0.02, 0.01, 0.005):
-        rounds.append(AnnealingStage(scale, 0.015, 6))
-        tried = fit.solve(observations, rounds, now, expected=start)
-        if found and tried.inlier_ratios[tried.inlier_ratios > 0.0].mean() < 0.7:
-            break
-        found, now, rounds = tried, (tried.own, tried.shared), []
-    assert found is not None
-    # Covariances use a few frames and at most 1000 distances: errors of the surface are the same in
-    # all frames. They are measured at a scale at which none of the contours are outliers.
-    some = np.unique(np.linspace(0, len(observations) - 1, covariance_frames).round().astype(int))
-    coarse = AnnealingStage(0.08, 0.015)
-    masks = fit.compared_masks([observations[k] for k in some], found.parameters[some], coarse)
-    distances = distances_in_masks(body.outlines, masks, 1000)
-    turns = [name.split(".")[-1] in CAMERA_NAMES[:3] for name in fit.names[fit.own_count :]]
-    is_angle = np.concatenate([np.tile(kinematics.is_angle[free], len(some)), turns])
-    sizes = estimate_sizes(distances, is_angle, prior_deviation=SHARED.prior_deviation)
-    whole = values_covariance(distances, sizes, np.arange(len(is_angle)), is_angle)
-    X_CW, _, motions = fit.place_cameras(found.parameters[0])
-    own = np.arange(len(whole) - len(poses), len(whole)).reshape(len(searched), 6)
-    found_cameras = [replace(cameras[k], X_WC=np.linalg.inv(X_CW[k])) for k in searched]
-    covariances = [
-        pose_covariance(X_CW[k], motions[k, :6], whole[np.ix_(at, at)])
-        for k, at in zip(searched, own, strict=True)
-    ]
-    factors = np.exp(np.append(found.shared[count : count + len(parts)], 0.0)[body.groups])
-    values = found.parameters[:, : values.shape[1]]
-    return found_cameras, np.array(covariances), values, factors

@@ -20,6 +20,7 @@ from drake_pose.fit.evidence import Observation
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import BodyParameters
 from drake_pose.fit.problem import parameter_names
+from drake_pose.registration.bundle import adjust_bundle
 from drake_pose.registration.hand_eye import hand_eye_starts, rotation_spread
 from drake_pose.registration.joint_offsets import (
     describe_constants,
@@ -44,7 +45,6 @@ from drake_pose.registration.shared_fit import (
     SHARED,
     SharedFit,
     SharedValues,
-    adjust_bundle,
     scatter_factor,
 )
 from drake_pose.registration.standing_object import (

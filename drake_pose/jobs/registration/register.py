@@ -48,6 +48,7 @@ from drake_pose.jobs.registration.result import (
 )
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.person.shape import shape_parts, shape_values
+from drake_pose.registration.bundle import adjust_bundle
 from drake_pose.registration.joint_offsets import KinematicParameter, calibrate_joints
 from drake_pose.registration.picture_registration import (
     PictureRegistration,
@@ -67,7 +68,6 @@ from drake_pose.registration.register import (
     overlap_areas,
     suggest_pose,
 )
-from drake_pose.registration.shared_fit import adjust_bundle
 from drake_pose.registration.standing_object import (
     CalibrationTarget,
     TargetSearch,

@@ -110,7 +110,7 @@ def measure_cost(cameras: int, size: tuple[int, int] = (640, 480), seed: int = 0
     studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]))
     motion = make_motion(studio.skeleton, 4 * FEWEST_FRAMES, seed)
     begin = motion.names.index(MOTIONS[0])
-    track = SilhouetteTrack.build(studio.model, studio.cameras, studio.backgrounds)
+    track = SilhouetteTrack.build(studio)
     track.place(motion.q[begin])
     with one_core():
         for q in motion.q[begin : begin + _FRAMES]:

@@ -145,6 +145,7 @@ class PerFrameFit:
         )
 
     def _inlier_ratios(self, compared: Comparison, frame: MultiViewFrame) -> dict[str, float]:
+        """Return the inlier ratio of each camera that has a mask."""
         sums = zip(self.camera_names, compared.sums, strict=True)
         return {name: inlier_ratio_of(one) for name, one in sums if name in frame.masks}
 

@@ -310,6 +310,7 @@ class PictureSearch:
         return PosedFrames(self._body.kinematics, outlines, camera, posed)
 
     def _level(self, width: int) -> "PyramidLevel":
+        """Return the pyramid level of a width [pixel], made when it is first used."""
         if width not in self._levels:
             k = (width > 64) + (width > 120)
             count = PICTURES.search_frames if width < PICTURES.compare_width else len(self.frames)

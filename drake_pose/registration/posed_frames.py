@@ -103,6 +103,7 @@ class PosedFrames:
         return np.concatenate(self._corners(self.X_WN[:: max(1, len(self.X_WN) // 5)]))
 
     def _corners(self, poses: Array) -> list[Array]:
+        """Return the hull's corners (n, 3) for each of the nodes' poses (frames, nodes, 4, 4)."""
         own = [_hull_of(outline) for outline in self.outlines]
         return [
             _hull(
@@ -165,6 +166,7 @@ def reduced_sums(mask: Mask, camera: Camera) -> NDArray[np.int32]:
 
 @lru_cache(maxsize=512)
 def _hull_of(outline: Outline) -> Array:
+    """Return the corners (n, 3) of a surface's convex hull in its own frame."""
     return _hull(outline.vertices)
 
 

@@ -1,1 +1,1 @@
-"""Tests of where cameras stand."""
+"""Tests of the registration of cameras."""

@@ -1,4 +1,4 @@
-"""Drake's pictures of a small arm at known positions, from cameras anywhere."""
+"""Masks of a small arm at known joint positions, rendered by Drake."""
 
 import cv2
 import numpy as np
@@ -11,7 +11,7 @@ from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 
 def looking_at(place: np.ndarray, middle: np.ndarray, roll: float) -> PinholeCamera:
-    """A camera at a place (3,), whose picture's middle is a point (3,), turned by roll [rad]."""
+    """Return a camera at a place (3,) that looks at a point (3,), rolled about its axis [rad]."""
     z = (middle - place) / np.linalg.norm(middle - place)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)
@@ -26,7 +26,7 @@ def looking_at(place: np.ndarray, middle: np.ndarray, roll: float) -> PinholeCam
 def see(
     model: ArticulatedModel, body: RegistrationBody, camera: PinholeCamera, count: int, seed: int
 ) -> list[PosedFrame]:
-    """Drake's pictures of random poses."""
+    """Return frames with Drake's masks of random joint positions."""
     rng, kinematics = np.random.default_rng(seed), body.kinematics
     renderer = LabelRenderer(model, camera)
     frames = []
@@ -40,7 +40,7 @@ def see(
 def damaged(
     mask: np.ndarray, generator: np.random.Generator, radii: tuple[int, int] = (3, 9)
 ) -> np.ndarray:
-    """A mask grown or worn by up to two pixels, with holes of 3 % of its area."""
+    """Return a mask dilated or eroded by up to two pixels, with holes of 3 % of its area."""
     by = int(generator.integers(-2, 3))
     ball = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(by) + 1,) * 2)
     drawn = (cv2.dilate if by > 0 else cv2.erode)(mask.astype(np.uint8), ball)
@@ -52,7 +52,7 @@ def damaged(
 
 
 def errors(found: np.ndarray, true: np.ndarray) -> tuple[float, float]:
-    """How far a pose (4, 4) is off [m, rad]."""
+    """Return the errors of a pose (4, 4): translation [m] and rotation [rad]."""
     cosine = 0.5 * (np.trace(found[:3, :3].T @ true[:3, :3]) - 1.0)
     shift = float(np.linalg.norm(found[:3, 3] - true[:3, 3]))
     return shift, float(np.arccos(np.clip(cosine, -1.0, 1.0)))

@@ -1,4 +1,4 @@
-"""A small arm that stands on a plate in the world, and pictures of one that swings."""
+"""A small arm on a plate in the world, and a recording of a swinging arm."""
 
 from collections.abc import Callable
 from typing import Any
@@ -31,7 +31,7 @@ def episode(tmp_path_factory: pytest.TempPathFactory) -> PaintedEpisode:
 
 @pytest.fixture(scope="session")
 def recording(episode: PaintedEpisode) -> Callable[..., Recording]:
-    """That episode's, but for what is given."""
+    """Return a function that makes the episode's recording, with some fields replaced."""
 
     def record(**changes: Any) -> Recording:
         given = {

@@ -13,12 +13,12 @@ from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.benchmarks.registration import load_arm, write_box_arm
 
 LATE = 0.06
-"""By how much later than their times the pictures of the shared episode are [s]."""
+"""Time offset of the shared episode's pictures [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class PaintedEpisode:
-    """An arm that swings before a picture: (f, H, W, 3) at times (f,) [s], values (f, m)."""
+    """Pictures (f, H, W, 3) of a swinging arm with values (f, m) at times (f,) [s]."""
 
     path: Path
     model: ArticulatedModel
@@ -30,12 +30,12 @@ class PaintedEpisode:
     background: np.ndarray
 
     def values_at(self, times: np.ndarray) -> np.ndarray:
-        """(n, m) where the arm truly is."""
+        """Return the true values (n, m) at times (n,) [s]."""
         return swinging(np.asarray(times), self.values.shape[1])
 
 
 def swinging(times: np.ndarray, count: int) -> np.ndarray:
-    """(n, count) positions of joints that swing, each at its own rate."""
+    """Return positions (n, count) of joints that swing, each at its own rate."""
     k = np.arange(count)
     return 0.9 * np.sin(2.0 * k + (1.1 + 0.25 * k) * times[:, None]) + 0.15 * (k - 2)
 
@@ -44,7 +44,7 @@ def painted_episode(
     folder: Path, frames: int = 16, size: tuple[int, int] = (160, 120), late: float = 0.0,
     every: float = 0.4,
 ) -> PaintedEpisode:  # fmt: skip
-    """An episode, a picture every so many seconds; they show where the arm is so much later [s]."""
+    """Return an episode with a picture `every` [s], of the arm `late` [s] after its time."""
     path = write_box_arm(folder / "boxes.urdf")
     body = load_arm(path)
     width, height = size

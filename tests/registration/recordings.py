@@ -11,7 +11,7 @@ NAMES = tuple(f"joint{k}" for k in range(5))
 
 
 def write_log(path, times, values, names=NAMES):
-    """Joint positions by time (CSV)."""
+    """Write joint positions by time (CSV)."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["time", *names])
@@ -19,7 +19,7 @@ def write_log(path, times, values, names=NAMES):
 
 
 def write_episode(scene, painted):
-    """A folder of pictures with their times, a joint log at another rate, and the camera."""
+    """Write a folder of pictures with times, a joint log at another rate, and the camera."""
     images = scene / "images" / "camera"
     images.mkdir(parents=True)
     for k, picture in enumerate(painted.pictures):

@@ -1,4 +1,4 @@
-"""What contradicts the rest is named, in Drake's own pictures of an arm, damaged and changed."""
+"""Diagnosis of errors and outlier frames in Drake's masks of an arm, damaged and changed."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -38,7 +38,7 @@ def cameras() -> tuple[PinholeCamera, ...]:
 
 @pytest.fixture(scope="module")
 def poses(body: RegistrationBody) -> np.ndarray:
-    """(frames, joints) at which every joint shows: the arm neither straight nor folded up."""
+    """Joint positions (frames, joints) in which every joint is observable."""
     generator = np.random.default_rng(5)
     middle = np.radians([0.0, 50.0, 20.0, 60.0, 40.0])
     return middle + np.radians(25.0) * generator.uniform(-1.0, 1.0, (COUNT, 5))
@@ -53,16 +53,16 @@ def moved(camera: PinholeCamera, by: Sequence[float]) -> PinholeCamera:
 @pytest.mark.parametrize(
     ("shift", "kept"), [(1.0, slice(0, 4)), (2.0, slice(4, 6)), (0.0, slice(6))]
 )
-def test_the_likeliest_set_of_frames_agrees(shift: float, kept: slice) -> None:
-    """Four frames that are off alike outvote two that are right, unless that is hardly possible.
+def test_the_likeliest_set_of_inliers_is_chosen(shift: float, kept: slice) -> None:
+    """Four frames with a common error outvote two correct ones unless the error is improbable.
 
-    Frames as numbers of deviation .02; all of them together explain none of them.
+    The frames are numbers with standard deviation 0.02; their common mean explains none of them.
     """
     off = np.array([shift, shift + 0.01, shift - 0.01, shift, 0.0, 0.01])
 
     def evaluate(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         weight = 1.0 / 0.02**2
-        # Without any frame what is given is right to within a tolerance.
+        # Without frames, the given values are right to within a tolerance.
         variance = 1.0 / ((1.0 if chosen.any() else 1e4) + weight * chosen.sum())
         x = weight * off[chosen].sum() * variance
         return chi2.sf((off - x) ** 2 / (0.02**2 + variance), 1), np.array([x])
@@ -73,8 +73,8 @@ def test_the_likeliest_set_of_frames_agrees(shift: float, kept: slice) -> None:
 
 
 @pytest.mark.parametrize("ratio", [0.49, 0.51, 0.74, 0.76])
-def test_a_frame_is_explained_beside_the_best_of_its_cameras(ratio: float) -> None:
-    """Three quarters of what the best frames have, and half at least, in all its pictures."""
+def test_a_frame_is_explained_relative_to_its_cameras_best(ratio: float) -> None:
+    """At least 0.75 of the best frames' inlier ratio, and 0.5, in all its pictures."""
     best = 1.0 if ratio > 0.6 else 0.6
     ratios = [{"left": best, "right": 0.9}, {"left": best}, {"left": ratio, "right": 0.9}]
     found = explained_frames([*ratios, {"left": best, "right": 0.4}])
@@ -91,7 +91,7 @@ def test_a_frame_is_explained_beside_the_best_of_its_cameras(ratio: float) -> No
         ((0.5, 0.5), 0.3, False),
     ],
 )
-def test_half_a_pixel_along_both_axes_is_named_unless_by_chance(offset, sd, is_half) -> None:
+def test_half_a_pixel_along_both_axes_is_reported_if_significant(offset, sd, is_half) -> None:
     assert is_half_pixel(np.array(offset), sd**2 * np.eye(2)) == is_half
 
 
@@ -99,7 +99,7 @@ Frames = Sequence[tuple[np.ndarray, np.ndarray, Sequence[PinholeCamera]]]
 
 
 def seen(model: ArticulatedModel, body: RegistrationBody, frames: Frames) -> list[MultiViewFrame]:
-    """Damaged pictures of frames: the pose, the values that are given, who takes the pictures."""
+    """Return damaged masks of frames: (true pose, given values, cameras that took the pictures)."""
     generator, found = np.random.default_rng(1), []
     for k, (pose, values, taken) in enumerate(frames):
         q, X_WB = body.tree.positions_from(body.kinematics.split(pose))
@@ -118,7 +118,7 @@ def audit(
     taken: Sequence[PinholeCamera],
     told: Sequence[PinholeCamera] | None = None,
 ) -> Diagnosis:
-    """Pictures by the cameras taken, audited with the positions and cameras that are told."""
+    """Return the audit of pictures taken by some cameras, with given values and given cameras."""
     frames = seen(model, body, [(*one, taken) for one in zip(poses, given, strict=True)])
     fit = PerFrameFit(body.kinematics, (body.medium, body.full), told or taken, frames)
     return diagnose_frames(fit, [fit.fit(frame) for frame in frames])
@@ -126,7 +126,7 @@ def audit(
 
 @pytest.fixture(scope="module")
 def right(model, body, poses, cameras) -> Callable[[int], tuple[PerFrameFit, list[FrameFit]]]:
-    """Frames of so many cameras in which everything is right, fitted once."""
+    """Return a function that fits correct frames of a number of cameras, once."""
 
     @cache
     def fitted(count: int) -> tuple[PerFrameFit, list[FrameFit]]:
@@ -139,7 +139,7 @@ def right(model, body, poses, cameras) -> Callable[[int], tuple[PerFrameFit, lis
 
 @pytest.fixture
 def with_wrong(model, body, poses, right) -> Callable[..., Finding]:
-    """What is found where frame WRONG has other positions, or other cameras took its pictures."""
+    """Return the finding of frame WRONG with other values, or pictures by other cameras."""
 
     def wrong(values: np.ndarray, taken: Sequence[PinholeCamera]) -> Finding:
         fit, fits = right(len(taken))
@@ -159,7 +159,7 @@ def joint_off(poses: np.ndarray, joint: int, frames: slice, degrees: float) -> n
 
 
 class TestAuditFrames:
-    def test_nothing_is_named_where_all_is_right_and_a_joint_from_where_it_is_said_to_be(
+    def test_correct_frames_give_no_finding_and_the_minimum_detectable_offset_gives_one(
         self, model, body, poses, cameras, right
     ) -> None:
         found = diagnose_frames(*right(1))
@@ -171,42 +171,42 @@ class TestAuditFrames:
         found = audit(model, body, poses, joint_off(poses, 3, slice(None), by), cameras[:1])
         assert [(one.kind, one.name) for one in found.common] == [("joint", "elbow_turn")]
 
-    def test_a_joint_that_is_off_in_one_frame(self, poses, cameras, with_wrong) -> None:
+    def test_joint_offset_in_one_frame(self, poses, cameras, with_wrong) -> None:
         finding = with_wrong(joint_off(poses, 1, slice(None), 2.0)[WRONG], cameras[:1])
         assert (finding.kind, finding.name) == ("joint", "shoulder_turn")
-        # By what must be added to what is given.
+        # The finding's angle is the correction of the given value.
         assert np.degrees(finding.angle) == pytest.approx(-2.0, abs=0.3)
         assert abs(finding.angle - np.radians(-2.0)) < 4.0 * finding.angle_sd
 
     def test_positions_of_another_frame(self, poses, cameras, with_wrong) -> None:
         assert with_wrong(poses[WRONG + 2], cameras[:1]).pixels > 5.0
 
-    def test_a_base_that_moved_in_one_frame(self, poses, cameras, with_wrong) -> None:
-        """Both cameras see it move; none of them has."""
+    def test_base_motion_in_one_frame(self, poses, cameras, with_wrong) -> None:
+        """Both cameras see the motion, so it is not a camera's."""
         away = [moved(camera, [0.0, -0.01, 0.0]) for camera in cameras]
         finding = with_wrong(poses[WRONG], away)
         assert finding.kind == "base"
         assert finding.shift == pytest.approx(0.01, abs=0.002)
 
-    def test_a_joint_whose_zero_is_off(self, model, body, poses, cameras) -> None:
+    def test_joint_offset_in_all_frames(self, model, body, poses, cameras) -> None:
         given = joint_off(poses, 3, slice(None), -2.0)
         found = audit(model, body, poses, given, cameras[:1])
         assert found.outliers == ()
         assert [(one.kind, one.name) for one in found.common] == [("joint", "elbow_turn")]
         assert np.degrees(found.common[0].angle) == pytest.approx(2.0, abs=0.2)
 
-    def test_a_camera_that_was_moved(self, model, body, poses, cameras) -> None:
+    def test_camera_pose_error_in_all_frames(self, model, body, poses, cameras) -> None:
         for count, by in ((2, [0.0, 0.0, 0.01]), (1, [0.0, 0.01, 0.005])):
             told = [*cameras[: count - 1], moved(cameras[count - 1], by)]
             found = audit(model, body, poses, poses, cameras[:count], told)
             assert found.outliers == ()
             assert [(one.kind, one.name) for one in found.common] == [("camera", told[-1].name)]
             assert found.common[0].shift == pytest.approx(np.linalg.norm(by), abs=0.003)
-        # Seen by one camera alone it may be the base.
+        # With a single camera, the base is an alternative cause.
         assert "base" in found.common[0].alternatives
 
-    def test_lenses_that_are_told_wrongly(self, model, body, poses, cameras) -> None:
-        """Of both cameras, by what must be added to what is given."""
+    def test_intrinsics_errors_in_all_frames(self, model, body, poses, cameras) -> None:
+        """Both cameras have the same error; findings are corrections."""
         longer = [
             replace(one, focal_x=1.04 * one.focal_x, focal_y=1.04 * one.focal_y) for one in cameras
         ]
@@ -224,7 +224,7 @@ class TestAuditFrames:
         assert found.common[0].shift == pytest.approx(5.0, abs=0.7)
 
 
-def test_masks_of_another_size_and_empty_ones_are_refused(body, poses, cameras) -> None:
+def test_masks_of_wrong_size_and_empty_masks_are_refused(body, poses, cameras) -> None:
     mask, surfaces = np.ones((480, 640), bool), (body.medium, body.full)
     frame = MultiViewFrame("0007", poses[0], {"left": mask[:100]})
     with pytest.raises(MaskError, match=r"'left', frame '0007'.*640 x 480"):
@@ -238,7 +238,7 @@ def test_masks_of_another_size_and_empty_ones_are_refused(body, poses, cameras) 
 
 
 @pytest.mark.parametrize(("shift", "word"), [(0.05, "later"), (-0.05, "earlier")])
-def test_a_clock_that_is_off_is_told_in_milliseconds(shift, word):
+def test_clock_error_is_described_in_milliseconds(shift, word):
     off = Finding("clock", "left", 0.0, shift, 0.0, 0.004, 1.0, 0.0)
     assert f"camera 'left': its pictures show the joints of 50 +- 4 ms {word} by" in describe_error(
         off, "off"

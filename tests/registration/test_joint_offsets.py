@@ -1,4 +1,4 @@
-"""Zeros of encoders are found where they are off, and none where they are right."""
+"""Calibration of joint offsets and link scales."""
 
 import re
 from dataclasses import replace
@@ -21,7 +21,7 @@ NAMES = ("shoulder_turn", "roll_turn", "elbow_turn")
 
 
 def misread(frames: list[PosedFrame], zeros: np.ndarray) -> list[PosedFrame]:
-    """What encoders read whose zeros (m,) are to be added."""
+    """Return frames as encoders read them that lack offsets (m,)."""
     return [PosedFrame(one.name, one.values - zeros, one.mask) for one in frames]
 
 
@@ -36,7 +36,7 @@ def camera() -> PinholeCamera:
 
 class TestCalibrateJoints:
     @pytest.mark.parametrize("off", [np.radians([2.0, 0.0, -2.0]), np.zeros(3)])
-    def test_finds_zeros(self, model, body, camera, off: np.ndarray) -> None:
+    def test_offsets_are_estimated(self, model, body, camera, off: np.ndarray) -> None:
         zeros = np.zeros(len(body.kinematics.names))
         zeros[[body.kinematics.names.index(name) for name in NAMES]] = off
         frames = misread(see(model, body, camera, 4, 4), zeros)
@@ -52,8 +52,8 @@ class TestCalibrateJoints:
         assert turn < np.radians(0.15)
 
     @pytest.mark.slow
-    def test_cameras_share_zeros_and_lengths(self, model, body) -> None:
-        """What two cameras see is one robot: they tell its zero together, better than each."""
+    def test_cameras_share_offsets_and_link_scales(self, model, body) -> None:
+        """Two cameras together estimate a robot's offset better than each alone."""
         places = (np.array([1.6, 0.4, 0.5]), np.array([0.3, -1.6, 0.7]))
         off = np.zeros(len(body.kinematics.names))
         off[body.kinematics.names.index("elbow_turn")] = np.radians(2.0)
@@ -78,15 +78,17 @@ class TestCalibrateJoints:
             assert shift < 4e-3
             assert turn < np.radians(0.15)
 
-    def test_names_what_a_zero_cannot_be_told_from(self, model, body, camera) -> None:
-        """All that is seen of this arm hangs on its first joint."""
+    def test_an_unobservable_offset_is_listed_with_its_correlated_unknowns(
+        self, model, body, camera
+    ) -> None:
+        """All visible parts of this arm move with its first joint."""
         frames = see(model, body, camera, 3, 4)
         found = calibrate_joints(body, [known(camera)], [frames], ["turret_turn"])
         assert not found.offsets[0].determined
         assert not found.offsets[0].significant
         assert any("turn" in name or "shift" in name for name in found.offsets[0].gauge)
 
-    def test_refuses(self, model, body, camera) -> None:
+    def test_wrong_names_and_too_few_frames_are_refused(self, model, body, camera) -> None:
         frames, registered = see(model, body, camera, 1, 4), known(camera)
         with pytest.raises(UnknownNameError, match="knee"):
             calibrate_joints(body, [registered], [frames], ["knee"])
@@ -96,7 +98,7 @@ class TestCalibrateJoints:
             calibrate_joints(body, [registered], [frames], NAMES)
 
 
-def test_the_cost_bends_as_the_normal_equations_say(model, body, camera) -> None:
+def test_cost_curvature_matches_normal_equations_and_cost_differences(model, body, camera) -> None:
     frames = see(model, body, camera, 4, 4)
     seen = PosedFrames(body.kinematics, body.full, camera, frames)
     fit = SharedFit([seen], [camera.X_CW], ["elbow_turn"])
@@ -105,7 +107,7 @@ def test_the_cost_bends_as_the_normal_equations_say(model, body, camera) -> None
     bends, said = fit.cost_curvature(fit.start, by, step)
     assert said > 0.0
     assert bends == pytest.approx(said, rel=0.5)
-    # And as its own differences say, but for what was known beforehand.
+    # Second differences of the cost, without the prior.
     less, here, more = (
         fit.equations(fit.start._replace(shared=sign * by), step).cost for sign in (-1.0, 0.0, 1.0)
     )
@@ -114,10 +116,10 @@ def test_the_cost_bends_as_the_normal_equations_say(model, body, camera) -> None
 
 
 @pytest.mark.parametrize("degrees", [3.0, -3.0, 0.0, 0.4])
-def test_an_offset_that_was_not_asked_for_shows_in_what_frames_have_in_common(
+def test_a_missing_offset_is_suspected_from_common_residuals(
     model, body, camera, degrees: float
 ) -> None:
-    """The camera has followed it, and its standard deviation alone would not say why."""
+    """The camera absorbs the offset, and its standard deviation does not show that."""
     zeros = np.zeros(len(body.kinematics.names))
     zeros[body.kinematics.names.index("elbow_turn")] = np.radians(degrees)
     frames = misread(see(model, body, camera, 6, 4), zeros)

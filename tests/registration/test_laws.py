@@ -1,4 +1,4 @@
-"""Laws of the parts that a registration is made of; each is a matter of milliseconds."""
+"""Laws of the parts of a registration, each tested in milliseconds."""
 
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -70,11 +70,11 @@ def posed(model: ArticulatedModel, body: RegistrationBody) -> PosedFrames:
 
 
 def with_zero(posed: PosedFrames) -> SharedFit:
-    """A fit of a camera, its focal length and a joint's zero."""
+    """Return a fit of a camera, its focal length and a joint offset."""
     return SharedFit([posed], [posed.camera.X_CW], posed.kinematics.names[3:4], camera_unknowns=7)
 
 
-def test_what_is_known_beforehand_pulls_by_what_it_says(posed: PosedFrames) -> None:
+def test_priors_add_their_information_to_the_normal_equations(posed: PosedFrames) -> None:
     fit, free = with_zero(posed), with_zero(posed)
     free.problem.information = np.zeros_like(free.problem.information)
     shared = np.array([0.01, 0.0, -0.01, 0.002, 0.003, 0.0, 0.04, -0.03])
@@ -88,8 +88,8 @@ def test_what_is_known_beforehand_pulls_by_what_it_says(posed: PosedFrames) -> N
     assert with_prior.cost - without.cost == pytest.approx(known @ shared**2)
 
 
-def test_slopes_of_the_cost_are_those_of_the_equations(posed: PosedFrames) -> None:
-    """g is half the derivative of the cost: of a pose, the focal length, a zero and a width."""
+def test_gradient_matches_cost_differences(posed: PosedFrames) -> None:
+    """g is half the cost's derivative by pose, focal length, joint offset and boundary bias."""
     fit, own = with_zero(posed), np.zeros(2)
     at = np.array([0.02, -0.01, 0.02, 0.01, 0.01, 0.01, 0.02, 0.03])
     wide = AnnealingStage(0.2, 0.01)
@@ -103,8 +103,8 @@ def test_slopes_of_the_cost_are_those_of_the_equations(posed: PosedFrames) -> No
     assert (wider - narrower) / 1.0 == pytest.approx(float(widths.sum()), rel=0.05)
 
 
-def test_a_camera_s_covariance_is_that_of_its_moves(posed: PosedFrames) -> None:
-    """J sigma J^T, J the derivative of X_WC by POSE_NAMES."""
+def test_camera_covariance_matches_derivatives(posed: PosedFrames) -> None:
+    """It is J sigma J^T, with the derivative J of X_WC by POSE_NAMES."""
     fit = SharedFit([posed], [posed.camera.X_CW])
     at = np.array([0.1, -0.2, 0.3, 0.02, 0.03, -0.01])
     X_WC, J = fit.cameras(SharedValues(at, np.zeros(2)))[0].X_WC, np.zeros((6, 6))
@@ -117,7 +117,7 @@ def test_a_camera_s_covariance_is_that_of_its_moves(posed: PosedFrames) -> None:
     np.testing.assert_allclose(found, (J / 1e-6) @ covariance @ (J / 1e-6).T, atol=1e-4)
 
 
-def test_what_frames_share_does_not_scatter_and_what_they_do_not_does(posed: PosedFrames) -> None:
+def test_scatter_measures_disagreement_of_frames_only(posed: PosedFrames) -> None:
     fit = SharedFit([posed], [posed.camera.X_CW])
     seen, rng = fit.distances(fit.start, STEP), np.random.default_rng(3)
     sizes = estimate_sizes(seen, np.zeros(seen.X.shape[1], bool), 0.0)
@@ -129,16 +129,16 @@ def test_what_frames_share_does_not_scatter_and_what_they_do_not_does(posed: Pos
     apart = np.where(seen.pictures == seen.pictures[0], *apart.T)
     assert scatter(0.0 * apart) == 1.0
     assert scatter(apart) > 2.0
-    # Nor do their own widths, and twice as far apart is a variance of four times, but for what was
-    # known beforehand.
+    # Boundary biases and a common error do not scatter. Errors k times as large have k^2 times the
+    # variance, apart from the prior.
     widths, alike = seen.X[:, 6:] @ [3.0, -2.0], seen.X[:, :6] @ rng.normal(0.0, 0.05, 6)
     assert scatter(apart + widths + alike) == pytest.approx(scatter(apart), rel=1e-6)
     first, twice, thrice = (scatter(k * apart) for k in (1.0, 2.0, 3.0))
     assert (thrice - first) / (twice - first) == pytest.approx(8.0 / 3.0)
 
 
-def test_a_wider_mask_is_told_from_a_nearer_camera(posed: PosedFrames) -> None:
-    """The width that is found is that of the mask, whatever the camera's distance takes of it."""
+def test_boundary_bias_is_separated_from_depth(posed: PosedFrames) -> None:
+    """The estimated bias is the dilation of the mask, whatever the camera's depth absorbs."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
     frames = [
         replace(one, mask=cv2.dilate(one.mask.view(np.uint8), disc).view(bool))
@@ -150,7 +150,7 @@ def test_a_wider_mask_is_told_from_a_nearer_camera(posed: PosedFrames) -> None:
     np.testing.assert_allclose(wider - exact, 2.0, atol=0.4)
 
 
-def test_bounds_pull_along_the_derivative_of_how_far_they_are_off(posed: PosedFrames) -> None:
+def test_bound_gradient_matches_cost_differences(posed: PosedFrames) -> None:
     bound = (np.array([[200.0, 100.0], [400.0, 380.0]]), np.ones((2, 2), bool))
     X_CW = posed.camera.X_CW
     p_C = (posed.points[0] @ X_CW[:3, :3].T + X_CW[:3, 3])[None]
@@ -169,12 +169,12 @@ def test_bounds_pull_along_the_derivative_of_how_far_they_are_off(posed: PosedFr
     steps = 1e-5 * np.eye(3)
     slopes = [(cost(one) - cost(-one)) / 2e-5 for one in steps]
     np.testing.assert_allclose(g, slopes, rtol=1e-4)
-    # Of four sides three unknowns follow.
+    # Four bounds determine three unknowns.
     assert np.linalg.matrix_rank(H) == 3
 
 
-def test_a_border_that_a_silhouette_touches_bounds_nothing() -> None:
-    """Pixel (i, j) is the square around its middle; two rows are as near as none."""
+def test_sides_at_the_picture_border_are_no_bounds() -> None:
+    """Pixel (i, j) is the square around its centre; sides within two rows do not count."""
     for left, top, right, bottom in (
         (5, 6, 12, 15),
         (1, 2, 17, 17),
@@ -190,10 +190,10 @@ def test_a_border_that_a_silhouette_touches_bounds_nothing() -> None:
         assert seen.tolist() == [[left > 1, top > 1], [right < 18, bottom < 18]]
 
 
-def test_a_hand_turns_about_one_axis_or_two(
+def test_rotation_spread_about_one_axis_or_two(
     make_target: Callable[[str], CalibrationTarget],
 ) -> None:
-    """Angles between turns about known axes; frames that tell too little are refused."""
+    """Rotations about known axes; frames with too little rotation are refused."""
     z, x = (Rotation.from_rotvec(0.3 * axis).as_matrix() for axis in np.eye(3)[[2, 0]])
     np.testing.assert_allclose(
         rotation_spread(np.array([np.eye(3), z])), [0.3, 0.0, 0.0], atol=1e-9
@@ -208,17 +208,17 @@ def test_a_hand_turns_about_one_axis_or_two(
             require_rotation("eye", thing, frames)
 
 
-def test_a_body_is_placed_where_its_bounds_are_the_silhouettes(posed: PosedFrames) -> None:
+def test_positions_match_the_silhouettes_bounds(posed: PosedFrames) -> None:
     camera = posed.camera
     p_CW = positions_from_bounds(posed, camera.X_CW[None, :3, :3])[0]
     assert np.linalg.norm(p_CW - camera.X_CW[:3, 3]) < 0.03
-    # Before the camera it is whatever rotation is tried.
+    # For every rotation, the body is in front of the camera.
     R_CW = uniform_rotations(200)
     depths = (positions_from_bounds(posed, R_CW) + R_CW @ posed.middle)[:, 2]
     assert depths.min() >= 0.5 * posed.extent - 1e-9
 
 
-def test_areas_in_one_or_the_other_alone_and_in_both() -> None:
+def test_E_total_and_iou_match_pixel_counts() -> None:
     rng = np.random.default_rng(4)
     body, mask = rng.random((2, 30, 40)) < 0.4
     found = np.array([np.count_nonzero(one) for one in (body, mask, body & mask)], float)
@@ -254,7 +254,7 @@ def make_target(
 
 
 @pytest.mark.parametrize("name", LOOKS)
-def test_turns_after_which_an_object_looks_alike(
+def test_target_symmetries_are_found(
     name: str, make_target: Callable[[str], CalibrationTarget]
 ) -> None:
     _, turns, axes, apart = LOOKS[name]
@@ -267,11 +267,11 @@ def test_turns_after_which_an_object_looks_alike(
     corners = np.abs(points - thing.middle).max(axis=0)
     for X in found:
         turned = points @ X[:3, :3].T + X[:3, 3] - thing.middle
-        # About its middle, and no corner leaves the box around it.
+        # The rotation is about the target's middle, and no corner leaves the bounding box.
         assert (np.abs(turned) < corners + 0.02 * thing.radius).all()
 
 
-def test_turns_of_a_round_object_differ_where_its_axis_points_elsewhere() -> None:
+def test_motions_of_a_round_target_differ_by_the_direction_of_its_axis() -> None:
     rotvecs = np.radians([[0, 0, 0], [0, 0, 15], [30, 0, 0], [30, 0, 0], [0, 8, 0], [180, 0, 0]])
     turns = np.tile(np.eye(4), (6, 1, 1))
     turns[:, :3, :3] = Rotation.from_rotvec(rotvecs).as_matrix()
@@ -279,7 +279,7 @@ def test_turns_of_a_round_object_differ_where_its_axis_points_elsewhere() -> Non
     np.testing.assert_array_equal(round_about_z, turns[[0, 2, 4, 5]])
 
 
-def test_an_object_that_is_round_may_be_turned_about_its_axis_by_anything(
+def test_rotation_of_a_round_target_about_its_axis_is_uncertain(
     make_target: Callable[[str], CalibrationTarget],
 ) -> None:
     X_WT = looking_at(PLACE, MIDDLE, 0.4).X_WC
@@ -293,10 +293,10 @@ def test_an_object_that_is_round_may_be_turned_about_its_axis_by_anything(
     np.testing.assert_allclose(np.diag(others @ can[:3, :3] @ others.T), 1e-6, rtol=1e-3)
 
 
-def test_an_object_s_covariance_is_that_of_its_moves(
+def test_target_covariance_matches_derivatives(
     make_target: Callable[[str], CalibrationTarget],
 ) -> None:
-    """J sigma J^T, J the derivative of the pose by TARGET_POSITIONS."""
+    """It is J sigma J^T, with the derivative J of the pose by TARGET_POSITIONS."""
     thing, X_WT = make_target("box"), looking_at(PLACE, MIDDLE, 0.4).X_WC
     J = np.zeros((6, 6))
     for k in range(6):
@@ -308,7 +308,7 @@ def test_an_object_s_covariance_is_that_of_its_moves(
     np.testing.assert_allclose(thing.pose_covariance(X_WT, covariance), expected, atol=1e-4)
 
 
-def test_masks_of_another_size_and_empty_ones_are_refused(
+def test_masks_of_wrong_size_and_empty_masks_are_refused(
     body: RegistrationBody, posed: PosedFrames
 ) -> None:
     for mask in (np.ones((10, 10), bool), np.zeros((480, 640), bool)):
@@ -317,26 +317,26 @@ def test_masks_of_another_size_and_empty_ones_are_refused(
             PosedFrames(body.kinematics, body.medium, posed.camera, [frame])
 
 
-def test_poses_of_an_object_are_one_that_show_it_alike(
+def test_poses_of_a_target_are_distinct_up_to_symmetries(
     make_target: Callable[[str], CalibrationTarget],
 ) -> None:
-    """Nearer to each other than a share of its radius, or turned as its looks repeat."""
+    """Poses nearer than 0.15 of the radius, or related by a symmetry, are the same."""
     thing = make_target("box")
     search, X = TargetSearch(thing), looking_at(PLACE, MIDDLE, 0.4).X_WC
     near, far = X.copy(), X.copy()
     near[0, 3] += 0.1 * thing.radius
     far[0, 3] += 0.3 * thing.radius
-    # Turned about its middle by so much, of which its points move by about 0.8.
+    # Rotations about the target's middle by small and large angles.
     little, much = (thing.moved(X, np.array([0, 0, 0, turn, 0, 0])) for turn in (0.12, 0.4))
     poses = [one[None] for one in (X, X, near, X @ thing.symmetry[0][2], far, little, much)]
     kept = search._apart(poses, thing.symmetry[0])
     np.testing.assert_array_equal(kept, [X[None], far[None], much[None]])
 
 
-def test_a_camera_on_a_hand_and_what_it_sees_are_found_together(
+def test_hand_eye_fit_finds_camera_and_target(
     make_target: Callable[[str], CalibrationTarget],
 ) -> None:
-    """From near both, and told from other looks; a region that is none of it is not chosen."""
+    """From a start near both; a mask that does not show the target is not chosen."""
     thing = make_target("box")
     search, rng = TargetSearch(thing), np.random.default_rng(6)
     camera, still = looking_at(PLACE, MIDDLE, 0.1).resized(160, 120), np.eye(4)
@@ -368,7 +368,7 @@ def test_a_camera_on_a_hand_and_what_it_sees_are_found_together(
     found = search._fitted(fit, fit.fit([STEP] * 12), off)
     began, ended = search._misfits(camera, [[one] for one in frames], np.array([off, found]), 100.0)
     assert ended < 0.3 * began
-    # One look after a turn that shows the object alike is the same, others are not.
+    # Poses related by a symmetry of the target are the same, others are not.
     alike = np.array([true[0], true[1] @ thing.symmetry[0][1]])
     far = np.array([true[0], thing.moved(true[1], np.array([0.2, 0, 0, 0, 0, 0]))])
     np.testing.assert_array_equal(search._distinct([true, alike, far], frames), [true, far])
@@ -393,7 +393,7 @@ def shared(*values: float) -> SharedValues:
 
 
 @pytest.mark.parametrize("share", [0.99, 1.01])
-def test_an_interval_without_0_is_significant_and_a_length_s_is_that_of_its_logarithm(
+def test_significance_matches_the_interval_and_scales_have_log_intervals(
     share: float,
 ) -> None:
     covariance = np.diag([1.0, 0.01**2, 0.01**2])
@@ -408,7 +408,7 @@ def test_an_interval_without_0_is_significant_and_a_length_s_is_that_of_its_loga
     assert (zero.deviation, length.deviation) == pytest.approx((0.01, 0.01 * np.exp(value)))
 
 
-def test_what_a_constant_cannot_be_told_from_is_its_gauge() -> None:
+def test_gauge_lists_correlated_unknowns() -> None:
     by = 0.5 * SHARED.constant_deviation
     covariance = np.diag([0.01, by**2, 1e-8])
     covariance[0, 1] = covariance[1, 0] = 0.095 * by
@@ -419,8 +419,8 @@ def test_what_a_constant_cannot_be_told_from_is_its_gauge() -> None:
 
 
 @pytest.mark.parametrize("elbow", [0.02, 0.035, 0.06])
-def test_constants_are_significant_beside_those_that_are_held(elbow: float) -> None:
-    """Backward elimination, against the conditional normal distribution by its information."""
+def test_significant_constants_match_conditional_distributions(elbow: float) -> None:
+    """Backward elimination equals conditioning of the normal distribution on constants at 0."""
     x, limit = np.array([elbow, 0.045]), 3.0
     C = np.array([[1.0, 0.8], [0.8, 1.0]]) * 0.01**2
     covariance = np.zeros((3, 3))
@@ -438,9 +438,7 @@ def test_constants_are_significant_beside_those_that_are_held(elbow: float) -> N
 
 
 @pytest.mark.parametrize(("share", "times"), [(1.0, 1.0), (2.0, 1.0), (0.25, 4.0)])
-def test_what_bends_the_cost_less_than_it_should_is_as_much_less_sure(
-    share: float, times: float
-) -> None:
+def test_too_little_cost_curvature_enlarges_the_covariance(share: float, times: float) -> None:
     rng = np.random.default_rng(1)
     covariance = np.cov(rng.normal(size=(3, 9)))
     asked: list[np.ndarray] = []
@@ -454,7 +452,7 @@ def test_what_bends_the_cost_less_than_it_should_is_as_much_less_sure(
     )
     found = widen_to_cost_curvature(fit, shared(0, 0, 0), np.ones(1, bool), covariance)
     assert found[2, 2] == pytest.approx(times * covariance[2, 2])
-    # Along what goes with it; across it nothing changes.
+    # The covariance grows along the constant's correlated direction only.
     (along,) = asked
     assert along[2] ** 2 == pytest.approx(4.0 * covariance[2, 2])
     across = np.linalg.svd(along[None])[2][1:]
@@ -462,15 +460,15 @@ def test_what_bends_the_cost_less_than_it_should_is_as_much_less_sure(
 
 
 def random_poses(rng: np.random.Generator, count: int, turn: float = 1.0) -> np.ndarray:
-    """(count, 4, 4)."""
+    """Return random poses (count, 4, 4)."""
     X = np.tile(np.eye(4), (count, 1, 1))
     X[:, :3, :3] = Rotation.from_rotvec(rng.normal(0.0, turn, (count, 3))).as_matrix()
     X[:, :3, 3] = rng.normal(0.0, 0.5, (count, 3))
     return X
 
 
-def test_three_pictures_tell_camera_and_object() -> None:
-    """A X = X B exactly, however the object looks alike, beside poses that are wrong."""
+def test_hand_eye_starts_solve_AX_XB_exactly() -> None:
+    """With symmetric and wrong candidate poses of the target beside the true ones."""
     rng = np.random.default_rng(2)
     X_WL, (X_LC, X_WT) = random_poses(rng, 4), random_poses(rng, 2)
     half = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -480,12 +478,12 @@ def test_three_pictures_tell_camera_and_object() -> None:
     off = np.abs(found[:, 0] - X_LC).max(axis=(1, 2))
     best = found[off.argmin()]
     np.testing.assert_allclose(best[0], X_LC, atol=1e-9)
-    # Which of its looks the object has nobody knows.
+    # The target's pose is known up to its symmetry.
     assert min(np.abs(best[1] - X_WT @ turn).max() for turn in (np.eye(4), half)) < 1e-9
 
 
-def test_a_bundle_finds_poses_and_a_camera_together(body: RegistrationBody) -> None:
-    """From positions that are off, and a camera that stands elsewhere; another one holds both."""
+def test_bundle_adjustment_corrects_camera_and_positions(body: RegistrationBody) -> None:
+    """From wrong positions and a wrong camera; another camera with a known pose fixes the world."""
     cameras = [replace(one, name=n) for one, n in zip(arm_cameras(), ("a", "b"), strict=True)]
     rng, kinematics, frames = np.random.default_rng(3), body.kinematics, []
     true = rng.uniform(-0.8, 0.8, (3, len(kinematics.names)))
@@ -509,7 +507,7 @@ def test_a_bundle_finds_poses_and_a_camera_together(body: RegistrationBody) -> N
     assert off @ np.linalg.solve(covariance, off) < 22.5
 
 
-def test_edges_are_as_fine_as_they_are_asked_for_and_a_pixel_at_most(posed: PosedFrames) -> None:
+def test_edge_points_have_the_requested_spacing_but_at_least_a_pixel(posed: PosedFrames) -> None:
     mask, camera = posed.frames[0].mask, posed.camera
     frame = MultiViewFrame("0", posed.frames[0].values, {camera.name: mask})
     counts = [len(frame.edges([camera], spacing).uv) for spacing in (0.2, 1.0, 2.0, 6.0)]
@@ -521,7 +519,7 @@ def test_edges_are_as_fine_as_they_are_asked_for_and_a_pixel_at_most(posed: Pose
 def per_frame(
     body: RegistrationBody, posed: PosedFrames
 ) -> tuple[PerFrameFit, list[MultiViewFrame]]:
-    """Of a pinhole and of a parallel camera at its place, and frames of the former."""
+    """A fit with a pinhole camera and a parallel camera at its pose, and frames of the former."""
     camera = posed.camera
     flat = ParallelCamera("flat", 640, 480, 300.0, camera.center_x, camera.center_y, camera.X_WC)
     frames = [MultiViewFrame(one.name, one.values, {"eye": one.mask}) for one in posed.frames]
@@ -530,7 +528,7 @@ def per_frame(
 
 
 @pytest.mark.parametrize("wider", [-2, 1, 2])
-def test_masks_are_as_much_wider_as_they_were_made(per_frame, body, wider: int) -> None:
+def test_boundary_bias_matches_dilation_and_erosion(per_frame, body, wider: int) -> None:
     fit, (frame, *_) = per_frame
     posed_body = body.kinematics, body.medium
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(wider) + 1,) * 2)
@@ -547,8 +545,8 @@ def test_masks_are_as_much_wider_as_they_were_made(per_frame, body, wider: int) 
     assert widths[1] - widths[0] == pytest.approx(wider, abs=0.35)
 
 
-def test_cameras_that_move_like_a_pixel_or_a_longer_lens_see_that(per_frame) -> None:
-    """Principal points and focal lengths told as motions, against projections."""
+def test_intrinsics_jacobians_match_projections(per_frame) -> None:
+    """Changes of principal point and focal length are expressed as motions of the body."""
     fit, _ = per_frame
     for k, camera in enumerate(fit.cameras):
         still = camera.with_pose(np.eye(4))
@@ -573,14 +571,12 @@ def test_cameras_that_move_like_a_pixel_or_a_longer_lens_see_that(per_frame) -> 
 @pytest.mark.parametrize(
     ("size", "least", "most"), [(0.0, 0.0, 0.3), (0.01, 0.3, 0.8), (0.15, 0.9, 1.05)]
 )
-def test_offsets_and_the_camera_that_goes_with_them_come_nearer_by_their_size(
-    size: float, least: float, most: float
-) -> None:
-    """Monte Carlo: mean squared errors over those of the fit, of six offsets and of a pose."""
+def test_shrinkage_reduces_the_mean_squared_error(size: float, least: float, most: float) -> None:
+    """Monte Carlo, against the unshrunk errors of six offsets and of a pose."""
     rng, names = np.random.default_rng(2), tuple("abcdef")
     kinematics = SimpleNamespace(names=names, is_angle=np.ones(6, bool))
     fit = SimpleNamespace(names=("pose", *names), views=[SimpleNamespace(kinematics=kinematics)])
-    # The pose takes up what the first offset errs by.
+    # The pose absorbs the error of the first offset.
     A = np.diag([0.002, *([0.01] * 6)])
     A[0, 1] = -0.02
     errors = []
@@ -594,8 +590,8 @@ def test_offsets_and_the_camera_that_goes_with_them_come_nearer_by_their_size(
         assert least <= ratio < most
 
 
-def test_a_first_joint_is_as_unsure_as_pictures_of_still_parts() -> None:
-    """The variance of it and of the camera that goes with it grows by the factor's square."""
+def test_still_factor_enlarges_constants_correlated_with_a_camera() -> None:
+    """The variances of the constant and of the camera grow by the factor's square."""
     fit = SimpleNamespace(names=("eye.turn_y", "base", "elbow"), constants=("base", "elbow"))
     A = np.array([[1.0, 0.1, 0.0], [1.0, 0.0, 0.0], [0.2, 0.0, 1.0]])
     covariance = A @ A.T

@@ -1,4 +1,4 @@
-"""Which frames are kept, when the camera is searched for, and when it is said to have moved."""
+"""Keyframes, searches and motions of a camera that is registered online."""
 
 import copy
 from collections.abc import Sequence
@@ -25,10 +25,10 @@ from tests.registration.test_register import looking_at
 
 NOT_REGISTERED, REGISTERED, CONTRADICTED = CameraStatus
 SEEN = np.ones((480, 640), dtype=bool)
-# Each: the turn of a joint; the body's points are elsewhere in all of them.
+# Positions of the first joint; the body's pose differs in all of them.
 TURNS = np.radians([-140.0, -100.0, -60.0, -20.0, 20.0, 60.0, 100.0, 140.0])
 
-# Where the camera stands [m].
+# Positions of the camera along x [m].
 PLACES = {"here": 1.6, "a little off": 1.62, "there": 2.0}
 
 
@@ -37,7 +37,7 @@ def camera_at(x: float) -> PinholeCamera:
 
 
 class ScriptedSearch:
-    """In place of a search: a frame's name says where the camera stood, most frames are right."""
+    """Fake search: a frame's name says where its camera was, and most frames are inliers."""
 
     def __init__(self) -> None:
         self.searches = self.refinements = 0
@@ -86,14 +86,14 @@ def online(body: RegistrationBody, search: ScriptedSearch) -> OnlineRegistration
 
 
 def frame(place: str, turn: float) -> PosedFrame:
-    """A frame of a camera at a place; the arm is bent so that its first joint moves it."""
+    """Return a frame of a camera at a place; the arm is bent, so that its first joint moves it."""
     return PosedFrame(place, np.array([turn, 1.0, 0.3, 1.2, 0.2]), SEEN)
 
 
 def follow(
     online: OnlineRegistration, state: OnlineState, frames: Sequence[PosedFrame]
 ) -> tuple[OnlineState, list[int]]:
-    """What is known after some frames, and the status after each."""
+    """Return the state after some frames, and the status after each."""
     statuses = []
     for one in frames:
         state = online.next(state, one)
@@ -102,7 +102,7 @@ def follow(
 
 
 def registered_at(state: OnlineState, x: float) -> bool:
-    """Whether the camera is known to stand where ``camera_at`` puts it."""
+    """Return whether the registered camera is at ``camera_at(x)``."""
     return state.registered is not None and np.allclose(
         state.registered.camera.X_WC, camera_at(x).X_WC
     )
@@ -113,11 +113,13 @@ def names(state: OnlineState) -> set[str]:
 
 
 class TestKeyframes:
-    def test_searches_once_there_are_enough_and_keeps_the_newest(self, online, search) -> None:
+    def test_the_camera_is_searched_with_enough_keyframes_and_the_newest_are_kept(
+        self, online, search
+    ) -> None:
         frames = [frame("here", t) for t in TURNS]
         state, statuses = follow(online, OnlineState(), frames[:3])
         assert statuses == [NOT_REGISTERED] * 3
-        # The same again is no new evidence, and an empty mask none at all.
+        # A repeated pose of the body and an empty mask are no new information.
         state, _ = follow(online, state, [frame("here", TURNS[1] + 0.01)] * 5)
         empty = PosedFrame("empty", np.zeros(5), np.zeros((480, 640), dtype=bool))
         assert online.next(state, empty) is state
@@ -138,10 +140,10 @@ class TestKeyframes:
         _, statuses = follow(online, state, [frame("here", TURNS[5])])
         assert statuses == [REGISTERED]
 
-    def test_frames_that_nothing_explains_register_nothing_and_are_not_kept(self, online) -> None:
+    def test_unexplained_frames_do_not_register_a_camera_and_are_not_kept(self, online) -> None:
         state, statuses = follow(online, OnlineState(), [frame("nowhere", t) for t in TURNS])
         assert set(statuses) == {NOT_REGISTERED}
-        # So that good ones find room.
+        # The number of keyframes stays bounded.
         assert len(state.keyframes) == 6
         frames = [frame("here", t) for t in TURNS[:4]]
         frames.insert(1, frame("nowhere", TURNS[5]))
@@ -159,23 +161,23 @@ class TestMovedCamera:
     def known(self, online: OnlineRegistration) -> OnlineState:
         return follow(online, OnlineState(), [frame("here", t) for t in TURNS[:5]])[0]
 
-    def test_is_found_where_frames_contradict_and_agree(self, online, search, known) -> None:
+    def test_is_found_when_outliers_agree_with_each_other(self, online, search, known) -> None:
         state, statuses = follow(online, known, [frame("there", t) for t in TURNS[4:]])
-        # Three tell that the pose is wrong, four that the camera is there.
+        # Three outliers contradict the pose, the fourth determines the new one.
         assert statuses == [REGISTERED, REGISTERED, CONTRADICTED, REGISTERED]
         assert (search.searches, state.moves) == (2, 1)
         assert registered_at(state, 2.0)
         assert names(state) == {"there"}
 
-    def test_is_noticed_while_the_body_stands_still(self, online, search, known) -> None:
+    def test_is_noticed_while_the_body_does_not_move(self, online, search, known) -> None:
         before = search.refinements
         _, statuses = follow(online, known, [frame("there", TURNS[4])] * 6)
         assert statuses == [REGISTERED] * 2 + [CONTRADICTED] * 4
-        # One pose of the body, however often it is seen, does not tell where the camera is: each
-        # picture is compared with those before, and no more.
+        # One pose of the body does not determine the camera: each frame is only compared with
+        # earlier ones.
         assert (search.searches, search.refinements - before) == (1, 6)
 
-    def test_hidden_frames_do_not_move_it(self, online, known) -> None:
+    def test_occluded_frames_are_no_motion(self, online, known) -> None:
         state, statuses = follow(online, known, [frame("nowhere", t) for t in TURNS])
         assert statuses == [REGISTERED] * 2 + [CONTRADICTED] * 6
         assert state.registered is known.registered
@@ -183,15 +185,13 @@ class TestMovedCamera:
         assert statuses == [REGISTERED]
         assert (state.moves, state.outlier_frames) == (0, ())
 
-    def test_a_pose_that_is_not_known_well_is_corrected_and_has_not_moved(
-        self, online, search, known
-    ) -> None:
+    def test_an_uncertain_pose_is_corrected_without_a_motion(self, online, search, known) -> None:
         search.deviation = 0.3
         state, statuses = follow(online, known, [frame("there", t) for t in TURNS[4:]])
         assert (statuses[-1], state.moves) == (REGISTERED, 0)
         assert registered_at(state, 2.0)
 
-    def test_a_few_wrong_frames_are_left_out(self, online, known) -> None:
+    def test_a_few_outlier_frames_are_ignored(self, online, known) -> None:
         places = ["here", "nowhere", "here", "nowhere", "nowhere", "here"]
         turns = np.resize(TURNS[5:], len(places))
         frames = [frame(place, t) for place, t in zip(places, turns, strict=True)]
@@ -200,20 +200,20 @@ class TestMovedCamera:
         assert state.moves == 0
         assert "nowhere" not in names(state)
 
-    def test_a_small_move_is_found_by_the_newest_frames_alone(self, online, known) -> None:
+    def test_a_small_motion_is_found_from_the_newest_keyframes(self, online, known) -> None:
         state, statuses = follow(online, known, [frame("a little off", t) for t in TURNS[5:]])
         assert set(statuses) == {REGISTERED}
         assert state.moves == 1
         assert [one.name for one in state.keyframes] == ["a little off"] * 3
         assert registered_at(state, 1.62)
-        # Where poses have differed as much before, it is none.
+        # Poses that differed as much before are no motion.
         restless = replace(known, distances=(5000.0,) * 12)
         state, _ = follow(online, restless, [frame("a little off", t) for t in TURNS[5:]])
         assert state.moves == 0
 
 
 def bumped(camera: PinholeCamera, degrees: float, metres: float) -> PinholeCamera:
-    """A camera that is turned and shifted."""
+    """Return a camera that is rotated and shifted."""
     X_WC = camera.X_WC.copy()
     axis = np.array([0.48, -0.6, 0.64])
     X_WC[:3, :3] = Rotation.from_rotvec(np.radians(degrees) * axis).as_matrix() @ X_WC[:3, :3]
@@ -223,10 +223,10 @@ def bumped(camera: PinholeCamera, degrees: float, metres: float) -> PinholeCamer
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("degrees", "metres"), [(0.4, 0.006), (6.0, 0.08)])
-def test_a_bumped_camera_is_found_again(
+def test_a_bumped_camera_is_registered_again(
     model: ArticulatedModel, body: RegistrationBody, degrees: float, metres: float
 ) -> None:
-    """From Drake's own pictures of an arm that moves on; small and large bumps."""
+    """With Drake's masks of a moving arm, and small and large bumps."""
     rng, kinematics = np.random.default_rng(11), body.kinematics
     before = camera_at(1.6)
     cameras = [before] * 10 + [bumped(before, degrees, metres)] * 7

@@ -1,4 +1,4 @@
-"""Cameras from pictures alone, of an arm of boxes painted over Drake's label images."""
+"""Cameras registered from pictures alone, of an arm of boxes painted over Drake's label images."""
 
 from contextlib import nullcontext
 from dataclasses import replace
@@ -48,8 +48,8 @@ def level(episode: PaintedEpisode) -> PyramidLevel:
     return PyramidLevel(episode.body.coarse, episode.camera, pictures, X_WN, 80)
 
 
-def test_starts_show_a_body_where_pictures_change_and_about_as_large(level: PyramidLevel) -> None:
-    """Against the moments of what changes; then some of the starts are nearer, or aside."""
+def test_starts_show_the_body_where_pictures_change(level: PyramidLevel) -> None:
+    """Positions and sizes match the moments of the changes, with the intended variation."""
     starts = np.array(level.starts()).reshape(3, 2, -1, 4, 4)
     moments = cv2.moments(level.backgrounds.changed_frames())
     middle = np.array([moments["m10"], moments["m01"]]) / moments["m00"]
@@ -60,7 +60,7 @@ def test_starts_show_a_body_where_pictures_change_and_about_as_large(level: Pyra
     aside = (uv[:, 1] - middle) / spread
     np.testing.assert_allclose(aside.mean(axis=1), 0.0, atol=0.05)
     np.testing.assert_allclose(aside.std(axis=1), 0.5, atol=0.05)
-    # As if all of it were equally far, a body is as large as what changes.
+    # At a single depth, the body is as large as the changes.
     points = level._points - level._middle
     sizes = np.array(
         [np.sqrt(((points @ X[:2, :3].T) ** 2).sum(axis=1).mean()) for X in starts[0, 0]]
@@ -68,12 +68,12 @@ def test_starts_show_a_body_where_pictures_change_and_about_as_large(level: Pyra
     for times, depths in zip((0.7, 1.0, 1.5), p_C[:, 0, :, 2], strict=True):
         seen = level.camera.focal_x * sizes / depths / spread
         assert np.median(seen) == pytest.approx(1.0 / times, rel=0.03)
-        # It is farther away only where it would be about the camera.
+        # It is farther away only where it would surround the camera.
         assert seen.max() < 1.05 / times
     assert (np.einsum("...j,pj->...p", starts[:, 0, :, 2, :3], points) + p_C[:, 0, :, 2:]).min() > 0
 
 
-def test_upright_cameras_are_rolled_a_little_and_look_all_around() -> None:
+def test_upright_rotations_have_small_roll_and_all_headings() -> None:
     R_CW = upright_rotations(1000)
     np.testing.assert_allclose(np.linalg.det(R_CW), 1.0)
     np.testing.assert_allclose(
@@ -83,12 +83,12 @@ def test_upright_cameras_are_rolled_a_little_and_look_all_around() -> None:
     rolls = np.arctan2(right[:, 2], -down[:, 2])
     assert rolls.std() == pytest.approx(0.15, rel=0.1)
     assert (forward[:, 2].min(), forward[:, 2].max()) == pytest.approx((-0.98, 0.5))
-    # Each eighth of all headings has its share.
+    # Every octant of headings is covered evenly.
     headings = np.arctan2(forward[:, 1], forward[:, 0])
     np.testing.assert_allclose(np.histogram(headings, 8, (-np.pi, np.pi))[0], 125, atol=3)
 
 
-def test_a_simplex_moves_turn_shift_and_depth_of_a_body_apart(level: PyramidLevel, episode) -> None:
+def test_moved_poses_separate_rotation_shift_and_depth(level: PyramidLevel, episode) -> None:
     X_CW, x = episode.camera.X_CW, np.array([0.3, -0.2, 0.5, 0.04, -0.07, 0.2])
     moved = level._moved(X_CW, x)
     before, after = (X[:3, :3] @ level._middle + X[:3, 3] for X in (X_CW, moved))
@@ -98,9 +98,7 @@ def test_a_simplex_moves_turn_shift_and_depth_of_a_body_apart(level: PyramidLeve
     np.testing.assert_allclose(turn, x[:3])
 
 
-def test_poses_that_improve_explain_more_and_the_true_one_most(
-    level: PyramidLevel, episode
-) -> None:
+def test_score_increases_towards_the_true_pose(level: PyramidLevel, episode) -> None:
     true = episode.camera.X_CW
     aside = level._moved(true, np.array([0.06, -0.05, 0.04, 0.02, -0.02, 0.03]))
     poses = [aside, true, *level.starts()[::1200]]
@@ -112,7 +110,7 @@ def test_poses_that_improve_explain_more_and_the_true_one_most(
     best = level.best(poses, LEVEL_FRAMES, 0.4)
     assert len(best) == np.ceil(0.4 * len(poses))
     assert [level.score(X) for X in best] == sorted(scores, reverse=True)[: len(best)]
-    # Fewer frames have as much less that could be explained; a share of all is at most that.
+    # The possible gain is proportional to the number of frames; an explained fraction is at most 1.
     assert level.score(true, 3) == pytest.approx(scores[1], rel=0.3)
     share, contour = level.explained(true)
     assert 0.5 < share < 1.0
@@ -122,11 +120,11 @@ def test_poses_that_improve_explain_more_and_the_true_one_most(
     assert contour == pytest.approx(told[Explained.CONTOUR] / told[Explained.OUTLINE])
 
 
-def test_what_a_pose_explains_is_told_apart_by_squares(level: PyramidLevel, episode) -> None:
+def test_tile_gains_sum_to_the_gain(level: PyramidLevel, episode) -> None:
     X_CW = episode.camera.X_CW
     pieces = level.tile_gains(X_CW)
     assert pieces.sum() == pytest.approx(level.statistics(X_CW)[Explained.GAIN])
-    # 80 by 60 pixels, in squares of 5.
+    # 80 x 60 pixels, in tiles of 5.
     assert pieces.shape == (16, 16)
     assert (pieces[12:] == 0.0).all()
     v, u = np.unravel_index(pieces.argmax(), pieces.shape)
@@ -134,7 +132,7 @@ def test_what_a_pose_explains_is_told_apart_by_squares(level: PyramidLevel, epis
     assert covered.mean() > level.backgrounds.changed_frames().mean()
 
 
-def test_poses_are_distinct_that_show_a_body_elsewhere(level: PyramidLevel, episode) -> None:
+def test_distinct_poses_are_apart(level: PyramidLevel, episode) -> None:
     rng = np.random.default_rng(5)
     true = episode.camera.X_CW
     poses = [level._moved(true, rng.normal(0.0, 0.03, 6)) for _ in range(30)]
@@ -153,16 +151,16 @@ def test_poses_are_distinct_that_show_a_body_elsewhere(level: PyramidLevel, epis
     np.testing.assert_array_equal(level.distinct(poses, 3), expected[:3])
 
 
-def test_slow_frames_carry_a_search_and_the_fastest_are_beside_them(episode, recording) -> None:
+def test_search_frames_are_slow_and_the_fastest_are_added(episode, recording) -> None:
     given = recording()
     chosen, moving = choose_pictures(episode.body, episode.camera, given, 5)
     assert not set(chosen) & set(moving)
     X = [node_places(episode.body, episode.values_at(given.times + by)) for by in (1e-3, -1e-3)]
     order = np.linalg.norm(X[0] - X[1], axis=2).mean(axis=1).argsort()
-    # Of 16: the slower six tenths; the eight that move most, but for those.
+    # Of 16 frames: the slowest 60 %; the eight fastest, without these.
     assert set(chosen) <= set(order[:10].tolist())
     assert set(moving) == set(order[-8:].tolist()) - set(chosen)
-    # Those without joints are never chosen; nor is any fast without times.
+    # Frames without joints are never chosen, and without times no fast ones.
     unknown = order[[0, -1]]
 
     def values_at(offset: float) -> np.ndarray:
@@ -177,7 +175,7 @@ def test_slow_frames_carry_a_search_and_the_fastest_are_beside_them(episode, rec
     assert (sorted(still[0]), still[1]) == (list(range(16)), [])
 
 
-def test_a_recording_s_clock_and_zeros(episode, recording) -> None:
+def test_recording_with_drift_and_offsets(episode, recording) -> None:
     given: Recording = recording()
     drifting = given.with_drift(0.1, 2.0)
     at = 1.1 * given.times - 0.2
@@ -194,13 +192,13 @@ def test_a_recording_s_clock_and_zeros(episode, recording) -> None:
     np.testing.assert_allclose(poses[1].values, episode.values_at(given.times + 0.2)[1])
 
 
-def test_a_clock_is_told_by_what_its_offsets_explain(episode, recording) -> None:
+def test_time_offset_is_scanned(episode, recording) -> None:
     clock = scan_time_offsets(episode.body, episode.camera, recording(), range(0, 16, 2))
     offset, scores = clock.value, clock.scores
     assert (offset, clock.drift) == (pytest.approx(LATE, abs=0.012), 0.0)
     assert scores[:, 1].max() == 1.0
     assert scores[scores[:, 1].argmax(), 0] == pytest.approx(LATE, abs=0.0126)
-    # Those before the log begins are not tried.
+    # Offsets before the log begins are not scanned.
     assert scores[0, 0] == -1.0
 
     def logged(by: float | np.ndarray) -> np.ndarray:
@@ -215,10 +213,8 @@ def test_a_clock_is_told_by_what_its_offsets_explain(episode, recording) -> None
 
 
 @pytest.mark.parametrize("rate", [0.1, -0.15])
-def test_a_rate_that_is_far_off_is_told_with_the_offset_of_the_middle(
-    episode, recording, rate
-) -> None:
-    """A log whose clock runs that much faster than the pictures', both from the first picture."""
+def test_drift_is_scanned_with_the_offset_at_the_mean_time(episode, recording, rate) -> None:
+    """The log's clock is faster by a rate, and both start with the first picture."""
     first = episode.times[0]
 
     def logged(offset: float) -> np.ndarray:
@@ -232,8 +228,8 @@ def test_a_rate_that_is_far_off_is_told_with_the_offset_of_the_middle(
     assert told.value == pytest.approx(rate * middle, abs=0.051)
 
 
-def test_a_search_ends_about_where_the_camera_is(episode) -> None:
-    """With fewer starts and rounds than usual; and fitted on lines the best of it is very near."""
+def test_search_and_coarse_fit_approach_the_camera(episode) -> None:
+    """With fewer starts and rounds than usual."""
     shown = range(0, 16, 2)
     frames = [PosedPicture(f"{k}", episode.values[k], episode.pictures[k]) for k in shown]
     search = PictureSearch(episode.body, episode.camera.with_pose(np.eye(4)), frames)
@@ -250,11 +246,11 @@ def test_a_search_ends_about_where_the_camera_is(episode) -> None:
     assert turn < np.radians(0.5)
     assert told == search.compared.explained(camera.X_CW)
     assert evidence(*told) == pytest.approx(told[0] + 4.0 * told[1])
-    # A body that leaves the pictures is not fitted.
+    # A body outside the pictures is not fitted.
     assert search.coarse_fit(np.diag([-1.0, 1.0, -1.0, 1.0]) @ found[0]) is None
 
 
-def test_parts_that_are_small_or_stand_still_do_not_carry_a_search(episode) -> None:
+def test_small_and_static_nodes_are_left_out(episode) -> None:
     frames = [PosedPicture(f"{k}", episode.values[k], episode.pictures[k]) for k in range(6)]
     search = PictureSearch(episode.body, episode.camera, frames)
     assert search.compared.camera.width == 160
@@ -263,7 +259,7 @@ def test_parts_that_are_small_or_stand_still_do_not_carry_a_search(episode) -> N
     radii = np.array([one.ball[3] for one in episode.body.coarse])
     assert shown[1] == shown[2] == (radii > 0).tolist()
     assert shown[0] == (radii >= 0.25 * radii.max()).tolist()
-    # What moves by less than six hundredths of the body's size stands still.
+    # A node that moves by less than 0.06 of the body's size is static.
     outlines, counts = episode.body.coarse, set()
     for share in np.geomspace(0.02, 0.3, 8):
         values = episode.values[:6].mean(axis=0)
@@ -284,7 +280,7 @@ def test_parts_that_are_small_or_stand_still_do_not_carry_a_search(episode) -> N
 
 @pytest.fixture(scope="module")
 def registered(episode, recording) -> PictureRegistration:
-    """From a camera turned by a degree, and a clock that is off by ten milliseconds."""
+    """From a camera rotated by a degree, and a time offset wrong by ten milliseconds."""
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_rotvec(np.radians([0.5, -0.6, 0.6])).as_matrix()
     near = episode.camera.with_pose(turn @ episode.camera.X_WC)
@@ -292,7 +288,7 @@ def registered(episode, recording) -> PictureRegistration:
     return fit_pictures(episode.body, start, recording())
 
 
-def test_a_clock_is_fitted_with_a_camera_and_told_as_surely_as_it_is(registered, episode) -> None:
+def test_time_offset_and_camera_are_fitted_within_their_deviations(registered, episode) -> None:
     shift, turn = errors(registered.found.camera.X_WC, episode.camera.X_WC)
     assert shift < 0.008
     assert turn < np.radians(0.3)
@@ -302,15 +298,15 @@ def test_a_clock_is_fitted_with_a_camera_and_told_as_surely_as_it_is(registered,
     assert clock.deviation < 0.003
     assert clock.drift == 0.0
     assert all(one.is_inlier for one in registered.found.frames)
-    # Masks and log-odds are those of the joints' values before the last step.
+    # Masks and log-odds belong to the joint values before the last step.
     values = episode.values_at(episode.times[::3] + LATE - 0.01)
     np.testing.assert_allclose([one.values for one in registered.frames], values)
     np.testing.assert_array_equal(registered.pictures["0003"], episode.pictures[3])
     assert registered.focal_deviation == 0.0
 
 
-def test_pictures_are_judged_by_where_the_others_show_a_body(registered, episode) -> None:
-    """One without it, and one of another moment; the rest agrees, with masks of where it is."""
+def test_pictures_are_evaluated_with_the_registered_camera(registered, episode) -> None:
+    """A picture without the body is lost, one of another frame an outlier; the rest are inliers."""
     pictures = [*episode.pictures]
     pictures[5], pictures[9] = episode.background.astype(np.uint8), pictures[2]
     zeros = np.arange(5.0)
@@ -331,7 +327,7 @@ def test_pictures_are_judged_by_where_the_others_show_a_body(registered, episode
     for frame in frames:
         np.testing.assert_allclose(frame.values, expected[frame.name], atol=0.01)
         assert frame.foreground is None
-    # Nothing is asked of pictures that should not show it.
+    # Pictures that should not show the body are skipped.
     away = np.eye(4)
     away[:3, :3] = np.diag([-1.0, 1.0, -1.0])
     behind = registered.found.camera.with_pose(registered.found.camera.X_WC @ away)
@@ -340,19 +336,19 @@ def test_pictures_are_judged_by_where_the_others_show_a_body(registered, episode
 
 
 @pytest.mark.parametrize(("count", "of", "enough"), [(3, 4, False), (4, 8, True), (4, 9, False)])
-def test_a_target_is_seen_in_four_pictures_and_half_of_them(count, of, enough) -> None:
+def test_a_target_must_be_detected_in_four_pictures_and_half_of_them(count, of, enough) -> None:
     with nullcontext() if enough else pytest.raises(RegistrationError, match=f"{count} of {of}"):
         require_detections("hand", count, of)
 
 
 def near(camera, degrees=2.0):
-    """The camera turned a little about the arm."""
+    """Return a camera that is rotated a little about the arm."""
     X = np.eye(4)
     X[:3, :3] = Rotation.from_rotvec(np.radians(degrees) * np.array([0.5, -0.6, 0.6])).as_matrix()
     return camera.with_pose(X @ camera.X_WC)
 
 
-def test_frames_differ_most_that_are_chosen(episode):
+def test_chosen_frames_are_the_most_dissimilar(episode):
     places = node_places(episode.body, episode.values)
     chosen = choose_frames(places, 4)
     assert len(set(chosen)) == 4
@@ -362,9 +358,9 @@ def test_frames_differ_most_that_are_chosen(episode):
         assert nearest[chosen[k]] == nearest.max()
 
 
-def test_a_drift_and_a_focal_length_are_fitted_on_lines(episode, recording):
+def test_drift_and_focal_length_are_fitted(episode, recording):
     rates = recording().rates_at(0.0)
-    # A clock that drifts is told by how offsets grow.
+    # The slope of the time offset is the drift.
     later = episode.times[:12] - episode.times[:12].mean()
     drifting = episode.values_at(episode.times[:12] + LATE - 0.005 * later)
 
@@ -378,7 +374,7 @@ def test_a_drift_and_a_focal_length_are_fitted_on_lines(episode, recording):
     drift, deviation = fitted.fit.fit_slope(fitted.found, TIME_OFFSET, later, every, covariance)
     assert drift == pytest.approx(0.005, abs=0.002)
     assert 0.0 < deviation < 0.004
-    # The wrong focal length is told, too.
+    # A wrong focal length is corrected.
     wide = replace(episode.camera, focal_x=1.04 * episode.camera.focal_x,
                    focal_y=1.04 * episode.camera.focal_y)  # fmt: skip
     values = episode.values_at(episode.times + LATE - 0.015)
@@ -396,13 +392,13 @@ def test_a_drift_and_a_focal_length_are_fitted_on_lines(episode, recording):
         ({"values_at": lambda offset: np.zeros((16, 5))}, "hardly moves, by 0 mm"),
     ],
 )
-def test_what_tells_nothing_is_refused_before_the_search(episode, recording, changes, words):
+def test_uninformative_recordings_are_refused_before_the_search(episode, recording, changes, words):
     with pytest.raises(RegistrationError, match=words):
         register_pictures(episode.body, episode.camera, recording(**changes))
 
 
 @pytest.mark.slow
-def test_a_camera_is_found_without_a_guess_and_as_sure_as_it_is(episode, recording):
+def test_camera_is_found_without_initial_guess_within_its_deviations(episode, recording):
     nowhere = episode.camera.with_pose(np.eye(4))
     found = register_pictures(episode.body, nowhere, recording())
     error = pose_error(found.found.camera.X_WC, episode.camera.X_WC)
@@ -413,23 +409,23 @@ def test_a_camera_is_found_without_a_guess_and_as_sure_as_it_is(episode, recordi
         LATE, abs=4.0 * found.time_offset.deviation + 1e-3
     )
     assert found.time_offset.deviation < 0.02
-    # The best of all that were tried is next to what was fitted.
+    # The best scanned offset is next to the fitted one.
     offsets, scores = found.time_offset.scores.T
     assert offsets[scores.argmax()] == pytest.approx(LATE, abs=0.03)
 
 
 @pytest.mark.slow
-def test_a_clock_that_drifts_is_put_right(episode, recording):
+def test_drift_is_corrected(episode, recording):
     faster = recording(values_at=lambda offset: episode.values_at(0.97 * episode.times + offset))
     found = register_pictures(episode.body, episode.camera, faster)
-    # Pictures show later moments, and later ones the later they are.
+    # Pictures show later poses, increasingly so.
     assert found.time_offset.drift == pytest.approx(0.03 / 0.97, abs=0.003)
     assert found.time_offset.drift_deviation < 0.003
     assert np.linalg.norm(pose_error(found.found.camera.X_WC, episode.camera.X_WC)[3:]) < 0.012
 
 
 @pytest.mark.slow
-def test_mirrored_pictures_are_told(episode, recording):
+def test_mirrored_pictures_are_reported(episode, recording):
     mirrored = recording(read=lambda k: np.ascontiguousarray(episode.pictures[k][:, ::-1]))
     with pytest.raises(RegistrationError, match="its pictures are mirrored"):
         register_pictures(episode.body, episode.camera, mirrored)

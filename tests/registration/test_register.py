@@ -1,4 +1,4 @@
-"""A camera is found without a guess, from Drake's own pictures of an arm at known positions."""
+"""A camera is found without an initial guess from Drake's masks of an arm at known positions."""
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ class TestCameraSearch:
         assert shift < 4.0 * np.sqrt(3.0) * found.translation_sd < 0.01
         assert all(frame.iou > 0.99 for frame in found.frames)
 
-    def test_names_the_frame_that_contradicts(
+    def test_a_wrong_frame_is_an_outlier(
         self, model: ArticulatedModel, body: RegistrationBody
     ) -> None:
         camera = looking_at(np.array([1.6, 0.4, 0.5]), np.array([0.0, 0.0, 0.4]), 0.1)
@@ -59,20 +59,20 @@ class TestCameraSearch:
         assert shift < 3e-3
         assert turn < np.radians(0.15)
 
-    def test_refuses_to_begin_without_frames(self, body: RegistrationBody) -> None:
+    def test_a_search_without_frames_is_refused(self, body: RegistrationBody) -> None:
         camera = looking_at(np.array([1.6, 0.4, 0.5]), np.array([0.0, 0.0, 0.4]), 0.1)
         with pytest.raises(RegistrationError, match="'eye': no frame"):
             CameraSearch(body).register(camera, [])
 
 
-class TestSpreadRotations:
-    def test_no_rotation_is_far_from_all(self) -> None:
+class TestUniformRotations:
+    def test_every_rotation_is_near_one_of_them(self) -> None:
         R = uniform_rotations(3000)
         assert np.allclose(R @ np.swapaxes(R, 1, 2), np.eye(3), atol=1e-12)
         others = Rotation.random(500, random_state=3).as_matrix()
         trace_parts = np.einsum("nij,kij->kn", R, others)
         nearest = np.arccos(np.clip(0.5 * (trace_parts.max(axis=1) - 1.0), -1.0, 1.0))
-        # A ball of this radius about each would hold all rotations about twice over.
+        # Balls of this radius about all rotations would cover them about twice.
         assert np.degrees(nearest.max()) < 16.0
 
 
@@ -81,10 +81,10 @@ BEHIND = ((-2.0, -2.0, -1.0), (-0.2, 2.0, 2.0))
 
 
 class TestSuggestPose:
-    def test_tells_two_sides_of_the_arm_apart(
+    def test_suggests_positions_that_distinguish_two_cameras(
         self, model: ArticulatedModel, body: RegistrationBody
     ) -> None:
-        """From the front and from behind the arm's zero pose looks the same but for its boxes."""
+        """From front and back the arm's zero pose looks the same, except for its boxes."""
         places = [np.array([1.8, 0.0, 0.4]), np.array([-1.8, 0.0, 0.4])]
         cameras = [looking_at(place, MIDDLE, 0.0) for place in places]
         poses = [camera.X_WC for camera in cameras]
@@ -95,7 +95,7 @@ class TestSuggestPose:
         assert np.all((values >= kinematics.lower) & (values <= kinematics.upper))
         X_WN = kinematics.poses(values)
         for outline, X in zip(body.full, X_WN, strict=True):
-            # Its surfaces' points, but for what the coarse ones leave out.
+            # The tested points lie on the coarse surfaces.
             assert (outline.vertices @ X[0, :3] + X[0, 3]).min() > BEHIND[1][0] - 0.02
         q, X_WB = body.tree.positions_from(kinematics.split(values))
         masks = [LabelRenderer(model, camera).mask(q, X_WB) for camera in cameras]
@@ -104,7 +104,7 @@ class TestSuggestPose:
         assert abs(difference - told) < 0.1
         assert difference > 0.5
 
-    def test_no_room_no_pose(self, body: RegistrationBody) -> None:
+    def test_no_free_positions_give_no_suggestion(self, body: RegistrationBody) -> None:
         camera = looking_at(np.array([1.8, 0.0, 0.4]), MIDDLE, 0.0)
         everywhere = ((-9.0, -9.0, -9.0), (9.0, 9.0, 9.0))
         assert suggest_pose(body, camera, [camera.X_WC] * 2, [everywhere], tried=5) is None

@@ -114,6 +114,7 @@ class RegistrationInputs:
 
     @cached_property
     def _known(self) -> dict[str, MultiViewFrame]:
+        """Frames that have been read, by name."""
         return {one.name: one for one in self.frames}
 
     def of(self, camera: str) -> list[PosedFrame]:

@@ -1,4 +1,4 @@
-"""Recorded scenes of a small arm whose joint positions are known, drawn by Drake's renderer."""
+"""Recorded scenes of a small arm at known joint positions, rendered by Drake."""
 
 import csv
 import shutil
@@ -22,7 +22,7 @@ JOINTS = tuple(f"{name}_turn" for name, *_ in LINKS)
 
 @dataclass(frozen=True)
 class ArmScene:
-    """A scene's folder, its robot's file, its table of joint positions, and the true cameras."""
+    """A scene's folder, the robot's file, the table of joint positions, and the true cameras."""
 
     folder: Path
     model: Path
@@ -30,23 +30,23 @@ class ArmScene:
     cameras: dict[str, Camera]
 
     def read(self) -> RegistrationInputs:
-        """As a registration takes them."""
+        """Return the inputs of a registration."""
         return read_inputs(self.folder, self.model, self.joints, None, RegistrationSettings())
 
     def copy(self, place: Path) -> "ArmScene":
-        """The same elsewhere, to be spoilt."""
+        """Return a copy in another folder, which may be changed."""
         shutil.copytree(self.folder, place / "scene")
         joints = shutil.copy(self.joints, place / "joints.csv")
         return ArmScene(place / "scene", self.model, Path(joints), self.cameras)
 
     def register(self, out: Path, with_joints: bool = True) -> list[str]:
-        """The words of a registration."""
+        """Return the command line of a registration."""
         joints = ["--joints", self.joints] if with_joints else []
         given = [self.folder, "--model", self.model, "--out", out, *joints]
         return ["register", *map(str, given)]
 
     def add_to(self, name: str, value: float) -> list[list[str]]:
-        """Adds a value to a joint's readings in all frames; the table."""
+        """Add a value to a joint's positions in all frames, and return the table."""
         header, *rows = self.rows()
         column = header.index(name)
         for row in rows:
@@ -55,22 +55,22 @@ class ArmScene:
         return [header, *rows]
 
     def rows(self) -> list[list[str]]:
-        """The table, its first line among them."""
+        """Return the table with its header."""
         with self.joints.open(newline="") as file:
             return list(csv.reader(file))
 
     def write_rows(self, rows: Sequence[Sequence[object]]) -> None:
-        """Writes the table anew."""
+        """Write the table."""
         with self.joints.open("w", newline="") as file:
             csv.writer(file).writerows(rows)
 
     def edit_cameras(self, name: str, **fields: object) -> None:
-        """As edit_camera, in the scene's camera file."""
+        """Change fields of a camera in the scene's camera file."""
         edit_camera(self.folder / "cameras.yaml", name, **fields)
 
 
 def write_arm_scene(folder: Path, count: int = 5, seed: int = 4) -> ArmScene:
-    """Random poses before two cameras; `right` has its X_WC in the camera file, `left` has not."""
+    """Write random poses seen by two cameras; in the camera file only `right` has an X_WC."""
     scene = ArmScene(
         folder / "scene",
         folder / "arm.urdf",
@@ -90,6 +90,6 @@ def write_arm_scene(folder: Path, count: int = 5, seed: int = 4) -> ArmScene:
 
 
 def pose_errors(found: np.ndarray, true: np.ndarray) -> tuple[float, float]:
-    """How far a pose (4, 4) is off [mm, deg]."""
+    """Return the errors of a pose (4, 4): translation [mm] and rotation [deg]."""
     metres, radians = errors(found, true)
     return 1e3 * metres, float(np.degrees(radians))

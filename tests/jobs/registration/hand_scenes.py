@@ -1,4 +1,4 @@
-"""Cameras on an arm's hand that see its base or another object, drawn by Drake's renderer."""
+"""Cameras on an arm's hand that see its base or a calibration target, rendered by Drake."""
 
 import shutil
 from collections.abc import Sequence
@@ -27,14 +27,14 @@ BASE = """<link name="base">
 </link>
 <joint name="weld" type="fixed"><parent link="world"/><child link="base"/>
   <origin xyz="0.05 0 -0.03" rpy="0 0 0.3"/></joint>"""
-# No looks of its own: it is where the camera is screwed on.
+# The camera's mount, without geometry.
 FLANGE = """<link name="flange"/><joint name="screw" type="fixed"><parent link="hand"/>
   <child link="flange"/><origin xyz="0 0 0.05" rpy="0 0 0.5"/></joint>"""
 X_LC = np.array(
     [[0.0, -0.98, 0.199, 0.05], [1.0, 0.0, 0.0, -0.02], [0.0, 0.199, 0.98, 0.08], [0, 0, 0, 1.0]]
 )
 X_LC[:3, :3] = np.linalg.svd(X_LC[:3, :3])[0] @ np.linalg.svd(X_LC[:3, :3])[2]
-# Six joints, whose last three axes meet.
+# Six joints; the last three axes intersect.
 SIX = (
     ("turret", 0.0, "0 0 1", (-170, 170), (0.15, 0.15), 0.3),
     ("upper", 0.3, "0 1 0", (-100, 120), (0.1, 0.12), 0.4),
@@ -53,18 +53,18 @@ CAN = '<visual><geometry><cylinder radius="0.06" length="0.18"/></geometry></vis
 
 @dataclass(frozen=True)
 class TargetScene:
-    """A scene, the model file of what is seen, and where that stands."""
+    """A scene, the model file of the target, and the target's true pose."""
 
     arm: ArmScene
     target: Path
     X_WT: np.ndarray
 
     def register(self, out: Path) -> list[str]:
-        """The words of a registration of the camera on the flange."""
+        """Return the command line of a registration of the camera on the flange."""
         return [*self.arm.register(out), "--on", "flange", "--target", str(self.target)]
 
     def with_looks(self, before: str, after: str, path: Path) -> "TargetScene":
-        """The same with another target, of which a text was replaced."""
+        """Return the same scene with a text replaced in the target's file."""
         text = self.target.read_text()
         assert before in text
         path.write_text(text.replace(before, after))
@@ -80,11 +80,11 @@ def write_hand_scene(
     width: int = 320,
     moving: int | None = None,
 ) -> TargetScene:
-    """Random poses of an arm whose hand has a camera that has all of what it sees in the picture.
+    """Write random poses of an arm with a camera on its hand that sees all of base or target.
 
     Args:
-        looks: of a target that stands anywhere; None: the arm's own base is seen.
-        moving: the only joint that moves; None: all.
+        looks: geometry of a target at a random pose; None: the camera sees the arm's base.
+        moving: index of the only joint that moves; None: all move.
     """
     arm = ArmScene(folder / "scene", folder / "arm.urdf", folder / "joints.csv", {})
     base = BASE if looks is None else ""
@@ -95,7 +95,7 @@ def write_hand_scene(
     target.write_text(f'<robot name="thing">{inside}</robot>')
     limits = np.radians([limit for _, _, _, limit, *_ in links]).T
     if looks is None:
-        # The arm is bent over its base, at which the hand looks back.
+        # The arm is bent over its base, and the hand looks back at it.
         limits = np.array([[-2.0, -0.4, -0.6, 1.2, 0.3], [2.0, 0.4, 0.6, 2.0, 1.5]])
     else:
         turn = rng.uniform([-0.3, -0.3, -3.0], [0.3, 0.3, 3.0])
@@ -136,7 +136,7 @@ def write_hand_scene(
 
 
 def damage_masks(folder: Path, seed: int, wrong: str) -> None:
-    """Masks up to two pixels wider or narrower, with holes of 3 %; the wrong one mirrored."""
+    """Dilate or erode masks by up to two pixels, add holes of 3 %, and mirror the mask `wrong`."""
     rng = np.random.default_rng(seed)
     for path in sorted(folder.glob("*.png")):
         mask = damaged(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) > 0, rng, (2, 6))
@@ -144,10 +144,10 @@ def damage_masks(folder: Path, seed: int, wrong: str) -> None:
 
 
 def paint_pictures(folder: Path, seed: int = 0) -> None:
-    """Pictures in place of a scene's masks, which the target fills, before clutter that changes.
+    """Replace a scene's masks by pictures of the target in front of changing clutter.
 
-    The target is dull and brighter at its top left, what is behind it in stripes and boxes of
-    other colours; each picture's noise is 4 of 255.
+    The target is grey, brighter at the top left; the background has grain and boxes of other
+    colours. Each picture has noise with a standard deviation of 4 of 255.
     """
     rng = np.random.default_rng(seed)
     for path in sorted((folder / "masks" / "wrist").glob("*.png")):

@@ -1,4 +1,4 @@
-"""`drake-pose audit`: what contradicts the rest, from masks, cameras and joint positions."""
+"""`drake-pose audit`: errors and outlier frames, from masks, cameras and joint positions."""
 
 import json
 import re
@@ -42,20 +42,20 @@ def audited(tmp_path_factory: pytest.TempPathFactory) -> ArmScene:
 def found(
     audited: ArmScene, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, dict[str, Any]]:
-    """The result folder, and what the command printed as JSON."""
+    """The result folder, and the command's JSON."""
     out = tmp_path_factory.mktemp("audit") / "out"
     result = run(audited, "--out", out, "--json")
     return out, json.loads(result.stdout)
 
 
 def audit_with(scene: ArmScene, cameras: dict[str, Camera], folder: Path) -> SceneAudit:
-    """An audit of other cameras than the scene's."""
+    """Audit a scene with other cameras."""
     save_cameras(folder / "cameras.yaml", cameras)
     return audit_scene(scene.folder, scene.model, scene.joints, cameras=folder / "cameras.yaml")
 
 
 class TestAudit:
-    def test_the_frame_with_another_one_s_positions_is_named(self, found) -> None:
+    def test_frame_with_wrong_positions_is_an_outlier(self, found) -> None:
         out, summary = found
         assert [one["name"] for one in summary["contradictions"]] == ["0002"]
         assert summary["contradictions"][0]["what"] == "frame"
@@ -65,7 +65,7 @@ class TestAudit:
         assert summary["principal_point_px"] is None
         assert summary == json.loads((out / "summary.json").read_text())
 
-    def test_a_scene_s_own_positions_are_those_of_its_table(self, audited, found, tmp_path) -> None:
+    def test_a_scene_s_own_table_is_used(self, audited, found, tmp_path) -> None:
         own, (_, summary) = audited.copy(tmp_path), found
         table = own.joints.rename(own.folder / "joint_angles.csv")
         again = audit_scene(own.folder, own.model)
@@ -78,16 +78,16 @@ class TestAudit:
             with pytest.raises(SettingsError, match="positions of all joints"):
                 audit_scene(own.folder, own.model)
 
-    def test_only_what_contradicts_is_drawn(self, found) -> None:
+    def test_only_outliers_are_drawn(self, found) -> None:
         drawn = {str(path.relative_to(found[0])) for path in found[0].rglob("*.png")}
         overlays = {f"{one}/0002.png" for one in ("overlay/left", "overlay/right")}
         as_given = {f"overlay_as_given/{one}/0002.png" for one in ("left", "right")}
         assert drawn - as_given == overlays
 
-    def test_the_page_says_what_is_off_with_its_interval_and_what_goes_unnoticed(
+    def test_page_shows_errors_with_intervals_and_minimum_detectable_offsets(
         self, audited, tmp_path: Path
     ) -> None:
-        """The encoder of the elbow reads two degrees too much: two are to be taken off."""
+        """The elbow's encoder reads two degrees too high; the correction is -2 degrees."""
         own, out = audited.copy(tmp_path / "scene"), tmp_path / "out"
         own.add_to("elbow_turn", np.radians(2.0))
         summary = audit_scene(own.folder, own.model, own.joints, out).summary
@@ -113,8 +113,8 @@ class TestAudit:
         assert "frame '0002'" in result.stdout
         assert "4 of 5 frames are consistent" in result.stdout
 
-    def test_a_camera_file_of_another_place(self, audited, tmp_path: Path) -> None:
-        """One camera was told to stand 2 cm beside where it took the pictures."""
+    def test_wrong_camera_pose_is_found(self, audited, tmp_path: Path) -> None:
+        """The given pose of one camera is off by 2 cm."""
         left = audited.cameras["left"]
         X_WC = left.X_WC.copy()
         X_WC[:3, 3] += 0.02 * X_WC[:3, 0]
@@ -126,10 +126,10 @@ class TestAudit:
         assert result.folder is None
 
     @pytest.mark.parametrize(("degrees", "word"), [(2.0, "high"), (-2.0, "low")])
-    def test_an_encoder_reads_too_high_or_too_low(
+    def test_encoder_error_is_described_with_its_sign(
         self, audited, tmp_path: Path, degrees: float, word: str
     ) -> None:
-        """What it read is the truth, with which Drake drew the masks, and so many degrees more."""
+        """The log is the true position plus an error."""
         own = audited.copy(tmp_path)
         own.add_to("elbow_turn", np.radians(degrees))
         (found, *_) = audit_scene(own.folder, own.model, own.joints).summary["contradictions"]
@@ -139,17 +139,17 @@ class TestAudit:
         told = re.match(text, found["text"])
         assert told
         assert (float(told[1]), told[2]) == (pytest.approx(2.0, abs=0.3), word)
-        # To be added to the readings.
+        # The correction of the readings.
         assert found["angle_deg"] == pytest.approx(-degrees, abs=0.3)
 
-    def test_cameras_that_are_exchanged_are_named(self, audited, tmp_path: Path) -> None:
+    def test_exchanged_cameras_are_found(self, audited, tmp_path: Path) -> None:
         left, right = audited.cameras.values()
         exchanged = {"left": left.with_pose(right.X_WC), "right": right.with_pose(left.X_WC)}
         result = audit_with(audited, exchanged, tmp_path)
         assert any("'left' and 'right' seem to be ex" in text for text in result.warnings)
 
     @pytest.mark.parametrize("half", [0.5, pytest.param(-0.5, marks=pytest.mark.slow)])
-    def test_half_a_pixel_of_the_principal_points_is_named(
+    def test_half_pixel_error_of_principal_points_is_reported(
         self, audited, tmp_path: Path, half: float
     ) -> None:
         moved = {
@@ -163,7 +163,7 @@ class TestAudit:
         assert "half a pixel" in warnings
         assert ("CameraInfo's numbers" in warnings) == (half > 0.0)
 
-    def test_joints_and_cameras_must_be_known(self, audited, tmp_path: Path) -> None:
+    def test_unknown_joints_and_cameras_are_refused(self, audited, tmp_path: Path) -> None:
         own = audited.copy(tmp_path)
         own.write_rows([row[:-1] for row in own.rows()])
         with pytest.raises(SceneError, match=JOINTS[-1]):
@@ -179,7 +179,9 @@ class TestAudit:
             (lambda X: X * np.array([1.0, 1.0, 1.0, 1e3]), "check X_WC"),
         ],
     )
-    def test_a_camera_that_cannot_show_the_robot(self, audited, tmp_path, spoil, match) -> None:
+    def test_camera_that_cannot_show_the_robot_is_refused(
+        self, audited, tmp_path, spoil, match
+    ) -> None:
         cameras = {
             name: one.with_pose(np.vstack([spoil(one.X_WC)[:3], [0.0, 0.0, 0.0, 1.0]]))
             for name, one in audited.cameras.items()
@@ -187,7 +189,7 @@ class TestAudit:
         with pytest.raises(CameraError, match=match):
             audit_with(audited, cameras, tmp_path)
 
-    def test_frames_of_which_nothing_is_near_or_seen(self, audited, tmp_path: Path) -> None:
+    def test_unexplained_and_empty_masks(self, audited, tmp_path: Path) -> None:
         own, nothing = audited.copy(tmp_path), np.zeros((240, 320), bool)
         corner = nothing.copy()
         corner[:12, :12] = True
@@ -205,8 +207,8 @@ class TestAudit:
             audit_scene(own.folder, own.model, own.joints)
 
 
-def test_what_the_page_draws_as_found_is_the_truth() -> None:
-    """A value that was logged with an error, and the finding that says what must be added."""
+def test_corrected_values_are_the_true_ones() -> None:
+    """Logged values with an error, and the finding that corrects them."""
     names, truth = ("a", "b", "slide"), np.array([0.3, -0.7, 0.05])
     nothing = Finding("joint", "", 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
     logged = {

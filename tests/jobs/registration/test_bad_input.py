@@ -1,4 +1,4 @@
-"""What cannot be registered: a message that names the culprit, and nothing like a pose is left."""
+"""Registrations that are refused: the message names what is wrong, and nothing is written."""
 
 import re
 from collections.abc import Callable
@@ -34,7 +34,7 @@ def add_column(rows: list[list[str]]) -> None:
 
 
 def to_next(rows: list[list[str]]) -> None:
-    """What was said of a frame is said of the one before."""
+    """Give each frame the positions of the next one."""
     places = [row[1:] for row in rows[1:]]
     for row, place in zip(rows[1:], [*places[1:], places[0]], strict=True):
         row[1:] = place
@@ -115,9 +115,7 @@ def test_unknown_names_are_refused(arm_scene: ArmScene, tmp_path: Path, out: Pat
 
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.9, 1.15])
-def test_a_focal_length_that_is_not_the_camera_s(
-    factor: float, own_arm: ArmScene, out: Path
-) -> None:
+def test_wrong_focal_length_is_refused(factor: float, own_arm: ArmScene, out: Path) -> None:
     true = own_arm.cameras["left"].focal_x
     own_arm.edit_cameras("left", focal_x=factor * true, focal_y=factor * true)
     result = run(own_arm, out)

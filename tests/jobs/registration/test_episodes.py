@@ -1,4 +1,4 @@
-"""Registrations of episodes: pictures and joints by time, no masks."""
+"""Registration of episodes: pictures and a joint log, no masks."""
 
 import csv
 import json
@@ -32,7 +32,7 @@ LATE = 0.04
 
 @pytest.fixture(scope="module")
 def episode(tmp_path_factory):
-    """A folder of pictures with a joint log at another rate, and what is in it."""
+    """A folder of pictures with a joint log at another rate, and its contents."""
     folder = tmp_path_factory.mktemp("episode")
     painted = painted_episode(folder, late=LATE)
     write_episode(folder / "scene", painted)
@@ -50,7 +50,7 @@ def read(
 
 
 def run(command: str, episode, out: Path, *more: object) -> dict[str, Any]:
-    """The summary of a command's result."""
+    """Return the summary of a command's result."""
     scene, painted = episode
     words = [command, scene, "--model", painted.path, "--out", out, "--json", *more]
     result = run_command([str(word) for word in words])
@@ -58,7 +58,7 @@ def run(command: str, episode, out: Path, *more: object) -> dict[str, Any]:
     return json.loads((out / "summary.json").read_text())
 
 
-def test_what_is_an_episode(episode, tmp_path):
+def test_episodes_are_recognised(episode, tmp_path):
     settings = RegistrationSettings()
     assert is_episode(episode[0], settings)
     (tmp_path / "images").mkdir()
@@ -67,7 +67,7 @@ def test_what_is_an_episode(episode, tmp_path):
     assert not is_episode(tmp_path, settings)
 
 
-def test_a_sequence_of_pictures_begins_where_its_log_says(episode, tmp_path):
+def test_starts_of_a_sequence_come_from_its_joint_log(episode, tmp_path):
     scene, painted = episode
     for name in ("images", "cameras.yaml", "joint_angles.csv"):
         (tmp_path / name).symlink_to(scene / name)
@@ -90,14 +90,14 @@ def test_a_folder_of_recordings_names_them(episode, tmp_path, command):
     assert "give one of its subfolders: scene" in " ".join(result.output.split())
 
 
-def test_joints_are_where_their_log_says_at_the_pictures_times(episode):
+def test_log_is_interpolated_at_the_pictures_times(episode):
     _, painted = episode
     found = read(*episode)
     assert found.visible_nodes is None
     assert not found.assumed_focal
     (recording,) = found.recordings.values()
     for offset in (0.0, 0.07):
-        # Between rows of the log a swing is straight.
+        # The log is interpolated linearly.
         np.testing.assert_allclose(
             recording.values_at(offset), painted.values_at(painted.times + offset), atol=2e-3
         )
@@ -109,7 +109,7 @@ def test_joints_are_where_their_log_says_at_the_pictures_times(episode):
     np.testing.assert_array_equal(few.read(1), painted.pictures[8])
 
 
-def test_parts_that_unlogged_joints_move_are_not_looked_at(episode, tmp_path):
+def test_parts_moved_by_unlogged_joints_are_not_used(episode, tmp_path):
     _, painted = episode
     times, table = np.arange(0.0, 6.0, 0.1), tmp_path / "some.csv"
     write_log(table, times, painted.values_at(times)[:, :3], NAMES[:3])
@@ -119,7 +119,7 @@ def test_parts_that_unlogged_joints_move_are_not_looked_at(episode, tmp_path):
     assert read(*episode, table, hold={"joint3": 0.0, "joint4": 10.0}).visible_nodes is None
 
 
-def test_a_focal_length_that_nobody_knows_is_a_usual_one(episode, tmp_path):
+def test_unknown_focal_length_is_assumed(episode, tmp_path):
     scene, painted = episode
     for name in ("images", "joint_angles.csv"):
         (tmp_path / name).symlink_to(scene / name)
@@ -129,7 +129,7 @@ def test_a_focal_length_that_nobody_knows_is_a_usual_one(episode, tmp_path):
     assert not given.assumed_focal
 
 
-def test_whether_a_camera_s_place_is_given(episode, tmp_path):
+def test_given_poses_of_cameras_are_known(episode, tmp_path):
     scene, painted = episode
     file = edit_camera(scene / "cameras.yaml", "camera", tmp_path / "cameras.yaml", X_WC=None)
     for own, expected in ((None, {"camera"}), (scene / "cameras.yaml", {"camera"}), (file, set())):
@@ -157,7 +157,7 @@ def test_whether_a_camera_s_place_is_given(episode, tmp_path):
         ),
     ],
 )
-def test_what_cannot_be_used_is_named(episode, tmp_path, spoil, words):
+def test_unusable_episodes_are_refused(episode, tmp_path, spoil, words):
     scene, painted = episode
     for file in ("joint_angles.csv", "cameras.yaml"):
         (tmp_path / file).write_bytes((scene / file).read_bytes())
@@ -167,7 +167,7 @@ def test_what_cannot_be_used_is_named(episode, tmp_path, spoil, words):
         read(tmp_path, painted)
 
 
-def test_what_needs_masks_or_pictures_is_refused(episode, tmp_path):
+def test_missing_masks_or_pictures_are_refused(episode, tmp_path):
     scene, painted = episode
     for name, value, advice in (("on", "box4", "; with target=FILE"), ("suggest", True, "$")):
         settings = RegistrationSettings(**{name: value})
@@ -183,7 +183,7 @@ def test_what_needs_masks_or_pictures_is_refused(episode, tmp_path):
 
 
 def require_overlay_as_given(picture: np.ndarray) -> None:
-    """The contour of the camera as given lies on that of the one that was found."""
+    """Require that the contours of the given and the registered camera coincide."""
     found, given = ((picture == rgb[::-1]).all(axis=2) for rgb in (EXCESS_RGB, MISSING_RGB))
     legend = slice(-38, None)
     assert found[legend].any()
@@ -201,7 +201,7 @@ def test_an_episode_becomes_a_calibrated_scene(episode, out):
     error = pose_error(load_cameras(out / "cameras.yaml")["camera"].X_WC, painted.camera.X_WC)
     assert np.linalg.norm(error[3:]) < 0.012
     assert np.degrees(np.linalg.norm(error[:3])) < 0.4
-    # The result is a scene of masks, that other commands read.
+    # The result is a scene of masks for other commands.
     masks = load_scene(out)
     with (out / "joint_angles.csv").open(newline="") as file:
         rows = {row["frame"]: row for row in csv.DictReader(file)}
@@ -209,7 +209,7 @@ def test_an_episode_becomes_a_calibrated_scene(episode, out):
     told = [[float(rows[frame][name]) for name in NAMES] for frame in masks.frames]
     np.testing.assert_allclose(told, painted.values[list(map(int, masks.frames))], atol=0.02)
     assert (out / "overlay" / "camera" / f"{masks.frames[0]}.png").is_file()
-    # The camera file had the true place: as it was given the robot is seen where it was found.
+    # The camera file has the true pose, so both contours coincide.
     errors = {frame: one["E_total"] for frame, one in summary["frames"].items()}
     in_order = sorted(errors, key=lambda frame: -errors[frame])
     given = sorted((out / "overlay_as_given" / "camera").glob("*.png"))
@@ -226,9 +226,7 @@ def test_an_episode_becomes_a_calibrated_scene(episode, out):
 
 
 @pytest.mark.slow
-def test_an_audit_of_an_episode_names_its_clock_and_a_camera_that_stands_elsewhere(
-    episode, tmp_path
-):
+def test_audit_of_an_episode_finds_wrong_clock_and_camera(episode, tmp_path):
     _, painted = episode
     summary = run("audit", episode, tmp_path / "audit")
     (clock,) = summary["contradictions"]

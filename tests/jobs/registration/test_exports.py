@@ -1,4 +1,4 @@
-"""What `register --export` writes, read by the programs that it is for."""
+"""Exports of `register --export`, read by the programs they are for."""
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
@@ -26,7 +26,7 @@ TEXTS = ("ros", "mujoco", "drake")
 
 @pytest.fixture(scope="module")
 def written(arm_scene, tmp_path_factory):
-    """The folder of the arm's two cameras, where they truly are."""
+    """Exports of the arm's two true cameras."""
     folder = tmp_path_factory.mktemp("exports")
     inputs = arm_scene.read()
     write_exports(folder, TEXTS, inputs, arm_scene.cameras.values(), {}, {})
@@ -34,7 +34,7 @@ def written(arm_scene, tmp_path_factory):
 
 
 def drake_cameras(path):
-    """The cameras of a Scenario by Drake's own reader."""
+    """Return the cameras of a Scenario, read by Drake."""
     text = path.read_text()
     return {
         name: yaml_load_typed(schema=CameraConfig, data=yaml_dump(content))
@@ -42,7 +42,7 @@ def drake_cameras(path):
     }
 
 
-def test_drake_reads_its_cameras_and_so_do_we(written, arm_scene):
+def test_drake_and_load_cameras_read_the_scenario(written, arm_scene):
     cameras, configs = load_cameras(written / "drake.yaml"), drake_cameras(written / "drake.yaml")
     assert list(cameras) == list(configs) == list(arm_scene.cameras)
     for name, camera in arm_scene.cameras.items():
@@ -72,7 +72,7 @@ def test_mujoco_and_ros_have_all_cameras(written, arm_scene):
         assert "--frame-id world " in node.get("args")
 
 
-def test_transforms_start_at_the_link_that_stands_in_the_origin(tmp_path, arm_scene):
+def test_transforms_start_at_the_link_at_the_world_s_origin(tmp_path, arm_scene):
     path = tmp_path / "arm.urdf"
     base = (
         '<link name="base"><visual><geometry><sphere radius="0.05"/></geometry></visual></link>'
@@ -93,7 +93,7 @@ def test_transforms_start_at_the_link_that_stands_in_the_origin(tmp_path, arm_sc
     assert [one.X_PB.base_frame for one in configs.values()] == ["hand", None]
 
 
-def test_a_recording_for_the_viewer(arm_scene, tmp_path):
+def test_rerun_recording_has_robot_cameras_and_masks(arm_scene, tmp_path):
     pytest.importorskip("rerun")
     from rerun.chunk import RrdReader
 
@@ -118,7 +118,7 @@ def test_a_recording_for_the_viewer(arm_scene, tmp_path):
         np.testing.assert_allclose(
             own["Transform3D:translation"][0][0], X_WN[:3, 3], rtol=0, atol=1e-6
         )
-        # rerun's matrices go by columns.
+        # rerun's matrices are in column order.
         R_WN = np.reshape(own["Transform3D:mat3x3"][0][0], (3, 3)).T
         np.testing.assert_allclose(R_WN, X_WN[:3, :3], atol=1e-6)
     np.testing.assert_allclose(
@@ -133,7 +133,7 @@ def test_a_recording_for_the_viewer(arm_scene, tmp_path):
     assert [one[0] for one in told["/frame"]["TextLog:text"]] == ["0000", "0001"]
 
 
-def test_what_cannot_be_written_is_refused_before_work():
+def test_unsupported_exports_are_refused_before_work():
     flat = ParallelCamera("flat", 64, 48, 50.0, 31.5, 23.5, np.eye(4))
     for name in TEXTS:
         with pytest.raises(CameraError, match=r"'flat'.*parallel"):

@@ -34,7 +34,7 @@ def read(folder: Path, text: str, held: dict[str, float] | None = None) -> Known
     return read_known_positions(folder / "joints.csv", kinematics)
 
 
-def test_what_is_held_needs_no_column(tmp_path: Path) -> None:
+def test_held_joints_need_no_column(tmp_path: Path) -> None:
     found = read(tmp_path, "frame,swing\n0,0.5\n1,-1\n", {"rail": 0.3})
     assert found.of("0", "left").tolist() == [0.3, 0.5]
     assert found.of("1", "left").tolist() == [0.3, -1.0]
@@ -42,7 +42,7 @@ def test_what_is_held_needs_no_column(tmp_path: Path) -> None:
         read(tmp_path, "frame,swing,rail\n0,0.5,0.2\n", {"rail": 0.3})
 
 
-def test_columns_are_put_in_the_tree_s_order(tmp_path: Path) -> None:
+def test_columns_are_sorted_into_the_tree_s_order(tmp_path: Path) -> None:
     found = read(tmp_path, "frame,swing,rail\n7,-0.5,0.25\nstart,1.5,0.75\n3.0,0,0\n")
     assert found.warnings == ()
     assert found.of("0007", "left").tolist() == [0.25, -0.5]
@@ -52,7 +52,7 @@ def test_columns_are_put_in_the_tree_s_order(tmp_path: Path) -> None:
         found.of("0008", "left")
 
 
-def test_the_poses_of_an_estimate(tmp_path: Path) -> None:
+def test_poses_of_an_estimate_are_read(tmp_path: Path) -> None:
     text = "frame,rail,swing,error,seconds\n0,0.1,0.5,0.02,1\n1,nan,nan,nan,3\n2,0.2,-1,0.03,1\n"
     found = read(tmp_path, text)
     assert found.is_estimate
@@ -61,7 +61,7 @@ def test_the_poses_of_an_estimate(tmp_path: Path) -> None:
     assert not read(tmp_path, "frame,rail,swing\n0,0.1,0.5\n").is_estimate
 
 
-def test_a_base_that_moves_becomes_joints(tmp_path: Path) -> None:
+def test_moving_base_becomes_joints(tmp_path: Path) -> None:
     read(tmp_path, "frame,rail,swing\n0,0.1,0.5\n")
     model, rng = load_model(tmp_path / "slide.urdf"), np.random.default_rng(3)
     lines, bases = ["frame,rail,swing,base_x,base_y,base_z,base_qw,base_qx,base_qy,base_qz"], []
@@ -102,22 +102,22 @@ def test_a_base_that_moves_becomes_joints(tmp_path: Path) -> None:
         ("frame,swing,rail\n0,0.5,0\n0,0.5,0\n", "line 3: frame '0' is given twice"),
     ],
 )
-def test_what_is_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_bad_tables_are_refused(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(SceneError, match=message):
         read(tmp_path, text)
 
 
-def test_a_position_outside_its_limits_is_warned_of(tmp_path: Path) -> None:
+def test_positions_outside_their_limits_are_warned_of(tmp_path: Path) -> None:
     (text,) = read(tmp_path, "frame,swing,rail\n0,0.5,0.1\n4,2.6,0.5\n").warnings
     assert "column 'swing', frame 4: 2.6 rad lies outside the joint's limits, -2 to 2 rad" in text
     for value, turned in ((0.5 + 2.0 * np.pi, 0.5), (-1.9 - 2.0 * np.pi, -1.9)):
         (text,) = read(tmp_path, f"frame,swing,rail\n0,0.5,0.1\n4,{value},0.5\n").warnings
         assert f"a full turn off, {turned} rad, it would not" in text
-    # An encoder's own error is none of ours.
+    # Small encoder errors are accepted.
     assert read(tmp_path, "frame,swing,rail\n0,2.05,-0.01\n").warnings == ()
 
 
-def test_one_pose(tmp_path: Path) -> None:
+def test_equal_poses_are_recognised(tmp_path: Path) -> None:
     found = read(tmp_path, "frame,swing,rail\n0,0.5,0.1\n")
     rows = np.array([[0.1, 0.5], [0.102, 0.505]])
     assert found.are_one_pose(rows)

@@ -1,4 +1,4 @@
-"""What is wrong by much in all frames is named with its size, in Drake's pictures of an arm."""
+"""Large errors in all frames are found with their sizes, in Drake's masks of an arm."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -25,7 +25,7 @@ COUNT = 8
 
 @pytest.fixture(scope="module")
 def right(tmp_path_factory: pytest.TempPathFactory) -> ArmScene:
-    """Eight frames of two cameras, in which everything is right."""
+    """Eight correct frames of two cameras."""
     scene = write_arm_scene(tmp_path_factory.mktemp("right"), count=COUNT, seed=9)
     save_cameras(scene.folder / "cameras.yaml", scene.cameras)
     return scene
@@ -33,19 +33,19 @@ def right(tmp_path_factory: pytest.TempPathFactory) -> ArmScene:
 
 @pytest.fixture
 def scene(right: ArmScene, tmp_path: Path) -> ArmScene:
-    """The same, to be spoilt."""
+    """A copy that may be changed."""
     return right.copy(tmp_path)
 
 
 def audit(scene: ArmScene, cameras: Sequence[Camera] = ()) -> SceneAudit:
-    """An audit, of other cameras where they are given."""
+    """Audit a scene, with other cameras if they are given."""
     if cameras:
         save_cameras(scene.folder / "cameras.yaml", {one.name: one for one in cameras})
     return audit_scene(scene.folder, scene.model, scene.joints)
 
 
 def change(scene: ArmScene, joint: str, changed: Callable[[float], float]) -> np.ndarray:
-    """Changes a column of the log; by how much, modulo a turn [deg]."""
+    """Change a column of the log, and return by how much, modulo a turn [deg]."""
     header, *rows = scene.rows()
     j, off = header.index(joint), []
     for row in rows:
@@ -57,7 +57,7 @@ def change(scene: ArmScene, joint: str, changed: Callable[[float], float]) -> np
 
 
 def masks(scene: ArmScene, spoilt: Callable[[np.ndarray], np.ndarray], frames: str = "*") -> None:
-    """Changes the masks of some frames."""
+    """Change the masks of some frames."""
     for path in scene.folder.rglob(f"masks/*/{frames}.png"):
         write_mask(path, spoilt(read_mask(path)))
 
@@ -66,7 +66,7 @@ def told(result: SceneAudit) -> list[tuple[str, str]]:
     return [(one["cause"], one["cause_name"]) for one in result.summary["contradictions"]]
 
 
-def test_nothing_is_said_of_a_scene_that_is_right(right: ArmScene) -> None:
+def test_correct_scene_gives_no_findings(right: ArmScene) -> None:
     result = audit(right)
     assert (told(result), result.warnings) == ([], ())
 
@@ -74,19 +74,19 @@ def test_nothing_is_said_of_a_scene_that_is_right(right: ArmScene) -> None:
 @pytest.mark.parametrize(
     ("joint", "degrees"), [("hand_turn", 25.0), ("hand_turn", -70.0), ("elbow_turn", 40.0)]
 )
-def test_an_offset_that_fits_do_not_reach_has_its_size(scene, joint, degrees) -> None:
+def test_large_joint_offset_is_measured(scene, joint, degrees) -> None:
     change(scene, joint, lambda q: q + np.radians(degrees))
     result = audit(scene)
     assert told(result) == [("joint", joint)]
     off = result.summary["contradictions"][0]
-    # What must be added to the log.
+    # The correction of the log.
     assert abs(off["angle_deg"] + degrees) < max(4.0 * off["angle_sd_deg"], 0.3)
     assert off["angle_sd_deg"] < 1.0
     assert result.summary["agreeing_count"] == COUNT
 
 
 @pytest.mark.parametrize("joint", ["hand_turn", "shoulder_turn"])
-def test_a_sign_that_is_turned_round_is_named(scene, joint) -> None:
+def test_wrong_sign_is_found(scene, joint) -> None:
     change(scene, joint, lambda q: -q)
     result = audit(scene)
     assert told(result) == [("sign", joint)]
@@ -94,7 +94,7 @@ def test_a_sign_that_is_turned_round_is_named(scene, joint) -> None:
     assert result.summary["agreeing_count"] == 0
 
 
-def test_a_column_that_is_always_0_is_no_constant(scene) -> None:
+def test_constant_column_is_a_wrong_log(scene) -> None:
     off = change(scene, "hand_turn", lambda _: 0.0)
     result = audit(scene)
     assert told(result) == [("log", "hand_turn")]
@@ -104,7 +104,7 @@ def test_a_column_that_is_always_0_is_no_constant(scene) -> None:
     assert result.summary["agreeing_count"] == 0
 
 
-def test_two_joints_that_are_off_by_much_are_told_one_by_one(scene) -> None:
+def test_two_large_errors_are_separated(scene) -> None:
     change(scene, "hand_turn", lambda q: -q)
     change(scene, "elbow_turn", lambda q: q + np.radians(30.0))
     result = audit(scene)
@@ -118,7 +118,7 @@ def _rotated(camera: Camera, by: np.ndarray, unit: float = 1.0) -> Camera:
     return camera.with_pose(X_WC)
 
 
-# The axes of a camera's link, x forward, y left, z up, in those of its picture.
+# A camera link's axes, x forward, y left, z up, in the camera's frame.
 LINK = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
@@ -133,8 +133,8 @@ LINK = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
         (lambda one: _rotated(one, (one.X_WC[:3, :3] @ one.X_WC[:3, :3]).T), "of its rotation"),
     ],
 )
-def test_the_convention_of_a_camera_file_is_named(scene, spoil, text) -> None:
-    """Whether the robot is in the picture then, or not."""
+def test_pose_convention_is_recognised(scene, spoil, text) -> None:
+    """With and without the robot in the camera's view."""
     cameras = [spoil(one) for one in scene.cameras.values()]
     try:
         result = audit(scene, cameras)
@@ -147,7 +147,7 @@ def test_the_convention_of_a_camera_file_is_named(scene, spoil, text) -> None:
     assert re.search(text, found)
 
 
-def test_focal_lengths_that_are_far_too_long_are_told_as_such(scene) -> None:
+def test_large_focal_length_error_is_measured(scene) -> None:
     cameras = [
         replace(one, focal_x=1.15 * one.focal_x, focal_y=1.15 * one.focal_y)
         for one in scene.cameras.values()
@@ -157,14 +157,14 @@ def test_focal_lengths_that_are_far_too_long_are_told_as_such(scene) -> None:
     assert result.summary["contradictions"][0]["shift_percent"] == pytest.approx(-13.0, abs=1.0)
 
 
-def test_mirrored_masks_are_named(scene) -> None:
+def test_mirrored_masks_are_found(scene) -> None:
     masks(scene, lambda mask: mask[:, ::-1])
     (one,) = audit(scene).summary["contradictions"]
     assert "masks of all cameras seem to be mirrored" in one["text"]
 
 
-def test_cameras_that_moved_are_told_with_the_frame(scene) -> None:
-    """Each turned by two degrees where it stands, and moved 2 cm."""
+def test_moved_cameras_are_found_with_the_frame(scene) -> None:
+    """Each camera is rotated by two degrees about its centre, and shifted by 2 cm."""
     poses = [list(map(float, row[1:])) for row in scene.rows()[1:]]
     model, moved = load_model(scene.model), {}
     for name, one in scene.cameras.items():
@@ -181,12 +181,12 @@ def test_cameras_that_moved_are_told_with_the_frame(scene) -> None:
     for one in result.summary["contradictions"]:
         assert "was moved after frame '0003'" in one["text"]
         assert one["angle_deg"] == pytest.approx(2.0, abs=max(0.3, 3.0 * one["angle_sd_deg"]))
-        # The camera's own way, not that of the robot in the picture.
+        # The shift of the camera's centre, not of the robot in its view.
         assert one["shift_mm"] == pytest.approx(20.0, abs=max(5.0, 3.0 * one["shift_sd_mm"]))
     assert result.summary["agreeing_count"] == 4
 
 
-def test_a_camera_that_turned_where_it_stands_has_hardly_moved(scene) -> None:
+def test_rotated_camera_has_no_shift(scene) -> None:
     left, right = scene.cameras.values()
     X_WC = left.X_WC.copy()
     X_WC[:3, :3] = Rotation.from_euler("z", 0.5, degrees=True).as_matrix() @ X_WC[:3, :3]
@@ -197,9 +197,9 @@ def test_a_camera_that_turned_where_it_stands_has_hardly_moved(scene) -> None:
     assert "mm at the robot" in one["text"]
 
 
-def test_masks_that_show_more_less_or_nothing(scene) -> None:
+def test_masks_with_excess_lack_or_nothing_are_warned_of(scene) -> None:
     def with_shadow(mask: np.ndarray) -> np.ndarray:
-        """Something else in a corner, a quarter as large."""
+        """Add a patch with a quarter of the mask's area in a corner."""
         spoilt, side = mask.copy(), int(np.sqrt(0.25 * mask.sum()))
         spoilt[:side, :side] = True
         return spoilt
@@ -225,7 +225,7 @@ def test_inverted_masks_are_refused(scene) -> None:
         scene.read()
 
 
-def test_the_log_of_the_next_frame_is_named(scene) -> None:
+def test_positions_of_the_next_frame_are_recognised(scene) -> None:
     header, *rows = scene.rows()
     shifted = [[row[0], *other[1:]] for row, other in zip(rows, rows[-1:] + rows[:-1], strict=True)]
     scene.write_rows([header, *shifted])
@@ -234,8 +234,8 @@ def test_the_log_of_the_next_frame_is_named(scene) -> None:
     assert JOINTS[0] in header
 
 
-def test_cameras_that_stand_far_from_where_they_are_said_to_are_found(scene) -> None:
-    """A metre and 30 degrees: no convention, and nothing that fits of single frames reach."""
+def test_cameras_far_from_their_given_poses_are_found(scene) -> None:
+    """One metre and 30 degrees: no convention, and out of reach of fits of single frames."""
     left, right = scene.cameras.values()
     X_WC = np.eye(4)
     X_WC[:3, :3] = Rotation.from_euler("z", 30.0, degrees=True).as_matrix()
@@ -250,11 +250,11 @@ def test_cameras_that_stand_far_from_where_they_are_said_to_are_found(scene) -> 
     ("wrong", "last"),
     [("00011", 2), ("11000", 1), ("00001", None), ("01100", None), ("00000", None), ("11", None)],
 )
-def test_a_change_is_where_all_frames_on_one_side_contradict(wrong, last) -> None:
+def test_a_change_has_outliers_on_one_side_only(wrong, last) -> None:
     assert last_before_change([one == "1" for one in wrong]) == last
 
 
-def test_cameras_that_rest_on_frames_of_two_moments_are_told_so() -> None:
+def test_cameras_without_common_inliers_are_warned_of() -> None:
     def camera(name: str, agreeing: str) -> SimpleNamespace:
         frames = [
             SimpleNamespace(frame=f"{k}", is_inlier=one == "1") for k, one in enumerate(agreeing)

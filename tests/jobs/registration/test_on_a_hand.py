@@ -28,7 +28,7 @@ from tests.search.arms import LINKS
 
 
 def require_near(found: dict[str, Any], millimetres: float, degrees: float) -> None:
-    """The camera is off by less, and by no more than four of its standard deviations."""
+    """Require a camera pose within limits and within four of its standard deviations."""
     off = pose_errors(np.array(found["X_LC"]), X_LC)
     assert off[0] < millimetres
     assert off[1] < degrees
@@ -58,7 +58,7 @@ def test_the_camera_is_found_on_its_link(own_base: ArmScene, out: Path) -> None:
     assert (read.links, read.unplaced) == ({"wrist": "flange"}, ())
     np.testing.assert_allclose(read.cameras["wrist"].X_WC, found["X_LC"], atol=1e-12)
     assert yaml.safe_load((out / "registration.yaml").read_text())["wrist"]["link"] == "flange"
-    # It stands elsewhere in each frame: who needs cameras that stand still says so.
+    # The camera's pose in the world differs between frames, so load_cameras refuses the file.
     with pytest.raises(CameraError, match="'wrist' rides on link 'flange' of a robot"):
         load_cameras(out / "cameras.yaml")
 
@@ -70,7 +70,7 @@ def test_the_camera_is_found_on_its_link(own_base: ArmScene, out: Path) -> None:
 def test_camera_and_target_are_found(
     looks: str, links: tuple, alike: int, tmp_path: Path, out: Path
 ) -> None:
-    """A box looks alike turned by half a turn about each of its axes."""
+    """A box looks the same after half a turn about each of its axes."""
     scene = write_hand_scene(tmp_path, looks, links, seed=2)
     found = run_json(*scene.register(out))
     require_near(found, 1.0, 0.1)
@@ -87,7 +87,7 @@ def test_camera_and_target_are_found(
 
 
 @pytest.mark.slow
-def test_damaged_masks_and_a_wrong_one(tmp_path: Path, out: Path) -> None:
+def test_damaged_masks_and_an_outlier(tmp_path: Path, out: Path) -> None:
     scene = write_hand_scene(tmp_path, BRACKET, SIX, seed=3, width=640)
     damage_masks(scene.arm.folder / "masks" / "wrist", 3, "0005.png")
     found = run_json(*scene.register(out), "--no-overlay")
@@ -97,7 +97,7 @@ def test_damaged_masks_and_a_wrong_one(tmp_path: Path, out: Path) -> None:
 
 
 @pytest.mark.slow
-def test_pictures_are_enough_of_a_target(tmp_path: Path, out: Path) -> None:
+def test_pictures_of_a_target_are_segmented(tmp_path: Path, out: Path) -> None:
     scene = write_hand_scene(tmp_path, BRACKET, seed=4)
     masks = sorted((scene.arm.folder / "masks" / "wrist").glob("*.png"))
     drawn = {path.name: read_mask(path) for path in masks}
@@ -107,7 +107,7 @@ def test_pictures_are_enough_of_a_target(tmp_path: Path, out: Path) -> None:
     poses = [np.array(one["X_WT"]) for one in found["target"]["modes"]]
     assert min(pose_errors(X, scene.X_WT)[0] for X in poses) < 2.0
     assert (found["masks"], found["contradictions"]) == ("found", [])
-    # The result is a scene of the masks, as Drake has drawn them but for the noise of the pictures.
+    # The result is a scene of masks like Drake's, except for the noise of the pictures.
     for name, mask in drawn.items():
         assert intersection_over_union(read_mask(out / "masks" / "wrist" / name), mask) > 0.97
     again = replace(scene, arm=replace(scene.arm, folder=out, joints=out / "joint_angles.csv"))
@@ -125,14 +125,16 @@ def test_pictures_that_do_not_show_the_target_are_refused(tmp_path: Path, out: P
 
 
 @pytest.mark.slow
-def test_zeros_beside_camera_and_target(bracket: TargetScene, tmp_path: Path, out: Path) -> None:
+def test_joint_offsets_with_camera_and_target(
+    bracket: TargetScene, tmp_path: Path, out: Path
+) -> None:
     scene = replace(bracket, arm=bracket.arm.copy(tmp_path))
     scene.arm.add_to("elbow_turn", -np.radians(2.0))
     given = ["--zeros", "elbow_turn", "--zeros", "turret_turn"]
     found = run_json(*scene.register(out), *given)
     assert found["zeros"]["elbow_turn"]["value_deg"] == pytest.approx(2.0, abs=0.3)
     assert found["zeros"]["elbow_turn"]["significant"]
-    # The first joint's zero turns with the target, which stands anywhere.
+    # The first joint's offset cannot be separated from the target's unknown pose.
     assert not found["zeros"]["turret_turn"]["determined"]
     assert any(name.startswith("target_") for name in found["zeros"]["turret_turn"]["gauge"])
     require_near(found, 2.0, 0.3)
@@ -151,7 +153,9 @@ def test_zeros_beside_camera_and_target(bracket: TargetScene, tmp_path: Path, ou
         ("target", "--zeros target_turn_x", "no joint 'target_turn_x'"),
     ],
 )
-def test_what_is_refused(seen, more, said, own_base: ArmScene, bracket: TargetScene, out: Path):
+def test_wrong_names_and_too_few_frames_are_refused(
+    seen, more, said, own_base: ArmScene, bracket: TargetScene, out: Path
+):
     words = own_base.register(out) if seen == "base" else bracket.register(out)
     assert_refused(run_command([*words, *more.split()]), said)
     assert not out.exists()

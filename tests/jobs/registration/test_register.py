@@ -30,29 +30,29 @@ from tests.search.arms import arm_cameras, arm_tree
 def registered(
     arm_scene: ArmScene, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, dict[str, Any], Result]:
-    """The camera without X_WC, found on the command line: folder, JSON, all that was said."""
+    """The camera without X_WC, registered by the command: folder, JSON, and its output."""
     out = tmp_path_factory.mktemp("registered") / "out"
     result = run_to_end(*arm_scene.register(out), "--json")
     return out, json.loads(result.stdout), result
 
 
 class TestRegister:
-    def test_the_camera_is_found_and_the_other_one_held(self, arm_scene, registered) -> None:
+    def test_camera_is_registered_and_the_known_one_kept(self, arm_scene, registered) -> None:
         out, found, result = registered
         assert result.stderr == ""
         assert found["warnings"] == []
-        # An estimate reads them.
+        # The camera file is readable for an estimate.
         written = load_scene(arm_scene.folder, load_cameras(out / "cameras.yaml")).cameras
         assert list(written) == ["left", "right"]
         millimetres, degrees = pose_errors(written["left"].X_WC, arm_scene.cameras["left"].X_WC)
-        # Two metres before a camera of 320 x 240 pixels.
+        # The robot is two metres from a camera of 320 x 240 pixels.
         assert millimetres < min(8.0, 4.0 * np.sqrt(3.0) * found["translation_sd_mm"])
         assert degrees < min(0.2, 4.0 * np.sqrt(3.0) * found["rotation_sd_deg"])
         np.testing.assert_array_equal(written["right"].X_WC, arm_scene.cameras["right"].X_WC)
         for name in ("width", "focal_x", "focal_y", "center_x", "center_y", "near"):
             assert getattr(written["left"], name) == getattr(arm_scene.cameras["left"], name)
 
-    def test_numbers(self, registered) -> None:
+    def test_summary_and_registration_file(self, registered) -> None:
         out, found, _ = registered
         assert found == json.loads((out / "summary.json").read_text())
         assert list(found["cameras"]) == ["left"]
@@ -78,7 +78,7 @@ class TestRegister:
         assert [path.stem for path in pictures] == [f"{k:04d}" for k in range(5)]
         picture = cv2.imread(str(pictures[0]))[:, :, ::-1]
         assert picture.shape[1] >= 560
-        # But for the legend's squares, body and mask are one.
+        # Except for the legend, body and mask coincide.
         wrong = [(picture == rgb).all(axis=2).mean() for rgb in (MISSING_RGB, EXCESS_RGB)]
         assert max(wrong) < 0.005
         page = (registered[0] / "report.html").read_text()
@@ -95,9 +95,7 @@ class TestRegister:
 
 
 @pytest.mark.slow
-def test_one_pose_and_a_held_camera_that_looks_elsewhere_are_warned_of(
-    own_arm: ArmScene, out: Path
-) -> None:
+def test_single_frame_and_wrong_known_camera_are_warned_of(own_arm: ArmScene, out: Path) -> None:
     elsewhere = np.array(own_arm.cameras["right"].X_WC)
     elsewhere[:3, 3] += [0.0, 0.8, 0.0]
     own_arm.edit_cameras("right", X_WC=elsewhere.tolist())
@@ -121,17 +119,17 @@ class TestRecordedArms:
             assert degrees < 0.5
         assert not any(one.outliers for one in found.registered.values())
 
-    def test_a_tool_that_the_model_lacks(self, shared_data: Path) -> None:
+    def test_tool_missing_in_the_model(self, shared_data: Path) -> None:
         scene = shared_data / "arm_one_view"
         model = shared_data / "arm_two_views" / "med7" / "med7.urdf"
         one = register_scene(scene, model, scene / "joint_angles.csv").registered["camera"]
         assert not one.outliers
         assert not len(one.alternatives)
-        # What the reference leaves: raw IoU 0.87 0.94 0.92 0.95 0.93, its README says.
+        # The reference has IoU 0.87 0.94 0.92 0.95 0.93 (its README).
         ious = [frame.iou for frame in one.frames]
         np.testing.assert_allclose(ious, (0.87, 0.94, 0.92, 0.95, 0.93), atol=0.01)
 
-    def test_frames_that_contradict_their_angles(self, shared_data: Path, out: Path) -> None:
+    def test_half_outliers_are_refused(self, shared_data: Path, out: Path) -> None:
         folder = shared_data / "franka_one_view"
         panda = folder / "panda" / "panda.urdf"
         scene = ArmScene(folder, panda, folder / "joint_angles.csv", {})
@@ -148,7 +146,7 @@ def registered_camera(name: str, frames: dict[str, bool]) -> RegisteredCamera:
     return RegisteredCamera(replace(arm_cameras()[0], name=name), np.eye(6), misfits)
 
 
-def test_cameras_tell_together_whose_fault_a_frame_is() -> None:
+def test_outliers_in_all_cameras_and_in_one_are_distinguished() -> None:
     left = registered_camera("left", {"0000": True, "0001": False, "0002": False, "0003": False})
     right = registered_camera("right", {"0000": True, "0001": False, "0002": True})
     common, alone = common_outlier_warnings([left, right])
@@ -156,12 +154,12 @@ def test_cameras_tell_together_whose_fault_a_frame_is() -> None:
     assert "joint positions are not those of the pictures" in common
     assert "frames 0002 are outliers in camera 'left'" in alone
     assert "masks are not" in alone
-    # One camera alone cannot tell.
+    # A single camera cannot distinguish the two.
     assert common_outlier_warnings([left]) == []
 
 
 def body_poses(path: Path, q: np.ndarray, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Where Drake has links (4, 4) by name."""
+    """Return Drake's poses (4, 4) of links by name."""
     plant = load_model(path).plant
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, q)
@@ -169,18 +167,18 @@ def body_poses(path: Path, q: np.ndarray, names: tuple[str, ...]) -> dict[str, n
     return {name: one.EvalPoseInWorld(context).GetAsMatrix4() for name, one in bodies.items()}
 
 
-def test_a_longer_link_carries_the_next_joint_farther_along_it(tmp_path: Path) -> None:
-    """A tenth more of the .35 m between two joints, by the URDF; what is not determined stays."""
+def test_link_scale_shifts_the_next_joint(tmp_path: Path) -> None:
+    """A scale of 1.1 on 0.35 m between two joints; a link with scale 1 has no shift."""
     lengths = [SimpleNamespace(name="shoulder", value=0.1), SimpleNamespace(name="elbow", value=0)]
     shifts = joint_shifts(arm_tree(tmp_path), lengths)
     assert shifts == {"roll_turn": pytest.approx([0.0, 0.0, 0.035])}
 
 
 @pytest.mark.slow
-def test_zeros_and_lengths_are_found_and_written_to_a_urdf(
+def test_offsets_and_scales_are_estimated_and_written_to_a_urdf(
     own_arm: ArmScene, tmp_path: Path, out: Path
 ) -> None:
-    """Drake poses the corrected robot at the encoders' readings as the right one at the truth."""
+    """Drake poses the corrected robot at the readings like the true robot at the true positions."""
     rows = own_arm.add_to("elbow_turn", -np.radians(3.0))
     short = tmp_path / "short.urdf"
     short.write_text(own_arm.model.read_text().replace('"0 0 0.35"', '"0 0 0.34"'))
@@ -198,9 +196,9 @@ def test_zeros_and_lengths_are_found_and_written_to_a_urdf(
     one = yaml.safe_load((out / "registration.yaml").read_text())["left"]
     assert (one["zeros"], one["lengths"]) == (zeros, lengths)
     assert "too low</td>" in (out / "report.html").read_text()
-    # The shorter robot at the truth, its joints shifted by the lengths that were found.
+    # The shorter robot at the true positions, with joints shifted by the estimated scales.
     read = np.array([float(one) for one in rows[1][1:]])
-    # What is not significant was held where it was.
+    # Insignificant parameters are not written.
     written = {name: one["value_deg"] for name, one in zeros.items() if one["significant"]}
     shifts = np.radians([written.get(name, 0.0) for name in rows[0][1:]])
     corrected, names = out / "short_calibrated.urdf", ("turret", "shoulder", "roll", "hand")
@@ -213,20 +211,17 @@ def test_zeros_and_lengths_are_found_and_written_to_a_urdf(
     np.testing.assert_allclose(found["hand"][:3, 3], right["hand"][:3, 3] + moved, atol=1e-9)
 
 
-def test_too_few_frames_for_all_zeros(
+def test_too_few_frames_are_refused_before_the_search(
     own_arm: ArmScene, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And nothing is searched for first."""
     monkeypatch.setattr(CameraSearch, "register", None)
     words = own_arm.register(out)
     assert_refused(run_command([*words, "--zeros", "all", "--frame", "0000"]), "more frames")
     assert not out.exists()
 
 
-def test_that_no_picture_can_be_suggested_is_said(
-    tiny_scene: TinyScene, tmp_path: Path, out: Path
-) -> None:
-    """An arm in a plane looks the same from two places, and is nowhere outside the box."""
+def test_missing_suggestion_is_warned_of(tiny_scene: TinyScene, tmp_path: Path, out: Path) -> None:
+    """A planar arm looks the same from two places, and the box leaves no free pose."""
     joints = write_truth(tiny_scene, tmp_path / "joints.csv")
     arm = ArmScene(tiny_scene.folder, tiny_scene.model, joints, {})
     words = [*arm.register(out), "--no-overlay", "--camera", "front"]

@@ -1,4 +1,4 @@
-"""The page of a registration in pictures: clocks, focal lengths."""
+"""The report of a registration from pictures: time offsets, focal lengths, parameters."""
 
 from types import SimpleNamespace
 
@@ -28,9 +28,9 @@ def summary(**camera):
 
 
 @pytest.mark.parametrize("late", [0.1, -0.35])
-def test_the_clock_s_offset_is_drawn_at_the_curve_s_peak(tmp_path, late):
+def test_time_offset_is_drawn_at_the_peak_of_the_scores(tmp_path, late):
     offsets = np.linspace(-1.0, 1.0, 81)
-    # Two offsets were not tried.
+    # Two offsets have not been scanned.
     scores = np.column_stack([offsets, 1.0 - 0.3 * np.abs(offsets - late)])[
         [*range(5), *range(7, 81)]
     ]
@@ -51,7 +51,7 @@ def test_the_clock_s_offset_is_drawn_at_the_curve_s_peak(tmp_path, late):
     assert (band.x0, band.x1) == pytest.approx((1e3 * late - 39.2, 1e3 * late + 39.2))
 
 
-def test_what_pictures_do_not_tell(tmp_path):
+def test_undetermined_time_offset_and_given_focal_length(tmp_path):
     page = make_registration_report(tmp_path, summary())
     assert "The time offset is not determined" in page
     assert "Focal length 500.0 pixels, as given" in page
@@ -61,7 +61,7 @@ def test_what_pictures_do_not_tell(tmp_path):
     assert "Clocks" not in page
 
 
-def test_zeros_and_lengths_are_shown_with_what_to_make_of_them(tmp_path):
+def test_parameters_are_shown_with_their_significance(tmp_path):
     low = {"value_deg": 3.0, "sd_deg": 0.1, "low_deg": 2.8, "high_deg": 3.2}
     small = {"value_mm": 0.1, "sd_mm": 0.2, "low_mm": -0.3, "high_mm": 0.5}
     long = {"value_percent": 2.9, "sd_percent": 0.5, "low_percent": 1.9, "high_percent": 3.9}
@@ -91,7 +91,7 @@ def test_zeros_and_lengths_are_shown_with_what_to_make_of_them(tmp_path):
         assert f"<td>{row}" in page
 
 
-def test_what_is_written_of_clocks_and_focal_lengths():
+def test_summary_of_time_offset_and_focal_length():
     camera, scores = arm_cameras()[0], np.array([[0.0, 0.5], [0.1, 1.0]])
     clock = TimeOffset(0.1, 0.02, scores, drift=1e-3, drift_deviation=1e-4)
     one = SimpleNamespace(

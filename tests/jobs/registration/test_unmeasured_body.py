@@ -1,4 +1,4 @@
-"""`drake-pose register` of a body whose joint positions nobody measured."""
+"""`drake-pose register` without measured joint positions."""
 
 import shutil
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ PERSON = bundled_model("person").with_name("person_shape.urdf")
 def register_near(
     words: Sequence[str], out: Path, name: str, true: np.ndarray, *limits: float
 ) -> dict[str, Any]:
-    """Runs register; a camera is off by less than limits: mm, degrees and standard deviations."""
+    """Register a camera, and require errors below limits [mm, deg, standard deviations]."""
     told = run_json(*words)
     found = yaml.safe_load((out / "registration.yaml").read_text())[name]
     X_WC = load_cameras(out / "cameras.yaml")[name].X_WC
@@ -38,7 +38,7 @@ def register_near(
 
 
 def write_free_arm(scene: ArmScene, seed: int = 7) -> None:
-    """Frames in which the whole arm stands elsewhere, and a poses.csv that is a little off."""
+    """Write frames in which the whole arm moves, and a poses.csv with small errors."""
     model, rng = load_model(scene.model), np.random.default_rng(seed)
     rows = [["frame", *JOINTS, *BASE, "error", "seconds"]]
     for k in range(6):
@@ -64,10 +64,10 @@ class TestFound:
         words = arm_scene.register(out, with_joints=False)
         assert register_near(words, out, "left", true, 25.0, 0.8, 4.0)["joints"] is None
 
-    def test_the_base_moves_and_the_table_is_an_estimate_s(self, own_arm, out) -> None:
+    def test_moving_base_from_an_estimate(self, own_arm, out) -> None:
         write_free_arm(own_arm)
         true = own_arm.cameras["left"].X_WC
-        # Held at the table, which is off by a degree and 5 mm, it is 10 mm and more.
+        # Without adjustment of the positions, the error would be 10 mm or more.
         found = register_near(own_arm.register(out), out, "left", true, 15.0, 0.5, 4.0)
         assert "0006" not in found["frames"]
 
@@ -76,44 +76,44 @@ class TestFound:
         words = ArmScene(source, PERSON, out, {}).register(out, with_joints=False)
         true = load_cameras(source / "cameras.yaml")["cam03"].X_WC
         words += ["--camera", "cam03", "--frame", "0:19"]
-        # Four metres away, the person's surface known to a centimetre or two.
+        # The person is four metres away, and the surface is known to a centimetre or two.
         register_near(words, out, "cam03", true, 100.0, 2.5, 5.0)
 
-    def test_a_body_that_stands_still_is_warned_of(self, own_arm, out: Path) -> None:
+    def test_a_body_that_does_not_move_is_warned_of(self, own_arm, out: Path) -> None:
         as_estimated(own_arm, slice(1))
         result = run_to_end(*own_arm.register(out))
         assert "camera 'left': there is one frame, '0000'" in " ".join(result.stderr.split())
 
 
 def as_estimated(arm: ArmScene, frames: slice = slice(None)) -> None:
-    """Some rows as an estimate has written them."""
+    """Rewrite some rows as an estimate writes them."""
     header, *rows = arm.rows()
     rows = [[*row, "0.1", "1.0"] for row in rows[frames]]
     arm.write_rows([[*header, "error", "seconds"], *rows])
 
 
 class TestRefused:
-    def test_nothing_is_known(self, own_arm: ArmScene, out: Path) -> None:
+    def test_nothing_known(self, own_arm: ArmScene, out: Path) -> None:
         own_arm.edit_cameras("right", X_WC=None)
         result = run_command(own_arm.register(out, with_joints=False))
         assert_refused(result, "neither a camera's pose nor", "X_WC of one camera", "--joints")
         assert not out.exists()
 
-    def test_a_person_before_one_known_camera(self, arm_scene: ArmScene, out: Path) -> None:
+    def test_person_with_one_known_camera(self, arm_scene: ArmScene, out: Path) -> None:
         words = replace(arm_scene, model=PERSON).register(out, with_joints=False)
         assert_refused(run_command(words), "right is the only camera", "two cameras or more")
 
     @pytest.mark.parametrize("more", [["--zeros", "all"], ["--focal"], ["--on", "hand"]])
-    def test_what_needs_measured_positions(self, more, arm_scene, out: Path) -> None:
+    def test_options_that_need_measured_positions(self, more, arm_scene, out: Path) -> None:
         words = arm_scene.register(out, with_joints=False)
         assert_refused(run_command([*words, *more]), f"{more[0]} needs measured joint positions")
 
-    def test_no_moment_in_common(self, own_arm: ArmScene, out: Path) -> None:
+    def test_no_synchronised_frame(self, own_arm: ArmScene, out: Path) -> None:
         own_arm.write_rows([["frame", *JOINTS, "error", "seconds"], [7, *([0.1] * 5), 0.1, 1.0]])
         result = run_command(own_arm.register(out))
         assert_refused(result, "camera 'left' has no mask of a frame in which")
 
-    def test_an_estimate_without_its_cameras(self, own_arm: ArmScene, out: Path) -> None:
+    def test_estimate_without_masks_of_its_cameras(self, own_arm: ArmScene, out: Path) -> None:
         as_estimated(own_arm)
         shutil.rmtree(own_arm.folder / "masks" / "right")
         result = run_command(own_arm.register(out))

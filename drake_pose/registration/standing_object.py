@@ -382,19 +382,21 @@ class TargetSearch:
                 alike = [self._apart([X[None] for X in found], turns) for *_, found in likely]
                 X_CT.append(np.concatenate([X for found in alike for X in found]))
         some = [own[0] for own in likely_masks]
-        X_WL = self._target.link_poses(np.array([one.values for one in some]))
-        begun = hand_eye_starts(X_WL, X_CT, turns)
-        if not len(begun):
+        hypotheses = np.zeros((0, 2, 4, 4))
+        if len(some) >= 3:
+            X_WL = self._target.link_poses(np.array([one.values for one in some]))
+            hypotheses = hand_eye_starts(X_WL, X_CT, turns)
+        if not len(hypotheses):
             raise RegistrationError(
                 f"camera '{camera.name}': in no three of its frames does the target rotate in the "
                 "camera as the link does: are these masks of this target, did it stand still, are "
                 "the joint positions those of these frames, and does the camera ride on this link? "
                 "Nothing was written"
             )
-        misfits = self._misfits(camera, likely_masks, begun, SEARCH.start_side)
+        misfits = self._misfits(camera, likely_masks, hypotheses, SEARCH.start_side)
         order = np.argsort(misfits, kind="stable")
         fitted = []
-        for pose in self._distinct(begun[order[: 10 * starts]], some)[:starts]:
+        for pose in self._distinct(hypotheses[order[: 10 * starts]], some)[:starts]:
             # The mask of each frame that the hypothesis explains best.
             by = [[self._misfit(camera, one, pose[None])[0] for one in own] for own in likely_masks]
             chosen = [own[int(np.argmin(each))] for own, each in zip(likely_masks, by, strict=True)]

@@ -33,6 +33,7 @@ from drake_pose.registration.online_registration import pose_difference
 from drake_pose.registration.per_frame_fit import PerFrameFit
 from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrame, PosedFrames
 from drake_pose.registration.register import (
+    CameraSearch,
     E_total,
     RegistrationBody,
     _mask_bounds,
@@ -368,6 +369,10 @@ def test_hand_eye_fit_finds_camera_and_target(
     found = search._fitted(fit, fit.fit([STEP] * 12), off)
     began, ended = search._misfits(camera, [[one] for one in frames], np.array([off, found]), 100.0)
     assert ended < 0.3 * began
+    # Fewer than three frames with a likely mask are refused.
+    quick = TargetSearch(thing, CameraSearch(thing.in_own_frame, rotations=20, fitted=2))
+    with pytest.raises(RegistrationError, match="in no three of its frames"):
+        quick.choose(camera, [[other, frames[0]]] * 3, explained=-1.0)
     # Poses related by a symmetry of the target are the same, others are not.
     alike = np.array([true[0], true[1] @ thing.symmetry[0][1]])
     far = np.array([true[0], thing.moved(true[1], np.array([0.2, 0, 0, 0, 0, 0]))])

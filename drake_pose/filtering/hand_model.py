@@ -146,7 +146,7 @@ class HandModel:
             *(f"point_{point}_{axis}" for point in points for axis in "xy"),
             *(f"{kind}_{line}" for line in lines for kind in ("alpha", "rho")),
             "scale",
-            *(f"usual_{k}" for k in range(0 if self.prior is None else len(self.prior.mean))),
+            *(f"prior_{k}" for k in range(0 if self.prior is None else len(self.prior.mean))),
         )
 
     @cached_property

@@ -56,7 +56,7 @@ def film(studio):
         left_upper_arm_x=-50, left_upper_arm_z=30, left_forearm_x=-50, right_upper_arm_z=-50,
         left_thigh_x=-25, left_shin_x=30, head_y=12,
     )  # fmt: skip
-    path = [start] * 2 + [start + share * (goal - start) for share in np.linspace(0.25, 1, 6)]
+    path = [start] * 2 + [start + fraction * (goal - start) for fraction in np.linspace(0.25, 1, 6)]
     return path, [{n: studio.picture(q, n) for n in studio.cameras} for q in path]
 
 
@@ -243,7 +243,7 @@ class TestHorizontalImage:
         assert evaluated(system, color_image=picture_to_colour_image(None)) is None
         assert evaluated(system, "region") is None
 
-    def test_bad_input_is_named(self, studio, backgrounds):
+    def test_invalid_inputs_are_refused_by_name(self, studio, backgrounds):
         camera = studio.ring["camera_1"]
         whole = picture_to_colour_image(np.zeros((240, 320, 3), np.uint8))
         small = picture_to_colour_image(np.zeros((120, 160, 3), np.uint8))
@@ -260,7 +260,7 @@ class TestHorizontalImage:
 
 
 class TestFeatureFinder:
-    def test_nothing_measured_and_nobody_known(self, studio):
+    def test_without_measurements_features_stay_and_without_a_person_are_nan(self, studio):
         system = FeatureFinder(list(studio.ring.values()))
         last = np.arange(15.0)
         np.testing.assert_array_equal(evaluated(system, "features", last_features=last), last)
@@ -269,7 +269,7 @@ class TestFeatureFinder:
         assert np.isnan(evaluated(system, "features", last_features=unknown)).all()
         assert evaluated(system, "found", last_features=unknown) is None
 
-    def test_cameras_are_checked(self, studio):
+    def test_invalid_cameras_are_refused(self, studio):
         camera = studio.ring["camera_0"]
         for cameras in ([camera], [camera, camera]):
             with pytest.raises(SettingsError, match="two or more different cameras"):
@@ -277,7 +277,9 @@ class TestFeatureFinder:
 
 
 class TestPreparation:
-    def test_skin_is_where_the_cameras_see_it(self, studio, backgrounds):
+    def test_the_prepared_skeleton_has_its_features_where_skin_is_visible(
+        self, studio, backgrounds
+    ):
         q = studio.registered.q
         ring = {f"camera_{k}": studio.ring[f"camera_{k}"] for k in (0, 1, 3, 6)}
         pictures = {name: studio.picture(q, name) for name in ring}
@@ -300,7 +302,7 @@ class TestPreparation:
         found = evaluated(recogniser, "recognised_positions", **views)
         np.testing.assert_allclose(found[:3], q[:3], atol=0.03)
 
-    def test_face_camera_must_be_there(self, studio, backgrounds):
+    def test_the_face_camera_must_exist(self, studio, backgrounds):
         with pytest.raises(UnknownNameError, match="camera 'nose'"):
             prepare_paper_capture(
                 studio.model, studio.ring, "nose", studio.posed(), {}, backgrounds

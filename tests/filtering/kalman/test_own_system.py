@@ -69,10 +69,10 @@ def test_linear_models_without_limits_give_the_kalman_filter():
         if t:
             now, mean = STEP.transition @ now, STEP.transition @ mean
         now[:, n * t : n * t + n] += roots[t]
-        seen = np.isfinite(y)
-        weigh = 1.0 / np.sqrt(LINEAR.variances[seen])
-        rows.append(weigh[:, None] * SLOPE[seen] @ now)
-        values.append(weigh * (y - SLOPE @ mean)[seen])
+        partly_occluded = np.isfinite(y)
+        weigh = 1.0 / np.sqrt(LINEAR.variances[partly_occluded])
+        rows.append(weigh[:, None] * SLOPE[partly_occluded] @ now)
+        values.append(weigh * (y - SLOPE @ mean)[partly_occluded])
     A, b = np.concatenate(rows), np.concatenate(values)
     covariance = np.linalg.inv(np.eye(n * frames) + A.T @ A)
     np.testing.assert_allclose(found.mean, mean + now @ (covariance @ A.T @ b), atol=1e-6)
@@ -133,10 +133,10 @@ def test_filters_equal_stone_soups(linear):
     )
     predictor = KalmanPredictor(step)
     updater = KalmanUpdater() if linear else ExtendedKalmanUpdater()
-    begun = datetime(2020, 1, 1)
-    state = GaussianState(START.mean[:, None], START.covariance, timestamp=begun)
+    start_time = datetime(2020, 1, 1)
+    state = GaussianState(START.mean[:, None], START.covariance, timestamp=start_time)
     for t, (y, belief) in enumerate(zip(measured, ours, strict=True)):
-        at = begun + timedelta(seconds=0.1 * t)
+        at = start_time + timedelta(seconds=0.1 * t)
         prediction = predictor.predict(state, timestamp=at) if t else state
         detection = Detection(y[:, None], timestamp=at, measurement_model=model)
         state = updater.update(SingleHypothesis(prediction, detection))
@@ -333,10 +333,12 @@ def test_invalid_arguments_are_refused_by_name(act, words):
 def test_correct_jacobians_with_angles_and_nan_pass():
     """Also where an angle wraps, and where a measurement is NaN."""
 
-    def seen(x):
+    def partly_occluded(x):
         return np.array([np.arctan2(np.sin(x[0]), np.cos(x[0])), np.nan, x[2]])
 
-    bearing = FunctionObservation(("angle", "hidden", "length"), 0.1, seen, angles=["angle"])
+    bearing = FunctionObservation(
+        ("angle", "hidden", "length"), 0.1, partly_occluded, angles=["angle"]
+    )
     start = Belief(np.array([np.pi, 0.0, 1.0]), START.covariance)
     f = make(bearing)
     found = f.update(f.start(start), np.array([-np.pi + 0.1, 5.0, 1.0]))

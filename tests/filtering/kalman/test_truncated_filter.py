@@ -81,8 +81,8 @@ def test_linear_update_equals_the_information_form(iterations, R):
         # For a linear measurement the second iteration changes nothing.
         assert R is not None or model.calls <= 2
         information = np.linalg.inv(prior.covariance) + H.T @ np.linalg.inv(noise) @ H
-        told = np.linalg.solve(prior.covariance, prior.mean) + H.T @ np.linalg.solve(noise, y)
-        mean, covariance = np.linalg.solve(information, told), np.linalg.inv(information)
+        vector = np.linalg.solve(prior.covariance, prior.mean) + H.T @ np.linalg.solve(noise, y)
+        mean, covariance = np.linalg.solve(information, vector), np.linalg.inv(information)
         np.testing.assert_allclose(result.belief.mean, mean, atol=1e-9)
         np.testing.assert_allclose(result.belief.covariance, covariance, atol=1e-9)
         expected = multivariate_normal.logpdf(y, H @ prior.mean, H @ prior.covariance @ H.T + noise)

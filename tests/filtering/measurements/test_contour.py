@@ -113,11 +113,11 @@ def test_limits_are_inequalities_except_of_angles_that_turn_around(tmp_path):
     rows = ContourObservation(tree, [front_camera(200)]).inequalities()
     for name, (lower, upper) in angles.items():
         phi = rows.phi[:, rows.columns.index(name)]
-        told = {row: b for row, b, one in zip(rows.rows, rows.b, phi, strict=True) if one}
+        bounds = {row: b for row, b, one in zip(rows.rows, rows.b, phi, strict=True) if one}
         if name == "slant":
-            assert not told
+            assert not bounds
         else:
-            assert sorted(told.values()) == pytest.approx(sorted([upper, -lower]))
+            assert sorted(bounds.values()) == pytest.approx(sorted([upper, -lower]))
 
 
 def test_skin_is_drawn_with_angles_wrapped_into_the_limits(tmp_path):

@@ -75,8 +75,8 @@ def test_lines_and_tips_equal_the_true_hands_from_table_2s_guess(render, seed):
     mask = render(x)
     found = SILHOUETTE.measure(mask, guess, 1.0)
     off = normalised(found, x)
-    told = off[np.isfinite(off)]
-    assert len(told) >= 15
+    visible_errors = off[np.isfinite(off)]
+    assert len(visible_errors) >= 15
     # The measurement is relative to the final rough pose.
     edge, gate = find_edge_points(mask, MATCHING.spacing), SILHOUETTE._unit * MATCHING.gates[-1]
     lines = match_axes(edge, SILHOUETTE._rough(found.rough), gate, CENTER).lines.ravel()
@@ -85,7 +85,7 @@ def test_lines_and_tips_equal_the_true_hands_from_table_2s_guess(render, seed):
     shown = np.isfinite(measured)
     np.testing.assert_array_equal(measured[shown], lines[shown])
     # A segment that points at the camera may be mistaken for another's end.
-    assert np.mean(np.abs(told) < 3) > 0.9
+    assert np.mean(np.abs(visible_errors) < 3) > 0.9
     assert found.difference < 0.045
     assert np.count_nonzero(SILHOUETTE.draw(guess.mean) != mask) > 0.1 * np.count_nonzero(mask)
     again = SILHOUETTE.measure(mask, guess, 1.0)
@@ -99,8 +99,8 @@ def test_noise_covers_the_errors(render):
         x = hand(t, 35.0, 0.3 * math.sin(t))
         off.append(normalised(SILHOUETTE.measure(render(x), sure_of(x)), x))
     off = np.array(off)
-    told = np.isfinite(off).any(axis=0)
-    names = {name for name, seen in zip(MEASURED, told, strict=True) if not seen}
+    measured = np.isfinite(off).any(axis=0)
+    names = {name for name, seen in zip(MEASURED, measured, strict=True) if not seen}
     knuckles = {f"point_{i}{j}_{a}" for i in (1, 2) for j in (0, 1, 2) for a in "xy"}
     assert names == {"wrist_x", "wrist_y", "scale", *knuckles}
     assert 0.2 < np.sqrt(np.nanmean(off**2)) < 1.0
@@ -127,9 +127,9 @@ def test_joints_outside_the_silhouette_are_measured_half_a_radius_inside(render)
     edge, y = find_edge_points(mask, 1.0), np.full(len(MEASURED), np.nan)
     R = np.diag(OBSERVATION.variances)
     SILHOUETTE._add_hidden_points(bent, mask, edge, y, R)
-    told = np.flatnonzero(np.isfinite(y)).reshape(-1, 2)
-    assert 2 <= len(told) < 8
-    for rows in told:
+    measured = np.flatnonzero(np.isfinite(y)).reshape(-1, 2)
+    assert 2 <= len(measured) < 8
+    for rows in measured:
         u, v = np.rint(y[rows] + CENTER).astype(int)
         assert mask[v, u]
         point = OBSERVATION.drawing(bent)[(rows[0] - 2) // 2] + CENTER

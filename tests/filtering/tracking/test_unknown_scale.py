@@ -75,11 +75,11 @@ def test_a_drifting_scale_is_tracked_and_found_again_after_a_cut(tree):
     second[:, layout.index("root_shift_y")] += 0.5
     masks, answers = drawn(tree, camera, [*first, *second])
     search = KnownPoses(tree, answers)
-    follower, followed = MatchAndTrack(search, [camera], PERIOD, SETTINGS), TrackerState()
+    follower, tracker_state = MatchAndTrack(search, [camera], PERIOD, SETTINGS), TrackerState()
     scales, errors, kinds = [], [], []
     for frame, mask in enumerate(masks):
         search.frame = frame
-        followed, result = follower.next(followed, [View(camera, mask)])
+        tracker_state, result = follower.next(tracker_state, [View(camera, mask)])
         scales.append(result.scale / answers[frame][2])
         errors.append(np.degrees(np.abs(result.q - answers[frame][0])).max())
         kinds.append(result.stopped_by)
@@ -145,8 +145,8 @@ def test_all_poses_are_found_and_equal_fits_are_merged(fitted):
     (found,) = explanations
     index = [found.body.kinematics.names.index(name) for name in observation.layout.moving[:3]]
     off = np.degrees(np.abs(found.fitted.parameters[:, index] - states[:, :3]))
-    begun = np.degrees(np.abs(np.array(starts[0])[:, :3] - states[:, :3]))
-    assert np.median(off) < 0.25 * np.median(begun)
+    initial_errors = np.degrees(np.abs(np.array(starts[0])[:, :3] - states[:, :3]))
+    assert np.median(off) < 0.25 * np.median(initial_errors)
     deviations = np.degrees(found.deviations[:, index])
     assert (deviations > 0.0).all()
     assert np.mean(off < 2.0 * deviations) > 0.9
@@ -159,14 +159,14 @@ def test_a_frames_pose_set_has_the_explanations_pose_and_intervals(fitted):
             explanations[0].fitted.parameters[frame][: len(observation.parameters(states[0]))]
         )
         q, X_WB = observation.positions(x)
-        told = pose_set(explanations, [(q, X_WB, 7.0)], frame)
-        (mode,) = told.modes
+        found_set = pose_set(explanations, [(q, X_WB, 7.0)], frame)
+        (mode,) = found_set.modes
         assert mode.J == 7.0
         values = np.concatenate(tree.values_from_positions(q, X_WB))
         np.testing.assert_allclose(np.concatenate(mode.node_values), values, atol=1e-9)
         kinematics = explanations[0].body.kinematics
         ranges = np.minimum(kinematics.upper - kinematics.lower, 2.0 * np.pi)
-        for joint, value, whole in zip(told.joints, values, ranges, strict=True):
+        for joint, value, whole in zip(found_set.joints, values, ranges, strict=True):
             assert joint.low <= value <= joint.high
             assert joint.determined == (joint.high - joint.low < 0.5 * whole)
 

@@ -23,8 +23,8 @@ def test_positions_are_held_around_their_time():
     q = np.array([[1.0, -1.0], [2.0, 5.0], [4.0, 0.0]])
     held = held_positions(q, 0.2)
     for k, row in enumerate(q):
-        for share in (-0.49, 0.0, 0.49):
-            np.testing.assert_array_equal(held.value(0.2 * (k + share)).ravel(), row)
+        for fraction in (-0.49, 0.0, 0.49):
+            np.testing.assert_array_equal(held.value(0.2 * (k + fraction)).ravel(), row)
 
 
 def test_body_poses_move_with_the_base(body):

@@ -46,7 +46,7 @@ def played(truth):
     return PiecewisePolynomial.ZeroOrderHold(breaks, np.vstack([truth, truth[-1:]]).T)
 
 
-def followed(built, truth):
+def track_errors(built, truth):
     """Return errors and deviations (T, n) of tracked positions, and TRACK by name (T,)."""
     simulator = Simulator(built.diagram)
     root, rows = simulator.get_mutable_context(), []
@@ -171,7 +171,7 @@ def test_mimic_joints_are_tracked_together(tmp_path):
     built = build_simulated_matching(
         search, arm_cameras(), played(truth), PERIOD, tracking=TrackingSettings()
     )
-    errors, deviations, track = followed(built, truth)
+    errors, deviations, track = track_errors(built, truth)
     np.testing.assert_array_equal(track["tracked"][1:], 1.0)
     np.testing.assert_array_equal(errors[:, 2], errors[:, 3])
     np.testing.assert_array_equal(deviations[:, 2], deviations[:, 3])

@@ -33,11 +33,12 @@ from drake_pose.registration.shared_fit import SHARED
 class DiagnosisSettings(NamedTuple):
     """Thresholds of a diagnosis.
 
-    significance: probability with which a correct scene, or a correct frame, gets a finding.
-    min_pixels: errors that move outlines by less get no finding [pixel]. min_joint_pixels: the same
-    for joint offsets common to all frames, after the cameras' errors are removed. focal_sd_floor:
-    minimum standard deviation of focal lengths [relative]. min_information: directions with less
-    information, in units of the prior, are left out of statistics.
+    Args:
+        significance: probability with which a correct scene, or a correct frame, gets a finding.
+        min_pixels: errors that move outlines by less get no finding [pixel].
+        min_joint_pixels: the same for joint offsets in all frames, beside errors of the cameras.
+        focal_sd_floor: minimum standard deviation of focal lengths [relative].
+        min_information: statistics use directions with more information [of the prior].
     """
 
     significance: float = 1e-4

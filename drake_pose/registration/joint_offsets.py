@@ -231,7 +231,7 @@ def calibrate_joints(
 def shrink_constants(
     fit: SharedFit, found: SharedValues, covariance: Array, names: Sequence[str]
 ) -> Array:
-    """Return the shared values (u,) with the named constants shrunk towards 0.
+    """Return a fit's shared values (u,) with the named constants shrunk towards 0.
 
     Angular offsets, linear offsets and link scales each get a prior standard deviation, the most
     likely one given their estimates (empirical Bayes; Efron and Morris 1975). Correlated values,
@@ -263,6 +263,10 @@ def significant_constants(
     """Return the constants that exceed `most` standard deviations when the others are held at 0.
 
     Backward elimination: the least significant constant is held at 0 first, and the others follow.
+
+    Args:
+        fit, found, covariance: the fit, its values, and their covariance (u, u).
+        names: of the constants.
     """
     rows, kept = [fit.names.index(name) for name in names], list(names)
     x, C = found.shared[rows], covariance[np.ix_(rows, rows)]
@@ -336,6 +340,8 @@ def describe_constants(
     """Describe constants by name: 95 % interval, significance, and correlated unknowns.
 
     Args:
+        fit, found, covariance: the fit, its values, and their covariance (u, u).
+        names: of the constants.
         freedom: degrees of freedom of Student's t distribution.
         level: p-value below which a constant is significant.
         determined: maximum standard deviation of a determined constant, over the prior's.

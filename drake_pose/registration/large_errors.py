@@ -258,7 +258,10 @@ class LargeErrorSearch:
     def joint_correction(
         self, kind: str, name: str, sign: float, by: float, rank: float
     ) -> Correction:
-        """Return the correction sign * q + by of a joint's positions; by [rad or m]."""
+        """Return a correction to sign * q + by of a joint's positions q; by [rad or m].
+
+        kind, name, by and rank are those of the ``Correction``.
+        """
         j = self._body.kinematics.names.index(name)
 
         def changed(frame: MultiViewFrame) -> MultiViewFrame:

@@ -41,11 +41,14 @@ from drake_pose.workers import map_ordered
 class PictureSettings(NamedTuple):
     """Parameters of a search in pictures.
 
-    search_frames: number of frames in a search. triangles: number of triangles of a node in pyramid
-    levels up to 64 and up to 120 pixels wide, and in wider ones. compare_width, background_width:
-    width of the pictures in which poses are compared, and backgrounds are estimated [pixel].
-    contour_weight: weight of edges along the contours beside the explained fraction. rate_step:
-    half the interval of the differences that estimate joint velocities [s].
+    Args:
+        search_frames: number of frames in a search.
+        triangles: number of triangles of a node in pyramid levels up to 64 and up to 120 pixels
+            wide, and in wider ones.
+        compare_width, background_width: width of the pictures in which poses are compared, and
+            backgrounds are estimated [pixel].
+        contour_weight: weight of edges along the contours beside the explained fraction.
+        rate_step: half the interval of the differences that estimate joint velocities [s].
     """
 
     search_frames: int = 12

@@ -41,13 +41,16 @@ from drake_pose.workers import map_ordered
 class CameraSearchSettings(NamedTuple):
     """Stages and thresholds of the camera search.
 
-    coarse, fine, last: the stages of three successive fits. coarse_spacing, fine_spacing: spacing
-    of the silhouettes' edge points in the first two fits [square root of the silhouettes' area].
-    start_side, refined_side: square root of the silhouettes' area in the downscaled pictures in
-    which starts and coarsely fitted poses are ranked [pixel]. significance: poses fit equally well
-    if their costs differ by at most this many standard deviations of the difference. block_size:
-    side of the image blocks whose costs are compared [square root of the area], about the size of
-    missing or additional parts.
+    Args:
+        coarse, fine, last: stages of three successive fits.
+        coarse_spacing, fine_spacing: spacing of the silhouettes' edge points in the first two fits
+            [square root of the silhouettes' area].
+        start_side, refined_side: square root of the silhouettes' area in the downscaled pictures in
+            which starts, and coarsely fitted poses, are ranked [pixel].
+        significance: poses fit equally well if their costs differ by at most this many standard
+            deviations of the difference.
+        tile_side: side of the image tiles whose costs are compared [square root of the area], about
+            the size of parts that masks or model lack.
     """
 
     coarse: tuple[AnnealingStage, ...] = tuple(
@@ -69,7 +72,7 @@ class CameraSearchSettings(NamedTuple):
     start_side: float = 40.0
     refined_side: float = 100.0
     significance: float = 1.96
-    block_size: float = 0.2
+    tile_side: float = 0.2
 
 
 SEARCH = CameraSearchSettings()
@@ -254,7 +257,7 @@ class CameraSearch:
         last = PosedFrames(kinematics, self._body.full, camera, some, LAST_SPACING)
         halfway = map_ordered(partial(fit_pose, fine, rounds=SEARCH.fine), starts)
         fits = [SharedFit([fine], [X], fit_biases=False) for X in halfway]
-        side = max(1.0, SEARCH.block_size * fine.size)
+        side = max(1.0, SEARCH.tile_side * fine.size)
         costs = [fit.tile_costs(fit.start, side) for fit in fits]
         order = np.argsort([one.sum() for one in costs], kind="stable")
         # Poses far worse than the best are dropped half-way.
@@ -303,7 +306,7 @@ def select_best(
         the camera, with distinct poses that fit equally well as alternatives; the (u, u) covariance
         of the best fit's shared unknowns; and the indices of all equally good fits, best first.
     """
-    side = max(1.0, SEARCH.block_size * fitted[0][0].views[0].size)
+    side = max(1.0, SEARCH.tile_side * fitted[0][0].views[0].size)
     costs = [fit.tile_costs(found, side) for fit, found in fitted]
     order = np.argsort([one.sum() for one in costs], kind="stable")
     fit, best = fitted[order[0]]

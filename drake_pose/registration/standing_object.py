@@ -94,8 +94,8 @@ class CalibrationTarget:
         self._X_TO[:3, 3] = self.middle
         self._bodies = RegistrationBody(self.tree(np.eye(4)), (TARGET,), FEW)
 
-    def before(self, robot: ArticulatedModel) -> "CalibrationTarget":
-        """Return the same target before a robot with corrected joint origins."""
+    def with_robot(self, robot: ArticulatedModel) -> "CalibrationTarget":
+        """Return the same target seen by a robot with corrected joint origins."""
         other = copy.copy(self)
         other._robot = robot
         return other
@@ -260,15 +260,20 @@ class TargetSearch:
 
     Args:
         target: the target.
-        alone: finds the target's pose in a single frame.
+        single_search: finds the target's pose in a single frame.
     """
 
-    def __init__(self, target: CalibrationTarget, alone: CameraSearch | None = None) -> None:
-        self._target, self._alone = target, alone or CameraSearch(target.in_own_frame)
+    def __init__(
+        self, target: CalibrationTarget, single_search: CameraSearch | None = None
+    ) -> None:
+        self._target, self._single_search = (
+            target,
+            single_search or CameraSearch(target.in_own_frame),
+        )
 
     def rough(self) -> "TargetSearch":
         """Return a faster, less reliable search."""
-        return TargetSearch(self._target, self._alone.rough())
+        return TargetSearch(self._target, self._single_search.rough())
 
     def register(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
         """Estimate the camera's pose on the link and the target's pose in the world.
@@ -368,7 +373,7 @@ class TargetSearch:
             likely = []
             for one in own:
                 alone = [PosedFrame(one.name, np.zeros(0), one.mask)]
-                found = self._alone.search(camera, alone, single_poses)
+                found = self._single_search.search(camera, alone, single_poses)
                 posed = PosedFrames(body.kinematics, body.coarse, camera, alone)
                 off = float(
                     E_total(overlap_areas(posed, np.array(found), SEARCH.refined_side)).min()

@@ -435,7 +435,7 @@ class _Registration:
         if shifts:
             model = model.reshaped(joint_shifts=shifts)
         if target is not None and target_pose is not None:
-            target = target.before(model)
+            target = target.with_robot(model)
             by, by_covariance = found.object_values, found.object_covariance
             target_pose = target.moved_pose(target_pose, by, by_covariance)
             tree = target.tree(target_pose.X_WT)

@@ -119,9 +119,9 @@ def load_camera_file(path: str | Path, *, distorted: bool = False) -> CameraFile
 
         read = read_configs(configs, path)
         return CameraFile({_check_name(name, path): read[name] for name in read}, ())
-    ours = {field for kind in _REQUIRED for field in (*_REQUIRED[kind], *_OPTIONAL[kind])}
+    own_fields = {field for kind in _REQUIRED for field in (*_REQUIRED[kind], *_OPTIONAL[kind])}
     entries = [entry for entry in content.values() if isinstance(entry, dict)]
-    if not (calibrated or any(ours & {*entry} for entry in entries)):
+    if not (calibrated or any(own_fields & {*entry} for entry in entries)):
         found = ", ".join(map(str, content))
         raise CameraError(
             f"{path}: is not a camera file: it has {found[:200]}; supported are {FORMATS}"
@@ -214,13 +214,15 @@ def _is_scenario(entry: Any) -> bool:
 
 def _is_config(entry: dict[Any, Any]) -> bool:
     """Return whether an entry has fields of a CameraConfig, and none that only our cameras have."""
-    theirs = {
+    drake_fields = {
         *("focal", "X_PB", "X_BC", "X_BD", "name", "fps", "rgb", "depth", "label", "show_rgb"),
         *("clipping_far", "z_near", "z_far", "renderer_name", "renderer_class", "background"),
         *("capture_offset", "output_delay", "do_compress", "lcm_bus"),
     }
-    ours = {field for kind in _REQUIRED for field in (*_REQUIRED[kind], *_OPTIONAL[kind])}
-    return bool(theirs & set(entry)) and not set(entry) & (ours - {*_COMMON, "clipping_near"})
+    own_fields = {field for kind in _REQUIRED for field in (*_REQUIRED[kind], *_OPTIONAL[kind])}
+    return bool(drake_fields & set(entry)) and not set(entry) & (
+        own_fields - {*_COMMON, "clipping_near"}
+    )
 
 
 def _check_name(key: Any, path: Path) -> str:

@@ -421,7 +421,7 @@ def explain(
     camera: Array,
     sums: PixelSums,
     side: float,
-    squares: int,
+    tiles_per_side: int,
     always_covered: float = 0.3,
 ) -> tuple[Array, Array]:
     """Score the poses of a body in all frames by sums over the pixels.
@@ -436,8 +436,8 @@ def explain(
             background; only their outline is scored.
         camera: (8,) kernel parameters.
         sums: log-likelihoods of the images.
-        side, squares: the gain is also summed in (squares, squares) tiles of this side [pixel],
-            modulo ``squares``; 0: it is not.
+        side, tiles_per_side: the gain is also summed in (squares, squares) tiles of this side
+            [pixel], modulo ``tiles_per_side``; 0: it is not.
         always_covered: factor of the gain of pixels that the body covers in all frames, whose
             background is unknown.
 
@@ -446,7 +446,7 @@ def explain(
     """
     height, width = sums.uncovered.shape
     frames, one = X_CN.shape[0], np.uint64(1)
-    totals, tiles = np.zeros(4), np.zeros((squares, squares))
+    totals, tiles = np.zeros(4), np.zeros((tiles_per_side, tiles_per_side))
     words = np.zeros((height, width), dtype=np.uint64)
     rows, crossings = make_rows(packed, camera)
     top, bottom = height, 0
@@ -482,8 +482,10 @@ def explain(
                 if covered == every:
                     gain = always_covered * max(gain, 0.0)
                 totals[Explained.GAIN] += gain
-                if squares > 0:
-                    tiles[int(row / side) % squares, int(column / side) % squares] += gain
+                if tiles_per_side > 0:
+                    tiles[
+                        int(row / side) % tiles_per_side, int(column / side) % tiles_per_side
+                    ] += gain
             left_of = words[row, column - 1] if column > 0 else word
             right_of = words[row, column + 1] if column < width - 1 else word
             above = words[row - 1, column] if row > 0 else word

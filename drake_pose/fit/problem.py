@@ -190,7 +190,7 @@ class Problem:
         self._count, self._first_camera = len(every), len(body.names) + 1
         self._first_bias = len(every) - len(cameras)
         self._biases = np.flatnonzero(self.entries >= self._first_bias)
-        self._of_foreground = foreground_of_colours(len(body.outlines))
+        self._foreground_tables = foreground_of_colours(len(body.outlines))
         self._cameras_fixed = not np.any(self.entries >= self._first_camera)
         # Placing a body is faster without shift, scale or radius unknowns.
         self._values = len(kinematics.names)
@@ -198,7 +198,7 @@ class Problem:
         self._values_only = not places.any()
         # Without unknowns of the body all nodes share the camera's motion.
         self._is_static = not np.any(self.entries <= len(body.names))
-        self._placed: dict[bytes, Placement] = {}
+        self._placements: dict[bytes, Placement] = {}
         self._last_cameras: tuple[bytes, tuple[Array, Array, Array]] = (
             b"",
             self._cameras.place(np.zeros(len(self._cameras.names))),
@@ -349,36 +349,39 @@ class Problem:
         Returns:
             The comparison, and the cameras as of ``CameraParameters.place``.
         """
-        places = self.place_cameras(theta)
+        packed_cameras = self.place_cameras(theta)
         views = self._views(frame, theta)
-        own = self._of_body(theta, frame.rates)
+        values = self._body_parameters(theta, frame.rates)
         # A body without unknowns is placed once per distinct set of values.
-        placed = self._placed.get(key := own.tobytes()) or self.body.place(own)
+        placement = self._placements.get(key := values.tobytes()) or self.body.place(values)
         if self._is_static:
-            self._placed[key] = placed
-        weights = self._contours.weights(views.cameras, placed, stage)
-        compared = compare_views(views, placed, weights, len(self._biases) > 0)
+            self._placements[key] = placement
+        weights = self._contours.weights(views.cameras, placement, stage)
+        compared = compare_views(views, placement, weights, len(self._biases) > 0)
         for c, picture in enumerate(frame.foreground):
             if picture is not None:
                 # Lines closer than three pixels are redundant; offsets are 0.4 scales apart.
-                own = weights[c].copy()
-                own[2] = max(own[2], 3.0)
-                offset, bias = max(1, round(own[1] * 0.4)), theta[self._first_bias + c]
+                line_weights = weights[c].copy()
+                line_weights[2] = max(line_weights[2], 3.0)
+                offset = max(1, round(line_weights[1] * 0.4))
+                camera = packed_cameras[0][c], packed_cameras[1][c]
                 compare_lines(
-                    placed.packed, placed.X_WN, (places[0][c], places[1][c]), picture,
-                    self._of_foreground, own, offset, compared.A[c], compared.b[c],
-                    compared.sums[c], compared.bias_terms[c], bias,
+                    placement.packed, placement.X_WN, camera, picture, self._foreground_tables,
+                    line_weights, offset, compared.A[c], compared.b[c], compared.sums[c],
+                    compared.bias_terms[c], theta[self._first_bias + c],
                 )  # fmt: skip
-        return compared, places
+        return compared, packed_cameras
 
     def tile_costs(
         self, frame: Observation, theta: Array, stage: AnnealingStage, side: float
     ) -> Array:
         """Return the costs at all parameters (n,) in tiles of a side [pixel], (cameras, k, k)."""
         views = self._views(frame, theta)
-        return self._contours.tile_costs(views, self._of_body(theta, frame.rates), stage, side)
+        return self._contours.tile_costs(
+            views, self._body_parameters(theta, frame.rates), stage, side
+        )
 
-    def _of_body(self, theta: Array, rates: Array | None) -> Array:
+    def _body_parameters(self, theta: Array, rates: Array | None) -> Array:
         """Return the body's parameters; only the tree's values (m,) if all others are 0."""
         own = theta[: len(self.body.names)]
         if rates is not None:

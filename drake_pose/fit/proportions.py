@@ -41,7 +41,7 @@ class ProportionedBody(BodyParameters):
     Attributes:
         axes: (nodes,) axis 0, 1 or 2 of each node's frame along which its length is scaled.
         limbs: (nodes,) index of each node's limb.
-        placed: nodes at which limbs begin and whose joints may move.
+        movable: nodes at which limbs begin and whose joints may move.
 
     Args:
         kinematics: kinematics of the pose tree.
@@ -78,20 +78,20 @@ class ProportionedBody(BodyParameters):
             and offset.link == nodes[nodes[offset.node].parent].name
             and nodes[offset.node].name in firsts
         }
-        self.placed = np.array(sorted(self._joints), dtype=np.intp)
-        self.place_names = tuple(f"joint_place_{nodes[i].name}" for i in self.placed)
+        self.movable = np.array(sorted(self._joints), dtype=np.intp)
+        self.joint_shift_names = tuple(f"joint_shift_{nodes[i].name}" for i in self.movable)
         self.names = (
             *kinematics.names,
             *ROOT_NAMES,
             *self.length_names,
             *self.width_names,
-            *self.place_names,
+            *self.joint_shift_names,
         )
         values = kinematics.flatten(kinematics.tree.default_values())
         X_WN = kinematics.poses(values)
         # Each node's axis, its length vector [m], and the same vector at rest in the parent.
         self.axes = np.zeros(len(nodes), dtype=np.int64)
-        self._along, self._rest = np.zeros((2, len(nodes), 3))
+        self._length_vectors, self._rest_vectors = np.zeros((2, len(nodes), 3))
         for i, node in enumerate(nodes):
             carried = (X_WN[list(node.children), :3, 3] - X_WN[i, :3, 3]) @ X_WN[i, :3, :3]
             along = np.abs(carried).sum(axis=0)
@@ -101,24 +101,24 @@ class ProportionedBody(BodyParameters):
                 along = np.abs(middle)
             axis = self.axes[i] = int(np.argmax(along))
             ends = carried[:, axis] if len(carried) else middle[[axis]]
-            self._along[i, axis] = ends[np.argmax(np.abs(ends))]
-            self._rest[i] = X_WN[i, :3, :3] @ self._along[i]
+            self._length_vectors[i, axis] = ends[np.argmax(np.abs(ends))]
+            self._rest_vectors[i] = X_WN[i, :3, :3] @ self._length_vectors[i]
             if node.parent >= 0:
-                self._rest[i] = X_WN[node.parent, :3, :3].T @ self._rest[i]
+                self._rest_vectors[i] = X_WN[node.parent, :3, :3].T @ self._rest_vectors[i]
         self._parents = np.array([node.parent for node in nodes])
         # Which nodes each motion of `place` moves, in its order, and which parameter causes it.
         count, every = len(kinematics.names) + len(ROOT_NAMES), np.arange(len(nodes))
         below = np.eye(len(nodes), dtype=np.bool_)
         for i, parent in enumerate(self._parents):
             below[i] |= (parent >= 0) & below[parent]
-        hanging = np.flatnonzero(self._parents >= 0)
+        carried_nodes = np.flatnonzero(self._parents >= 0)
         lengths, widths = count + every, count + len(nodes) + self.limbs
-        by = self._parents[hanging]
-        places = len(self.names) - len(self.placed) + np.arange(len(self.placed))
-        own, hung = every[:, None] == every, below[:, hanging]
+        by = self._parents[carried_nodes]
+        places = len(self.names) - len(self.movable) + np.arange(len(self.movable))
+        own, below_carried = every[:, None] == every, below[:, carried_nodes]
         moves = (
             kinematics.motions(values).moves, np.ones((len(nodes), 4), np.bool_), own, own,
-            hung, hung, below[:, self.placed],
+            below_carried, below_carried, below[:, self.movable],
         )  # fmt: skip
         caused_by = np.arange(count), lengths, widths, lengths[by], widths[by], places
         self._owners = owners_of(np.hstack(moves), np.concatenate(caused_by))
@@ -143,22 +143,24 @@ class ProportionedBody(BodyParameters):
         Raises:
             ModelError: the model's file is not a URDF.
         """
-        nodes, joint_shifts = self.kinematics.tree.nodes, self.joint_places(theta)
+        nodes, joint_shifts = self.kinematics.tree.nodes, self.relative_joint_shifts(theta)
         factors = zip(nodes, self.factors(theta).tolist(), strict=True)
         return model.reshaped(
             link_scales={node.name: tuple(row) for node, row in factors},
             joint_shifts={
-                joint: tuple(joint_shifts[i] * self._rest[i]) for i, joint in self._joints.items()
+                joint: tuple(joint_shifts[i] * self._rest_vectors[i])
+                for i, joint in self._joints.items()
             },
             link_shifts={
-                nodes[i].name: tuple(-joint_shifts[i] * self._along[i]) for i in self._joints
+                nodes[i].name: tuple(-joint_shifts[i] * self._length_vectors[i])
+                for i in self._joints
             },
         )
 
-    def joint_places(self, theta: Array) -> Array:
+    def relative_joint_shifts(self, theta: Array) -> Array:
         """Return (nodes,) shift of each part's joint along the part [part's length]."""
         joint_shifts = np.zeros(len(self.limbs))
-        joint_shifts[self.placed] = theta[len(self.names) - len(self.placed) : len(self.names)]
+        joint_shifts[self.movable] = theta[len(self.names) - len(self.movable) : len(self.names)]
         return joint_shifts
 
     def place(self, theta: Array) -> Placement:
@@ -166,20 +168,20 @@ class ProportionedBody(BodyParameters):
         kinematics = self.kinematics
         count = len(kinematics.names)
         at_rest = kinematics.motions(theta[:count])
-        scale, joint_shifts = self.factors(theta), self.joint_places(theta)
+        scale, joint_shifts = self.factors(theta), self.relative_joint_shifts(theta)
         R = at_rest.X_WN[:, :3, :3]
         # Stretch of each node as a linear map of vectors in the world.
         maps = np.einsum("nik,nk,njk->nij", R, scale, R)
         places = at_rest.X_WN[:, :3, 3].copy()
         # Offset of a part's flesh from its joint, and offset of the joint from its model position.
-        back = -np.einsum("nik,nk,n->ni", R, self._along, joint_shifts)
+        back = -np.einsum("nik,nk,n->ni", R, self._length_vectors, joint_shifts)
         carried = np.zeros_like(places)
         for i, node in enumerate(kinematics.tree.nodes):
             if node.parent >= 0:
                 offset = at_rest.X_WN[i, :3, 3] - at_rest.X_WN[node.parent, :3, 3]
                 carried[i] = maps[node.parent] @ offset
                 places[i] = places[node.parent] + back[node.parent] + carried[i]
-                places[i] += joint_shifts[i] * (R[node.parent] @ self._rest[i])
+                places[i] += joint_shifts[i] * (R[node.parent] @ self._rest_vectors[i])
         shift, root_scale = theta[count : count + 3], float(np.exp(theta[count + 3]))
         moved = places[0] + shift - root_scale * places[0]
         # M (k, 3, 3) and v (k, 3) of values, root translation and root scale. M p + v applies to
@@ -196,16 +198,16 @@ class ProportionedBody(BodyParameters):
         of_values += (1.0 / root_scale - 1.0) * velocity * (nodes == 0)[:, None]
         M = [turned, np.zeros((3, 3, 3)), np.eye(3)[None]]
         v = [of_values, np.eye(3) / root_scale, -places[:1]]
-        hanging = np.flatnonzero(self._parents >= 0)
+        carried_nodes = np.flatnonzero(self._parents >= 0)
         along = R[np.arange(len(R)), :, self.axes]
         long = along[:, :, None] * along[:, None]
         for stretch in (long, np.eye(3) - long):
             M.append(stretch)
             v.append(-np.einsum("nij,nj->ni", stretch, places + back))
         for stretch in (long, np.eye(3) - long):
-            v.append(np.einsum("nij,nj->ni", stretch[self._parents], carried)[hanging])
-        beside = np.einsum("nij,nj->ni", R[self._parents], self._rest)
-        v.append((beside - np.einsum("nij,nj->ni", R, self._along))[self.placed])
+            v.append(np.einsum("nij,nj->ni", stretch[self._parents], carried)[carried_nodes])
+        beside = np.einsum("nij,nj->ni", R[self._parents], self._rest_vectors)
+        v.append((beside - np.einsum("nij,nj->ni", R, self._length_vectors))[self.movable])
         all_v = np.concatenate(v)
         all_M = np.zeros((len(all_v), 3, 3))
         turning = np.concatenate(M)
@@ -215,8 +217,8 @@ class ProportionedBody(BodyParameters):
         X_WN[:, :3, 3] = moved + root_scale * places
         packed = scale_surfaces(self._at(theta[:count]), scale)
         # A node's rigid surface moves with its joint's position; skin bands stay at the joints.
-        flesh = -self._along * joint_shifts[:, None]
-        for i in self.placed.tolist():
+        flesh = -self._length_vectors * joint_shifts[:, None]
+        for i in self.movable.tolist():
             vertices = packed.starts[i, 0] + np.arange(len(self.outlines[i].vertices))
             triangles = packed.starts[i, 1] + np.arange(len(self.outlines[i].triangles))
             packed.points[:, vertices] += flesh[i][:, None]
@@ -287,7 +289,7 @@ def fit_proportions(
             Unknowns([*moving, *ROOT_NAMES], lower=limits[0], upper=limits[1]),
             Unknowns(body.length_names, True, deviation=0.15),
             Unknowns(body.width_names, True, deviation=0.1),
-            Unknowns(body.place_names, True, deviation=0.15),
+            Unknowns(body.joint_shift_names, True, deviation=0.15),
         ],
         noise=noise,
         pixels=1.0,

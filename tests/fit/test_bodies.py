@@ -271,10 +271,10 @@ def test_without_evidence_proportions_follow_the_prior(stretched):
     np.testing.assert_allclose(deviations[:, deviations.any(axis=0)], 0.5, rtol=1e-3)
     counts = [
         len(names)
-        for names in (stretched.length_names, stretched.width_names, stretched.place_names)
+        for names in (stretched.length_names, stretched.width_names, stretched.joint_shift_names)
     ]
     known = np.repeat([0.15**-2, 0.1**-2, 0.15**-2], counts)
     np.testing.assert_allclose(np.diag(found.equations.H[0, free:, free:]), known)
-    limbs = {f"joint_place_{kinematics.tree.nodes[i].name}" for i in stretched.placed}
-    assert limbs == set(stretched.place_names)
+    limbs = {f"joint_shift_{kinematics.tree.nodes[i].name}" for i in stretched.movable}
+    assert limbs == set(stretched.joint_shift_names)
     assert len(limbs) == 5

@@ -178,12 +178,12 @@ class _BodyFit:
         nodes, X_WN = body.kinematics.tree.nodes, body.place(theta).X_WN
         apart = np.linalg.norm(X_WN[:, :3, 3] - X_WN[[n.parent for n in nodes], :3, 3], axis=1)
         lengths = (apart / np.linalg.norm(X_WN[0, :3, 0])).round(5).tolist()
-        factors, places = body.factors(theta).round(4).tolist(), body.joint_places(theta)
+        factors, places = body.factors(theta).round(4).tolist(), body.relative_joint_shifts(theta)
         costs = [one.fitted.cost / explanations[0].fitted.cost for one in explanations]
         self._more |= {
             "proportions": {node.name: row for node, row in zip(nodes, factors, strict=True)},
             "lengths": {n.name: k for n, k in zip(nodes, lengths, strict=True) if n.parent >= 0},
-            "joint_places": {nodes[i].name: round(places[i], 4) for i in body.placed},
+            "joint_places": {nodes[i].name: round(places[i], 4) for i in body.movable},
             "explanations": [round(cost, 4) for cost in costs],
         }
         return best

@@ -36,8 +36,6 @@ def read_csv(
     Cells are stripped of surrounding spaces.
 
     Args:
-        path: the file.
-        error_type: type of the error that is raised.
         whole_lines: ignore text after the last line break, which an interrupted writer left.
 
     Raises:

@@ -50,7 +50,6 @@ class UnknownNameError(DrakePoseError):
 
     Args:
         kind: kind of the name, for example ``"link"``.
-        name: the unknown name.
         known: the existing names.
         where: where the name was looked up, for example a file's path.
     """

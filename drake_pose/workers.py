@@ -38,8 +38,6 @@ def map_ordered(
     """Return the function's result for each item, in the order of the items.
 
     Args:
-        function: called with one item, in any thread.
-        items: the items.
         workers: number of threads; None: as set by ``use_workers``. Nested calls, and calls in
             child processes of ``multiprocessing``, use a single thread.
     """

@@ -58,8 +58,6 @@ def read_yaml(
     unless the caller walks through every copy.
 
     Args:
-        path: the file.
-        error_type: type of the error that is raised.
         tags: store local tags of mappings, as Drake's files have them, under the key ``_tag``.
         largest: maximum size of the file [byte].
 
@@ -89,8 +87,6 @@ def typed_entry(
     Args:
         entry: plain values as from ``read_yaml``.
         schema: the dataclass.
-        where: start of the error message.
-        error_type: type of the error that is raised.
 
     Raises:
         error_type: a field is unknown or has the wrong type.

@@ -47,7 +47,6 @@ def open_bag(path: Path, joints: JointLog | None) -> Episode:
     frame is attached to others by `/tf_static` is mounted on the last of these.
 
     Args:
-        path: the bag.
         joints: joint log to use instead of the bag's.
 
     Raises:

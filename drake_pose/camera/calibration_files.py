@@ -31,7 +31,6 @@ def read_camera_content(path: Path, largest: int = 1 << 20) -> Any:
     """Return the content of a YAML, JSON, TOML or FileStorage file as plain values and arrays.
 
     Args:
-        path: the file.
         largest: maximum size of the file [byte].
 
     Raises:
@@ -69,7 +68,6 @@ def calibrated_cameras(
 
     Args:
         content: content of the file, as from ``read_camera_content``.
-        path: the file, for messages.
 
     Returns:
         By name, the lens and the pose X_WC (4, 4) [m] of each camera; None: the file has no pose.
@@ -136,7 +134,6 @@ def lens_of(size: Any, matrix: Any, distortion: Any, model: str, where: str) -> 
         matrix: (3, 3) camera matrix [pixel].
         distortion: OpenCV's distortion coefficients.
         model: name of the distortion model.
-        where: start of the error message.
 
     Raises:
         CameraError: the model is unknown, or a value is invalid.
@@ -188,7 +185,6 @@ def _lens(
     Args:
         size, matrix, distortion: values of the file.
         fisheye: whether the coefficients are those of OpenCV's fisheye.
-        where: start of the error message.
         largest_skew: maximum skew that is ignored [f_x]; it amounts to half a pixel at the edge of
             an image.
     """
@@ -228,7 +224,6 @@ def _pose(
     Args:
         content: the mapping.
         rotation, translation: keys of R, a matrix or a rotation vector [rad], and T [m].
-        where: start of the error message.
         farthest: maximum distance from the world's origin [m]; beyond it lengths are taken to be in
             millimetres.
     """

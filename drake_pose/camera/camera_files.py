@@ -101,7 +101,6 @@ def load_camera_file(path: str | Path, *, distorted: bool = False) -> CameraFile
     """Read a camera file as load_cameras does, but allow cameras without X_WC.
 
     Args:
-        path: the file.
         distorted: allow cameras with `distortion`, which the caller removes from images.
 
     Raises:

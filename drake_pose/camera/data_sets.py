@@ -170,12 +170,10 @@ def _video_camera(
     """Return the camera of a video, restricted to a time span.
 
     Args:
-        name: name of the camera.
-        file: the video.
         span: (2,) start and end of the episode in the video [s].
         half: half a period between images, by which the span is advanced [s].
         count: number of rows of the episode.
-        warnings: warnings are appended.
+        warnings: list to which warnings are appended.
     """
     video = TimedVideo(file)
     first, last = np.searchsorted(video.times, span - half).tolist()
@@ -205,7 +203,6 @@ def open_droid(path: Path, joints: JointLog | None) -> Episode:
     gripper_position is 0 for open and 1 for closed.
 
     Args:
-        path: the folder.
         joints: joint log to use instead of the trajectory's.
 
     Raises:
@@ -263,8 +260,6 @@ def _zed_cameras(
 
     Args:
         file: the open trajectory.
-        path: the video.
-        warnings: warnings are appended.
         stereo: minimum ratio of width to height of a stereo video.
         calibrated: width and height of the images to which the intrinsics apply: HD720 [pixel].
     """

@@ -35,7 +35,6 @@ def camera_to_drake(
     middle of the depth range.
 
     Args:
-        camera: the camera.
         renderer_name: name of the renderer in the SceneGraph.
         depth_range: minimum and maximum visible depth [m]; None: `near` to 1 km. For a parallel
             camera: depths of the body in the camera's frame, possibly negative and as tight as
@@ -86,7 +85,6 @@ def camera_from_drake(
     """Return the camera of a Drake CameraInfo or RenderCameraCore.
 
     Args:
-        name: name of the camera.
         source: the intrinsics; a RenderCameraCore also provides the near plane and the sensor's
             pose X_BS in its body.
         X_WC: pose of the camera in the world; with a RenderCameraCore the pose of its body B.
@@ -176,7 +174,6 @@ def read_configs(entries: Mapping[str, Any], path: Path) -> dict[str, PinholeCam
 
     Args:
         entries: entries by key.
-        path: the file, for messages.
 
     Raises:
         CameraError: names the file, the camera and the problem.
@@ -215,7 +212,6 @@ def dump_scenario(
     """Return the text of a Scenario, for ``LoadScenario``, with cameras that render label images.
 
     Args:
-        cameras: the cameras.
         links: link of each camera that is mounted on one, by the camera's name; its pose is in the
             link's frame.
 

@@ -64,7 +64,6 @@ class EpisodeCamera:
     """One camera of an episode, and its images.
 
     Args:
-        name: name of the camera.
         width, height: size of the images [pixel].
         times: (n,) ascending times of the images [s]; nan if unknown.
         camera: calibrated camera of the undistorted images, if recorded. Its X_WC is the pose in
@@ -108,7 +107,6 @@ class Episode:
     """A recorded episode.
 
     Attributes:
-        path: file or folder of the recording.
         cameras: cameras by name.
         joints: joint log; None if there is none.
         warnings: problems of the recording that do not prevent its use.
@@ -130,9 +128,6 @@ class Episode:
         """Return an episode; warnings about its times and positions are appended to given ones.
 
         Args:
-            path: file or folder of the recording.
-            cameras: the cameras.
-            joints: the joint log.
             reader_warnings: warnings of the reader.
 
         Raises:

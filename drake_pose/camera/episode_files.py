@@ -74,7 +74,6 @@ def open_folder(path: Path, joints: JointLog | None) -> Episode:
     """Open a folder with `videos/<camera>.mp4` or `images/<camera>/<frame>.png`, and a joint table.
 
     Args:
-        path: the folder.
         joints: joint log to use instead of the folder's `joint_angles.csv`.
 
     Raises:
@@ -151,7 +150,6 @@ def read_sequence(path: Path, sequence: bool = False) -> tuple[bool, float | Non
     """Return whether frames are a sequence, and their rate [Hz] or None, by a scene.yaml.
 
     Args:
-        path: the file.
         sequence: default if the file does not say.
 
     Raises:
@@ -231,7 +229,6 @@ def open_episode(
     """Open an episode of any of the formats in `tutorials/file_formats.md`.
 
     Args:
-        path: the folder or file.
         joints: table of joint positions to use instead of the recording's own.
         episode: number of the episode in a LeRobot data set; None: the only one that is present.
 

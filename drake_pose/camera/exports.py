@@ -47,7 +47,6 @@ def ros_transforms(
     """Return a launch file (XML) of ROS 2 with a static_transform_publisher for each optical frame.
 
     Args:
-        cameras: the cameras.
         frames: parent frame of each pose X_WC [m], by the camera's name.
     """
     launch = ElementTree.Element("launch")

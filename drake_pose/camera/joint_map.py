@@ -69,7 +69,6 @@ def map_joints(
     """Convert a joint log to a model's names, order and units.
 
     Args:
-        log: the joint log.
         names: (m,) joints of the model.
         lower, upper: (m,) their limits, infinite if there are none [rad or m].
         is_angle: (m,) whether a joint is revolute.

@@ -103,8 +103,6 @@ def write_file(path: str | Path, text: str, what: str) -> None:
     """Write a text file; CameraError if it cannot be written.
 
     Args:
-        path: the file.
-        text: its content.
         what: name of the content, for the message.
     """
     try:
@@ -165,7 +163,6 @@ class PinholeCamera(_PosedCamera):
     """A pinhole camera without distortion.
 
     Args:
-        name: name of the camera.
         width, height, focal_x, focal_y: size of the image and focal lengths [pixel].
         center_x, center_y: principal point [pixel], pixel centres at integers.
         X_WC: pose of the camera in the world, x right, y down, z forward [m]: a RigidTransform or a

@@ -76,8 +76,6 @@ def read_binary_mask(
     """Return a mask (H, W) from a PNG image of black and one other colour on the object.
 
     Args:
-        path: the file.
-        error_type: type of the error that is raised.
         size: required width and height [pixel]; None: any.
         may_be_empty: accept a mask without any object.
         lossy: accept JPEG files, whose values are thresholded.
@@ -194,10 +192,7 @@ def _decode(
     """Return a complete PNG or JPEG image as OpenCV decodes it.
 
     Args:
-        data: content of the file.
         how: OpenCV's reading mode.
-        path: the file, for messages.
-        error_type: type of the error that is raised.
         only_png: refuse JPEG.
 
     Raises:

@@ -44,7 +44,6 @@ class SourceSpecification:
     """Source of a camera's images; plain values, so that another machine can open it.
 
     Args:
-        camera: name of the camera.
         kind: folder: images `<frame>.png` or `.jpg`, optionally with a `timestamps.csv` (frame,
             time [s]); video: a file that OpenCV reads; device: a live camera.
         location: path of the folder or file; number or address of a device.
@@ -93,7 +92,6 @@ class SourceSpecification:
 
         Args:
             picture: (H, W, 3) image.
-            where: start of the error message.
 
         Raises:
             SceneError: the image should be a mask and is not.
@@ -183,7 +181,6 @@ class DeviceSource(FrameSource):
     once and reopened repeatedly, with growing pauses.
 
     Args:
-        specification: the source.
         clock: returns the time [s].
         pauses: initial and maximum pause before reopening [s]; each pause doubles the previous one.
     """

@@ -24,7 +24,6 @@ class CameraChange(NamedTuple):
     """A camera that stopped or returned.
 
     Attributes:
-        camera: name of the camera.
         time: its last (stopped) or first (returned) time stamp [s]; nan if it never had an image.
         stopped: whether it stopped; else it returned.
     """
@@ -87,9 +86,7 @@ class Synchroniser(Generic[Item]):
         """Add a camera's next image; return whether it can be part of a group.
 
         Args:
-            camera: name of the camera.
             time: time stamp [s].
-            item: the image.
 
         Raises:
             UnknownNameError: there is no such camera.

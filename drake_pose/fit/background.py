@@ -328,7 +328,6 @@ def _deviations(picture: Floats, noise: float) -> Floats:
     """Return (H, W) standard deviations of a background's colours (H, W, 3).
 
     Args:
-        picture: the background.
         noise: standard deviation of the noise [of 255].
     """
     gradient = _largest(np.hypot(*_slopes(picture)))
@@ -435,7 +434,6 @@ def explain(
         is_static: (nodes,) whether a node is static in all frames. Static nodes belong to the
             background; only their outline is scored.
         camera: (8,) kernel parameters.
-        sums: log-likelihoods of the images.
         side, tiles_per_side: the gain is also summed in (squares, squares) tiles of this side
             [pixel], modulo ``tiles_per_side``; 0: it is not.
         always_covered: factor of the gain of pixels that the body covers in all frames, whose

@@ -206,7 +206,6 @@ def add_pictures(
 
     Args:
         compared: comparison with the silhouettes of all cameras.
-        cameras: the cameras.
         pictures: image of each camera; None: none.
         histograms: (cameras, nodes, 3, COLOURS) colour histograms.
         stage: scale of the residuals and spacing of the lines [pixel].
@@ -281,7 +280,6 @@ def update_histograms(
 
     Args:
         placement: the body at its estimated pose.
-        cameras: the cameras.
         pictures: image of each camera; None: its histograms stay.
         histograms: histograms before the frame.
         pose_is_known: the pose is known: all lines are used, and the old histograms are discarded.
@@ -382,7 +380,6 @@ def _find_edge(
         clearance: (2,) distance inwards and outwards [pixel] over which the line crosses no other
             contour.
         step: distance between offsets [pixel].
-        scratch: (3, 2 blocks + 2) work space.
 
     Returns:
         The edge's offset outwards [pixel], and its variance [pixel^2]; -1: no information.

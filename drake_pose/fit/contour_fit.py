@@ -154,7 +154,6 @@ class ContourFit:
         tree: the body's pose tree, or its kinematics.
         outlines: surface of each node, preferably with few triangles; None: simplified surfaces of
             the tree.
-        noise: noise of the silhouettes.
         steps: settings of the optimiser's steps.
         pixels: unit of length of the stages and the noise [pixel], scalar or (c,); None: the size
             of a metre at the body's root.
@@ -194,8 +193,6 @@ class ContourFit:
             evidence: the cameras and their silhouettes' edges, or a function that compares the
                 contours.
             values: (m,) initial guess [rad or m].
-            stages: the annealing stages.
-            prior: prior of the values.
             held: (m,) which values are fixed.
         """
         index = np.flatnonzero(np.ones(len(values), bool) if held is None else ~held)
@@ -253,8 +250,6 @@ def compare_views(
     """Compare a placed body's contours with all cameras' edges.
 
     Args:
-        views: the cameras and edges.
-        placement: the placed body.
         weights: (c, 4) as of `compare_contours`.
         with_bias: compute derivatives by the silhouettes' boundary bias.
     """
@@ -274,9 +269,6 @@ def camera_weights(
 
     Args:
         cameras: X_CW (c, 4, 4) and kernel parameters (c, 8).
-        placement: the placed body.
-        stage: the annealing stage.
-        noise: noise of the silhouettes.
         pixels: unit of length [pixel], scalar or (c,); None: the size of a metre at the root.
     """
     size = pixels_per_metre(cameras, placement.X_WN[0, :3, 3]) if pixels is None else pixels
@@ -293,7 +285,6 @@ def normal_equations(compared: Comparison, size: int) -> tuple[Array, Array]:
     """Return H (size, size) and g (size,) of H dx = -g, summed over cameras.
 
     Args:
-        compared: the comparison.
         size: number of body parameters.
     """
     A, b = compared.A.sum(axis=0), compared.b.sum(axis=0)

@@ -82,7 +82,6 @@ class ComparedMask(NamedTuple):
         X_CW: (4, 4) pose of the world in the camera.
         moves: (nodes, m, 12) affine motions of the nodes caused by the m values.
         size: unit of errors at the body's distance [m].
-        camera: index of the camera.
     """
 
     A: Array
@@ -279,7 +278,6 @@ def estimate_sizes(
     """Return the most likely sizes of the errors, given the residuals and the prior.
 
     Args:
-        residuals: the residuals.
         is_angle: (m,) which values are angles.
         min_camera: minimum error of a camera [of the unit].
         prior_deviation: standard deviation of the sizes' logarithms about the unit.
@@ -347,8 +345,6 @@ def values_covariance(
     It is H^-1 J^T V J H^-1 (the sandwich of Huber 1967), with V the covariance of the residuals.
 
     Args:
-        residuals: the residuals.
-        sizes: sizes of the errors.
         free: (f,) indices of the free values.
         is_angle: (m,) which values are angles.
     """

@@ -104,7 +104,6 @@ class LinearPrior:
         """Return equations with the prior's gradient and cost added; H stays, see ``curvature``.
 
         Args:
-            equations: equations of the frames.
             own: (frames, p) own unknowns.
         """
         residual = self.rows @ own.ravel() - self.mean
@@ -133,8 +132,6 @@ def minimise(
             without the coupling.
         own, shared: (frames, p) and (q,) initial guess.
         limits: lower and upper (p + q,), own unknowns first.
-        stages: the annealing stages.
-        settings: settings of the steps.
         coupling: prior that couples the own unknowns of several frames.
 
     Returns:
@@ -192,7 +189,6 @@ def damped_step(
         own, shared: (frames, p) and (q,) current unknowns.
         limits: lower and upper (p + q,).
         damping: fraction of the diagonal that is added to it.
-        settings: settings of the steps.
         curvature: (frames p, frames p) of a coupling.
     """
     lower, upper = limits

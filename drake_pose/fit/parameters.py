@@ -232,7 +232,6 @@ def carried_joints(tree: PoseTree, links: Collection[str] | None = None) -> list
     """Return the vectors from links' joints to the robot's joints that they carry at a distance.
 
     Args:
-        tree: the pose tree.
         links: names of the carrying links; None: all.
     """
     return [

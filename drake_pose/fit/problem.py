@@ -128,15 +128,12 @@ class Problem:
     """Unknowns of several frames of a body seen by the same cameras.
 
     Attributes:
-        body: parameters of the body.
         names: names of the u unknowns: the p own ones of each frame, then the q shared ones.
         entries: (u,) index of the frame parameter to which each unknown is added.
         own_count: p.
         information: (u,) inverse variances of the unknowns' priors.
 
     Args:
-        body: parameters of the body.
-        cameras: the cameras.
         unknowns: the unknown parameters.
         pivot: (3,) or (cameras, 3) point in the world about which cameras rotate [m]; None: the
             root's position.
@@ -217,8 +214,6 @@ class Problem:
         """Return the best fit near an initial guess.
 
         Args:
-            observations: evidence of the frames.
-            stages: the annealing stages.
             start: initial guess of own (frames, p) and shared (q,) unknowns; None: 0.
             expected: mean of the unknowns' prior; None: the initial guess.
             shared_information: (q, q) further information matrix of the shared unknowns.

@@ -45,7 +45,6 @@ class ProportionedBody(BodyParameters):
 
     Args:
         kinematics: kinematics of the pose tree.
-        surfaces: surfaces of the pose tree.
 
     Raises:
         ModelError: the model has mimic joints.
@@ -138,7 +137,6 @@ class ProportionedBody(BodyParameters):
 
         Args:
             model: the tree's model, or one like it.
-            theta: (n,) parameters.
 
         Raises:
             ModelError: the model's file is not a URDF.
@@ -265,13 +263,10 @@ def fit_proportions(
     """Fit a body's proportions, and its pose in each frame, to several frames of one camera.
 
     Args:
-        body: parameters of the body.
-        camera: the camera.
         frames: edges of the silhouettes of three or more frames.
         starts: (frames, k) initial guess of the tree's values and ROOT_NAMES, or (frames, n) of all
             parameters, with the proportions taken from the first frame.
         stages: the annealing stages [pixel].
-        noise: noise of contours [pixel].
         limits: lower and upper (p,) limits of the free tree values, then of ROOT_NAMES.
         prior: prior of these unknowns in all frames.
 

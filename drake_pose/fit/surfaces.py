@@ -164,7 +164,6 @@ def collapse_edges(outline: Outline, count: int, unit: float = 1.0) -> Outline:
     """Return a surface simplified by edge collapses (quadric error metric, Garland and Heckbert).
 
     Args:
-        outline: the surface.
         count: number of triangles.
         unit: unit of length in which the simplifier works [m].
     """

@@ -240,6 +240,5 @@ def test_masks_of_wrong_size_and_empty_masks_are_refused(body, poses, cameras) -
 @pytest.mark.parametrize(("shift", "word"), [(0.05, "later"), (-0.05, "earlier")])
 def test_clock_error_is_described_in_milliseconds(shift, word):
     off = Finding("clock", "left", 0.0, shift, 0.0, 0.004, 1.0, 0.0)
-    assert f"camera 'left': its pictures show the joints of 50 +- 4 ms {word} by" in describe_error(
-        off, "off"
-    )
+    text = f"its pictures show joint positions that are logged 50 +- 4 ms {word} than their times"
+    assert describe_error(off) == f"camera 'left': {text}"

@@ -454,11 +454,11 @@ class SceneComparison:
         sizes = np.abs((by + np.pi) % (2.0 * np.pi) - np.pi if turns else by)
         text = f"it is {factor * sizes.min():.0f} to {factor * sizes.max():.0f} {unit} off"
         if correction.kind == "log":
-            text += ", no constant and no sign explains it"
+            text += ", and neither a constant offset nor another sign explains that"
             if np.ptp(logged) < 1e-6:
                 text += f"; the log has {logged[0]:.4g} in all frames"
         elif abs(correction.amount) > 1e-9:
-            text += f"; then {factor * correction.amount:.0f} {unit} are to be added"
+            text += f"; to the reversed column add {factor * correction.amount:.0f} {unit}"
         angle, shift = (float(sizes.max()), 0.0) if turns else (0.0, float(sizes.max()))
         return replace(off, link=self._link(correction.name), text=text, angle=angle, shift=shift)
 

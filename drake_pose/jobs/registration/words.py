@@ -23,15 +23,15 @@ def describe_error(one: Finding, verb: str = "off") -> str:
     if one.kind == "clock":
         word = "later" if one.shift > 0.0 else "earlier"
         return (
-            f"camera '{one.name}': its pictures show the joints of {1e3 * abs(one.shift):.0f} +- "
-            f"{1e3 * one.shift_sd:.0f} ms {word} by the joint log's clock"
+            f"camera '{one.name}': its pictures show joint positions that are logged "
+            f"{1e3 * abs(one.shift):.0f} +- {1e3 * one.shift_sd:.0f} ms {word} than their times"
         )
     if one.kind == "rate":
         return describe_drift(one.name, one.shift, one.shift_sd)
     name = "the base" if one.kind == "base" else f"{one.kind} '{one.name}'"
     name = f"the {one.name}" if one.kind in ("focal", "center") else name
     if one.alternatives:
-        name += f" (or {', '.join(one.alternatives)}: the masks cannot tell)"
+        name += f" (or {', '.join(one.alternatives)}: the masks do not distinguish them)"
     angle, angle_sd = np.degrees([one.angle, one.angle_sd]).tolist()
     unit, factor = shift_unit(one.kind)
     shift, shift_sd = factor * one.shift, factor * one.shift_sd
@@ -54,15 +54,15 @@ def describe_error(one: Finding, verb: str = "off") -> str:
 
 def describe_common_finding(one: Finding) -> str:
     """Return an error common to all inlier frames in words."""
-    pixels = f", outlines by {one.pixels:.1f} pixels" if one.pixels else ""
+    pixels = f", which moves outlines by {one.pixels:.1f} pixels" if one.pixels else ""
     link = f"link '{one.link}' is not where the log says"
     if one.kind == "sign":
         return (
-            f"joint '{one.name}' is logged with the other sign: {link}, {one.text}{pixels}: turn "
-            "the sign of its column round"
+            f"joint '{one.name}' is logged with the other sign (reverse its column): {link}, "
+            f"{one.text}{pixels}"
         )
     if one.kind == "log":
-        return f"{link}: joint '{one.name}' is another than in the log, {one.text}{pixels}"
+        return f"{link}: joint '{one.name}' differs from the log, {one.text}{pixels}"
     if one.kind == "link":
         return f"{link}: {one.text}"
     if one.kind == "reading":
@@ -76,7 +76,7 @@ def describe_common_finding(one: Finding) -> str:
 
 def describe_frame_finding(one: FrameDiagnosis, found: Finding) -> str:
     """Return the error of an outlier frame in words."""
-    pixels = f"outlines by {found.pixels:.1f} pixels"
+    pixels = f"which moves outlines by {found.pixels:.1f} pixels"
     if found.kind == "unexplained":
         worst = min(one.fitted_ratios, key=lambda name: one.fitted_ratios[name])
         return (

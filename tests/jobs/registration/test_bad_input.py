@@ -56,7 +56,7 @@ BEFORE_WORK: dict[str, tuple[Spoil, list[str]]] = {
     "no table": (lambda s: s.joints.unlink(), ["joints.csv: cannot read it"]),
     "a column of no joint": (
         change_rows(add_column),
-        ["joints.csv has a column that the model lacks", "'time'", "turret_turn"],
+        ["joints.csv has an unknown column", "'time'", "turret_turn"],
     ),
     "a frame without row": (
         change_rows(lambda r: r.pop(3)),
@@ -81,7 +81,7 @@ BEFORE_WORK: dict[str, tuple[Spoil, list[str]]] = {
     ),
     "a position that is none": (
         change_rows(lambda rows: rows[2].__setitem__(2, "1e308")),
-        ["joints.csv", "frame 1", "no joint's position"],
+        ["joints.csv", "frame 1", "too large for a joint position"],
     ),
     "no focal length": (edit("left", focal_x=None), ["camera 'left'", "needs focal_x"]),
     "all cameras stand": (

@@ -75,10 +75,7 @@ def _left(found: RegisteredCamera) -> float:
 
 
 def require_explained(
-    search: Search,
-    found: RegisteredCamera,
-    frames: Sequence[PosedFrame],
-    much_better: float = 0.6,
+    search: Search, found: RegisteredCamera, frames: Sequence[PosedFrame], much_better: float = 0.6
 ) -> None:
     """Refuse a pose that does not explain its best frames.
 
@@ -269,10 +266,7 @@ def compare_camera(
 
 
 def compare_clock(
-    body: RegistrationBody,
-    one: PictureRegistration,
-    recording: Recording,
-    clock_sd: float = 0.002,
+    body: RegistrationBody, one: PictureRegistration, recording: Recording, clock_sd: float = 0.002
 ) -> list[Finding]:
     """Return findings of a camera's clock that is off the joint log's, or drifts.
 

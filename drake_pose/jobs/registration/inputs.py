@@ -428,9 +428,7 @@ def _select_cameras(
 
 
 def make_registration_tree(
-    model: ArticulatedModel,
-    settings: RegistrationSettings,
-    target: CalibrationTarget | None = None,
+    model: ArticulatedModel, settings: RegistrationSettings, target: CalibrationTarget | None = None
 ) -> tuple[PoseTree, tuple[str, ...] | None]:
     """Return the pose tree, and the names of its nodes that masks show; None: all.
 

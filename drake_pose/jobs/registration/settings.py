@@ -62,8 +62,7 @@ class RegistrationSettings(AuditSettings):
     """If several poses of a camera fit equally well, suggest joint positions that distinguish
     them."""
     keep_out: Annotated[
-        tuple[tuple[Corner, Corner], ...],
-        from_text(parse_boxes, "X,Y,Z:X,Y,Z", repeated=True),
+        tuple[tuple[Corner, Corner], ...], from_text(parse_boxes, "X,Y,Z:X,Y,Z", repeated=True)
     ] = ()
     """With --suggest: corners of a box in the world that the robot must not enter [m]; repeat for
     several."""

@@ -60,10 +60,10 @@ def adjust_bundle(
     deviations = np.where(is_length, 0.03, 0.5) / error
     pose, lengths = (
         Unknowns(
-            np.array(kinematics.names)[included].tolist(), shared, kinematics.lower[included],
-            kinematics.upper[included], deviations[included],
+            np.array(kinematics.names)[chosen].tolist(), shared, kinematics.lower[chosen],
+            kinematics.upper[chosen], deviations[chosen],
         )
-        for included, shared in ((free, False), (is_length, True))
+        for chosen, shared in ((free, False), (is_length, True))
     )  # fmt: skip
     radius_scales = [name for name in body.names if name.startswith(RADIUS_SCALE_PREFIX)]
     poses = [f"{cameras[k].name}.{name}" for k in searched for name in POSE_NAMES]

@@ -69,7 +69,7 @@ class _Information(NamedTuple):
     freedom: float
 
     def plus(self, info: "_Information", sign: float = 1.0) -> "_Information":
-        """Add another frame, weighted by its variance factor, or remove it (sign -1)."""
+        """Add another frame, divided by its variance factor, or remove it (sign -1)."""
         weight = sign / info.scale
         return self._replace(
             N=self.N + weight * info.N,

@@ -53,8 +53,8 @@ class OnlineSettings:
             keyframes overlap, so each new one adds fewer than the pose's six.
         novelty: a frame is a keyframe if the body's points are this far from every keyframe's, root
             mean square [extent of the body].
-        tolerance: a frame in the pose of a keyframe replaces it if its E_total is larger by more
-            [the mask's area].
+        tolerance: a frame in the pose of a keyframe is fitted, and replaces it, only if its E_total
+            is larger by more than this [the mask's area].
         min_iou: minimum mean intersection over union of a found pose.
         false_alarm: p-value of a difference that counts as a moved camera.
 

@@ -10,13 +10,13 @@ from drake_pose.compiled import compiled, multiply
 
 
 class PackedSteps(NamedTuple):
-    """A chain of joints in the arrays that kernels take.
+    """s joints in the arrays that kernels take, usually a chain or several chains in a row.
 
     Attributes:
         sizes: (s,) int64 number of positions of each joint.
         inverted: (s,) bool, whether the joint is traversed inwards.
         starts: (s,) int64 index of each joint's first row in ``coefficients``.
-        coefficients: (r, 16) coefficients of ``JointMap``.
+        coefficients: (r, 16) coefficients of each joint's ``JointMap``, one joint after another.
     """
 
     sizes: np.ndarray
@@ -26,12 +26,12 @@ class PackedSteps(NamedTuple):
 
 
 class PackedBands(NamedTuple):
-    """Skin bands in the arrays that kernels take, one band after another.
+    """b skin bands with v vertices in all, in the arrays that kernels take, one after another.
 
     Attributes:
         starts: (b + 1, 3) int64 index of each band's first step, weight and vertex.
         steps: the joints from each node's parent to the node.
-        weights: (l,) the distinct vertex weights of each band.
+        weights: (l,) the distinct vertex weights in [0, 1] of each band.
         weight_index: (v,) int64 index of each vertex's weight, counted in its band.
         points: (v, 3) vertices at rest [m], in the node's frame, or in its parent's if inverted.
         inverted: (b,) bool, whether the node is nearer to the plant's world than its parent.
@@ -46,7 +46,7 @@ class PackedBands(NamedTuple):
 
 
 def join_bands(bands: Sequence[PackedBands]) -> PackedBands:
-    """Return several packed bands as one."""
+    """Return all bands of several ``PackedBands`` in one, in the given order."""
     steps = [band.steps for band in bands]
     rows = np.cumsum([0, *(len(chain.coefficients) for chain in steps)])
     counts = [np.diff(band.starts, axis=0) for band in bands]
@@ -68,7 +68,7 @@ def join_bands(bands: Sequence[PackedBands]) -> PackedBands:
 
 
 def pack_steps(steps: Sequence[JointMap]) -> PackedSteps:
-    """Return joints in the kernel's arrays."""
+    """Return joints, in their order, in the arrays that kernels take."""
     rows = [len(step.coefficients) for step in steps]
     return PackedSteps(
         sizes=np.array([step.position_count for step in steps], dtype=np.int64),
@@ -88,16 +88,20 @@ def evaluate_joint(
     basis: np.ndarray,
     X: np.ndarray,
 ) -> None:
-    """Write the upper rows of a joint's transform in traversal order, or of a derivative.
+    """Write the upper three rows of a joint's transform, or of its derivative by one position.
+
+    The transform is in traversal order: it is inverted if the joint is.
 
     Args:
-        step: index of the joint.
-        values: the joint's values [rad or m], and any further ones.
+        steps: joints in the kernels' arrays.
+        step: index of the joint in ``steps``.
+        values: (j,) array whose first entries are the joint's values [rad or m].
         fraction: factor by which the values are multiplied.
-        derived: index of the position by which to differentiate; -1: none. A derivative is that of
-            the transform outwards, whether or not the joint is inverted.
-        basis: (3, 4) scratch.
-        X: (3 or 4, 4) output.
+        derived: index among the joint's positions of the one by which to differentiate; -1: write
+            the transform itself. A derivative is that of the transform outwards, whether or not the
+            joint is inverted.
+        basis: (3, 4) working memory, overwritten.
+        X: (3 or 4, 4) output, whose first three rows are written.
     """
     size, begin, coefficients = steps.sizes[step], steps.starts[step], steps.coefficients
     for k in range(size):
@@ -139,13 +143,15 @@ def place_bands(
     """Place the vertices of bands in their nodes' frames; skip bands whose values have not changed.
 
     Args:
+        bands: b bands with v vertices in all.
         ranges: (b, 2) range of each band's values [first, end) in the columns of ``values``.
-        values: (n, m) all values [rad or m].
-        last_values: (n, m) values of the previous call, or NaN; overwritten.
-        placed: (n, v, 3) vertices of all bands [m]; overwritten.
+        values: (n, m) values [rad or m] of n poses.
+        last_values: (n, m) ``values`` of the previous call, NaN at the first; overwritten.
+        placed: (n, v, 3) vertices of all bands in their nodes' frames [m]; the vertices of changed
+            bands are overwritten, the others keep their positions of the previous call.
 
     Returns:
-        (n, b) bool, which bands were placed anew.
+        (n, b) bool, whether each band was placed anew at each pose.
     """
     basis, joint, product = np.empty((3, 4)), np.empty((3, 4)), np.empty((3, 4))
     max_count, x = 0, np.empty(3)

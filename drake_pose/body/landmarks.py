@@ -54,7 +54,7 @@ def landmarks_file(model_path: Path | str) -> Path:
 
 
 def load_landmarks(model_path: Path | str) -> dict[str, Landmark]:
-    """Read the landmarks from ``landmarks.yaml`` in a model file's folder.
+    """Read the landmarks, by name, from ``landmarks.yaml`` in a model file's folder.
 
     The file maps each name to a link and a point in that link's frame [m]::
 
@@ -86,7 +86,9 @@ def landmark_positions(
     """Return the landmarks (n, 3) in the world [m], in the mapping's order.
 
     Args:
-        q: (nq,) the plant's positions.
+        model: the model that the landmarks' links belong to.
+        landmarks: the n landmarks by name (``load_landmarks``).
+        q: (nq,) the plant's positions [rad or m].
         X_WB: (4, 4) pose of the plant's world frame in the world; None: the identity.
 
     Raises:
@@ -108,6 +110,8 @@ def landmark_positions(
 
 def landmarks_of_nodes(tree: PoseTree, landmarks: Mapping[str, Landmark]) -> NodeLandmarks:
     """Return the landmarks in the frames of a tree's nodes, for fast evaluation at many poses.
+
+    ``landmarks``: the landmarks by name (``load_landmarks``).
 
     Raises:
         UnknownNameError: a landmark's link does not exist.
@@ -137,7 +141,7 @@ def landmarks_of_nodes(tree: PoseTree, landmarks: Mapping[str, Landmark]) -> Nod
 
 
 def _body(model: ParsedModel, name: str, link: str) -> int:
-    """Return the index of a landmark's link among the plant's bodies."""
+    """Return the index of ``link`` among the plant's bodies; errors name the landmark ``name``."""
     if link not in model.link_names:
         where = f"{landmarks_file(model.path)}: '{name}': {model.path.name}"
         raise UnknownNameError("link", link, model.link_names, where)

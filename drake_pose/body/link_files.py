@@ -125,18 +125,18 @@ def sanitise_urdf(path: Path, finder: FileFinder, warn: Warn) -> str:
 
 
 def _joints(root: ElementTree.Element) -> list[ElementTree.Element]:
-    """Return all joints, ``drake:joint`` included."""
+    """Return all joint elements of a <robot>, ``drake:joint`` included."""
     return [child for child in root if child.tag in ("joint", "drake:joint")]
 
 
 def _end(joint: ElementTree.Element, end: str) -> str:
-    """Return the name of a joint's "parent" or "child" link; "" if it has none."""
+    """Return the name of the link at a joint's ``end``, "parent" or "child"; "" if it has none."""
     element = joint.find(end)
     return "" if element is None else element.get("link", "")
 
 
 def _check_origin(element: ElementTree.Element, where: str) -> None:
-    """Raise ModelError unless an element's <origin> holds finite numbers."""
+    """Raise ModelError, which begins with ``where``, unless an <origin> holds finite numbers."""
     for origin in element.iterfind("origin"):
         for name in ("xyz", "rpy"):
             if name in origin.attrib:
@@ -146,7 +146,13 @@ def _check_origin(element: ElementTree.Element, where: str) -> None:
 def _check_urdf_visual(
     visual: ElementTree.Element, where: str, path: Path, finder: FileFinder
 ) -> None:
-    """Refuse a <visual> that cannot be drawn, and make its file names absolute."""
+    """Refuse a URDF <visual> that cannot be drawn, and make its file names absolute, in place.
+
+    Args:
+        where: the link, at the beginning of messages.
+        path: the URDF file.
+        finder: finds the mesh files.
+    """
     _check_origin(visual, where)
     shapes = visual.findall("geometry/*")
     if not shapes:
@@ -166,7 +172,7 @@ def _check_urdf_visual(
 
 
 def _check_urdf_joint(joint: ElementTree.Element) -> None:
-    """Refuse limits that make Drake abort, and remove limits that have no effect."""
+    """Refuse a URDF joint's limits that make Drake abort; remove limits that have no effect."""
     name = joint.get("name", "")
     _check_origin(joint, f"joint '{name}'")
     for axis in joint.iterfind("axis"):
@@ -194,7 +200,10 @@ def _check_urdf_joint(joint: ElementTree.Element) -> None:
 
 
 def _inline_colours(root: ElementTree.Element) -> None:
-    """Replace each visual's material by an unnamed colour, because Drake needs unique names."""
+    """Replace each visual's material in a <robot> by an unnamed colour, in place.
+
+    Drake needs unique names of materials.
+    """
     shared = root.findall("material")
     per_visual = root.findall("link/visual/material")
     colours: dict[str, str] = {}
@@ -220,7 +229,10 @@ def _colour(material: ElementTree.Element) -> str | None:
 
 
 def _checked_shape(shape: ElementTree.Element, where: str, *, is_urdf: bool) -> str:
-    """Return the type of a shape; raise ModelError for an unknown type or an invalid size."""
+    """Return the type of a shape; raise ModelError for an unknown type or an invalid size.
+
+    Messages begin with ``where``. ``is_urdf``: the shape is from a URDF file, else SDFormat.
+    """
     # The sizes of each shape and how many numbers each has: URDF attributes, SDFormat elements.
     known: dict[str, dict[str, int]] = {
         "box": {"size": 3},
@@ -252,7 +264,7 @@ def sanitise_sdf(
         path: the SDFormat file.
         finder: finds the files that the SDFormat file names.
         warn: receives a message for each part that is not read or not enforced.
-        sanitise_file: returns a sanitised copy of an included model file.
+        sanitise_file: returns the path of a sanitised copy of an included model file.
 
     Returns:
         The text, and the limits (lower, upper) [rad] of universal and screw joints by position
@@ -303,7 +315,7 @@ def sanitise_sdf(
 
 
 def _uri(element: ElementTree.Element, missing: str) -> tuple[ElementTree.Element, str]:
-    """Return an element's <uri> and its text; ModelError says ``missing`` if there is none."""
+    """Return an element's <uri> and its text; ModelError(``missing``) if there is none."""
     uri = element.find("uri")
     name = "" if uri is None else (uri.text or "").strip()
     if uri is None or not name:
@@ -312,7 +324,7 @@ def _uri(element: ElementTree.Element, missing: str) -> tuple[ElementTree.Elemen
 
 
 def _model_of_folder(folder: Path, name: str) -> Path:
-    """Return the newest model file that a folder's model.config names."""
+    """Return the newest model file in a folder's model.config; messages name the URI ``name``."""
     config = folder / "model.config"
     if not config.is_file():
         raise ModelError(f"included model '{name}': {config} does not exist")
@@ -324,7 +336,10 @@ def _model_of_folder(folder: Path, name: str) -> Path:
 
 
 def _check_poses(element: ElementTree.Element, where: str) -> None:
-    """Raise ModelError unless an element's Euler-angle <pose> holds six finite numbers."""
+    """Raise ModelError unless an element's Euler-angle <pose> holds six finite numbers.
+
+    Messages begin with ``where``.
+    """
     for pose in element.iterfind("pose"):
         if (pose.text or "").strip() and pose.get("rotation_format", "euler_rpy") == "euler_rpy":
             read_numbers(pose.text, 6, f"{where}: its <pose>")
@@ -333,7 +348,10 @@ def _check_poses(element: ElementTree.Element, where: str) -> None:
 def _check_sdf_visual(
     visual: ElementTree.Element, where: str, path: Path, finder: FileFinder
 ) -> None:
-    """Refuse a <visual> that Drake cannot draw correctly, and make its file names absolute."""
+    """Refuse an SDFormat <visual> that Drake cannot draw; make its file names absolute, in place.
+
+    The arguments are those of ``_check_urdf_visual``; ``path`` is the SDFormat file.
+    """
     _check_poses(visual, where)
     for material in visual.findall("material"):
         for colour in material.findall("diffuse"):

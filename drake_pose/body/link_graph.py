@@ -36,7 +36,7 @@ class JointMap:
 
     Attributes:
         coefficients: (4^k, 16), one row of X_AC's entries for each product of basis functions of
-            the k positions.
+            the k positions; the last position's function changes fastest.
         position_count: number of positions k.
         inverted: whether a chain traverses the joint inwards, from C to A.
     """
@@ -86,9 +86,10 @@ class JointMap:
 
 
 def chain_transforms(steps: Sequence[JointMap], values: NDArray[Any]) -> NDArray[Any]:
-    """Return the transforms (n, 4, 4) along a chain of joints at their values (n, k) [rad or m].
+    """Return the transforms (n, 4, 4) along a chain of joints, from its first frame to its last.
 
-    The values may be complex, for derivatives by complex steps.
+    ``values``: (n, k) positions [rad or m] of all joints, one joint after another. They may be
+    complex, for derivatives by complex steps.
     """
     X: NDArray[Any] = np.broadcast_to(np.eye(4), (len(values), 4, 4))
     start = 0
@@ -147,7 +148,12 @@ class JointEdge:
 
 @dataclass(frozen=True)
 class LinkGraph:
-    """All groups and the joints between them, which form a tree; group 0 holds the world."""
+    """All link groups and the joints between them, which form a tree.
+
+    Attributes:
+        groups: the groups; group 0 holds the world.
+        edges: the joints that are not welds, outwards from the world.
+    """
 
     groups: tuple[LinkGroup, ...]
     edges: tuple[JointEdge, ...]
@@ -166,7 +172,10 @@ class LinkGraph:
 
 
 class PlantKinematics:
-    """Forward kinematics of the plant's bodies, with a context of its own."""
+    """Forward kinematics of a model's plant, with a context of its own.
+
+    ``body`` is the index of a body in the plant.
+    """
 
     def __init__(self, model: ParsedModel) -> None:
         """Start at the model's default positions."""
@@ -177,7 +186,7 @@ class PlantKinematics:
     def pose(self, body: int, positions: Mapping[int, float] | None = None) -> Array:
         """Return the pose (4, 4) of a body in the plant's world frame at the default positions.
 
-        ``positions`` [rad or m] by index in q replace default positions.
+        ``positions``: values [rad or m] by index in q that replace defaults; None: none.
         """
         q = np.array(self._defaults)
         for index, value in (positions or {}).items():
@@ -241,7 +250,12 @@ def build_link_graph(model: ParsedModel, preferred_frame: str | None) -> LinkGra
 def _make_group(
     model: ParsedModel, kinematics: PlantKinematics, bodies: list[int], preferred_frame: str | None
 ) -> LinkGroup:
-    """Return the group of welded bodies, their meshes joined in one frame."""
+    """Return the group of welded bodies, their meshes joined in one frame.
+
+    Args:
+        bodies: indices of the bodies in the plant, the one nearest to the world first.
+        preferred_frame: as for ``build_link_graph``.
+    """
     names = link_names(model.plant)
     links = tuple(names[body] for body in bodies)
     with_geometry = [name for name in links if name in model.link_meshes]
@@ -263,7 +277,10 @@ def _make_group(
 def _make_edge(
     kinematics: PlantKinematics, groups: tuple[LinkGroup, ...], joint: Joint, inner: int, outer: int
 ) -> JointEdge:
-    """Return the edge of one joint, with its map fitted to the plant."""
+    """Return the edge of one joint, with its map fitted to the plant.
+
+    ``inner`` and ``outer`` are the indices in ``groups`` of the joint's two groups.
+    """
     start, count = joint.position_start(), joint.num_positions()
     positions = tuple(range(start, start + count))
     if joint.type_name() in FLOATING_TYPES:

@@ -258,7 +258,10 @@ def _read_dae(path: Path) -> TriangleMesh:
 
 
 def _read_with_trimesh(path: Path, source: Path | io.BytesIO, extension: str) -> TriangleMesh:
-    """Return the mesh that trimesh reads from a file or from its content."""
+    """Return the mesh that trimesh reads from ``source``, a file or its content.
+
+    ``path`` names the file in messages; ``extension`` is its format, for example ".stl".
+    """
     import trimesh  # Slow to import, and needed for few models.
 
     try:
@@ -359,7 +362,10 @@ def _write_with_normals(mesh: TriangleMesh, path: Path) -> None:
 
 
 def _write_lines(file: TextIO, line: str, rows: NDArray[Any]) -> None:
-    """Write one formatted line per row, in large chunks for speed."""
+    """Write one line per row (n, k), in large chunks for speed.
+
+    ``line``: a %-format of k numbers that ends in a line break.
+    """
     for start in range(0, len(rows), 65536):
         chunk = rows[start : start + 65536]
         file.write((line * len(chunk)) % tuple(chunk.ravel().tolist()))
@@ -413,9 +419,10 @@ def _convex_mesh(shape: Convex) -> TriangleMesh:
 
 
 def body_mesh(plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody) -> TriangleMesh:
-    """Return the visual geometry of one body in its frame, without ground planes.
+    """Return the visual geometry of one of the plant's bodies in its frame, without ground planes.
 
-    Raises ModelError, which names the link: a shape cannot be drawn.
+    ``scene_graph`` is the one with which the plant is registered. Raises ModelError, which names
+    the link: a shape cannot be drawn.
     """
     return join_meshes(list(labelled_meshes(plant, scene_graph, body).values()))
 
@@ -423,7 +430,10 @@ def body_mesh(plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody) -
 def labelled_meshes(
     plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody
 ) -> dict[int, TriangleMesh]:
-    """Return the rendered geometry of one body in its frame, by label, without ground planes.
+    """Return the rendered geometry of one body in its frame, by Drake's integer render label.
+
+    Ground planes and geometry labelled "do not render" are left out. ``scene_graph`` is the one
+    with which the plant is registered.
 
     Raises ModelError, which names the link: a shape cannot be drawn.
     """

@@ -77,7 +77,10 @@ def sanitise_mjcf(path: Path, warn: Warn) -> tuple[str, list[MjcfCoupling]]:
 
 
 def _compile(path: Path, warn: Warn) -> tuple[Any, list[MjcfCoupling]]:
-    """Return MuJoCo's compiled model without undrawn parts, and the couplings between joints."""
+    """Return MuJoCo's compiled model without undrawn parts, and the couplings between joints.
+
+    ``warn`` receives a message about constraints that are not enforced.
+    """
     try:
         import mujoco
     except ModuleNotFoundError as error:
@@ -137,7 +140,7 @@ def _compile(path: Path, warn: Warn) -> tuple[Any, list[MjcfCoupling]]:
 
 
 def _shape_name(model: Any, geom: int) -> str:
-    """Return the name of a geom's shape; "" if the geom is not drawn."""
+    """Return the shape of the geom of index ``geom`` in a compiled model; "" if it is not drawn."""
     import mujoco
 
     if model.geom_group[geom] == _NOT_DRAWN:
@@ -147,7 +150,7 @@ def _shape_name(model: Any, geom: int) -> str:
 
 
 def _name(model: Any, address: int) -> str:
-    """Return the name at an address, decoded as UTF-8 where possible."""
+    """Return the name at an address in a compiled model's names, as UTF-8 where possible."""
     return str(model.names[address:].split(b"\0", 1)[0].decode("utf-8", "replace"))
 
 
@@ -158,6 +161,7 @@ def _add_body(model: Any, body: int, name: str, parent: ElementTree.Element) -> 
         model: MuJoCo's compiled model.
         body: index of the body.
         name: name of the innermost body.
+        parent: the element that the outermost body is added to.
     """
     first = model.body_jntadr[body]
     joints = range(first, first + model.body_jntnum[body])
@@ -181,7 +185,7 @@ def _add_body(model: Any, body: int, name: str, parent: ElementTree.Element) -> 
 
 
 def _add_joint(model: Any, joint: int, body: ElementTree.Element) -> None:
-    """Write one joint of the compiled model into a body element."""
+    """Write the joint of index ``joint`` of a compiled model into a body element."""
     name = _name(model, model.name_jntadr[joint])
     attributes = {"name": name} if name else {}
     kind = ("free", "ball", "slide", "hinge")[model.jnt_type[joint]]
@@ -199,7 +203,7 @@ def _add_joint(model: Any, joint: int, body: ElementTree.Element) -> None:
 
 
 def _mesh(model: Any, mesh: int) -> TriangleMesh:
-    """Return a mesh of the compiled model in MuJoCo's own mesh frame."""
+    """Return the mesh of index ``mesh`` of a compiled model in MuJoCo's own mesh frame."""
     first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
     begin, triangles = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
     return merge_duplicate_vertices(

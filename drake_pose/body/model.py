@@ -179,7 +179,9 @@ class ArticulatedModel(ParsedModel):
         return self._changed(text, skin)
 
     def with_base_joints(self, X_WB: Array) -> "ArticulatedModel":
-        """Return the model mounted on the six ``BASE_JOINTS``, which are zero at X_WB (4, 4).
+        """Return the model mounted on the six ``BASE_JOINTS``.
+
+        ``X_WB``: (4, 4) pose of the model's base in the world when these joints are zero.
 
         Raises ModelError: the model is no URDF.
         """
@@ -253,7 +255,7 @@ class ArticulatedModel(ParsedModel):
         return self._source
 
     def _changed(self, text: str, skin: Sequence[SkinBand]) -> "ArticulatedModel":
-        """Return the model parsed again from another URDF text, with another skin."""
+        """Return the model parsed again from another URDF text, with the bands ``skin``."""
         source = self._urdf().with_text(text)
         plant, scene_graph, _, _ = _parse(self.path, source)
         plant.Finalize()
@@ -304,7 +306,10 @@ def load_model(
 def read_model(
     path: Path, packages: Mapping[str, str], limits: Mapping[str, tuple[float, float]]
 ) -> ArticulatedModel:
-    """Read a model as ``load_model`` does, in this process and without the check."""
+    """Read a model as ``load_model`` does, in this process and without the check.
+
+    ``packages``: folders by package name. ``limits``: (lower, upper) [rad or m] by position name.
+    """
     source = ModelSource(path, packages)
     plant, scene_graph, instances, warnings = _parse(path, source)
     with _model_errors(path):
@@ -339,6 +344,8 @@ def _parse(
 ) -> tuple[MultibodyPlant, SceneGraph, list[ModelInstanceIndex], list[str]]:
     """Parse a model into a new plant that is not finalized, with drawable mesh files.
 
+    ``path`` names the model in messages.
+
     Returns:
         The plant, its SceneGraph, the model instances, and warnings about the file.
     """
@@ -361,7 +368,9 @@ def _visual_meshes(
 ) -> dict[str, TriangleMesh]:
     """Return the visual geometry of each link that has some, by link name.
 
-    ``bodies``: the bodies to read; None: all. Raises ModelError: no body has visual geometry.
+    ``bodies``: the bodies to read; None: all. ``path`` names the model in messages.
+
+    Raises ModelError: no body has visual geometry.
     """
     names = link_names(plant)
     chosen = [BodyIndex(k) for k in range(len(names))] if bodies is None else bodies

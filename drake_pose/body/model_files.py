@@ -85,7 +85,10 @@ def read_numbers(text: str | None, count: int, where: str) -> list[float]:
 
 
 def require_size(text: str | None, count: int, where: str, *, zero: bool = False) -> None:
-    """Raise ModelError for a size that is not positive; ``zero`` allows zero."""
+    """Raise ModelError unless a text holds ``count`` positive numbers; ``zero`` allows zero.
+
+    The message begins with ``where``.
+    """
     for number in read_numbers(text, count, where):
         if number < 0.0 or (number == 0.0 and not zero):
             bound = "must not be negative" if zero else "must be above 0"
@@ -93,7 +96,7 @@ def require_size(text: str | None, count: int, where: str, *, zero: bool = False
 
 
 def colour_text(text: str | None) -> str | None:
-    """Return three or four colour components clamped to [0, 1]; None for an invalid colour."""
+    """Return a text of 3 or 4 colour components, clamped to [0, 1]; None for an invalid colour."""
     count = 3 if len((text or "").split()) == 3 else 4
     try:
         return " ".join(f"{min(max(part, 0.0), 1.0):g}" for part in read_numbers(text, count, ""))
@@ -102,7 +105,7 @@ def colour_text(text: str | None) -> str | None:
 
 
 def require_scale(text: str, count: int, where: str) -> None:
-    """Raise ModelError for a mesh scale that is not ``count`` non-zero numbers."""
+    """Raise ModelError (it begins with ``where``) unless a text is ``count`` non-zero numbers."""
     if 0.0 in read_numbers(text, count, where):
         raise ModelError(f"{where} is '{text}'; no factor may be 0")
 
@@ -111,6 +114,10 @@ def read_limits(
     lower_text: str | None, upper_text: str | None, name: str
 ) -> tuple[float | None, float | None]:
     """Return a joint's lower and upper limit; None for a limit that is missing or infinite.
+
+    Args:
+        lower_text, upper_text: the limits as the file has them; None: missing.
+        name: the joint's name, for messages.
 
     Raises ModelError: a limit is no number or NaN, or the lower one is above the upper one.
     """
@@ -141,9 +148,9 @@ def leave_out(
 
     Args:
         root: the element whose descendants are filtered.
-        read: names of the child elements to keep, by element; an element that is not listed keeps
-            all.
-        known: names of elements that are removed without a warning.
+        read: names of the child elements to keep, by the name of their parent element; a parent
+            that is not listed keeps all.
+        known: names of child elements that are removed without a warning.
         warn: receives a message for each other removed element.
     """
     stack = [root]
@@ -169,8 +176,9 @@ def open_loops(
     """Remove the joints of a model that close a loop of links.
 
     Args:
-        model: the element that contains the joints.
-        ends: the parent and the child link of each joint.
+        model: the element that contains the joints; changed in place.
+        joints: the elements of the joints.
+        ends: the names of each joint's parent and child link.
         warn: receives a message for each removed joint.
     """
     # Keep the first joint that names a link as its child: Drake cannot invert every joint type.
@@ -203,12 +211,16 @@ FOLLOWING = ("revolute", "continuous", "prismatic")
 def take_mimic(
     parent: ElementTree.Element, name: str, leaders: Collection[str], warn: Warn
 ) -> dict[str, str] | None:
-    """Remove a joint's <mimic> and return the attributes of the one that Drake enforces, or None.
+    """Remove each <mimic> of a joint, and return the last one that Drake enforces.
 
     Args:
         parent: the element that contains <mimic>, with its values as attributes or elements.
+        name: the joint's name.
         leaders: names of the joints that can be followed.
         warn: receives a message for a <mimic> that is not enforced.
+
+    Returns:
+        The attributes joint, multiplier and offset of a <mimic>; None: none can be enforced.
     """
     found, defaults = None, {"multiplier": "1", "offset": "0", "reference": "0"}
     for mimic in parent.findall("mimic"):
@@ -292,7 +304,10 @@ class FileFinder:
     def resolve(self, name: str, file: Path, what: str) -> Path:
         """Return the absolute path of a file or folder that a model file names.
 
-        ``what``: what the name stands for, for messages.
+        Args:
+            name: the URI or path, as the model file has it.
+            file: the model file; other names than URIs are relative to its folder.
+            what: what the name stands for, for messages.
 
         Raises ModelError: the package is unknown, or the file does not exist or is not local.
         """
@@ -319,7 +334,10 @@ class FileFinder:
         raise ModelError(f"{what} '{name}': {os.path.abspath(paths[0])} does not exist")
 
     def _package_folders(self, name: str, file: Path) -> list[Path]:
-        """Return the folders where a package may be, in order of precedence."""
+        """Return the existing folders of the package ``name``, in order of precedence.
+
+        ``file``: the model file that names the package; the folders above it are searched.
+        """
         if self._known.Contains(name):
             return [Path(self._known.GetPath(name))]
         if not re.fullmatch(r"\w[\w.-]*", name):
@@ -345,7 +363,7 @@ class FileFinder:
 
 
 def _folders_at(folder: Path, name: str) -> list[Path]:
-    """Return a folder if it is the package itself, and its subfolder of the package's name."""
+    """Return a folder if it is the package ``name``, and its subfolder ``name`` if that exists."""
     names = [folder.name]
     with suppress(ModelError, OSError):
         if (folder / "package.xml").is_file():

@@ -43,7 +43,7 @@ class NodeSkin:
         mesh: the closed band at rest (all joints at zero).
         weights: (v,) float64 read-only weights in [0, 1] with which vertices move with the link
             farther from the plant's world: the node, or its parent if ``inverted``.
-        colour: (r, g, b) in [0, 1].
+        colour: (red, green, blue) in [0, 1].
         inverted: whether the node, not its parent, is nearer to the plant's world.
         steps: the joints from the parent to the node.
     """
@@ -106,7 +106,7 @@ def _pose_at_rest(steps: tuple[JointMap, ...]) -> Array:
 def find_skin(
     model: ParsedModel, graph: LinkGraph, parent: int, group: int, steps: tuple[JointMap, ...]
 ) -> NodeSkin | None:
-    """Return the skin band between a node and its parent, or None.
+    """Return the skin band between a node and its parent; None if the model declares none.
 
     Args:
         parent: index of the parent's link group.
@@ -130,7 +130,10 @@ def find_skin(
 def require_neighbours(
     model: ParsedModel, graph: LinkGraph, pairs: Collection[tuple[int, int]]
 ) -> None:
-    """Raise ModelError for a band whose links are not one of the (parent, node) pairs of groups."""
+    """Raise ModelError if the two links of a skin band are not neighbours in a tree.
+
+    ``pairs``: the link groups (parent, node) of all neighbours, as indices in ``graph.groups``.
+    """
     for band in model.skin:
         ends = (graph.group_of(band.parent), graph.group_of(band.child))
         if ends not in pairs and ends[::-1] not in pairs:

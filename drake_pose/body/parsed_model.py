@@ -58,7 +58,7 @@ def skin_file(model_path: Path) -> Path:
 def load_skin(model_path: Path, link_names: Sequence[str]) -> tuple[SkinBand, ...]:
     """Read the skin file beside a model file; return () where there is none.
 
-    Each entry of ``bands`` has these fields:
+    ``link_names``: the names of the model's links. Each entry of ``bands`` has these fields:
 
     - ``parent``, ``child``: names of the two links.
     - ``mesh``: a closed mesh file in the child link's frame at rest, relative to the skin file.
@@ -90,7 +90,7 @@ def load_skin(model_path: Path, link_names: Sequence[str]) -> tuple[SkinBand, ..
 
 @dataclass
 class BandEntry:
-    """A band as a skin file has it; see ``load_skin``."""
+    """A band as a skin file has it; ``load_skin`` describes the fields."""
 
     parent: str = ""
     child: str = ""
@@ -102,10 +102,11 @@ class BandEntry:
 
 
 def _make_band(path: Path, entry: dict[str, Any], link_names: Sequence[str]) -> SkinBand:
-    """Check one entry of a skin file and return its band.
+    """Check one entry of the skin file ``path`` and return its band.
 
-    The weight is the smoothstep w = f^2 (3 - 2 f) of the fraction f of the way from ``begin`` to
-    ``end``.
+    ``entry``: the fields of ``BandEntry`` by name, as YAML has them. ``link_names``: the names of
+    the model's links. The weight of a vertex is the smoothstep w = f^2 (3 - 2 f) of the fraction f
+    of the way from ``begin`` to ``end``.
     """
     where = f"{path}: band '{entry.get('parent')}' - '{entry.get('child')}'"
     given = typed_entry(entry, BandEntry, where, ModelError)
@@ -156,24 +157,28 @@ _ROUNDING = 1e-9
 
 
 def covers_full_turn(lower: Array, upper: Array, periodic: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return (k,) which periodic positions have limits (k,) [rad] of a full turn or more."""
+    """Return (k,) bool: the position is periodic (k,) and its limits span a full turn or more.
+
+    ``lower``, ``upper``: (k,) limits [rad or m].
+    """
     return np.asarray(periodic & (upper - lower >= _FULL_TURN - _ROUNDING))
 
 
 def one_turn(lower: Any, upper: Any, near: Any) -> tuple[Any, Any]:
-    """Return limits (k,) [rad] that span at most one turn.
+    """Return lower and upper limits (k,), (k,) [rad] that span at most one turn.
 
-    Limits that are wider are narrowed to the full turn inside them whose middle is nearest to
-    ``near`` (k,).
+    Where ``lower`` and ``upper`` (k,) are farther apart, they are narrowed to the full turn between
+    them whose middle is nearest to ``near`` (k,). All arguments may be scalars.
     """
     low = np.clip(near - np.pi, lower, np.maximum(upper - _FULL_TURN, lower))
     return low, np.minimum(low + _FULL_TURN, upper)
 
 
 def nearest_turn(values: Array, near: Array, periodic: NDArray[np.bool_] | bool) -> Array:
-    """Return values (k,) [rad], periodic ones moved by full turns to within half a turn of near.
+    """Return values (k,) [rad], periodic ones moved by full turns to the turn nearest to ``near``.
 
-    A value exactly half a turn away stays on its side.
+    ``near``: (k,) [rad]. ``periodic``: (k,) bool, or one for all. A result is within half a turn of
+    ``near``; a value exactly half a turn away stays on its side.
     """
     turns = np.round((values - near) / _FULL_TURN)
     return np.asarray(np.where(periodic, values - _FULL_TURN * turns, values))
@@ -245,9 +250,10 @@ def describe_positions(
 
 
 def _resolve_chains(found: Sequence[Coupling], names: Sequence[str]) -> tuple[Coupling, ...]:
-    """Return the couplings with leaders that follow no other position.
+    """Return the couplings ``found`` in a plant, rewritten so that no leader follows a position.
 
-    Raises ModelError: two positions are coupled in two ways.
+    ``names``: the position names, for messages. Raises ModelError: two positions are coupled in two
+    ways.
     """
     of = {k: Coupling(k, k, 1.0, 0.0) for coupling in found for k in coupling[:2]}
     for i, j, multiplier, offset in found:
@@ -310,12 +316,20 @@ def _intersect_limits(
 def _search_limits(
     joint: Joint, index: int, name: str, default: float, given: tuple[float, float] | None
 ) -> tuple[float, float, bool, str]:
-    """Return the limits of one position for the search, whether they are ignored, and a warning.
-
-    The warning is "" where there is none.
+    """Return the limits of one position for the search.
 
     Limits more than four turns apart (a hundred turns for a screw, a kilometre for a slide) count
     as no limits. An angle without limits is searched over one turn about its default.
+
+    Args:
+        index: index of the position in the joint.
+        name: the position's name, for messages.
+        default: the default position [rad or m].
+        given: limits (lower, upper) [rad or m] that replace the joint's; None: the joint's.
+
+    Returns:
+        The lower and the upper limit [rad or m], whether the position counts as unlimited, and a
+        warning ("": none). An unlimited length has infinite limits.
 
     Raises ModelError: limits are NaN or crossed, an angle's are one-sided, or a screw's too wide.
     """
@@ -371,7 +385,7 @@ class ParsedModel:
     Arrays about positions have shape (nq,), are in the order of the plant's q, and are read-only.
 
     Attributes:
-        position_names: the joint's name, or ``joint_suffix`` for joints of several positions.
+        position_names: each position's joint, or ``joint_suffix`` for joints of several positions.
         position_kinds: "angle" [rad], "length" [m] or "quaternion".
         lower, upper: limits [rad or m]. A joint that turns freely has half a turn either side of
             its default position; a floating body's pose and slides without limits have infinite
@@ -382,6 +396,8 @@ class ParsedModel:
         is_unlimited_angle: whether the position is an angle without limits, or with limits so wide
             that they are ignored.
         couplings: positions that follow others; no leader follows another position.
+        path: the model file, or the name of the plant.
+        name: the model's name in its file.
         plant: a finalized MultibodyPlant, from which contexts are made; do not change it.
         scene_graph: the SceneGraph with the plant's geometry.
         link_meshes: the visual geometry of each link that has some, in the link's frame.

@@ -169,7 +169,7 @@ class ModelSource:
             self.warnings.append(text)
 
     def _restore_names(self, text: str, where: str) -> str:
-        """Return Drake's message with original file names instead of the sanitised copies'.
+        """Return Drake's message ``text`` with original file names instead of sanitised copies'.
 
         ``where``: the name of the main file.
         """
@@ -182,7 +182,7 @@ class ModelSource:
 
 
 def summarise_warnings(warnings: Sequence[str], max_count: int = 10) -> list[str]:
-    """Return the warnings, at most ``max_count`` of each kind, and how many more there are.
+    """Return the warnings, at most ``max_count`` of each kind; the last one counts those left out.
 
     Warnings are of one kind if they differ in quoted names and numbers only.
     """
@@ -223,7 +223,12 @@ def _sanitise_directives(
 ) -> str:
     """Return the text of model directives in which every file is replaced by its sanitised copy.
 
-    YAML tags and aliases are kept. ``sanitise_file`` returns the copy of a file.
+    YAML tags and aliases are kept.
+
+    Args:
+        path: the file of model directives.
+        finder: finds the files that it names.
+        sanitise_file: returns the path of a file's sanitised copy.
     """
     try:
         node = top = yaml.compose(path.read_bytes(), Loader=yaml.SafeLoader)
@@ -278,6 +283,11 @@ def check_in_child(
     A process of one thread forks the child, which then needs no imports; others start a new
     process.
 
+    Args:
+        read: reads the model; its results in the child are discarded, except meshes.
+        path: the model file.
+        packages, limits: passed to ``read``.
+
     Raises ModelError: the model cannot be used, or reading crashed, timed out or took too much
     memory.
     """
@@ -290,7 +300,10 @@ def check_in_child(
 
 @functools.lru_cache(maxsize=64)
 def _check_cached(read: Reader, path: str, packages: str, limits: str, _digest: str) -> None:
-    """Raise ModelError if the model cannot be used; ``_digest`` keys the cache by file content."""
+    """As ``check_in_child``, with packages and limits as JSON; return if the model can be used.
+
+    ``_digest`` keys the cache by file content.
+    """
     try:
         try:
             # Forking is safe in a process of one thread; threads can be counted on Linux only.
@@ -321,6 +334,7 @@ def why_unusable(read: Reader, path: str, packages: str, limits: str) -> str:
 
     Args:
         read: the function that reads the model.
+        path: the model file.
         packages: package folders by name, as JSON.
         limits: limits [rad or m] by position name, as JSON.
     """
@@ -350,6 +364,8 @@ def why_unusable(read: Reader, path: str, packages: str, limits: str) -> str:
 
 def _check_in_fork(read: Reader, path: str, packages: str, limits: str) -> str:
     """Return ``why_unusable`` from a fork of this process, and keep the meshes that it read.
+
+    The arguments are those of ``why_unusable``.
 
     Raises:
         TimeoutError: the fork did not answer in time.
@@ -383,7 +399,13 @@ def _check_in_fork(read: Reader, path: str, packages: str, limits: str) -> str:
 def _run_check(
     sender: Connection, output: int, read: Reader, path: str, packages: str, limits: str
 ) -> None:
-    """Send the result of ``why_unusable`` and the meshes that were read, then exit the fork."""
+    """Send the result of ``why_unusable`` and the meshes that were read, then exit the fork.
+
+    Args:
+        sender: receives (reason, {file: (vertices, triangles)}).
+        output: descriptor of the file that takes standard output and standard error.
+        read, path, packages, limits: arguments of ``why_unusable``.
+    """
     faulthandler.disable()
     for descriptor in (1, 2):
         os.dup2(output, descriptor)
@@ -393,7 +415,7 @@ def _run_check(
 
 
 def _check_in_subprocess(path: str, packages: str, limits: str) -> str:
-    """As ``_check_in_fork`` in a newly started process, which takes longer."""
+    """As ``_check_in_fork``, with ``read_model`` in a newly started process, which takes longer."""
     # os._exit skips clean-up, which may crash after a broken file.
     program = (
         "import json, os, sys\n"
@@ -430,7 +452,10 @@ def _check_in_subprocess(path: str, packages: str, limits: str) -> str:
 
 
 def _describe_exit(status: int, output: str) -> str:
-    """Return how a process ended that sent no answer, from its exit status and output."""
+    """Return how a process ended that sent no answer.
+
+    ``status``: its exit status, negative for a signal. ``output``: what it printed.
+    """
     if status < 0:
         return f"crashed Drake ({signal.Signals(-status).name})"
     return f"failed ({(output.strip().splitlines() or [f'exit status {status}'])[-1]})"

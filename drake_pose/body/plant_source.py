@@ -60,7 +60,11 @@ _JOINTS: dict[str, _Make] = {
 class Coupling(NamedTuple):
     """A position that follows another one: q[follower] = multiplier * q[leader] + offset.
 
-    The offset's unit is rad or m.
+    Attributes:
+        follower: index in q.
+        leader: index in q, or where stated so among the values of a tree's node.
+        multiplier: factor of the leader's value.
+        offset: constant [rad or m].
     """
 
     follower: int
@@ -97,7 +101,10 @@ def read_couplings(plant: MultibodyPlant) -> list[Coupling]:
 def add_coupler(
     plant: MultibodyPlant, follower: Joint, leader: Joint, multiplier: float, offset: float
 ) -> None:
-    """Add a coupler constraint, unless the plant's contact solver does not support them."""
+    """Add the constraint q_follower = multiplier * q_leader + offset [rad or m] to a plant.
+
+    A plant whose contact solver does not support such constraints stays as it is.
+    """
     if plant.get_discrete_contact_solver() == DiscreteContactSolver.kSap:
         plant.AddCouplerConstraint(follower, leader, multiplier, offset)
 

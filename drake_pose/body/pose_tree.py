@@ -85,8 +85,8 @@ class NodePlacement:
         is_angle: (k,) bool, whether a value is an angle; else a length.
         periodic: (k,) bool, whether the value is an angle with the same pose after a full turn.
         is_unlimited_angle: (k,) bool, whether the value is an angle without limits, and not held.
-        follows: for each position of the steps: its index in q, the parent's value that it follows,
-            multiplier and offset; (): the node has values of its own.
+        follows: for each position of the steps: its index in q, the index of the parent's value
+            that it follows, multiplier and offset; (): the node has values of its own.
     """
 
     X_PA: Array
@@ -110,7 +110,13 @@ def place_node(
     steps: tuple[JointMap, ...],
     follows: tuple[Coupling, ...] = (),
 ) -> NodePlacement:
-    """Return the placement of a node with positions in q, or of a root with a RootRotation."""
+    """Return the placement of a node with positions in q, or of a root with a RootRotation.
+
+    Args:
+        positions: indices in q of the node's own positions; ignored if ``rotation`` is given.
+        held: values [rad or m] of positions that are not searched, by index in q.
+        X_PA, rotation, steps, follows: as in ``NodePlacement``.
+    """
     if rotation is not None:
         lower, upper = rotation.lower, rotation.upper
         all_true, all_false = np.full(len(lower), True), np.full(len(lower), False)
@@ -146,6 +152,9 @@ class PoseTree:
         followers: couplings of the positions that follow searched positions.
         root: name of the root node; "world" if the plant's own roots are kept.
         placements: how each node is placed in its parent.
+        _base: how the plant takes up the pose of the tree's root.
+        _rebuild: returns the tree with the root's origin at a position (3,) in the world [m]; None:
+            the tree was not made by ``pose_tree``.
     """
 
     model: ParsedModel
@@ -219,7 +228,7 @@ class PoseTree:
         Args:
             node: index of the node.
             interval: sampling interval of angles [rad].
-            intervals: intervals [rad or m] of single positions or root values, by name.
+            intervals: intervals [rad or m] of single positions or root values, by name; None: none.
             length_interval: sampling interval of lengths [m].
 
         Raises:
@@ -274,7 +283,7 @@ class PoseTree:
         return lower, np.where(placement.is_unlimited_angle, np.inf, placement.upper)
 
     def covers_full_turn(self, node: int) -> NDArray[np.bool_]:
-        """Return (k,) which of a node's values are angles that can take every direction."""
+        """Return (k,) bool, whether each value of a node is an angle with a full turn or more."""
         placement = self.placements[node]
         return covers_full_turn(placement.lower, placement.upper, placement.periodic)
 
@@ -344,9 +353,10 @@ class PoseTree:
     def positions_with_root_at(
         self, values: Sequence[Array], root_position: Array
     ) -> tuple[Array, Array]:
-        """Return ``positions_from`` with the root's origin at another position (3,) [m].
+        """Return ``positions_from`` with the root's origin at ``root_position`` (3,) [m].
 
-        No new tree is built unless the plant's base is fixed.
+        ``values``: each node's values (k_i,) [rad or m]. No new tree is built unless the plant's
+        base is fixed.
         """
         if self._base.kind == "constant":
             return self.with_root_position(root_position).positions_from(values)
@@ -361,7 +371,7 @@ class PoseTree:
         return self._base.solve(self.model, self._completed(values), X_WN)
 
     def _completed(self, values: Sequence[Array]) -> Array:
-        """Return q (nq,) from values, held positions, followers and defaults."""
+        """Return q (nq,) from each node's values (k_i,), held positions, followers and defaults."""
         q = np.array(self.model.default_positions)
         for index, value in self.held.items():
             q[index] = value
@@ -427,7 +437,7 @@ def axis_samples(
 def product_grid(axes: Sequence[Sequence[float]], node: str, max_samples: int = 5_000_000) -> Array:
     """Return all combinations (n, k) of the samples of k axes; the last axis changes fastest.
 
-    Raises SettingsError, which names the node: there are more than ``max_samples`` combinations.
+    Raises SettingsError, which names ``node``: there are more than ``max_samples`` combinations.
     """
     size = math.prod(len(axis) for axis in axes)
     if size > max_samples:

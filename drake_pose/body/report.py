@@ -22,9 +22,12 @@ class ModelReport:
     """What a model file holds, what may be unexpected, and what forbids its use.
 
     Attributes:
-        nodes: one dictionary for each node of the pose tree: name, parent, number of triangles,
-            whether it is watertight, and joints. A joint has name, kind, lower and upper limit [deg
-            or m], and the joint that it follows with multiplier and offset [rad or m] ("": none).
+        path: the model file.
+        name: the model's name; "" if the model cannot be used.
+        nodes: one dictionary for each node of the pose tree: ``name``, ``parent`` (its name, or
+            "world"), ``triangles`` (number of them), ``watertight`` (bool), ``joints``. A joint has
+            ``name``, ``kind`` (as ``position_kinds``), ``lower`` and ``upper`` limit [deg or m],
+            and ``follows``: multiplier, leader and offset [rad or m] as a text ("": none).
         warnings: what may be unexpected.
         errors: why the model cannot be used.
     """
@@ -44,7 +47,10 @@ class ModelReport:
 def describe_model(
     path: Path | str, *, package_paths: Mapping[str, Path | str] | None = None
 ) -> ModelReport:
-    """Return a report on a model file; a problem of the model becomes an entry of ``errors``."""
+    """Return a report on a model file; a problem of the model becomes an entry of ``errors``.
+
+    ``package_paths``: folders by package name, as for ``load_model``.
+    """
     path = Path(path)
     try:
         model = load_model(path, package_paths=package_paths)
@@ -61,7 +67,7 @@ def describe_model(
 
 
 def _describe_node(tree: PoseTree, index: int) -> dict[str, Any]:
-    """Return the dictionary of one node for ``ModelReport.nodes``."""
+    """Return the dictionary of the node of index ``index`` for ``ModelReport.nodes``."""
     model, node = tree.model, tree.nodes[index]
     followers = {coupling.follower for coupling in tree.placements[index].follows}
     follows = {
@@ -205,7 +211,8 @@ def _is_symmetric(
     the axis.
 
     Args:
-        X_turn: (4, 4) a quarter turn about the axis.
+        mesh: the surface.
+        X_turn: (4, 4) a quarter turn about the axis, in the mesh's frame.
         levels: number of levels along the axis.
         sectors: number of sectors about the axis; with seven sectors no square passes for round.
         tolerance: largest difference between sectors, as a fraction of the largest distance.

@@ -146,7 +146,13 @@ def _root_rotation(
     rotation: ArrayLike | None,
     interval_deg: float | None,
 ) -> RootRotation:
-    """Check the arguments and return a RootRotation with read-only copies of the arrays."""
+    """Check the arguments and return a RootRotation with read-only copies of the arrays.
+
+    Args:
+        limits_deg: (lower, upper) [deg] of each value.
+        rotation: R_W0 (3, 3); None: the identity.
+        interval_deg: sampling interval [deg]; None: the search's own interval.
+    """
     R = np.eye(3) if rotation is None else np.array(rotation, dtype=np.float64)
     orthonormal = R.shape == (3, 3) and np.allclose(R @ R.T, np.eye(3), atol=1e-6)
     if not orthonormal or np.linalg.det(R) < 0.0:
@@ -218,7 +224,10 @@ class BasePose:
     def solve(self, model: ParsedModel, q: Array, X_WN: Array) -> tuple[Array, Array]:
         """Complete the base positions in q (nq,) and return q and X_WB (4, 4).
 
-        ``X_WN``: (nodes, 4, 4) poses of all nodes in the world.
+        Args:
+            model: the model whose plant has the positions q.
+            q: (nq,) the plant's positions [rad or m]; the base positions are overwritten.
+            X_WN: (nodes, 4, 4) poses of all nodes in the world.
 
         Raises ModelError: no values of the base joints reach the root's pose.
         """
@@ -249,7 +258,10 @@ class BasePose:
         return q, np.eye(4)
 
     def _solve_joints(self, model: ParsedModel, q: Array, X_WA: Array) -> Array:
-        """Return base positions (n,) with the anchor at X_WA (4, 4), within limits if possible."""
+        """Return the base positions (n,) [rad or m] that put the anchor at X_WA (4, 4).
+
+        They are within the limits if possible. q (nq,) holds the start and the held positions.
+        """
         from scipy.optimize import least_squares  # Slow to import.
 
         index = list(self.positions)
@@ -300,7 +312,9 @@ class BasePose:
 
 
 def chain_jacobian(steps: Sequence[JointMap], values: Array) -> Array:
-    """Return the derivative (12, k) of the upper rows of a chain's end pose by its values (k,).
+    """Return the derivative (12, k) of the upper rows of a chain's end pose by its positions.
+
+    ``values``: (k,) positions [rad or m] of all joints, one joint after another.
 
     Complex steps make it exact to rounding.
     """
@@ -319,9 +333,10 @@ def base_of_chain(
     """Return how the joints from the world outwards to a node take up that node's pose.
 
     Args:
+        graph: the model's link graph, from which the chain is.
         chain: the joints from the world outwards.
         node: index of the node in the tree.
-        held: indices in q of positions that keep their values if the others suffice.
+        held: indices in q of positions that keep their values if the others can reach every pose.
     """
     body = graph.groups[chain[-1].outer].body if chain else graph.groups[0].body
     floating = [edge for edge in chain if edge.joint_map is None]

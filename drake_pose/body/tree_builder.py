@@ -58,7 +58,7 @@ def build_pose_tree(
     root_rotation: RootRotation | None = None,
     held: Mapping[str, float] | None = None,
 ) -> PoseTree:
-    """Build a pose tree; see ``ArticulatedModel.pose_tree``."""
+    """Build a pose tree of a model; other arguments as for ``ArticulatedModel.pose_tree``."""
     held, rounding = held or {}, 1e-6
     if root is not None and root not in model.link_names:
         raise UnknownNameError("link", root, model.link_names, str(model.path))
@@ -127,6 +127,10 @@ def _choose_root(
 
     None: the tree keeps the plant's own roots, which are attached to the plant's world. The plant's
     own root has a default position; other roots need one.
+
+    Args:
+        root: name of the root link; None: the user named none.
+        rotation: the root's rotation; None: the user gave none.
     """
     floating = _floating_tops(graph)
     if len(floating) > 1:
@@ -150,7 +154,7 @@ def _choose_root(
 
 
 def _floating_tops(graph: LinkGraph) -> list[int]:
-    """Return the first node's group behind each floating joint that moves geometry."""
+    """Return the index of the first node's group behind each floating joint that moves geometry."""
     tops = []
     for edge in graph.edges:
         if edge.joint_map is None:
@@ -169,7 +173,7 @@ def _floating_tops(graph: LinkGraph) -> list[int]:
 
 
 def _branches(graph: LinkGraph, start: int) -> list[Branch]:
-    """Return the branches reached from a group without crossing a floating joint.
+    """Return the branches reached from the group ``start`` without crossing a floating joint.
 
     Groups without geometry are skipped unless several branches meet there. Branches are sorted by
     depth, then by body.
@@ -206,7 +210,7 @@ def _branches(graph: LinkGraph, start: int) -> list[Branch]:
 
 
 def _ordered(graph: LinkGraph, found: list[Branch]) -> list[Branch]:
-    """Return branches sorted by depth, then by body, with updated parent indices."""
+    """Return the branches ``found`` sorted by depth, then by body, with updated parent indices."""
     bodies = [graph.groups[branch.group].body for branch in found]
     order = sorted(range(len(found)), key=lambda i: (found[i].depth, bodies[i]))
     return [
@@ -222,6 +226,8 @@ def _attach_followers(
 
     The pose of a node in its parent then depends on its own values only, or on its parent's values
     only. A branch stays where it is if other joints move it or a skin band is attached to it.
+
+    ``held``: indices in q of positions that are not searched; they follow nothing.
     """
     couplings = _couplings_by_position(model)
     skinned = {graph.group_of(link) for band in model.skin for link in (band.parent, band.child)}
@@ -272,7 +278,10 @@ def _couplings_by_position(model: ParsedModel) -> dict[int, Coupling]:
 
 
 def _relative_coupling(couplings: Mapping[int, Coupling], follower: int, leader: int) -> Coupling:
-    """Return how one of two positions with a common leader follows the other."""
+    """Return how position ``follower`` follows position ``leader``; both have a common leader.
+
+    ``couplings``: the coupling of each position, by its index in q.
+    """
     first, second = couplings[follower], couplings[leader]
     multiplier = first.multiplier / second.multiplier
     return Coupling(follower, leader, multiplier, first.offset - multiplier * second.offset)
@@ -281,7 +290,10 @@ def _relative_coupling(couplings: Mapping[int, Coupling], follower: int, leader:
 def _followers(
     model: ParsedModel, searched: Sequence[int], known: Collection[int]
 ) -> tuple[Coupling, ...]:
-    """Return the couplings of positions that follow searched ones and are not known already."""
+    """Return the couplings of positions that follow ``searched`` ones and are not in ``known``.
+
+    Both hold indices in q. The leaders in the result are searched positions.
+    """
     couplings, found = _couplings_by_position(model), []
     for follower, coupling in couplings.items():
         own = [p for p in searched if p in couplings and couplings[p].leader == coupling.leader]
@@ -293,7 +305,12 @@ def _followers(
 def _plant_rooted(
     model: ParsedModel, graph: LinkGraph, position: Array | None, held: dict[int, float]
 ) -> PoseTree:
-    """Return the tree with the plant's own roots, which are attached to the plant's world."""
+    """Return the tree with the plant's own roots, which are attached to the plant's world.
+
+    Args:
+        position: (3,) the root's origin in the world [m]; None: as in the model file.
+        held: values of held positions [rad or m], by index in q.
+    """
     branches = _attach_followers(model, graph, _branches(graph, 0), held)
     # The world is a branch itself if it has geometry.
     on_world = 0 if branches and branches[0].group == 0 else -1
@@ -330,9 +347,10 @@ def _plant_rooted(
 
 
 def _solve_translations(model: ParsedModel, top: Branch, p_WN: Array) -> dict[int, float]:
-    """Return values [m] of three translations that put a node's origin at p_WN (3,) [m].
+    """Return values [m], by index in q, of the first three positions of the root branch ``top``.
 
-    Raises ModelError: later joints move the origin, or the translations do not span all directions.
+    The three are translations; they put the node's origin at p_WN (3,) [m]. Raises ModelError:
+    later joints move the origin, or the translations do not span all directions.
     """
     values = model.default_positions[list(top.positions)].copy()
     values[:3] = 0.0
@@ -365,9 +383,11 @@ def _rerooted(
     """Return the tree that starts at a link with its own pose in the world.
 
     Args:
-        start: index of the root's group.
+        start: index of the root's group in ``graph``.
         is_own: whether the root is the plant's own root.
-        position: (3,) the root's origin in the world [m]; None: its default position.
+        position: (3,) the root's origin in the world [m]; None: its default position, which only
+            the plant's own root has.
+        rotation: the root's rotation in the world.
         held: values of held positions [rad or m], by index in q.
 
     Raises SettingsError: a position is missing, or a held position follows from the root's pose.
@@ -421,7 +441,13 @@ def _assemble(
     held: dict[int, float],
     root: str,
 ) -> PoseTree:
-    """Return the pose tree with the nodes of all branches."""
+    """Return the pose tree with one node for each branch, in their order.
+
+    Args:
+        base: how the plant takes up the pose of the tree's root.
+        held: values of held positions [rad or m], by index in q.
+        root: name of the root node, for ``PoseTree.root``.
+    """
     placements: list[NodePlacement] = []
     nodes: list[PoseTreeNode] = []
     for index, branch in enumerate(branches):
@@ -469,13 +495,13 @@ def _assemble(
 
 
 def _unlimited_slides(model: ParsedModel, positions: Sequence[int]) -> list[int]:
-    """Return the positions that are lengths without a finite lower or upper limit."""
+    """Return those of the positions (indices in q) that are lengths without finite limits."""
     limited = np.isfinite(model.lower) & np.isfinite(model.upper)
     return [i for i in positions if model.position_kinds[i] == "length" and not limited[i]]
 
 
 def _missing_limits(model: ParsedModel, positions: Sequence[int]) -> str:
-    """Return the message that joints lack limits, with advice."""
+    """Return the message that the positions (indices in q) lack limits, with advice."""
     names = [model.position_names[position] for position in positions]
     many = len(names) > 1
     return (

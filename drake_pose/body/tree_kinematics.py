@@ -113,7 +113,7 @@ class TreeKinematics:
         self._moves = moves
 
     def flatten(self, node_values: Sequence[np.ndarray]) -> np.ndarray:
-        """Return all values (m,), given each node's (k_i,); SettingsError for a wrong size."""
+        """Return all values (m,), given each node's (k_i,) values; SettingsError for wrong sizes."""
         parts = [np.asarray(values, dtype=np.float64).reshape(-1) for values in node_values]
         sizes = [len(node.value_names) for node in self.tree.nodes]
         if [len(part) for part in parts] != sizes:
@@ -195,7 +195,10 @@ class TreeKinematics:
 
 
 def _pack_tree(tree: PoseTree, firsts: np.ndarray) -> PackedTree:
-    """Return the tree in arrays; the axis rotations of a limited root become joints."""
+    """Return the tree in arrays; the axis rotations of a limited root become joints.
+
+    ``firsts``: (nodes + 1,) index of each node's first value in the tree's values.
+    """
     starts, end = firsts.copy(), firsts[-1]
     for i, placement in enumerate(tree.placements):
         if placement.follows:
@@ -228,7 +231,10 @@ def _pack_tree(tree: PoseTree, firsts: np.ndarray) -> PackedTree:
 
 @compiled
 def _write_twist(X_WA: np.ndarray, M: np.ndarray, twist: np.ndarray) -> None:
-    """Write the twist (6,) in the world of a twist matrix M (3, 4) in frame A."""
+    """Write the twist (omega, v) (6,) in the world of a twist matrix M (3, 4) in frame A.
+
+    ``X_WA``: (3 or 4, 4) pose of A in the world. M = ([omega]x, v).
+    """
     w0, w1, w2 = M[2, 1], M[0, 2], M[1, 0]
     for i in range(3):
         twist[i] = X_WA[i, 0] * w0 + X_WA[i, 1] * w1 + X_WA[i, 2] * w2
@@ -243,7 +249,10 @@ def _write_twist(X_WA: np.ndarray, M: np.ndarray, twist: np.ndarray) -> None:
 def _write_free_rotation(
     X_WA: np.ndarray, r: np.ndarray, X: np.ndarray, twists: np.ndarray
 ) -> None:
-    """Write the rotation X (3, 4) of a rotation vector r (3,) and the twists (3, 6) of r."""
+    """Write the rotation X (3, 4) of a rotation vector r (3,) [rad] and the twists (3, 6) of r.
+
+    ``X_WA``: (4, 4) pose of the frame before the rotation in the world, which the twists are in.
+    """
     # Rodrigues's formula R = I + a K + b K^2, and the left Jacobian of SO(3), J = I + b K + c K^2.
     angle = math.sqrt(r[0] ** 2 + r[1] ** 2 + r[2] ** 2)
     if angle > 1e-4:
@@ -267,7 +276,10 @@ def _write_free_rotation(
 
 @compiled
 def find_motions(packed: PackedTree, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return X_WN (n, 4, 4) and the twists (m, 6) of all values (m,)."""
+    """Return the poses X_WN (n, 4, 4) of all nodes, and the twist (omega, v) (m, 6) of each value.
+
+    ``values``: (m,) values [rad or m] in the order of ``packed``.
+    """
     count, steps = packed.parents.shape[0], packed.steps
     X_WN, twists = np.zeros((count, 4, 4)), np.zeros((values.shape[0], 6))
     basis, Y, dT = np.empty((3, 4)), np.empty((3, 4)), np.empty((3, 4))
@@ -333,9 +345,10 @@ class LinkVector(NamedTuple):
 
 
 def link_vectors(tree: PoseTree, min_length: float = 1e-3) -> tuple[LinkVector, ...]:
-    """Return the vector to each joint from the joint (or the world) that places its parent link.
+    """Return the vector to each joint of a tree from the joint that places its parent link.
 
-    Vectors of at most ``min_length`` [m] are left out.
+    A joint on a link that no joint moves has the vector from the world. Vectors of at most
+    ``min_length`` [m] are left out.
     """
     model, plant, kinematics = tree.model, tree.model.plant, PlantKinematics(tree.model)
 
@@ -378,6 +391,10 @@ def _offset(
     """Return the vector (3,) [m] to a joint from the origin of the rigid part that carries it.
 
     The vector is in the plant's world frame.
+
+    Args:
+        inboard: the joint that carries each body, by the index of the body.
+        pose: returns a body's pose (4, 4) in the plant's world.
     """
     link = first = joint.parent_body()
     while (joint_before := inboard.get(int(first.index()))) and joint_before.num_positions() == 0:

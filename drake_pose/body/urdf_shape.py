@@ -10,7 +10,7 @@ from drake_pose.arrays import Array
 from drake_pose.body.model_files import xml_text
 
 Vectors = Mapping[str, Sequence[float]]
-"""(3,) by the name of a link or joint."""
+"""Vectors (3,) by the name of a link or joint."""
 
 # Keep the prefix of Drake's own elements, which Drake requires.
 ElementTree.register_namespace("drake", "http://drake.mit.edu")
@@ -64,9 +64,9 @@ BASE_JOINTS = ("free_x", "free_y", "free_z", "free_turn_z", "free_turn_y", "free
 
 
 def with_base_joints(text: str, position: Sequence[float], rpy: Sequence[float]) -> str:
-    """Return a URDF text mounted on ``BASE_JOINTS``, which move it from a position (3,) [m].
+    """Return a URDF text whose model is mounted on ``BASE_JOINTS``.
 
-    At zero its base is rotated by ``rpy`` (3,) [rad].
+    With these joints at zero its base is at ``position`` (3,) [m], rotated by ``rpy`` (3,) [rad].
     """
     root = ElementTree.fromstring(text)
     for element in root.iter():
@@ -105,7 +105,7 @@ def _move_origin(
     scale: Sequence[float] | None,
     *shifts: Sequence[float] | Array | None,
 ) -> None:
-    """Scale the origin (3,) of an element, then add shifts (3,) [m]."""
+    """Scale the <origin> of an element by factors (3,), then add shifts (3,) [m]; None: neither."""
     vectors = [np.array(shift) for shift in shifts if shift is not None]
     if scale is None and not vectors:
         return
@@ -115,7 +115,7 @@ def _move_origin(
 
 
 def _offset_joint(joint: ElementTree.Element, offset: float) -> None:
-    """Add a constant [rad or m] to a joint's position by moving its origin and its limits."""
+    """Add ``offset`` [rad or m] to a joint's position by moving its origin and its limits."""
     from scipy.spatial.transform import Rotation  # Slow to import.
 
     axis_element = joint.find("axis")

@@ -37,7 +37,7 @@ class BitView(NamedTuple):
     Attributes:
         camera: (8,) kernel parameters.
         X_CW: (4, 4) pose of the world in the camera.
-        window: (4,) int64 first row, first column, height h and width w.
+        window: (4,) int64 first row, first column, height h and width w [pixel].
         inside: (h, w + 1) int32 number of silhouette pixels before each pixel, row after row.
         margin: (h, w + 1) int32 the same for the pixels of the margin; (0, 0) without a margin.
         nearest: (h, w) int32 for each silhouette pixel, about the nearest pixel outside the
@@ -116,20 +116,25 @@ def draw_bits(
     pairs: np.ndarray,
     limit: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Draw a surface at many poses as bits; skip poses that lie too far outside the silhouette.
+    """Draw a node's surface at many poses as bits of one camera's silhouette pixels.
+
+    Poses with too much area outside the silhouette are skipped.
 
     Args:
         celled: the surface; its skin band, if any, is deformed to the pair's sample.
+        view: the camera's silhouette.
         X_WP: (g, 4, 4) poses of the parent in the world.
         X_PN: (n, 4, 4) poses of the node in its parent at its samples.
         pairs: (m, 2) int32 indices of a parent pose and a sample.
-        limit: largest area outside the silhouette [pixel].
+        limit: largest area outside the silhouette, margin included [pixel].
 
     Returns:
-        kept (m,) bool, whether the pair is within the limit. The other arrays are about the m' kept
-            pairs, in order: areas (m', 3) int32 inside the silhouette, in the margin, and outside
-            both [pixel]; runs (m', 2, 3) int64, for silhouette and margin, the first word, the
-            number of words, and their start in words; words (n,) uint64.
+        kept: (m,) bool, whether the pair is within the limit. The other arrays are about the m'
+            kept pairs, in order.
+        areas: (m', 3) int32 area inside the silhouette, in the margin, and outside both [pixel].
+        runs: (m', 2, 3) int64 for the bits of the silhouette's pixels and of the margin's: index of
+            the first word that is not 0, number of words stored, and their start in ``words``.
+        words: (n,) uint64 stored words; bit k of a mask is bit k % 64 of its word k // 64.
     """
     camera, packed, e = view.camera, celled.packed, celled.edges.shape[0] + 1
     rows, crossings = make_rows(packed, camera)
@@ -183,14 +188,18 @@ def _walk_cell(
     rows: Rows,
     scratch: tuple[np.ndarray, np.ndarray],
 ) -> bool:
-    """Walk the contour edges of the viewing direction's cell, with the span kernel's arithmetic.
+    """Append the crossings of a surface's contour edges, found by the viewing direction's cell.
+
+    The skin band is left out. The crossings equal those of the span kernel.
 
     Args:
+        celled: the surface.
         X: (3, 4) pose of the surface in the camera.
         camera: (8,) kernel parameters.
-        crossings: (height, capacity) output.
-        rows: scratch of the span kernel.
-        scratch: integer and floating-point scratch for edges.
+        crossings: (height, capacity) output, as in ``add_surface``.
+        rows: scratch of the span kernel; ``counts`` and ``row_range`` are updated.
+        scratch: (4, e) int32 and (e, 4) float64 scratch for at least as many edges as the surface
+            has.
 
     Returns:
         Whether the cells are valid at this pose; if not, nothing is written.
@@ -282,12 +291,12 @@ def _gather_spans(
     spans: np.ndarray,
     areas: np.ndarray,
 ) -> tuple[int, np.ndarray]:
-    """Collect the spans of all rows inside the window, and empty the rows.
+    """Collect the spans of all rows inside the window of the view, and empty the rows.
 
     Args:
         crossings, rows: output of the span kernel.
-        limit: largest area outside the silhouette [pixel].
-        spans: (k, 3) output: row of the window, and columns [a, b); grown as needed.
+        limit: largest area outside the silhouette, margin included [pixel].
+        spans: (k, 3) output: row and columns [a, b) in the window; grown as needed.
         areas: (3,) output: area inside the silhouette, in the margin, and outside both [pixel].
 
     Returns:
@@ -335,12 +344,14 @@ def write_runs(
     """Write the bits of spans behind the used words; return the new number of used words.
 
     Args:
-        numbers: (h, w + 1) pixel numbers, such as ``BitView.inside``.
-        spans: (k, 3) row, and columns [a, b).
+        numbers: (h, w + 1) number of counted pixels before each pixel of the window, such as
+            ``BitView.inside``; a counted pixel's number is the index of its bit.
+        spans: (k, 3) row and columns [a, b) in the window, row after row.
         count: number of spans.
-        words: (n,) uint64 output.
+        words: (n,) uint64 output, with room for the new words.
         used: number of used words.
-        run: (3,) output: first word, number of words, and their start in ``words``.
+        run: (3,) output: index of the mask's first stored word, number of stored words, and their
+            start in ``words``.
     """
     first, last, full = -1, -1, np.uint64(0xFFFFFFFFFFFFFFFF)
     for k in range(count):
@@ -377,12 +388,13 @@ def prune_by_balls(
     pairs: np.ndarray,
     limit: float,
 ) -> np.ndarray:
-    """Return (m,) bool, whether no ball inside the surface proves that a pair exceeds the limit.
+    """Return (m,) bool, which pairs to keep: no ball proves that they exceed the limit.
 
-    No pair within the limit is pruned.
+    No pair within the limit is pruned. The balls lie inside the node's surface.
 
     Args:
-        X_WP: (g, 4, 4) poses of the parent in the world.
+        view: one camera's silhouette.
+        X_WP: (g, 4, 4) poses of the node's parent P in the world.
         p_PB: (n, k, 3) centres of k balls in the parent's frame at each sample of the node [m].
         radii: (k,) radii of the balls [m].
         pairs: (m, 2) int32 indices of a parent pose and a sample.
@@ -433,7 +445,13 @@ def prune_by_balls(
 def _square_outside(
     sums: np.ndarray, window: np.ndarray, camera: np.ndarray, u: float, v: float, half: float
 ) -> int:
-    """Return the number of image pixels in a square about (u, v) outside the silhouette."""
+    """Return the number of image pixels in a square that are outside the silhouette.
+
+    Args:
+        sums, window, camera: as in ``BitView``.
+        u, v: middle of the square [pixel].
+        half: half its side [pixel].
+    """
     a, b = max(0, int(np.ceil(u - half))), min(int(camera[6]), int(np.ceil(u + half)))
     c, d = max(0, int(np.ceil(v - half))), min(int(camera[7]), int(np.ceil(v + half)))
     if a >= b or c >= d:
@@ -453,13 +471,15 @@ def draw_discs(
     """Draw discs that contain the image of a ball, as bits of the silhouette's pixels.
 
     Args:
+        view: one camera's silhouette.
         X_WP: (g, 4, 4) poses of the frame P that the ball is fixed in.
         p_PB: (3,) the ball's centre in frame P [m].
         radius: the ball's radius [m].
 
     Returns:
-        runs (g, 3) int64, the first word, the number of words, and their start in words; words (n,)
-        uint64.
+        runs: (g, 3) int64 index of the first stored word of each disc's bit mask, number of stored
+            words, and their start in ``words``.
+        words: (n,) uint64.
     """
     camera, window = view.camera, view.window
     height, width = window[2], window[3]

@@ -37,7 +37,8 @@ class Segments(NamedTuple):
     Attributes:
         ends: (n, 4) u, v of the start and u, v of the end [pixel].
         depths: (n, 2) depths of both ends [m]; ones for a parallel camera.
-        weights: (n,) int64 change of the winding number across the edge.
+        weights: (n,) int64 change of the winding number along a raster line where it crosses the
+            edge, if the edge runs towards later lines; otherwise the negative of the change.
         nodes: (n,) int64 index of the surface.
         vertices: (n, 2) int64 indices of both ends in the packed points.
     """
@@ -55,12 +56,13 @@ def find_segments(
 ) -> Segments:
     """Return the projected contour edges of surfaces.
 
-    Triangles nearer than the near plane are left out.
+    Triangles with a corner nearer than a pinhole camera's near plane are left out.
 
     Args:
-        X_CN: (nodes, 4, 4) poses of the surfaces in the camera.
+        packed: the surfaces of all nodes, each in its node's frame N.
+        X_CN: (nodes, 4, 4) poses of the nodes in the camera.
         camera: (8,) kernel parameters.
-        selected: (nodes,) bool, which surfaces.
+        selected: (nodes,) bool, whether each node's edges are returned.
     """
     rows, _ = make_rows(packed, camera)
     capacity, count = 1024, 0
@@ -119,9 +121,11 @@ def find_crossings(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return where contour edges cross the lines of a raster, sorted along each line.
 
-    An edge crosses lines from its upper end, included, to its lower end, excluded.
+    An edge crosses lines from its upper (for columns: left) end, included, to its other end,
+    excluded.
 
     Args:
+        segments: the contour edges.
         across: 0: the lines are rows, along u; 1: the lines are columns, along v.
         first: coordinate of the first line on the other axis [pixel].
         spacing: distance between lines [pixel].
@@ -252,8 +256,9 @@ def sample_contour(
     """Return points on the visible contour of the union of surfaces.
 
     Args:
-        X_CN: (nodes, 4, 4) poses of the surfaces in the camera; rotations may be scaled uniformly
-            for a parallel camera.
+        packed: the surfaces of all nodes, each in its node's frame N.
+        X_CN: (nodes, 4, 4) poses of the nodes in the camera; rotations may be scaled uniformly for
+            a parallel camera.
         camera: (8,) kernel parameters. Triangles nearer than the near plane are left out.
         spacing: distance between sampled rows and between columns [pixel]; the first row and column
             are pixel centres.
@@ -354,10 +359,12 @@ def divide_outline(
     """Return a surface with its cells of directions.
 
     Args:
+        outline: the rigid surface, in its node's frame N.
         spread: largest angle between the viewing directions of the surface's points and of its
             ball's centre [rad]; 0 for parallel rays.
         band: the surface's skin band at rest, which gets no cells; None: no band.
-        bands: (n, v, 3) vertices of the band at the samples of its node [m].
+        bands: (n, v, 3) vertices of the band at the samples of its node, in frame N [m]; None: no
+            band.
     """
     rigid, skin = pack((outline,)), band or TriangleMesh.empty()
     starts, edges = _find_cell_edges(rigid, _CELLS_PER_SIDE, spread)
@@ -376,7 +383,7 @@ def divide_outline(
 
 @compiled
 def find_cell(x: float, y: float, z: float) -> int:
-    """Return the index of a direction's cell; the direction may have any length but 0."""
+    """Return the index of the cell of direction (x, y, z), of any length but 0."""
     ax, ay, az = abs(x), abs(y), abs(z)
     if ax >= ay and ax >= az:
         face, s, t = 0, y / x, z / x
@@ -396,6 +403,7 @@ def _find_cell_edges(
     """Return ``cell_starts`` and ``cell_edges`` of ``CelledOutline``.
 
     Args:
+        packed: the one surface.
         side: number of cells along each side of a face.
         spread: as for ``divide_outline`` [rad].
         margin: tolerance for rounding errors of directions [rad].
@@ -427,7 +435,13 @@ def _find_cell_edges(
 
 
 def _directions(face: int, s: np.ndarray, t: float) -> np.ndarray:
-    """Return unit directions (n, 3) of the points (s, t) of a cube's face, s (n,)."""
+    """Return unit directions (n, 3) of points on a face of the cube [-1, 1]^3.
+
+    Args:
+        face: index of the axis on which all points have coordinate 1.
+        s: (n,) coordinates on the first of the other axes.
+        t: the points' coordinate on the second.
+    """
     columns = [s, np.full_like(s, t)]
     columns.insert(face, np.ones_like(s))
     directions = np.stack(columns, axis=1)

@@ -24,6 +24,7 @@ class AnnotatedPicture:
     """A picture of a COCO file with its annotations.
 
     Attributes:
+        file: file name of the picture, as in the COCO file.
         width, height: size [pixel].
         annotations: class name and COCO entry of each annotation.
     """
@@ -34,7 +35,7 @@ class AnnotatedPicture:
     annotations: Sequence[tuple[str, Mapping[str, Any]]] = ()
 
     def draw(self, classes: Container[str]) -> Mask:
-        """Return the union (H, W) of the areas of some classes.
+        """Return the union (H, W) of the areas of annotations whose class name is in ``classes``.
 
         Raises ValueError, which names the annotation: an area cannot be drawn.
         """
@@ -92,7 +93,12 @@ def read_coco(path: Path) -> Annotations:
 
 
 def _annotations(content: Mapping[str, Any], path: Path) -> Annotations:
-    """Return the content of a COCO file; the caller converts the exceptions."""
+    """Return the annotations in the JSON content of a COCO file.
+
+    ``path``: the file, for warnings.
+
+    Raises KeyError, TypeError, ValueError, AttributeError or IndexError for invalid content.
+    """
     names = {entry["id"]: str(entry["name"]) for entry in content.get("categories", ())}
     of_image: dict[Any, list[tuple[str, Mapping[str, Any]]]] = {}
     for entry in content["images"]:
@@ -142,7 +148,11 @@ def _side(value: Any) -> int:
 
 
 def _draw(segmentation: Any, height: int, width: int) -> Mask:
-    """Return the area (H, W) of a segmentation: run lengths, or a list of polygons."""
+    """Return the area (H, W) of a COCO segmentation in a picture of height x width pixels.
+
+    ``segmentation``: a mapping with size and counts (run lengths), or a list of polygons x0, y0,
+    x1, y1, ... [pixel].
+    """
     if isinstance(segmentation, dict):
         if list(segmentation["size"]) != [height, width]:
             raise ValueError(
@@ -156,7 +166,11 @@ def _draw(segmentation: Any, height: int, width: int) -> Mask:
 
 
 def fill_polygon(corners: Array, height: int, width: int) -> Mask:
-    """Return the pixels (H, W) whose centres lie in a polygon (n, 2) by the even-odd rule.
+    """Return the pixels (H, W) whose centres lie in a polygon by the even-odd rule.
+
+    Args:
+        corners: (n, 2) x, y [pixel]; the centre of pixel (row, column) is column + 0.5, row + 0.5.
+        height, width: size of the picture [pixel].
 
     Raises ValueError: there are fewer than three corners, or one is not finite.
     """
@@ -174,7 +188,10 @@ def fill_polygon(corners: Array, height: int, width: int) -> Mask:
 
 
 def decode_run_lengths(counts: Sequence[int] | str, height: int, width: int) -> Mask:
-    """Return the area (H, W) of COCO run lengths, as numbers or compressed text.
+    """Return the area (H, W) of COCO run lengths in a picture of height x width pixels.
+
+    ``counts``: lengths of alternate runs of 0 and 1, column after column, or COCO's compressed
+    text.
 
     Raises:
         ValueError: the run lengths do not fill the picture.

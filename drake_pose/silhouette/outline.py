@@ -159,7 +159,10 @@ def edge_records(triangles: np.ndarray) -> np.ndarray:
 
 
 def _position_in_run(*keys: np.ndarray) -> np.ndarray:
-    """Return each entry's position in its run of equal keys."""
+    """Return (n,) each entry's position, from 0, in its run of entries that are equal in all keys.
+
+    ``keys``: arrays (n,), sorted together.
+    """
     index = np.arange(len(keys[0]))
     begins = np.ones(len(index), dtype=bool)
     begins[1:] = np.any([key[1:] != key[:-1] for key in keys], axis=0)
@@ -171,7 +174,10 @@ EMPTY_OUTLINE = outline_of_triangles(np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 def pack(outlines: tuple[Outline, ...]) -> PackedOutlines:
-    """Return outlines in the kernel's arrays; results are cached, as outlines are immutable."""
+    """Return outlines, one per node, in the kernel's arrays.
+
+    Results are cached, as outlines are immutable.
+    """
     packed = _pack_rest(tuple(outline.rest or outline for outline in outlines))
     if all(outline.rest is None for outline in outlines):
         return packed
@@ -191,7 +197,7 @@ def mutable_copy(packed: PackedOutlines) -> PackedOutlines:
 
 @lru_cache(maxsize=256)
 def _pack_rest(outlines: tuple[Outline, ...]) -> PackedOutlines:
-    """As ``pack``, for outlines at rest."""
+    """As ``pack``, for outlines whose ``rest`` is None."""
     starts = np.zeros((len(outlines) + 1, 3), dtype=np.int64)
     sizes = [(len(o.vertices), len(o.triangles), len(o.edges)) for o in outlines]
     starts[1:] = np.cumsum(np.array(sizes, dtype=np.int64).reshape(-1, 3), axis=0)
@@ -220,7 +226,7 @@ def _kernel_edges(outline: Outline) -> np.ndarray:
 
 
 def _stacked(parts: Sequence[np.ndarray], columns: int, dtype: type) -> np.ndarray:
-    """Return arrays (k, columns) stacked vertically; (0, columns) if there are none."""
+    """Return parts (k, columns) stacked vertically, of type dtype; (0, columns) without parts."""
     return np.ascontiguousarray(np.vstack([np.empty((0, columns), dtype), *parts]), dtype=dtype)
 
 
@@ -259,6 +265,7 @@ def project(
     """Write the image coordinates u, v [pixel] of one surface's points, at any depth.
 
     Args:
+        packed: the surfaces of all nodes, each in its node's frame N.
         node: index of the surface.
         X_CN: (nodes, 3 or 4, 4) poses in the camera.
         camera: (8,) kernel parameters.
@@ -288,10 +295,15 @@ def project(
 def find_facings(
     packed: PackedOutlines, node: int, X_CN: np.ndarray, camera: np.ndarray, facings: np.ndarray
 ) -> None:
-    """Write which side of each triangle the camera sees: +1, 0 or -1, and 0 after the last one.
+    """Write which side of each triangle of one surface the camera sees: +1, 0 (edge-on) or -1.
 
     The sign is +1 where a pinhole camera sees the triangle counter-clockwise; for a parallel camera
     it is the opposite.
+
+    Args:
+        packed, node, X_CN, camera: as for ``project``.
+        facings: (at least triangles + 1,) int8 output, with 0 after the last triangle: the facing
+            of a missing second triangle.
     """
     e0, e1, e2, w = viewpoint_in_node(X_CN[node], camera)
     begin, end = packed.starts[node, 1], packed.starts[node + 1, 1]
@@ -315,11 +327,9 @@ def clip_triangle(
     """Write u, v [pixel] and 1 / depth [1/m] of a triangle's part beyond a pinhole's near plane.
 
     Args:
-        node: index of the surface.
+        packed, node, X_CN, camera: as for ``project``.
         t: index of the triangle within its surface.
-        X_CN: (nodes, 3 or 4, 4) poses in the camera.
-        camera: (8,) kernel parameters.
-        corners: (4, 3) output.
+        corners: (4, 3) output, one corner a row.
 
     Returns:
         The number of corners: 0, 3 or 4.
@@ -395,6 +405,7 @@ class BendingOutline:
     """A rigid surface and a skin band in its frame N, whose vertices move.
 
     Attributes:
+        rigid: the rigid surface.
         rest: both parts with the band at rest; the rigid part's vertices and triangles come first.
     """
 
@@ -436,7 +447,7 @@ _node_outlines: WeakKeyDictionary[TriangleMesh, Outline] = WeakKeyDictionary()
 
 
 def _node_outline(mesh: TriangleMesh) -> Outline:
-    """Return the outline of a node's mesh; it is shared by searches and trackers of one tree."""
+    """Return the outline of a node's mesh, cached while the mesh exists."""
     outline = _node_outlines.get(mesh)
     if outline is None:
         outline = _node_outlines[mesh] = outline_from_mesh(mesh)
@@ -447,8 +458,9 @@ class TreeSurfaces:
     """The surfaces of a pose tree's nodes at any values, each in its node's frame.
 
     Attributes:
-        value_counts: number of values of each node.
+        value_counts: number of values (joint positions) of each node.
         skins: the skin band of each node; None: it has none.
+        rigid: the outline of each node's rigid mesh.
         bending: the rigid part and band of each node; None: it has no band.
     """
 
@@ -463,7 +475,7 @@ class TreeSurfaces:
         ]
 
     def with_rigid(self, rigid: Sequence[Outline]) -> TreeSurfaces:
-        """Return the surfaces with the same bands and other rigid parts."""
+        """Return the surfaces with the same bands and other rigid parts, one outline per node."""
         other = copy.copy(self)
         other.rigid = list(rigid)
         other.bending = [
@@ -478,7 +490,7 @@ class TreeSurfaces:
         return any(bending is not None for bending in self.bending)
 
     def whole(self, node: int) -> Outline | BendingOutline:
-        """Return a node's surface, with its band if it has one."""
+        """Return a node's surface: with its band if it has one, else its rigid outline."""
         return self.bending[node] or self.rigid[node]
 
     def at_rest(self, node: int) -> Outline:
@@ -523,13 +535,13 @@ class PackedSurfaces:
         self._threads = threading.local()
 
     def at(self, values: np.ndarray) -> PackedOutlines:
-        """Return all nodes' surfaces at all values (m,) [rad or m]."""
+        """Return all nodes' surfaces at the tree's values (m,) [rad or m], the nodes' in order."""
         return self._rest if self._bands is None else mutable_copy(self.bend_to(values))
 
     def bend_to(self, values: np.ndarray | None) -> PackedOutlines:
         """As ``at``, in arrays that the thread's next call overwrites.
 
-        ``values``: (m,) [rad or m]; None: leave the bands as they are.
+        ``values``: (m,) [rad or m]; None: leave the bands where this thread's last call put them.
         """
         if self._bands is None:
             return self._rest

@@ -37,18 +37,20 @@ def score_bodies(
     prefixes: np.ndarray,
     bands: Sequence[np.ndarray] = (),
 ) -> np.ndarray:
-    """Return the areas of a body at many poses, and of its intersections with sets.
+    """Return the areas of a body at many poses, and of its intersections with pixel sets.
 
-    The union of the body's surfaces is exact.
+    The body's area is that of the exact union of its surfaces.
 
     Args:
-        X_CN: (n, nodes, 4, 4) poses of the surfaces in the camera.
-        prefixes: (k, H, W + 1) int32 prefix sums of the sets; k may be 0.
+        surfaces: (nodes,) the body's surfaces, one per node, each in its node's frame N.
+        X_CN: (n, nodes, 4, 4) poses of the nodes in the camera.
+        camera: the camera; the areas are of its image.
+        prefixes: (k, H, W + 1) int32 ``prefix_sums`` of the pixel sets' masks; k may be 0.
         bands: for each bending surface, (n, v, 3) vertices of its band in its frame N at each pose
             [m].
 
     Returns:
-        (n, 1 + k) int64 area inside the image, then area of the intersection with each set [pixel].
+        (n, 1 + k) int64 the body's area inside the image, then its area in each set [pixel].
 
     Raises ValueError: poses, bands or sums have the wrong shape or are not finite.
     """
@@ -77,7 +79,13 @@ def score_bodies(
 
 
 def draw_mask(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return the mask (H, W) bool of a body at poses X_CN (nodes, 4, 4) in the camera."""
+    """Return the mask (H, W) bool of a body.
+
+    Args:
+        outlines: the body's surfaces, one per node, each in its node's frame N.
+        X_CN: (nodes, 4, 4) poses of the nodes in the camera.
+        camera: the camera whose image is drawn.
+    """
     packed, poses = _check_body(outlines, np.asarray(X_CN)[None])
     return draw_packed(packed, poses[0], camera)
 
@@ -100,9 +108,9 @@ def draw_labels(
     """Return the label (H, W) int16 of the nearest surface in each pixel.
 
     Args:
+        outlines, X_CN, camera: as for ``draw_mask``.
         labels: (nodes,) non-negative labels of the surfaces.
-        X_CN: (nodes, 4, 4) poses of the surfaces in the camera.
-        empty: label of pixels without a surface.
+        empty: label of pixels without a surface, different from all labels.
     """
     packed, poses = _check_body(outlines, np.asarray(X_CN)[None])
     image = np.empty((camera.height, camera.width), dtype=np.int16)
@@ -124,7 +132,7 @@ def subtract_body(
     Args:
         mask: (H, W) bool, changed in place.
         prefix: (H, W + 1) int32 prefix sums of the mask, changed in place.
-        X_CN: (nodes, 4, 4) poses of the surfaces in the camera.
+        outlines, X_CN, camera: as for ``draw_mask``.
     """
     packed, poses = _check_body(outlines, np.asarray(X_CN)[None])
     first, end = paint(packed, poses[0], camera.kernel_parameters(), mask.view(np.uint8), 0)
@@ -134,7 +142,13 @@ def subtract_body(
 def _check_body(
     surfaces: Sequence[Outline | BendingOutline], X_CN: np.ndarray
 ) -> tuple[PackedOutlines, np.ndarray]:
-    """Check a body; return its packed surfaces, and poses (n, nodes, 3, 4)."""
+    """Check poses X_CN (n, nodes, 4, 4) of a body's surfaces.
+
+    Returns:
+        The packed surfaces, with bands at rest, and the poses (n, nodes, 3, 4).
+
+    Raises ValueError: the poses have another shape or are not finite.
+    """
     poses = np.asarray(X_CN)
     if poses.ndim != 4 or poses.shape[1] != len(surfaces) or poses.shape[2:] != (4, 4):
         raise ValueError(f"poses must be (n, {len(surfaces)}, 4, 4), not {poses.shape}")
@@ -151,6 +165,7 @@ class VisualHull:
         """Draw the images of a surface.
 
         Args:
+            outline: the surface, in its frame N.
             side: width and height of each image [pixel].
             directions: number of viewing directions.
         """
@@ -166,9 +181,11 @@ class VisualHull:
             self._scale = scale
 
     def radii(self, p_N: np.ndarray, shrink: float = 0.97) -> np.ndarray:
-        """Return the radii (n,) [m] of the largest balls around points (n, 3) [m] inside the hull.
+        """Return radii (n,) [m] of the largest balls inside the hull around points; 0 outside it.
 
-        ``shrink``: factor that allows for the hull's extent between the viewing directions.
+        Args:
+            p_N: (n, 3) the points in frame N [m].
+            shrink: factor that allows for the hull's extent between the viewing directions.
         """
         if not self._views:
             return np.zeros(len(p_N))
@@ -228,6 +245,10 @@ def _distance_image(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw a surface from one direction and measure distances to its silhouette's edge.
 
+    Args:
+        R_CN: (3, 3) rotation of the surface's frame N in the camera.
+        camera: parallel camera, in the middle of whose image the surface's ball is drawn.
+
     Returns:
         The image's axes (2, 3) in frame N [pixel/m], and each pixel's distance to the edge [pixel].
     """
@@ -251,7 +272,7 @@ def require_visible(
     far larger than the image, or if the body is outside the image.
 
     Args:
-        X_CN: (nodes, 4, 4) poses of the surfaces in the camera.
+        outlines, X_CN, camera: as for ``draw_mask``.
         max_pictures: largest size of the body, as a multiple of the image's diagonal.
     """
     solid = [

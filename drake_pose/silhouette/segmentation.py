@@ -28,10 +28,10 @@ class Background:
     """
 
     def __init__(self, mean: Picture, deviation: Floats, threshold: float = 5.0) -> None:
-        """Store the model.
+        """Store mean and deviation (see the class).
 
-        ``threshold``: a colour that differs by more than this is not the background's [standard
-        deviations].
+        ``threshold``: a colour with a channel that differs from the mean by more than this is not
+        the background's [standard deviations].
         """
         self.mean, self.deviation, self._threshold = mean, deviation, threshold
         largest = np.minimum(np.floor(threshold * deviation), 255.0).astype(np.uint8)
@@ -83,13 +83,16 @@ def background_of_recording(pictures: Sequence[Picture], min_deviation: float = 
 
 
 def _require_one_size(pictures: Sequence[Picture], min_count: int, message: str) -> None:
-    """Raise SettingsError unless there are enough pictures, all of one size."""
+    """Raise SettingsError(message) unless there are min_count or more pictures, all of one size."""
     if len(pictures) < min_count or any(picture.shape != pictures[0].shape for picture in pictures):
         raise SettingsError(message)
 
 
 def background_support(pictures: Sequence[Picture], background: Background) -> Floats:
-    """Return (H, W) the fraction of pictures in which each pixel shows the background."""
+    """Return (H, W) the fraction of pictures (H, W, 3) in which each pixel shows the background.
+
+    A pixel shows it if no channel differs from the mean by more than ``Background.tolerance``.
+    """
     shown = np.zeros(background.deviation.shape, dtype=np.float32)
     for picture in pictures:
         shown += _differs(picture, background.mean, background.tolerance) == 0
@@ -154,9 +157,11 @@ def person_region(picture: Picture, background: Background, min_fraction: float 
 
 
 def _differs(picture: Picture, mean: Picture, tolerance: Picture) -> NDArray[Any]:
-    """Return (H, W), non-zero where a channel differs from the mean by more than the tolerance.
+    """Return (H, W) uint8, non-zero where a channel differs from the mean by more than tolerance.
 
-    ``picture``: (H, W, 3 or 4); a fourth channel is ignored.
+    Args:
+        picture: (H, W, 3 or 4) uint8; a fourth channel is ignored.
+        mean, tolerance: (H, W, 3) uint8 as in ``Background`` [grey levels].
     """
     colours = cv2.cvtColor(picture, cv2.COLOR_RGBA2RGB) if picture.shape[2] == 4 else picture
     exceeds = cv2.compare(cv2.absdiff(colours, mean), tolerance, cv2.CMP_GT)
@@ -186,13 +191,14 @@ def foreground_log_ratios(
     break_even^2) / 2, within bounds.
 
     Args:
-        probabilities: (H, W) foreground probability at each pixel of each picture.
+        pictures: (H, W, 3) uint8 pictures.
+        probabilities: for each picture, (H, W) foreground probability at each pixel.
         indices: indices of the pictures whose ratios are returned.
         background_threshold: a pixel shows the background below this foreground probability.
         min_probability: pixels with a lower foreground probability in all returned pictures are
             skipped.
         min_count: number of pictures that must show a pixel's background.
-        max_count: largest number of pictures of a median.
+        max_count: largest number of pictures of a median; of more, every n-th is used.
         exposure_pixels: largest number of pixels from which exposure is estimated.
         min_deviation: lower bound of a colour's standard deviation [grey levels].
         uncertain_deviation: standard deviation where at most ``min_count`` pictures show the
@@ -239,7 +245,13 @@ def foreground_log_ratios(
 
 
 def _masked_median(stack: Floats, hidden: NDArray[np.bool_], count: NDArray[np.intp]) -> Floats:
-    """Return the median (p, 3) of a stack (n, p, 3) without hidden (n, p) entries, or 0."""
+    """Return the median (p, 3) over the visible entries of n pictures; 0 where there are none.
+
+    Args:
+        stack: (n, p, 3) colours of p pixels in n pictures.
+        hidden: (n, p) whether a pixel is left out.
+        count: (p,) number of entries of each pixel that are not hidden.
+    """
     values = np.sort(np.where(hidden[:, :, None], np.float32(np.inf), stack), axis=0)
     last, across = np.maximum(count - 1, 0), np.arange(len(count))
     middle = 0.5 * (values[last // 2, across] + values[(last + 1) // 2, across])
@@ -283,7 +295,8 @@ def grab_cut(
 
     Args:
         picture: (H, W, 3) the picture.
-        labels: (H, W) GrabCut's labels; not changed.
+        labels: (H, W) initial labels, cv2.GC_BGD, GC_FGD (both kept), GC_PR_BGD or GC_PR_FGD
+            (uncertain); not changed.
         iterations: number of iterations.
         stride: colours are learnt from every n-th row and column, and uncertain pixels are then cut
             once with these colours; 1: all uncertain pixels are cut in each iteration.
@@ -318,8 +331,8 @@ class _Region(NamedTuple):
 
     Attributes:
         mask: (h, w) the region.
-        strength: strength of its outline.
-        sign: 1 if the region is above its threshold, -1 if below.
+        strength: strength of its outline, as ``_strength``.
+        sign: 1 if the region's channel is above the threshold, -1 if below.
         level: the threshold [grey levels].
     """
 
@@ -385,9 +398,15 @@ def find_regions(
 
 
 def _strength(mask: Mask, change: Floats, quantile: float = 0.25) -> float:
-    """Return the strength of an outline: a quantile of the change along it, times sqrt(area).
+    """Return the strength of a mask's outline: a quantile of the change along it, times sqrt(area).
 
-    ``change``: (h, w) gradient magnitude of the channel.
+    Args:
+        mask: (h, w) the region.
+        change: (h, w) gradient magnitude of the channel.
+        quantile: the quantile, 0 to 1.
+
+    Returns:
+        The strength; 0 if the mask has no pixel on its edge.
     """
     inside = cv2.erode(mask.view(np.uint8), np.ones((3, 3), np.uint8), borderValue=1) > 0
     edge = change[mask & ~inside]
@@ -397,7 +416,11 @@ def _strength(mask: Mask, change: Floats, quantile: float = 0.25) -> float:
 
 
 def _components(above: Mask, sizes: tuple[float, float] = (0.003, 0.7)) -> Iterator[Mask]:
-    """Yield connected components (H, W), holes filled; ``sizes`` are fractions of the picture."""
+    """Yield the connected components (H, W) of ``above`` (H, W), with holes filled.
+
+    ``sizes``: smallest area of a component before, and largest area after filling, as fractions of
+    the picture's area.
+    """
     _, labels, stats, _ = cv2.connectedComponentsWithStats(above.view(np.uint8), connectivity=4)
     for k in np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= sizes[0] * above.size) + 1:
         region = _filled(labels == k)
@@ -419,7 +442,10 @@ def _filled(region: Mask, max_fraction: float = 0.1) -> Mask:
 
 
 def _upscaled(region: Mask, above: Mask) -> Mask:
-    """Return a region at full size (H, W), refined by its threshold ``above`` (H, W)."""
+    """Return a region (h, w) at full size (H, W), with its edge set by the threshold there.
+
+    ``above``: (H, W) whether the picture's pixels are on the region's side of its threshold.
+    """
     height, width = above.shape
     size = (width, height)
     rough = cv2.resize(region.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)

@@ -48,9 +48,9 @@ class Rows(NamedTuple):
 
 @compiled
 def make_rows(packed: PackedOutlines, camera: np.ndarray) -> tuple[Rows, np.ndarray]:
-    """Return scratch for the largest of the surfaces, and crossings (height, capacity) int32.
+    """Return scratch for the largest of packed surfaces, and crossings (height, capacity) int32.
 
-    ``camera``: (8,) kernel parameters.
+    ``camera``: (8,) kernel parameters. The capacity is 8; ``fill_rows`` enlarges it.
     """
     width, height = int(camera[6]), int(camera[7])
     points, triangles = 0, 0
@@ -84,8 +84,12 @@ def _walk_edge(
 ) -> None:
     """Append the crossings of the edge from (ua, va) to (ub, vb) [pixel] to the rows.
 
-    ``weight``: change of the winding number across the edge from left to right if it runs
-    downwards.
+    Args:
+        weight: change of the winding number across the edge from left to right if it runs
+            downwards.
+        width, height: size of the image [pixel].
+        crossings: (height, capacity) output; a row without room sets ``row_range[2]``.
+        counts, row_range: as in ``Rows``, updated.
     """
     # Always downwards, so that both directions of an edge cross rows at identical places.
     if va > vb:
@@ -124,7 +128,12 @@ def _clip_near(
     crossings: np.ndarray,
     rows: Rows,
 ) -> None:
-    """Walk the triangles that the near plane cuts, and set the facings of all nearer ones to 0."""
+    """Append the crossings of one surface's triangles that the near plane cuts.
+
+    The facings of these triangles, and of those wholly nearer than the near plane, become 0, so
+    that the caller skips them. Arguments as for ``add_surface``, with the surface's facings in
+    ``rows``.
+    """
     X, points = X_CN[node], packed.points
     begin, first = packed.starts[node, 0], packed.starts[node, 1]
     hidden = np.empty(packed.starts[node + 1, 0] - begin, dtype=np.bool_)
@@ -161,7 +170,17 @@ def add_surface(
     crossings: np.ndarray,
     rows: Rows,
 ) -> None:
-    """Append the crossings of one surface at poses X_CN (nodes, 3, 4) to the rows."""
+    """Append the crossings of one surface to the rows.
+
+    Args:
+        packed: the surfaces of all nodes, each in its node's frame N.
+        node: index of the surface.
+        X_CN: (nodes, 3, 4) poses of the nodes in the camera.
+        camera: (8,) kernel parameters.
+        crossings: (height, capacity) int32 output, 8 * pixel + weight + BIAS. Crossings beyond the
+            capacity are only counted, and ``rows.row_range[2]`` is set to 1.
+        rows: scratch; ``counts`` and ``row_range`` are updated.
+    """
     if packed.starts[node, 1] == packed.starts[node + 1, 1]:
         return
     cut = False
@@ -201,7 +220,9 @@ def fill_rows(
     crossings: np.ndarray,
     rows: Rows,
 ) -> np.ndarray:
-    """Write the crossings of the surfaces [first, end) at poses X_CN (nodes, 3, 4) into empty rows.
+    """Write the crossings of the surfaces with indices [first, end) into empty rows.
+
+    The other arguments are those of ``add_surface``.
 
     Returns:
         The crossings, reallocated until every row has room.
@@ -250,7 +271,7 @@ def find_spans(
 def _find_many_spans(
     row: int, count: int, crossings: np.ndarray, changes: np.ndarray, spans: np.ndarray
 ) -> int:
-    """As ``find_spans``, for any number of crossings."""
+    """As ``find_spans``, for any number ``count`` of the row's crossings."""
     found, winding, start = 0, 0, 0
     if count <= 24:  # Few crossings are sorted; many are summed in a difference array.
         for i in range(1, count):
@@ -295,10 +316,10 @@ def score(
     camera: np.ndarray,
     prefixes: np.ndarray,
 ) -> np.ndarray:
-    """Return the areas of whole bodies and of their intersections with sets.
+    """Return the areas of a whole body at many poses, and of its intersections with pixel sets.
 
     Args:
-        packed: the surfaces, whose bands are deformed in place.
+        packed: the surfaces of the body's nodes; their bands are deformed in place.
         parts: (b, 4) int64 the skin bands, as in ``bend``; b may be 0.
         bands: (n, v, 3) vertices of all bands, one band after the other, at each pose [m].
         X_CN: (n, nodes, 3, 4) poses of the surfaces in the camera.
@@ -328,7 +349,14 @@ def score(
 def paint(
     packed: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray, mask: np.ndarray, value: int
 ) -> np.ndarray:
-    """Set the pixels of a body at poses X_CN (nodes, 3, 4) in ``mask`` (H, W) uint8 to ``value``.
+    """Set the pixels of a body in a mask to a value.
+
+    Args:
+        packed: the surfaces of the body's nodes.
+        X_CN: (nodes, 3, 4) poses of the nodes in the camera.
+        camera: (8,) kernel parameters.
+        mask: (H, W) uint8, changed in place; pixels outside the body are kept.
+        value: the value, 0 to 255.
 
     Returns:
         (2,) int64 first row touched, and row after the last one.
@@ -361,6 +389,7 @@ def paint_labels(
     for which triangles are rasterised.
 
     Args:
+        packed: the surfaces of the body's nodes.
         labels: (nodes,) int16 non-negative labels, all different from ``empty``.
         closed: (nodes,) bool, whether a surface is closed with outward normals; only its front
             faces are then drawn.
@@ -420,7 +449,14 @@ def _paint_span(
 ) -> None:
     """Write a label to the pixels [a, b) of a row, and mark the tiles of contested pixels.
 
-    A pixel that has another label already gets -1 - label. ``bounds`` is extended by these pixels.
+    A pixel that has another label already is contested and gets -1 - label.
+
+    Args:
+        image: (H, W) int16, changed in place.
+        empty: label of pixels without a surface.
+        tiles: the entry (row of tiles + 1, column of tiles + 1) of a contested tile is set to 1.
+        bounds: (4,) first row, row after the last, first column and column after the last of all
+            contested pixels, extended by this span's.
     """
     contested = False
     for column in range(a, b):
@@ -453,9 +489,15 @@ def _draw_node(
     contested: tuple[np.ndarray, np.ndarray, np.ndarray],
     rows: Rows,
 ) -> None:
-    """Draw the triangles of one surface at contested pixels.
+    """Draw the label of one surface at the contested pixels where it is the nearest so far.
 
-    ``contested``: sums of contested tiles, bounds [pixel], and nearness of what is drawn so far.
+    Args:
+        packed, node, X_CN, camera, rows: as for ``add_surface``.
+        label: the surface's label.
+        closed: whether it is closed with outward normals; then only front faces are drawn.
+        image: (H, W) int16, changed in place.
+        contested: number of contested tiles above and left of each tile corner, the bounds of
+            ``_paint_span``, and nearness of the surface drawn so far at each pixel in the bounds.
     """
     u, v, facings, X, sums = rows.u, rows.v, rows.facings, X_CN[node], contested[0]
     project(packed, node, X_CN, camera, u, v)
@@ -511,9 +553,15 @@ def _draw_triangle(
     bounds: np.ndarray,
     depths: np.ndarray,
 ) -> None:
-    """Draw the triangle of the points 0, b, c of ``p`` (n, 3) at contested pixels.
+    """Draw the triangle of the points 0, b, c of ``p`` at pixels where it is nearer than before.
 
-    A point is u, v [pixel] and nearness.
+    Args:
+        p: (n, 3) points u, v [pixel] and nearness, 1 / depth [1/m] or, for a parallel camera,
+            -depth [m].
+        b, c: indices of the second and third point.
+        label, image: the label to write, and the (H, W) int16 image that gets it.
+        bounds: (4,) bounds of the contested pixels, as in ``_paint_span``.
+        depths: float32 nearness drawn so far in the bounds, updated; inf: not contested.
     """
     # Nearness increases towards the camera and is linear in the image: 1 / z, or -z (parallel).
     ua, va, da = p[0, 0], p[0, 1], p[0, 2]

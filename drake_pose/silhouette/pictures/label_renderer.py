@@ -43,6 +43,7 @@ class DeformableSkin:
     """A model's skin bands as a source of a SceneGraph, whose configuration port must be connected.
 
     Args:
+        skin: the model's bands.
         scene_graph: the SceneGraph to register with.
         labels: render label of each band's child link, by name; bands of other links get 0.
         name: name of the source.
@@ -82,10 +83,13 @@ class DeformableSkin:
 
 
 def _apexes(vertices: np.ndarray, triangles: np.ndarray, depth: float = 0.05) -> np.ndarray:
-    """Return a point (m, 3) just inside the middle of each triangle.
+    """Return a point (m, 3) [m] just inside the middle of each triangle.
 
-    ``depth``: depth of the point as a fraction of sqrt(2 area): large enough to be hidden, small
-    enough to stay inside thin bands.
+    Args:
+        vertices: (v, 3) the surface's vertices [m].
+        triangles: (m, 3) vertex indices, counter-clockwise from outside.
+        depth: depth of the point as a fraction of sqrt(2 area): large enough to be hidden, small
+            enough to stay inside thin bands.
     """
     a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
     normals = np.cross(b - a, c - a)
@@ -169,11 +173,14 @@ class LabelRenderer:
         return label_data(image).copy()
 
     def mask(self, q: np.ndarray, X_WB: np.ndarray | None = None) -> np.ndarray:
-        """Return the model's mask (H, W) bool; arguments as ``label_image``."""
+        """Return the model's mask (H, W) bool; q and X_WB as for ``label_image``."""
         return self.label_image(q, X_WB) != EMPTY
 
     def segments(self, q: np.ndarray, X_WB: np.ndarray | None = None) -> np.ndarray:
-        """Return (H, W) int16 the label (see ``link_names``) of each pixel; -1 if none."""
+        """Return (H, W) int16 the label (see ``link_names``) of each pixel; -1 if none.
+
+        Arguments q and X_WB are those of ``label_image``.
+        """
         labels = self.label_image(q, X_WB)
         return np.where(labels == EMPTY, np.int16(-1), labels)
 
@@ -200,7 +207,16 @@ class LabelRenderer:
     def _depths(
         self, q: np.ndarray, bands: Sequence[np.ndarray], X_CB: np.ndarray
     ) -> tuple[float, float]:
-        """Return the smallest and largest depth of the body in the camera [m], with a margin."""
+        """Return the smallest and largest depth of the body in the camera [m], with a margin.
+
+        Args:
+            q: (nq,) positions.
+            bands: (v, 3) vertices of each skin band in the plant's world frame B [m].
+            X_CB: (4, 4) pose of B in the camera.
+
+        Returns:
+            The two depths; -1 and 1 if the model has no geometry.
+        """
         X_BL = self.link_poses(q)
         placed = [(X_CB @ X_BL[label], p_L) for label, p_L in self._vertices]
         placed += [(X_CB, p_B) for p_B in bands]

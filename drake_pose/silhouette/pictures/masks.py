@@ -53,11 +53,11 @@ def encode_mask(mask: np.ndarray) -> bytes:
 
 @dataclass(frozen=True)
 class MaskAgreement:
-    """Agreement between the silhouettes of a frame and the body.
+    """Agreement between the silhouettes of a frame and the body's masks at an estimated pose.
 
     Args:
-        differing: area where silhouettes and body differ, over all cameras [pixel].
-        area: area of the silhouettes, over all cameras [pixel].
+        differing: area where silhouettes and body's masks differ, summed over cameras [pixel].
+        area: area of the silhouettes, summed over cameras [pixel].
         ious: intersection over union by camera.
     """
 
@@ -77,7 +77,10 @@ def intersection_over_union(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def _overlap(first: np.ndarray, second: np.ndarray) -> tuple[int, int, float]:
-    """Return the area where two masks differ and that of the first [pixel], and their IoU."""
+    """Return the area where two masks (H, W) bool differ, the first mask's area, and their IoU.
+
+    The areas are in pixels. The IoU (intersection over union) of two empty masks is 1.
+    """
     first_area, second_area, intersection = (
         int(np.count_nonzero(area)) for area in (first, second, first & second)
     )
@@ -88,7 +91,10 @@ def _overlap(first: np.ndarray, second: np.ndarray) -> tuple[int, int, float]:
 def compare_masks(
     masks: Mapping[str, np.ndarray], bodies: Mapping[str, np.ndarray]
 ) -> MaskAgreement:
-    """Return the agreement of masks (H, W) bool with the body's masks, both by camera."""
+    """Return the agreement of silhouettes with the body's masks, both (H, W) bool by camera.
+
+    ``bodies``: the body's masks, at least of the cameras of ``masks``.
+    """
     found = {camera: _overlap(mask, bodies[camera]) for camera, mask in masks.items()}
     return MaskAgreement(
         sum(differing for differing, _, _ in found.values()),

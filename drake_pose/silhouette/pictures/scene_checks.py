@@ -27,9 +27,10 @@ def read_scene(
     """Return a checked scene of the wanted cameras, and its wanted frames.
 
     Args:
-        wanted: names of cameras; empty: all.
+        path: the scene's folder.
+        wanted: names of cameras; empty: all that have files.
         frames: names or ranges of frames, as for ``select_frames``; empty: all.
-        cameras: cameras that replace those of the folder.
+        cameras: cameras by name that replace those of the folder; None: the folder's.
         sequence: as for ``load_scene``.
         every: keep every n-th frame, as ``Scene.every``.
 
@@ -113,7 +114,10 @@ def leave_out_unreadable(scene: Scene, frames: Iterable[str]) -> Scene:
 
 
 def require_readable(refused: Mapping[tuple[str, str], str], scene: Scene) -> None:
-    """Raise SceneError, with the first reason, if none of a scene's masks can be read."""
+    """Raise SceneError, with the first reason, if all of a scene's masks were refused.
+
+    ``refused``: reasons by (camera, frame).
+    """
     if refused and len(refused) == len(scene.masks):
         first = next(iter(refused.values()))
         raise SceneError(f"{scene.path}: none of {len(refused)} masks can be used: {first}")
@@ -124,7 +128,9 @@ def describe_unreadable(
 ) -> tuple[str, ...]:
     """Return one warning per camera about unreadable masks.
 
-    ``refused``: reasons by (camera, frame).
+    Args:
+        refused: reasons by (camera, frame).
+        known: names of all the scene's frames, in order.
     """
     found = []
     for camera in dict.fromkeys(name for name, _ in refused):
@@ -135,7 +141,10 @@ def describe_unreadable(
 
 
 def frame_ranges(frames: Iterable[str], known: Sequence[str], max_ranges: int = 6) -> str:
-    """Return frames as text, consecutive ones as first-last, with at most ``max_ranges`` ranges."""
+    """Return frames as text, consecutive ones as first-last, with at most ``max_ranges`` ranges.
+
+    ``known``: names of all frames, in order; these must include the given ones.
+    """
     order = {frame: k for k, frame in enumerate(known)}
     places = np.sort([order[frame] for frame in frames]).astype(int)
     runs = np.split(places, np.flatnonzero(np.diff(places) > 1) + 1) if len(places) else []
@@ -145,7 +154,7 @@ def frame_ranges(frames: Iterable[str], known: Sequence[str], max_ranges: int = 
 
 
 def _find_repeats(scene: Scene, min_change: float = 0.02) -> tuple[dict[str, list[str]], list[str]]:
-    """Return the frames in which cameras show their last picture again.
+    """Return the frames of a scene in which cameras show their last picture again.
 
     ``min_change``: change of the other cameras' silhouettes, as a fraction of their area, from
     which a camera that shows no change is frozen.
@@ -175,7 +184,7 @@ def _find_repeats(scene: Scene, min_change: float = 0.02) -> tuple[dict[str, lis
 
 
 def _repeated_files(scene: Scene) -> set[tuple[str, str]]:
-    """Return (camera, frame) of each mask file that equals the previous frame's, byte for byte.
+    """Return (camera, frame) of each mask of a scene whose file equals the previous frame's.
 
     Files are read only where sizes are equal; an unreadable file equals none.
     """
@@ -194,9 +203,11 @@ def _repeated_files(scene: Scene) -> set[tuple[str, str]]:
 
 
 def _check_gaps(frames: Sequence[str], max_gaps: int = 6) -> list[str]:
-    """Return a warning about numbers missing between consecutively numbered frames.
+    """Return one warning about numbers missing between consecutively numbered frames, or none.
 
-    At most ``max_gaps`` gaps are listed.
+    Args:
+        frames: names of the frames, in order.
+        max_gaps: largest number of gaps that are listed.
     """
     keys = [natural_key(frame) for frame in frames]
     if len(keys) < 3 or any(key[:-2] != keys[0][:-2] or key[-1][0] for key in keys):

@@ -36,6 +36,7 @@ class Scene:
     """A folder of masks and the cameras that took them.
 
     Args:
+        path: the folder.
         cameras: cameras by name, in the camera file's order.
         frames: frame names in natural order (2 before 10); a frame may lack some cameras.
         masks: mask file by (camera, frame).
@@ -50,7 +51,7 @@ class Scene:
         readers: functions that return a camera's picture (H, W, 3) by frame, for cameras without
             picture files.
         times: (frames,) recorded times [s], NaN where unknown.
-        joints: the robot's recorded joint positions, by time or by frame.
+        joints: the robot's recorded joint positions, by time or by frame; None: not recorded.
     """
 
     path: Path
@@ -98,7 +99,9 @@ class Scene:
         )
 
     def frames_with_files(self, wanted: Sequence[str]) -> tuple[str, ...]:
-        """Return the wanted frames (see ``select_frames``) that have a mask or a picture.
+        """Return the wanted frames that have a mask or a picture.
+
+        ``wanted``: names or ranges of frames, as for ``select_frames``; empty: all.
 
         Raises:
             SceneError: there is no such frame with a file.
@@ -114,7 +117,10 @@ class Scene:
     def every(self, step: int, wanted: Sequence[str]) -> "tuple[Scene, tuple[str, ...]]":
         """Return the scene with every ``step``-th frame, and those of its frames that are wanted.
 
-        The first wanted frame is kept. The frame rate is divided by ``step``.
+        The first wanted frame is kept. The frame rate of a sequence is divided by ``step``. With a
+        step of 1, ``wanted`` is returned as given.
+
+        ``wanted``: names or ranges of frames, as for ``select_frames``; empty: all.
 
         Raises:
             SettingsError: the step is below 1.
@@ -191,7 +197,10 @@ class Scene:
         return picture.copy()
 
     def _file(self, files: Mapping[tuple[str, str], Path], camera: str, frame: str) -> Path:
-        """Return the file of a camera's frame; UnknownNameError if there is none."""
+        """Return the file of a camera's frame in ``files``, which are by (camera, frame).
+
+        Raises UnknownNameError: there is no such camera, or it has no such frame.
+        """
         if camera not in self.cameras:
             raise UnknownNameError("camera", camera, self.cameras, str(self.path))
         if (camera, frame) not in files:
@@ -220,9 +229,10 @@ def load_scene(
     belong to one uncalibrated camera for each size of picture.
 
     Args:
-        cameras: cameras that replace those of the folder.
+        path: the folder.
+        cameras: cameras by name that replace those of the folder; None: those of ``cameras.yaml``.
         wanted: names of cameras; if all of them have a pose X_WC, other cameras of the file may
-            lack it.
+            lack it. Empty: all cameras of the file need a pose.
         sequence: whether the scene is a sequence if scene.yaml does not say.
 
     Raises:
@@ -270,7 +280,12 @@ def load_scene(
 
 
 def _unknown_cameras(folder: Path) -> tuple[dict[str, Camera], dict[tuple[str, str], Path]]:
-    """Return a parallel camera for each size of picture, and the masks by (camera, frame)."""
+    """Return uncalibrated cameras by name, and mask files by (camera, frame).
+
+    There is one parallel camera for each size of the masks ``folder/masks/<frame>.png``.
+
+    Raises SceneError: there is no such mask.
+    """
     if not any((folder / "masks").glob("*.png")):
         raise SceneError(
             f"{folder}: has no cameras.yaml, so its cameras must be given; only masks that lie in "
@@ -322,10 +337,10 @@ def common_rate(
 
 
 def select_frames(known: Sequence[str], wanted: Sequence[str], where: str) -> tuple[str, ...]:
-    """Return the wanted frames in the scene's order.
+    """Return the names of the wanted frames in the scene's order.
 
     Args:
-        known: names of all frames.
+        known: names of all frames, in the scene's order.
         wanted: names, or ranges ``FIRST:LAST`` with both ends included; empty: all frames. A number
             stands for the frame with that number, with or without leading zeros.
         where: the scene, for messages.
@@ -431,7 +446,7 @@ def find_images(
 
     Args:
         cameras: names of the cameras.
-        frames: names of known frames.
+        frames: names of known frames, for frames of videos; empty: none.
 
     Returns:
         Picture or video files by (camera, frame).
@@ -471,7 +486,7 @@ def _visible(folder: Path) -> list[os.DirEntry[str]]:
 
 
 def _list_masks(folder: Path) -> tuple[list[Path], list[str]]:
-    """Return the PNG files of a folder, and the names of its other files."""
+    """Return the PNG files of a folder, and the names of its other entries, folders' with a "/"."""
     names = [f"{entry.name}/" if entry.is_dir() else entry.name for entry in _visible(folder)]
     pictures = [name for name in names if name.lower().endswith(".png")]
     return [folder / name for name in pictures], [n for n in names if n not in pictures]
@@ -481,6 +496,8 @@ def _join_frames(
     files: Mapping[str, Sequence[Path]],
 ) -> tuple[dict[tuple[str, str], Path], list[str]]:
     """Merge the cameras' frames; a frame is named by its longest spelling.
+
+    ``files``: mask files by camera, named by frame.
 
     Returns:
         Mask files by (camera, frame), and warnings about duplicates.

@@ -496,7 +496,7 @@ def frame_warnings(records: Mapping[str, FrameRecord]) -> tuple[str, ...]:
     for frame, record in records.items():
         # The method person explains frames without a pose itself.
         if not record.found and record.share is None:
-            found.setdefault("no pose was found; check their masks", []).append(frame)
+            found.setdefault("no pose was found; check masks and pictures", []).append(frame)
         elif record.found and record.stopped_by in limits:
             text = f"the search was stopped by the {limits[record.stopped_by]}"
             found.setdefault(text, []).append(frame)

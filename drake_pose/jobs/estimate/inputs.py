@@ -355,7 +355,9 @@ def read_inputs(
         search = make_placement_search(model, settings, position, scene.scale_unknown)
     else:
         search = make_search(model, settings, position)
-        X_WN = search.tree.node_poses(search.tree.default_values())
+        tree, start = search.tree, starts.get(frames[0])
+        values = tree.default_values() if start is None else tree.values_from_positions(start)
+        X_WN = tree.node_poses(values)
         for camera in scene.cameras.values():
             require_visible(search.sampled.outlines, camera.X_CW @ X_WN, camera)
     of_model = model_warnings(model, search.tree, settings.hold)

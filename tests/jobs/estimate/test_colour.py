@@ -9,6 +9,7 @@ import pytest
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.errors import CameraError, SceneError, SettingsError, UnknownNameError
 from drake_pose.files.settings import EstimateSettings
+from drake_pose.jobs.estimate import inputs
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
@@ -175,7 +176,7 @@ def test_frames_in_which_the_body_is_lost_have_no_pose(recording, tmp_path, out)
     assert [row.frame for row in lost] == ["0003", "0004"]
     assert np.isnan([row.q for row in lost]).all()
     assert (
-        "frame 0003-0004 (2 of 8): no pose was found; check their masks"
+        "frame 0003-0004 (2 of 8): no pose was found; check masks and pictures"
         in found.summary["warnings"]
     )
     assert found.summary["compared_count"] == 1
@@ -225,6 +226,16 @@ def test_an_arm_is_tracked_from_its_first_logged_positions(episode):
     # The last link turns about its axis of symmetry.
     assert np.median(np.abs(off[:, :3])) < 1.0
     assert np.abs(off[:, :3]).max() < 4.0
+
+
+def test_cameras_must_show_the_arm_at_its_first_logged_positions(episode, monkeypatch):
+    scene, painted = episode
+    checked = []
+    monkeypatch.setattr(inputs, "require_visible", lambda _, X_CN, __: checked.append(X_CN))
+    found = inputs.read_inputs(scene, painted.path, EstimateSettings(), None)
+    tree = found.search.tree
+    X_WN = tree.node_poses(tree.values_from_positions(found.starts["0000"]))
+    np.testing.assert_allclose(checked, [painted.camera.X_CW @ X_WN])
 
 
 def test_selected_frames_are_compared_with_synchronised_positions(episode):

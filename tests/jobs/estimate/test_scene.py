@@ -182,9 +182,11 @@ def test_a_frame_without_a_pose(own_scene: TinyScene, monkeypatch: pytest.Monkey
     monkeypatch.setattr("drake_pose.jobs.estimate.inputs.PaperSearchSettings", strict)
     options = ["--method", "paper", "--no-replay", "--hold", "lift=-90"]
     lost, summary = run_estimate(own_scene, out, *options, status=1)
-    assert lost.stderr.count("no pose was found; check their masks\n") == 1
+    assert lost.stderr.count("no pose was found; check masks and pictures\n") == 1
     assert "frame 0000-0002 (3 of 3): no pose was found" in lost.stderr
-    assert summary["warnings"] == ["frame 0000-0002 (3 of 3): no pose was found; check their masks"]
+    assert summary["warnings"] == [
+        "frame 0000-0002 (3 of 3): no pose was found; check masks and pictures"
+    ]
     assert "no pose was found in any frame" in lost.stderr
     rows = read_rows(out / "poses.csv")
     assert [row["frame"] for row in rows] == ["0000", "0001", "0002"]

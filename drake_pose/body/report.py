@@ -14,7 +14,7 @@ from drake_pose.body.meshes import TriangleMesh, is_watertight
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.body.parsing import summarise_warnings
 from drake_pose.body.pose_tree import PoseTree
-from drake_pose.errors import DrakePoseError
+from drake_pose.errors import DrakePoseError, listed
 
 
 @dataclass(frozen=True)
@@ -136,11 +136,16 @@ def model_warnings(
             "these joints have no limits: they place the object in the world and keep their "
             "default values; a root position moves it: " + ", ".join(slides)
         )
-    warnings += [
-        f"link '{node.name}' is not watertight: its silhouette may have gaps; close its mesh"
+    leaky = [
+        f"'{node.name}'"
         for node in tree.nodes
         if not node.mesh.is_empty and not is_watertight(node.mesh)
     ]
+    if leaky:
+        warnings.append(
+            f"{'link' if len(leaky) == 1 else 'links'} {listed(leaky)} {'is' if len(leaky) == 1 else 'are'} not watertight: silhouettes "
+            "may have gaps; close the meshes"
+        )
     return tuple(summarise_warnings(warnings + _symmetry_warnings(model)))
 
 

@@ -40,7 +40,7 @@ def make_report(
     grid, plots = None, {}
     if {*found}.union(*use.values()) != {"found", "used"}:
         grid = plot_uri(draw_grid(frames, [*use.items(), ("pose", found)]))
-    if len(frames) > 1:
+    if len(frames) > 1 and estimate.found_count:
         curves = {"errors": [("E_total", np.array(errors))], "ious": ious}
         for name, values in curves.items():
             least = 0.0 if name == "errors" else None

@@ -143,8 +143,8 @@ def model_warnings(
     ]
     if leaky:
         warnings.append(
-            f"{'link' if len(leaky) == 1 else 'links'} {listed(leaky)} {'is' if len(leaky) == 1 else 'are'} not watertight: silhouettes "
-            "may have gaps; close the meshes"
+            f"the meshes of {listed(leaky)} are not watertight: silhouettes may have gaps; close "
+            "the meshes"
         )
     return tuple(summarise_warnings(warnings + _symmetry_warnings(model)))
 

@@ -113,7 +113,7 @@ class TreeKinematics:
         self._moves = moves
 
     def flatten(self, node_values: Sequence[np.ndarray]) -> np.ndarray:
-        """Return all values (m,), given each node's (k_i,) values; SettingsError for wrong sizes."""
+        """Return all values (m,) from each node's (k_i,) values; SettingsError for wrong sizes."""
         parts = [np.asarray(values, dtype=np.float64).reshape(-1) for values in node_values]
         sizes = [len(node.value_names) for node in self.tree.nodes]
         if [len(part) for part in parts] != sizes:

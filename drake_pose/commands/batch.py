@@ -53,7 +53,7 @@ def batch(
         chunk: 100
         defaults: {replay: false}
         scenes:
-          monday: {scene: recordings/monday, model: arm.urdf, interval: 15}
+          monday: {scene: recordings/monday, model: arm.urdf, every: 2}
           walker: {scene: recordings/walker}
           robot: {scene: recordings/robot, model: arm.urdf, audit: recordings/robot/joints.csv}
 

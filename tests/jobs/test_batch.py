@@ -2,6 +2,7 @@
 
 import dataclasses
 import gc
+import inspect
 import json
 import os
 import pickle
@@ -9,6 +10,7 @@ import shutil
 import signal
 import socket
 import sys
+import textwrap
 import threading
 import time
 from pathlib import Path
@@ -17,6 +19,7 @@ import psutil
 import pytest
 import yaml
 
+from drake_pose.commands.batch import batch
 from drake_pose.errors import ClusterError, OutputError, SettingsError
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.batch import Outcome, Task, perform, plan_scene, run_batch
@@ -238,6 +241,15 @@ def test_without_dask_one_process_works_and_workers_are_refused(tmp_path, out, m
     assert 'one process does all the work; to use all cores: pip install "dr' in done.stderr
     assert "scene 'gone'" in done.stderr
     assert json.loads((out / "batch.json").read_text())["scenes"]["gone"]["state"] == "failed"
+
+
+def test_example_of_the_help_is_a_job_file(tmp_path):
+    example = inspect.getdoc(batch).partition("    chunk:")[2].partition("\n\n")[0]
+    path = tmp_path / "jobs.yaml"
+    path.write_text(textwrap.dedent("    chunk:" + example))
+    assert [(job.name, job.audit is not None) for job in read_job(path)] == [
+        ("monday", False), ("walker", False), ("robot", True),
+    ]  # fmt: skip
 
 
 def test_job_file_gives_the_settings(tmp_path):

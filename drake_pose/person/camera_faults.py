@@ -259,15 +259,15 @@ class CameraComparison:
         ]
         if not moved:
             return None
-        first, limit = moved[0], np.inf if has_few else FAULT.similar_misfit * misfits[moved[0]]
-        motion, others_ratio = found[first]
+        worst, limit = moved[0], np.inf if has_few else FAULT.similar_misfit * misfits[moved[0]]
+        motion, others_ratio = found[worst]
         alternatives = [
             one
             for one in suspects
-            if one != first and misfits[one] < limit and found[one][0].metres > FAULT.min_metres
+            if one != worst and misfits[one] < limit and found[one][0].metres > FAULT.min_metres
         ]
         explained = not has_few and is_explained(motion, others_ratio)
-        return CameraFault(first, motion, explained, tuple(alternatives), others_ratio)
+        return CameraFault(worst, motion, explained, tuple(alternatives), others_ratio)
 
 
 def _shift_to_regions(camera: Camera, edges: Sequence[EdgePoints], places: Array) -> Array:

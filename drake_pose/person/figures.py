@@ -25,9 +25,7 @@ from drake_pose.person.views import (
 ReadFrame = Callable[[int], Mapping[str, Mask]]
 """Returns the masks (H, W) of a frame by camera; frames count from 0. A camera may lack a mask."""
 
-# Largest distance of a person's middle from the ray of one of the person's figures [m].
-
-# Middles of one person's silhouettes lie no farther apart [m].
+# Largest distance of a person's middle from the rays of the person's figures [m].
 _MAX_RAY_DISTANCE = 0.35
 
 

@@ -44,10 +44,13 @@ def grow(
     """Place one more node in every partial pose and keep the best results.
 
     Args:
+        store: the poses of nodes, which draws the node's.
         partial: the partial poses that are extended.
+        node: index of the node that is placed.
         width: beam width: greatest number of partial poses that are kept.
         outside_weight: cost of a pixel outside, relative to the gain of a newly covered one.
-        limit: partial poses are dropped if no completion can have an objective up to this [pixel].
+        limit: partial poses are dropped if no completion can have an objective up to this [pixel];
+            infinite: none is dropped for it.
         spare: number of candidates from which distinct ones are chosen, as a multiple of ``width``.
 
     Returns:
@@ -92,7 +95,8 @@ class BeamSearch:
     """Estimates poses on a grid of joint values by a beam search.
 
     Args:
-        settings: the grid and the stages of the search.
+        tree: the pose tree whose values are searched.
+        settings: the grid and the stages of the search; None: the defaults.
         examination: parameters of the proof of optimality and of the search for poses as good;
             None: the best pose alone is returned.
     """
@@ -110,7 +114,7 @@ class BeamSearch:
         self.sampled = self.body.sampled
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
-        """Estimate the pose that the views show; see ``PoseSearch``.
+        """Estimate the pose that the views show; see ``PoseSearch.match`` for the arguments.
 
         Returns:
             The best pose found; ``stopped_by`` is "exact" (J is within the tolerance), "end" or
@@ -154,6 +158,7 @@ class BeamSearch:
         area outside the silhouette is still run.
 
         Args:
+            views: the silhouettes, one per camera.
             root_position: (3,) the root's position [m]; None: that of the tree.
             count: greatest number of poses.
             overlap: two poses are alike if for every node the intersection over union of its
@@ -178,9 +183,16 @@ class _BeamRun:
     """One run of the beam search.
 
     Args:
+        body: the sampled body.
+        views: the silhouettes, one per camera.
+        settings: parameters of the search.
         root_position: (3,) the root's position [m]; None: that of the tree.
         collect: whether all whole poses met are collected, for ``distinct``.
         all_within: whether all poses within the tolerance are enumerated first.
+
+    Attributes:
+        within: all poses within the tolerance; None: not enumerated (all_within is False), or none
+            was found.
     """
 
     def __init__(
@@ -207,7 +219,6 @@ class _BeamRun:
         self._samples: np.ndarray | None = None
         self._J, self._first_J = np.inf, np.nan
         self._runs, self._stopped_by = 0, ""
-        # All poses within the tolerance, if they were asked for and there are any.
         self.within: PosesWithin | None = None
 
     def search(self) -> None:
@@ -283,7 +294,11 @@ class _BeamRun:
         return self._bits[exact]
 
     def _store(self, outside_fraction: float) -> PoseStore:
-        """Return the poses of nodes whose area outside is within a fraction of their mean area."""
+        """Return the store of nodes' poses whose area outside is within a limit; stores are cached.
+
+        ``outside_fraction``: the limit as a fraction of a node's mean projected area; 0: the limit
+        is the tolerance, at full resolution.
+        """
         if outside_fraction not in self._stores:
             exact = outside_fraction == 0.0
             limit = self._tolerance if exact else None
@@ -312,6 +327,7 @@ class _BeamRun:
         """Place nodes one after another.
 
         Args:
+            store: the poses of nodes.
             partial: the partial poses that are extended.
             order: the nodes, in the order in which they are placed.
             width, outside_weight, limit: as in ``grow``.
@@ -333,7 +349,12 @@ class _BeamRun:
         return partial, complete
 
     def _run_stage(self, stage: Stage) -> bool:
-        """Run one stage, keep its best pose, and return whether no hypothesis was dropped."""
+        """Run one stage and keep its best pose.
+
+        Returns:
+            Whether no partial pose within the stage's limit was dropped, so that an exact stage
+            without a result proves that there is no exact pose.
+        """
         exact = stage.outside_fraction == 0.0
         store = self._store(stage.outside_fraction)
         order = self._body.limb_order if stage.limb_by_limb else self._body.order
@@ -361,12 +382,13 @@ class _BeamRun:
         outer half.
 
         Args:
+            store: the poses of nodes.
             order: the nodes, in the order in which they are placed.
-            poses: (nodes,) the pose of each node in the store.
-            J: the objective of these [pixel].
+            poses: (nodes,) index of each node's pose in the store.
+            J: the objective of these poses at the store's resolution [pixel].
 
         Returns:
-            (nodes,) the poses of least J found.
+            (nodes,) index in the store of each node's pose of least J found.
         """
         nodes, subtrees = store.tree_nodes, self._body.sampled.tree.subtrees
         limbs = [
@@ -395,10 +417,14 @@ class _BeamRun:
         return poses
 
     def _turn_single_nodes(self, current: np.ndarray, scored: int = 4) -> None:
-        """Improve samples (nodes,) by changing single nodes, which move their descendants along.
+        """Improve a pose by changing single nodes, which move their descendants along.
 
-        ``scored``: number of a node's samples, the best at coarse resolution, that are scored at
-        full resolution.
+        The result is kept by ``_keep_if_better``.
+
+        Args:
+            current: (nodes,) samples of the pose.
+            scored: number of a node's samples, the best at coarse resolution, that are scored at
+                full resolution.
         """
         scoring, bits = self.scoring, self._bits_of(exact=False)
         sampled, words = scoring.sampled, int(bits.part_starts[-1])
@@ -433,7 +459,10 @@ class _BeamRun:
         self._keep_if_better(current)
 
     def _score(self, store: PoseStore, whole: PartialPoses) -> np.ndarray:
-        """Return J (n,) of whole poses at the store's resolution [pixel], and collect the poses."""
+        """Return J (n,) of whole poses at the store's resolution [pixel].
+
+        The poses are added to the collected ones if the run collects.
+        """
         Js = store.objectives(whole)
         if self._collect:
             area = store.bits.area

@@ -30,7 +30,10 @@ from drake_pose.search.settings import BoundLimits
 class Layer:
     """The edges of the graph that place one node, sorted by origin and sample.
 
+    A state is a partial pose; states of a layer are numbered from 0.
+
     Args:
+        node: index of the node.
         origins: (m,) int64 states of this layer from which the edges start.
         samples: (m,) int64 samples of the node.
         ends: (m,) int64 states of the next layer at which the edges end.
@@ -53,12 +56,13 @@ class PartialPoseGraph:
     removed.
 
     Attributes:
-        layers: one layer for each node.
+        layers: one layer for each node, in the order in which the nodes are placed.
         Js: (last states,) the objective of the poses that end in each last state [pixel].
         ways: for each layer, and for the last states, (states,) number of paths to each state.
     """
 
     def __init__(self, layers: Sequence[Layer], Js: np.ndarray) -> None:
+        """Make the graph from layers and Js as in the class, with states on no path removed."""
         # Remove states that are on no complete path, and number the others consecutively.
         origins = [layer.origins for layer in layers[1:]] + [np.arange(len(Js))]
         reached = [np.array([True])]
@@ -124,7 +128,10 @@ class PartialPoseGraph:
         return used
 
     def restricted(self, allowed: Sequence[np.ndarray]) -> "PartialPoseGraph":
-        """Return the poses all of whose samples are allowed, (samples,) bool for each node."""
+        """Return the poses all of whose samples are allowed.
+
+        ``allowed``: for each node (samples,) bool whether each of its samples is.
+        """
         layers = [layer.chosen(allowed[layer.node][layer.samples]) for layer in self.layers]
         return PartialPoseGraph(layers, self.Js)
 
@@ -136,7 +143,7 @@ class PartialPoseGraph:
         return PartialPoseGraph([*self.layers[:-1], last], self.Js[kept])
 
     def central(self) -> np.ndarray:
-        """Return samples (nodes,) of a pose of least J, in the part of the graph with most paths.
+        """Return samples (nodes,) of a pose of least J, going back along the states of most paths.
 
         Raises:
             ValueError: if the set is empty.
@@ -160,7 +167,7 @@ class PosesWithin:
     Attributes:
         J_limit: the limit of the objective [pixel].
         graph: poses of the grid with J up to the limit.
-        complete: whether the graph holds all of them.
+        complete: whether the graph certainly holds all of them.
         limited: whether poses may be missing because a limit of the search was reached.
         lower_bound: lower bound of J of all poses of the grid that are not in the graph [pixel].
     """
@@ -185,8 +192,12 @@ def branch_and_bound(
     beyond the bands around the silhouettes, where they are added.
 
     Args:
+        body: the sampled body, whose grid is searched.
+        views: the silhouettes, one per camera.
         J_limit: the greatest objective [pixel].
-        kept_samples: (nodes,) samples of a pose that is kept even if there are too many.
+        limits: limits of time, memory and size; None: the defaults.
+        kept_samples: (nodes,) samples of a pose that is kept even if there are too many; None: no
+            pose is preferred.
     """
     return _BranchAndBound(body, views, J_limit, limits or BoundLimits(), kept_samples).run()
 
@@ -287,9 +298,17 @@ class _BranchAndBound:
         return partial, node, pairs
 
     def _pruned_pairs(self, partial: PartialPoses, node: int, waiting: Sequence[int]) -> np.ndarray:
-        """Return the pairs (p, 2) after which the waiting nodes can still cover enough.
+        """Return the pairs of partial pose and node's pose that can still lead to the limit of J.
 
         Unlike the bound of a partial pose, this uses the poses that the waiting nodes can take.
+
+        Args:
+            partial: the partial poses.
+            node: index of the node that is placed.
+            waiting: indices of all nodes that can be placed next, with ``node`` or without.
+
+        Returns:
+            (p, 2) int32 pairs, as of ``PoseStore.pairs``.
         """
         pairs = self.store.pairs(partial, node)
         below = self.reaches.child_rows(node, pairs[:, 1])
@@ -308,7 +327,11 @@ class _BranchAndBound:
         return pairs[good]
 
     def _place(self, partial: PartialPoses, node: int, pairs: np.ndarray) -> PartialPoses:
-        """Place a node at the pairs (p, 2) of partial pose and pose, and add the layer."""
+        """Place a node at the pairs (p, 2) of partial pose and node's pose, and add the layer.
+
+        Returns:
+            The distinct partial poses, with masks, which are the states after the layer.
+        """
         store = self.store
         made = store.make(partial, node, pairs, store.score(partial, node, pairs))
         firsts, made, numbers = store.choose(
@@ -332,7 +355,10 @@ class _BranchAndBound:
         return store.with_masks(partial, made.chosen(kept), node, pairs[firsts[kept]])
 
     def _fit_pairs(self, partial: PartialPoses, node: int) -> PartialPoses:
-        """Return the best partial poses whose number of pairs with the node is within the limit."""
+        """Return the best partial poses, whose pairs with the node are within ``limits.pairs``.
+
+        The last layer's edges to the other partial poses are removed.
+        """
         counts = np.diff(self.store.groups(partial, node)).ravel()
         kept = self._keep(partial, counts, self.limits.pairs)
         if kept.all():
@@ -348,8 +374,13 @@ class _BranchAndBound:
     def _keep(self, partial: PartialPoses, counts: np.ndarray, limit: float) -> np.ndarray:
         """Return which partial poses are kept, (B,) bool.
 
-        Those whose bound exceeds the limit of J are dropped. If the sum of ``counts`` (B,) exceeds
-        ``limit``, only the best are kept.
+        Those whose bound exceeds the limit of J are dropped. If the others' sum of ``counts``
+        exceeds ``limit``, only the best are kept, up to this sum but at least one.
+
+        Args:
+            partial: the B partial poses.
+            counts: (B,) number of pairs, or 1, that each needs.
+            limit: greatest sum of the counts.
         """
         alive = partial.bounds <= self.J_limit
         if counts[alive].sum() <= limit:
@@ -381,7 +412,7 @@ class _SubtreeReaches:
         self._rows = [RowTable(1) for _ in store.tree_nodes]
 
     def rows(self, node: int, parents: np.ndarray, tries: int = 5000) -> np.ndarray:
-        """Return the rows (n,) of ``table`` for poses (n,) of the node's parent.
+        """Return the rows (n,) of ``table`` of a node, for poses ``parents`` (n,) of its parent.
 
         ``tries``: if more poses of the node would have to be drawn, the disc that contains the
         projections of all of them is used instead.
@@ -409,9 +440,10 @@ class _SubtreeReaches:
         return known.rows[parents, 0]
 
     def child_rows(self, node: int, poses: np.ndarray) -> np.ndarray:
-        """Return (children, all poses) int64 rows of the node's children.
+        """Return (children, all poses) int64 rows of ``table`` of a node's children.
 
-        Only the columns of the given poses (n,) of the node are set.
+        Columns are the node's poses in the store. Only those of ``poses`` (n,) are set; the others
+        are 0.
         """
         children = self._store.tree_nodes[node].children
         rows = np.zeros((len(children), len(self._store.nodes[node].samples)), dtype=np.int64)

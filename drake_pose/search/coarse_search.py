@@ -158,10 +158,12 @@ def _score_node(
     """Write the cost of a node at all samples, and the points that it covers.
 
     Args:
+        view: the silhouette.
         X_CP: (4, 4) pose of the node's parent in the camera.
-        scratch: three arrays (n,) that are overwritten.
+        balls: the node's balls.
+        scratch: three arrays (n,) float32 that are overwritten.
         costs: (n,) written: area outside the silhouette [pixel].
-        covered: (n, 4) uint64 written: the covered points.
+        covered: (n, 4) uint64 written: the covered points, one bit for each point.
     """
     ball_columns, ball_rows, scales = scratch
     zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
@@ -208,7 +210,9 @@ def score_samples(
     """Add to scores the cost of a node at all its n samples, for B hypotheses in one view.
 
     Args:
+        view: the silhouette.
         X_CP: (B, 4, 4) poses of the node's parent in the camera.
+        balls: the node's balls.
         masks: (B, 4) uint64 the points that the hypotheses cover.
         outside_weight: cost of a pixel outside, relative to the gain of a newly covered one.
         scores: (B, n) the costs, to which those of the node are added [pixel].
@@ -237,7 +241,10 @@ def score_samples(
 
 @dataclass(frozen=True)
 class CoarseSettings:
-    """Parameters of the coarse search; lengths in units of the root of the mean area, the size."""
+    """Parameters of the coarse search.
+
+    Lengths are fractions of the size: the square root of the silhouettes' mean area.
+    """
 
     hypotheses: int = 2500  # Hypotheses kept after each node,
     hypotheses_again: int = 300  # and when a limb of a pose is searched again.
@@ -249,7 +256,7 @@ class CoarseSettings:
     batch: int = 5000  # Number of samples scored at a time by a worker.
     outside_weight: float = 0.8  # Cost of a pixel outside, relative to the gain of a covered one.
     slack: float = 0.05  # Distance from the silhouette that costs nothing.
-    same: float = 0.04  # Poses of frames are equal below this distance [fraction of body's reach].
+    same: float = 0.04  # Poses of nodes are equal below this distance [fraction of body's reach].
     cells: float = 40.0  # Number of cells of a cover along the silhouettes' size.
     most_cells: int = 500  # Greatest number of rows or columns of a cover, which has 80 MB then.
     parts: int = 4  # Number of distances along a cell's side.
@@ -282,7 +289,10 @@ class CoarseSearch:
         balls: each node's balls.
 
     Args:
+        body: the sampled body.
+        views: the silhouettes, one per camera.
         hypotheses: number of hypotheses kept after each node; None: that of the settings.
+        settings: parameters of the search; None: the defaults.
     """
 
     def __init__(
@@ -370,14 +380,22 @@ class CoarseSearch:
         return self._find(start, set(nodes), self._hypotheses)
 
     def find_again(self, X_WN: np.ndarray, again: Sequence[int]) -> CoarsePoses:
-        """Search some nodes again, with the others at X_WN (nodes, 4, 4).
+        """Return the best poses when some nodes are searched again, with the others fixed.
 
-        ``again``: these nodes, with all their descendants.
+        Args:
+            X_WN: (nodes, 4, 4) poses; those of the nodes searched again are ignored.
+            again: the nodes that are searched again, with all their descendants.
         """
         return self._find(X_WN, set(again), self._settings.hypotheses_again)
 
     def _find(self, start: np.ndarray, wanted: set[int], hypotheses: int) -> CoarsePoses:
-        """Return the best poses of the wanted nodes, with the others at ``start``, as X_WN."""
+        """Return the best poses of the wanted nodes, with the others fixed.
+
+        Args:
+            start: (nodes, 4, 4) X_WN, of which the fixed nodes' are used.
+            wanted: indices of the nodes that are placed, with all their descendants.
+            hypotheses: greatest number of hypotheses kept after each node.
+        """
         nodes, weight = self._nodes, self._settings.outside_weight
         poses = CoarsePoses(np.full((1, len(nodes)), -1), start[None].copy(), np.zeros(1))
         masks = [np.zeros((1, 4), dtype=np.uint64) for _ in self.views]
@@ -402,7 +420,7 @@ class CoarseSearch:
             poses: the poses, best first.
             count: greatest number of poses that are returned.
             apart: poses differ if, in some view, the projection of some ball is farther than this
-                from that in the other pose [root of the silhouettes' mean area].
+                in u or v from that in the other pose [square root of the silhouettes' mean area].
         """
         marks = [
             np.vstack([p_NB.mean(axis=0), p_NB[0]]) @ np.swapaxes(X[:, :3, :3], 1, 2)
@@ -434,12 +452,14 @@ class CoarseSearch:
         """Place one more node in every hypothesis and keep the best.
 
         Args:
+            node: index of the node.
+            poses: the B hypotheses before.
             masks: for each view (B, 4) uint64 the points that the hypotheses cover.
             placed: the nodes that are placed, this one included.
             hypotheses: greatest number that is kept.
 
         Returns:
-            The new hypotheses, and the points that they cover.
+            The new hypotheses, best first, and the points that they cover, like ``masks``.
         """
         settings, balls, X_PN = self._settings, self.balls[node], self.body.sampled.X_PN[node]
         parent = self._nodes[node].parent
@@ -491,7 +511,8 @@ class CoarseSearch:
         Args:
             X_WN: (B, nodes, 4, 4) poses before the node was placed.
             of: (n,) index into these of each new hypothesis, best first.
-            own: (n, 4, 4) poses of the node that was placed.
+            node: index of the node that was placed.
+            own: (n, 4, 4) its poses in the new hypotheses.
             placed: the nodes that are placed, this one included.
         """
         open_nodes = [i for i in sorted(placed) if not placed.issuperset(self._nodes[i].children)]

@@ -180,7 +180,13 @@ class PoseMode:
         joints: tuple[JointEstimate, ...],
         size: float = 1.0,
     ) -> "PoseMode":
-        """Make a mode from its representative's values in the pose tree, (k_i,) for each node."""
+        """Make a mode from its representative's values in the pose tree.
+
+        Args:
+            tree: the pose tree.
+            node_values: for each node (k_i,) its values [rad or m].
+            J, joints, size: as in the class.
+        """
         return cls(*tree.positions_from(node_values), tuple(node_values), J, joints, size)
 
 
@@ -273,16 +279,23 @@ class PoseEstimate:
     def of_values(
         cls, tree: PoseTree, node_values: Sequence[np.ndarray], J: float, area: float, **more: Any
     ) -> "PoseEstimate":
-        """Make the estimate of a pose tree's values, (k_i,) for each node; ``more``: other fields.
+        """Make the estimate of a pose found, from its values in the pose tree.
 
-        ``J`` and ``area`` in pixels.
+        Args:
+            tree: the pose tree.
+            node_values: for each node (k_i,) its values [rad or m].
+            J, area: as in the class [pixel].
+            more: other fields of the class; ``stopped_by`` is required.
         """
         q, X_WB = tree.positions_from(node_values)
         return cls(True, q, X_WB, tuple(node_values), J, area, **more)
 
     @classmethod
     def nothing(cls, tree: PoseTree, **more: Any) -> "PoseEstimate":
-        """Make the estimate that reports that no pose was found; ``more``: other fields."""
+        """Make the estimate that reports that no pose was found: ``q``, J and area are NaN.
+
+        ``more``: other fields of the class; ``stopped_by`` is required.
+        """
         missing = np.full(len(tree.model.position_names), np.nan)
         return cls(False, missing, np.eye(4), (), math.nan, math.nan, **more)
 
@@ -325,9 +338,11 @@ class PoseEstimate:
         return replace(self, pose_set=known)
 
     def turned(self, tree: PoseTree, turns: Sequence[np.ndarray]) -> "PoseEstimate":
-        """Return the same pose with full turns added to its angles and their intervals.
+        """Return the same pose with full turns added to its angles, their intervals and modes.
 
-        ``turns``: for each node (k_i,) multiples of 2 pi, or 0 for lengths [rad].
+        Args:
+            tree: the pose tree.
+            turns: for each node (k_i,) what is added: multiples of 2 pi [rad], 0 for lengths.
         """
 
         def pose(one: PoseMode | PoseEstimate) -> dict[str, Any]:

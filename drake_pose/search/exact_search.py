@@ -47,6 +47,7 @@ class ExactSearch:
 
     Args:
         grids: beam searches on grids of 20 and of 15 degrees, which the settings' stages refer to.
+        settings: parameters of the search; None: the defaults.
     """
 
     def __init__(
@@ -63,6 +64,7 @@ class ExactSearch:
         """Return the best pose found.
 
         Args:
+            problem: the silhouettes and the body.
             root_position: (3,) the root's position [m]; None: that of the tree.
             deadline: time.perf_counter() at which the search ends [s].
 
@@ -93,9 +95,15 @@ class ExactSearch:
     def _descend(
         self, problem: RefinementProblem, poses: Sequence[np.ndarray], deadline: float
     ) -> ExactPose | None:
-        """Refine poses (m + 4,), place parts of the best one anew, and return the result.
+        """Refine poses (m + 4,) by the coarse passes, and the best of them by ``refine``.
 
-        None if J is hopelessly large after the coarse passes.
+        Args:
+            problem: the silhouettes and the body.
+            poses: (m + 4,) parameters of each start.
+            deadline: time.perf_counter() at which the search ends [s].
+
+        Returns:
+            The refined pose; None if J is hopelessly large after the coarse passes.
         """
         freedom, length = self.body.freedom(), problem.border_length
         coarse = [descend(problem, pose, freedom, PASSES.coarse) for pose in poses]
@@ -111,7 +119,10 @@ class ExactSearch:
         return reached._replace(steps=reached.steps + sum(steps for _, _, steps in coarse))
 
     def refine(self, problem: RefinementProblem, start: np.ndarray, deadline: float) -> ExactPose:
-        """Refine parameters (m + 4,), and place parts of the body anew where J decreases."""
+        """Refine parameters ``start`` (m + 4,), and place parts anew where J decreases.
+
+        ``deadline``: time.perf_counter() at which no further part is tried [s].
+        """
         fine, _, steps = descend(problem, start, self.body.freedom(), PASSES.fine)
         neighbourhood = NeighbourhoodSearch(problem, self._parts)
         good = self._settings.good * problem.border_length
@@ -121,9 +132,11 @@ class ExactSearch:
     def _end(
         self, problem: RefinementProblem, reached: ExactPose, parameters: np.ndarray
     ) -> ExactPose:
-        """Refine parameters (m + 4,) by the last passes, and return the best pose.
+        """Refine parameters (m + 4,) by the last passes.
 
-        The result is the best of the pose reached before, the parameters and their refinement.
+        Returns:
+            ``reached`` with the parameters and J of the best of three poses: its own, the given
+            parameters, and their refinement.
         """
         last, _, steps = descend(problem, parameters, self.body.freedom(), PASSES.last)
         best = min((reached.parameters, parameters, last), key=problem.J)
@@ -138,7 +151,11 @@ class ExactSearch:
     ) -> tuple[ExactPose, PoseSet]:
         """Return the best pose, which may be an alternative of the given one, and its pose set.
 
-        ``tree``: the pose tree, with its root where the body is.
+        Args:
+            problem: the silhouettes and the body.
+            reached: the pose found by ``find`` or ``refine``, with the alternatives stored in its
+                neighbourhood.
+            tree: the pose tree, with its root where the body is.
         """
         settings, others = self._settings, []
         for _ in range(settings.replacements):
@@ -164,13 +181,16 @@ def find_intervals(
 
         C = (H / s^2 + diag(12 / span^2))^-1,   s = noise_factor max(1 / sqrt(12), rms distance)
 
+    with H of the normal equations, the span between a value's limits, and distances [pixel].
     If J is above ``settings.misfit``, another pose may be right and no value is determined. On
     drawn bodies 99 % of the intervals around the true optimum contained the true value.
 
     Args:
+        problem: the silhouettes and the body.
         others: (m + 4,) each: alternative poses that are as good, best first.
         parameters: (m + 4,) the best pose, refined.
         tree: the pose tree, with its root where the body is; None: the body's.
+        settings: parameters of the intervals; None: the defaults.
 
     Returns:
         The set, with the best pose as the representative of the first mode.

@@ -2,7 +2,8 @@
 
 Section 5.1 places node after node at the best of its sampled poses, with backtracking. Section 5.2
 re-estimates the leaves together, and then single inner nodes. In several views all areas are
-summed over the views, and condition (4) must hold in each view.
+summed over the views, and condition (4), that a node's area outside the silhouette is at most the
+threshold r, must hold in each view.
 """
 
 import time
@@ -23,8 +24,8 @@ class NodeList:
     """The candidate list of one node, best first: JAC_i(1), JAC_i(2), ...
 
     Args:
-        samples: (n,) samples of the candidates.
-        X_WN: (n, 4, 4) their poses.
+        samples: (n,) the node's samples that are candidates.
+        X_WN: (n, 4, 4) the node's poses at these.
         adopted: u_i, index of the adopted candidate, from 0.
     """
 
@@ -42,6 +43,7 @@ class PaperSearch:
     """Estimates poses on a grid of joint values by the paper's search.
 
     Args:
+        tree: the pose tree whose values are searched.
         settings: the grid and the paper's parameters; None: the defaults.
     """
 
@@ -51,7 +53,10 @@ class PaperSearch:
         self.sampled = SampledTree(tree, self.settings)
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
-        """Estimate the pose that the views show; see ``PoseSearch``.
+        """Estimate the pose that the views show; see ``PoseSearch.match`` for the arguments.
+
+        Returns:
+            The best pose found; ``stopped_by`` is "end" or "run_limit".
 
         Raises:
             SettingsError: there is no view.
@@ -84,11 +89,13 @@ class PaperRun:
     """One run of the search with a fixed threshold r.
 
     Args:
+        scoring: the sampled tree and the views.
+        settings: the paper's parameters; their own ``outside_limit`` is ignored.
         outside_limit: the threshold r in each view [pixel].
         runs: number of runs of step 3 before this run.
 
     Attributes:
-        lists: candidate lists of the nodes that are placed.
+        lists: candidate list of each node that is placed.
         best_J, best_samples: the best pose found, its objective [pixel] and samples (nodes,).
         first_J: objective of the first whole pose [pixel].
         stopped_by: "end" or "run_limit".
@@ -124,9 +131,9 @@ class PaperRun:
                 return
 
     def _complete(self) -> bool:
-        """Run steps 1 to 6 until every node is placed.
+        """Run steps 1 to 6 until every node is placed; return whether every node is.
 
-        Return False if no pose is left or the limit of runs is reached.
+        False: no pose is left, or the limit of runs is reached.
         """
         uncovered: Regions | None = None
         while len(self.lists) < len(self.nodes):
@@ -158,10 +165,18 @@ class PaperRun:
         return True
 
     def make_list(self, node: int, uncovered: Regions) -> NodeList | None:
-        """Run steps 3 to 5 and return the candidate list; None if no pose satisfies (4).
+        """Run steps 3 to 5 for a node, with its parent at the adopted pose.
 
-        Poses are sampled, those inside the silhouette (4) are scored (5) and sorted, and the best K
-        are kept. ``uncovered``: the part of the silhouette that no placed node covers.
+        The node's poses with an area outside up to r in each view, condition (4), are sorted by the
+        uncovered silhouette that they cover, score (5), and the best K are kept (all for a node
+        without geometry).
+
+        Args:
+            node: index of the node.
+            uncovered: the part of the silhouette that no placed node covers.
+
+        Returns:
+            The candidate list; None if no pose satisfies (4).
         """
         parent = self.nodes[node].parent
         X_WN = self.scoring.candidate_poses(
@@ -183,7 +198,7 @@ class PaperRun:
         return NodeList(samples[best], X_WN[best])
 
     def _adopt(self, node: int, candidate: int) -> None:
-        """Adopt a candidate of a node, and remove all its descendants."""
+        """Adopt a candidate (index in the list) of a node, and remove its descendants' lists."""
         self.lists[node] = replace(self.lists[node], adopted=candidate)
         for below in self.scoring.sampled.tree.subtrees[node]:
             if below != node:
@@ -245,8 +260,9 @@ class PaperRun:
         """Group the pixels that no inner node covers by the leaves' candidates that cover them.
 
         Returns:
-            (n, candidates) bool the distinct sets of candidates, and (n,) for each set the number
-            of its pixels in the silhouettes minus the number outside.
+            (n, candidates) bool the distinct sets of candidates, with a column for each candidate,
+            leaf after leaf; and (n,) for each set the number of its pixels in the silhouettes minus
+            the number outside.
         """
         inner = [i for i, node in enumerate(self.nodes) if node.children]
         adopted = [array[inner] for array in self._adopted()]

@@ -51,6 +51,7 @@ class MultiStartSearch:
     """Estimates poses with continuous values by a multi-start search.
 
     Args:
+        tree: the pose tree whose values are searched.
         time_limit: greatest time of a match [s]; None: no limit.
         exact_masks: whether masks are known to be exact, like Drake's label images. If not, this is
             decided by a fitted pose; if that pose is wrong, exact masks may be taken for damaged
@@ -71,6 +72,7 @@ class MultiStartSearch:
 
     @cached_property
     def _rough(self) -> tuple[Outline, ...]:
+        """The surface of each node with few triangles, for stages of large spacing."""
         return simplify_outlines(self._outlines)
 
     @cached_property
@@ -98,7 +100,7 @@ class MultiStartSearch:
         return other
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
-        """Estimate the pose that the views show; see ``PoseSearch``.
+        """Estimate the pose that the views show; see ``PoseSearch.match`` for the arguments.
 
         Returns:
             The best pose found; ``stopped_by`` is "end" or "time_limit".
@@ -130,9 +132,10 @@ class MultiStartSearch:
 
         Args:
             tracked: the pose.
+            views: the silhouettes of its frame, one per camera.
             root_position: (3,) the root's position [m]; None: that of the tree.
             first: the pose with which the track began. If it has several modes, joints that are
-                ambiguous in it stay ambiguous.
+                ambiguous in it stay ambiguous. None: the intervals are those of this frame alone.
         """
         _, fit, _ = self._fit(views, root_position)
         values = self._kinematics.flatten(tracked.node_values)
@@ -142,7 +145,10 @@ class MultiStartSearch:
     def _fit(
         self, views: Sequence[View], root_position: np.ndarray | None
     ) -> tuple[SampledBody, ViewsFit, list[View]]:
-        """Return the body with its root in place, the fit, and the views without specks."""
+        """Return the body with its root in place, the fit, and the views without specks.
+
+        ``root_position``: (3,) the root's position [m]; None: that of the tree.
+        """
         clean = [View(view.camera, without_specks(view.mask)) for view in views]
         body, kinematics = self._body, self._kinematics
         if root_position is not None:
@@ -157,6 +163,8 @@ class _MultiStartRun:
     """One match.
 
     Args:
+        search: the search, with its settings.
+        body: the sampled body with its root in place.
         fit: the robust fit to the clean views.
         clean: the views without specks.
         views: the views as they were given; J is computed from these.
@@ -240,9 +248,15 @@ class _MultiStartRun:
         )
 
     def _refine_by_pixels(self, found: ExactPose | None, values: np.ndarray) -> ExactPose | None:
-        """Return the better of a pose and values (m,) refined by pixels.
+        """Refine values (m,) by pixels, and return the better of the result and ``found``.
 
-        None if neither explains the masks, or if J at the values as they are is smaller.
+        Args:
+            found: the pose of the search by pixels; None: that search found none.
+            values: (m,) values of the best pose by robust costs [rad or m].
+
+        Returns:
+            The better pose; None if J of neither is below ``settings.plausible``, or if J at the
+            values as they are is smaller.
         """
         exact, settings, J = self._search.exact, self._search.exact_settings, self._J(values)
         length = self._problem.border_length
@@ -253,7 +267,10 @@ class _MultiStartRun:
         return found if explained else None
 
     def _begin(self) -> list[FittedPose]:
-        """Return the poses of the coarse search, refined but for the final stage, best first."""
+        """Return the poses of the coarse search, refined but for the final stage, best first.
+
+        The coarse search is kept for ``_alternatives_to``.
+        """
         settings = self._settings
         self._coarse = CoarseSearch(self._body, self._clean.views, None if self._proceed() else 1)
         starts = self._coarse.choose_distinct(
@@ -306,7 +323,11 @@ class _MultiStartRun:
         ]
 
     def _explore(self, pool: list[FittedPose], rounds: int) -> list[FittedPose]:
-        """Return the best poses after rounds of the search for alternatives around them."""
+        """Return the best poses after ``rounds`` rounds of the search for alternatives to them.
+
+        ``pool``: refined poses, best first. Poses whose alternatives have been searched before are
+        skipped.
+        """
         settings = self._settings
         for _ in range(rounds):
             found = []
@@ -323,7 +344,7 @@ class _MultiStartRun:
         return pool
 
     def _finish(self, pool: Sequence[FittedPose]) -> list[FittedPose]:
-        """Return the best poses, refined by the final stage."""
+        """Return the best poses of ``pool``, refined by the final stage, best first."""
         settings = self._settings
         values = [pose.values for pose in pool[: settings.finalists]]
         return refine_best(self._fit, values, [(settings.final, settings.finalists)], self._proceed)
@@ -356,7 +377,7 @@ class _MultiStartRun:
         return False
 
     def _alternatives_to(self, values: np.ndarray) -> list[FittedPose]:
-        """Return refined alternatives to a pose (m,): flips, counter-turns, limbs placed anew."""
+        """Return refined alternatives to values (m,): flips, counter-turns, limbs placed anew."""
         kinematics, settings = self._kinematics, self._settings
         flipped = [flip.values for flip in flips(kinematics, values)]
         tried = counter_turns(kinematics, values, settings.interval)
@@ -390,9 +411,9 @@ class _MultiStartRun:
         return [one for one in map_ordered(refine, starts) if one is not None]
 
     def _values(self, coarse: CoarsePoses, values: np.ndarray | None = None) -> list[np.ndarray]:
-        """Return the values (m,) of each coarse pose.
+        """Return the values (m,) of each coarse pose [rad or m].
 
-        ``values``: (m,) the values of nodes that were not searched.
+        ``values``: (m,) the values of nodes that were not searched; None: zeros.
         """
         grids = self._body.sampled.values
         base = np.zeros(len(self._kinematics.names)) if values is None else values
@@ -411,7 +432,7 @@ class _MultiStartRun:
         return self._search.exact.body.parameters(own, self._root_position)
 
     def _J(self, values: np.ndarray) -> float:
-        """Return the objective (1) at values (m,), skin included [pixel]."""
+        """Return the objective J at values (m,), skin included [pixel]."""
         return float(self._problem.J(self._parameters(values)))
 
 
@@ -436,6 +457,7 @@ def without_specks(mask: np.ndarray, largest: int = 6, least: float = 0.02) -> n
     few specks are returned unchanged. A mask that the filter would empty is, too.
 
     Args:
+        mask: (H, W) bool; a filtered mask is a copy.
         largest: greatest area of a speck: a 4-connected component or hole [pixel].
         least: least area of all specks for the mask to be filtered, as a fraction of the mask's.
     """

@@ -22,7 +22,11 @@ _MIX = np.uint64(0x9E3779B97F4A7C15)
 
 
 def _count_bits(typing_context: Any, word: types.Type) -> Any:
-    """Return the number of ones of a uint64, by one processor instruction."""
+    """Numba intrinsic: return the number of ones of a uint64, by one processor instruction.
+
+    The arguments, and the returned signature and code generator, are those of
+    ``numba.extending.intrinsic``.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.ctpop(arguments[0])
@@ -55,7 +59,7 @@ def random_keys(count: int) -> np.ndarray:
 
 
 def hash_mask(mask: np.ndarray, keys: np.ndarray) -> np.uint64:
-    """Return the hash of a bit mask (W,) uint64 with keys (2 W,)."""
+    """Return the hash h of a bit mask (W,) uint64 with keys (2 W,) uint64."""
     halves = np.column_stack([mask & _LOW_HALF, mask >> _HALF]).ravel()
     return np.uint64((halves * keys).sum(dtype=np.uint64))
 
@@ -74,9 +78,10 @@ def score_pairs(
     Args:
         masks: (B, W) uint64 bit masks of the partial poses.
         pairs: (p, 2) int32 indices of partial pose and pose of the next node.
-        runs: (n, K, 3) int64 for each of n poses and each of the K parts of a mask: the first word
-            in the mask, the number of words, and the index of the first in ``words``.
-        words: (m,) uint64 the pixels of all poses.
+        runs: (n, K, 3) int64 for each of the next node's n poses and each of the K parts of a mask
+            (silhouettes and bands of the views): index of the pose's first word in the mask, number
+            of its words, and index of the first in ``words``.
+        words: (m,) uint64 the words of all poses' bit masks.
         silhouettes: number of parts that are silhouettes, which come first; the others are bands.
         keys: (2 W,) uint64 keys of the hashes.
 
@@ -121,7 +126,8 @@ def choose_pairs(
 
     Args:
         masks, pairs, runs, words: as in ``score_pairs``.
-        all_pixels: (w,) uint64 all pixels of the silhouettes.
+        all_pixels: (w,) uint64 bit mask of all pixels of the silhouettes, which are the first w of
+            a mask's W words.
         reachable: the pixels that the nodes still to be placed can cover.
         width: greatest number of pairs that are chosen.
         state_hashes: (p,) uint64 hashes, equal for pairs after which the search goes on alike.
@@ -129,12 +135,14 @@ def choose_pairs(
             If it is not empty, pairs beyond the limit are dropped, and so are dominated ones: those
             whose frontier hash equals that of an earlier pair that covers a superset of the
             silhouette and has no more area outside. (0,): neither is dropped.
-        outside: (p,) int64 area outside the silhouettes [pixel].
+        outside: (p,) int64 area outside the silhouettes of each pair [pixel].
         limit: greatest sum of the area outside and the unreachable area [pixel].
 
     Returns:
-        (n,) int64 the chosen pairs; (n,) int64 the silhouette area that is unreachable after each
-        [pixel]; and for each examined pair its index among the chosen ones, -1 if it was dropped.
+        chosen: (n,) int64 indices of the chosen pairs.
+        unreachable: (n,) int64 silhouette area that no later node can cover after each [pixel].
+        places: (e,) int64 for each of the first e pairs, which were examined, the index in
+            ``chosen`` of the pair with its state (itself or an earlier one); -1 if it was dropped.
     """
     made = min(width, pairs.shape[0])
     chosen, unreachable = np.empty(made, dtype=np.int64), np.empty(made, dtype=np.int64)
@@ -236,7 +244,8 @@ NO_CHILDREN = np.zeros((0, 0), dtype=np.int64)
 def unite_poses(masks: np.ndarray, poses: np.ndarray, runs: np.ndarray, words: np.ndarray) -> None:
     """Add the pixels of one pose to each mask, in place.
 
-    ``masks``: (n, W) uint64, ``poses``: (n,), ``runs`` and ``words`` as in ``score_pairs``.
+    ``masks``: (n, W) uint64; ``poses``: (n,) rows of ``runs``; ``runs``, ``words``: as in
+    ``score_pairs``.
     """
     groups = np.column_stack([poses, poses + 1]).astype(np.int64)
     unite(masks, np.arange(len(masks)), groups, runs, words, runs.shape[1], NO_CHILDREN)

@@ -75,6 +75,8 @@ class SilhouetteBits:
         all_pixels: (w,) uint64 bit mask of all pixels of the silhouettes.
 
     Args:
+        body: the body that is drawn.
+        views: the silhouettes, one per camera.
         band: width of the bands [pixel]; 0: no bands.
         in_full: whether surfaces are never simplified, so that areas are exact.
     """
@@ -106,6 +108,7 @@ class SilhouetteBits:
         There must be bands.
 
         Args:
+            node: index of the node.
             samples: (n,) its samples.
             X_WN: (n, 4, 4) its poses at these samples.
             masks: (n, W) bit masks to which the node's pixels are added.
@@ -127,7 +130,7 @@ class SilhouetteBits:
 
 
 class RowTable:
-    """A table of integer rows (k,) that are computed when they are first needed."""
+    """A table of rows of ``width`` integers that are computed when they are first needed."""
 
     def __init__(self, width: int) -> None:
         self.rows = np.zeros((0, width), dtype=np.int64)
@@ -158,8 +161,11 @@ class RowTable:
 class _Poses:
     """Drawn poses of one node, in groups with the same pose of the parent.
 
-    ``samples``: (n,) int32; ``X_WN``: (n, 4, 4); ``areas``: (n, 3) int32 area in the silhouettes,
-    in the bands and beyond [pixel]; ``runs``, ``words``: as in ``score_pairs``.
+    Attributes:
+        samples: (n,) int32 the node's sample at each pose.
+        X_WN: (n, 4, 4) the poses in the world.
+        areas: (n, 3) int32 area in the silhouettes, in the bands and beyond [pixel].
+        runs, words: bit masks of the poses, as in ``score_pairs``.
     """
 
     samples: np.ndarray
@@ -195,7 +201,7 @@ class PartialPoses:
         return len(self.poses)
 
     def chosen(self, kept: np.ndarray) -> "PartialPoses":
-        """Return a subset, by indices or (B,) bool."""
+        """Return the partial poses chosen by indices (n,) or by (B,) bool."""
         return PartialPoses(*[array[kept] for array in vars(self).values()])
 
     @property
@@ -228,10 +234,11 @@ class PoseStore:
         words: number of words W of a bit mask.
 
     Args:
+        body: the body that is searched.
         bits: the silhouettes.
-        outside_fraction: greatest area outside of a node, all views together, as a fraction of its
-            mean projected area.
-        outside_limit: greatest area outside of a node [pixel]; it replaces the fraction.
+        outside_fraction: greatest area of a node outside the silhouettes, all views together, as a
+            fraction of its mean projected area.
+        outside_limit: the same area [pixel]; it replaces the fraction. None: the fraction holds.
         limits: limits of time, memory and drawn poses; None: no limits. The methods that draw raise
             LimitReached when one is reached.
     """
@@ -273,7 +280,7 @@ class PoseStore:
         self._beyond_keys = keys[-2:]
 
     def reserve(self, size: int = 0) -> None:
-        """Add to the memory in use [byte], and check the limits.
+        """Add ``size`` [byte] to the memory in use, and check the limits.
 
         Raises:
             LimitReached: if memory, time or the number of drawn poses exceeds its limit.
@@ -289,15 +296,23 @@ class PoseStore:
             raise LimitReached
 
     def _batches(self, missing: np.ndarray, batch: int) -> Iterator[np.ndarray]:
-        """Yield poses (n,) of a parent in batches, and check the limits before each."""
+        """Yield poses ``missing`` (n,) of a parent in parts of ``batch``.
+
+        Raises LimitReached: a limit is reached before a part.
+        """
         for begin in range(0, len(missing), batch):
             self.reserve()
             yield missing[begin : begin + batch]
 
     def pose_groups(self, node: int, parents: np.ndarray, batch: int = 100_000) -> np.ndarray:
-        """Return (n, 2) first index and end of the node's poses, for poses (n,) of its parent.
+        """Return (n, 2) the range [first, end) of the node's poses for each pose of its parent.
 
-        Missing ones are drawn. ``batch``: number of poses tried between checks of the limits.
+        Poses that are not in the store are drawn.
+
+        Args:
+            node: index of the node.
+            parents: (n,) indices of the parent's poses in the store; zeros for a root.
+            batch: number of poses tried between checks of the limits.
         """
         known = self._groups[node]
         batch = max(1, batch // len(self.body.sampled.X_PN[node]))
@@ -314,7 +329,7 @@ class PoseStore:
         )
 
     def reach_rows(self, node: int, parents: np.ndarray, batch: int = 20_000) -> np.ndarray:
-        """Return (n,) rows of ``reach_runs`` of a node, for poses (n,) of its parent.
+        """Return (n,) rows of ``reach_runs`` of a node, for poses ``parents`` (n,) of its parent.
 
         A row has the pixels in the projection of a ball that contains the node and its descendants
         at all samples. ``batch``: number of balls drawn between checks of the limits.
@@ -343,12 +358,19 @@ class PoseStore:
         return np.asarray(poses[:, parent])
 
     def _parent_poses(self, node: int, parents: np.ndarray) -> np.ndarray:
-        """Return X_WP (n, 4, 4) of poses (n,) of the node's parent."""
+        """Return X_WP (n, 4, 4) of poses ``parents`` (n,) of the node's parent.
+
+        For a root it is (1, 4, 4), the identity.
+        """
         parent = self.tree_nodes[node].parent
         return np.eye(4)[None] if parent < 0 else self.nodes[parent].X_WN[parents]
 
     def _draw(self, node: int, parents: np.ndarray) -> np.ndarray:
-        """Draw the node for poses (n,) of its parent; return (n,) the number of poses of each."""
+        """Draw the node at all samples for poses ``parents`` (n,) of its parent, and store it.
+
+        Returns:
+            (n,) number of the node's poses within the limit of the area outside, for each parent.
+        """
         X_WP = self._parent_poses(node, parents)
         X_PN = self.body.sampled.X_PN[node]
         pairs = np.empty((len(X_WP) * len(X_PN), 2), dtype=np.int32)
@@ -407,7 +429,11 @@ class PoseStore:
     def without(self, poses: np.ndarray, nodes: frozenset[int]) -> PartialPoses:
         """Return the partial pose with poses (nodes,) from which some nodes are removed.
 
-        ``nodes``: these nodes, with all their descendants.
+        Its areas ``beyond`` and ``unreachable`` are 0.
+
+        Args:
+            poses: (nodes,) index of each node's pose in the store; -1: not placed.
+            nodes: the nodes that are removed, with all their descendants.
         """
         start = self.start()
         start.poses[0] = poses
@@ -428,20 +454,23 @@ class PoseStore:
         return np.asarray(self.bits.area - whole.covered + whole.outside)
 
     def groups(self, partial: PartialPoses, node: int) -> np.ndarray:
-        """Return (B, 2) first index and end of the poses that the node can take in each."""
+        """Return (B, 2) the range [first, end) of the node's poses for each of B partial poses."""
         if len(partial) == 0:
             return np.zeros((0, 2), dtype=np.int64)
         return self.pose_groups(node, self.parents(partial.poses, node))
 
     def pairs(self, partial: PartialPoses, node: int) -> np.ndarray:
-        """Return (p, 2) int32 pairs of each partial pose and each pose that the node can take."""
+        """Return (p, 2) int32 pairs of each partial pose and each pose that the node can take.
+
+        A pair is the index of the partial pose, and the index of the node's pose in the store.
+        """
         groups = self.groups(partial, node)
         return np.column_stack(expand_groups(groups[:, 0], groups[:, 1])).astype(np.int32)
 
     def score(
         self, partial: PartialPoses, node: int, pairs: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the areas added by pairs (p, 2) of partial pose and pose of the node.
+        """Return the areas added by pairs (p, 2) (see ``pairs``) of partial pose and node's pose.
 
         Returns:
             (p, 2) newly covered area of silhouettes and of bands [pixel]; (p,) uint64 the increase
@@ -457,9 +486,13 @@ class PoseStore:
         pairs: np.ndarray,
         scores: tuple[np.ndarray, np.ndarray],
     ) -> PartialPoses:
-        """Return the partial poses made by pairs (p, 2), without masks and unreachable areas.
+        """Return the p partial poses made by pairs, with masks (p, 0) and ``unreachable`` 0.
 
-        ``scores``: the pairs' result of ``score``.
+        Args:
+            partial: the partial poses before the node is placed.
+            node: index of the node.
+            pairs: (p, 2) pairs of partial pose and node's pose, as ``pairs`` returns.
+            scores: the pairs' result of ``score``.
         """
         areas, added = scores
         origins, added_beyond = pairs[:, 0], self.nodes[node].areas[pairs[:, 1], 2]
@@ -492,11 +525,12 @@ class PoseStore:
 
         Args:
             partial: the partial poses before the node was placed.
-            made: those made by the pairs.
+            made: those made by the pairs, in their order, as ``make`` returns.
+            node: index of the node.
             pairs: (p, 2) the pairs of partial pose and pose of the node.
             width: greatest number that is chosen.
-            limit: if it is finite, the greatest lower bound of the objective [pixel]; also, one
-                that is dominated by an earlier one is dropped, as described in ``choose_pairs``.
+            limit: if it is finite, a partial pose is dropped if its lower bound of the objective
+                exceeds it [pixel], or if an earlier one dominates it (see ``choose_pairs``).
             keep_beyond: whether partial poses that differ only in the area beyond the bands are
                 kept apart.
 
@@ -527,17 +561,24 @@ class PoseStore:
     def with_masks(
         self, partial: PartialPoses, made: PartialPoses, node: int, pairs: np.ndarray
     ) -> PartialPoses:
-        """Return ``made``, the partial poses made by pairs (n, 2), with their masks."""
+        """Return ``made``, the partial poses made by pairs (n, 2), with their masks.
+
+        Args:
+            partial: the partial poses before the node was placed.
+            made: those made by the pairs, in their order.
+            node: index of the node.
+            pairs: (n, 2) pairs of partial pose and node's pose.
+        """
         masks, stored = partial.masks[pairs[:, 0]], self.nodes[node]
         unite_poses(masks, pairs[:, 1], stored.runs, stored.words)
         return replace(made, masks=masks)
 
 
 def expand_groups(begins: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices in all groups, given by the first and the end of each group (n,).
+    """Return the indices in all of n groups, the ranges [begins (n,), ends (n,)).
 
     Returns:
-        (m,) the group of each index, and (m,) the indices.
+        (m,) the number of the group of each index, and (m,) the indices, group after group.
     """
     counts = ends - begins
     groups = np.repeat(np.arange(len(counts)), counts)

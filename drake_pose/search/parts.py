@@ -28,7 +28,8 @@ from drake_pose.silhouette.outline import pack
 from drake_pose.silhouette.scoring import prefix_sums
 from drake_pose.silhouette.span_kernel import score
 
-# For a coarse view: X_CW, the camera's kernel parameters and (2, H, W + 1) prefix sums.
+# For a coarse view: X_CW (4, 4), the camera's kernel parameters (8,), and prefix sums (2, H, W + 1)
+# of the silhouette and of the area outside it, both without the pixels that other nodes cover.
 _Region = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -38,7 +39,7 @@ class Part:
 
     Args:
         nodes: its nodes, parents before children.
-        sources: for each node the node whose mirror image it becomes.
+        sources: for each node the node whose mirror image it becomes, usually itself.
         held: children of these nodes that keep their pose.
     """
 
@@ -115,6 +116,7 @@ class PartSearch:
         reflections: the parts that are mirrored with left and right exchanged.
 
     Args:
+        body: the body.
         grids: for each node (n, k) its values at its samples [rad or m].
     """
 
@@ -132,7 +134,7 @@ class PartSearch:
         self._signs = self._mirror_signs()
 
     def _mirror_signs(self, count: int = 5, least: float = 0.01) -> dict[int, np.ndarray]:
-        """Return by node the signs (k,) by which its values follow from its partner's in a mirror.
+        """Return by node the signs (k,), 1 or -1, of its values from its partner's in a mirror.
 
         The mirror plane is perpendicular to that axis of the nodes' frames for which most nodes
         have such signs.
@@ -176,7 +178,8 @@ class PartSearch:
         """Return other placements of a part, the best first.
 
         Args:
-            parameters: (m + 4,) the pose.
+            problem: the silhouettes and the body.
+            parameters: (m + 4,) the pose, whose other nodes stay.
             part: the part that is placed anew.
             count: greatest number of placements.
             widths: number of hypotheses kept after the first, second, ... node of the part.
@@ -191,8 +194,6 @@ class PartSearch:
         """
         X_WN = self.body.poses(parameters)
         others = problem.fixed_borders(parameters, np.isin(np.arange(len(X_WN)), part.nodes))
-        # The sets whose areas are counted in each coarse view: silhouette, and outside of it,
-        # without the pixels that other nodes cover.
         regions: list[_Region] = []
         step = max(1, round((problem.area / (coarse_pixels * len(problem.views))) ** 0.5))
         for view, border in zip(problem.views, others, strict=True):
@@ -247,7 +248,7 @@ class PartSearch:
     def errors_near(self, problem: RefinementProblem, parameters: np.ndarray) -> np.ndarray:
         """Return (parts,) the area of the mismatch within reach of each part, over all views.
 
-        ``parameters``: (m + 4,) the pose. The areas [pixel] are estimated from every second row.
+        The areas [pixel] of ``problem`` at parameters (m + 4,) are estimated from every second row.
         """
         areas, stride = np.zeros(len(self.parts)), 2
         discs = self.reaches(problem, parameters)
@@ -261,7 +262,8 @@ class PartSearch:
     def reaches(self, problem: RefinementProblem, parameters: np.ndarray) -> np.ndarray:
         """Return discs that contain each part whatever its joint values, (views, parts, 3) [pixel].
 
-        A disc is given by the u and v of its centre and its radius. ``parameters``: (m + 4,).
+        A disc is given by the u and v of its centre and its radius. It is about the part's first
+        joint at parameters (m + 4,), in the views of ``problem``.
         """
         p_WN = self.body.poses(parameters)[:, :3, 3]
         origins = p_WN[[part.nodes[0] for part in self.parts]]
@@ -282,7 +284,10 @@ class PartSearch:
     ) -> np.ndarray:
         """Return (n,) silhouette minus outside area newly covered by k nodes, over all views.
 
-        ``X_WN``: (n, k, 4, 4) poses of the nodes. Areas in pixels of the coarse views.
+        Args:
+            regions: the coarse views, in whose pixels areas are counted.
+            nodes: (k,) indices of the nodes.
+            X_WN: (n, k, 4, 4) n placements of the nodes.
         """
         packed = pack(tuple(self._outlines[i] for i in nodes))
         total = np.zeros(len(X_WN))
@@ -294,7 +299,7 @@ class PartSearch:
         return total
 
     def mirror(self, parameters: np.ndarray, part: Part, view: View, steps: int = 20) -> np.ndarray:
-        """Return parameters with a part mirrored in a view's depth about its first joint.
+        """Return parameters (m + 4,) with a part mirrored in a view's depth about its first joint.
 
         The centre of each node is brought near to its mirror image, which under parallel projection
         is at the same place in the image.
@@ -344,7 +349,7 @@ class PartSearch:
     ) -> np.ndarray:
         """Return parameters (m + 4,) with some nodes moved back to X_WN by their own values.
 
-        ``X_WN``: (all nodes, 4, 4) wanted poses.
+        ``X_WN``: (all nodes, 4, 4) wanted poses; ``nodes``: indices of these nodes.
         """
         for node in nodes:
             radius = max(float(self._balls[node, 3]), 1e-6)
@@ -407,6 +412,7 @@ class NeighbourhoodSearch:
     """Searches around a pose for other placements of parts, and stores alternative poses.
 
     Args:
+        problem: the silhouettes and the body.
         search: the parts of the body.
         reflections: whether, in a single view, parts are mirrored with left and right exchanged.
     """
@@ -517,7 +523,10 @@ class NeighbourhoodSearch:
         return [pose for _, pose in kept]
 
     def _errors_near(self, parameters: np.ndarray, J: float) -> np.ndarray:
-        """Return (parts,) the error near each part [pixel]; that of reflections is J."""
+        """Return (parts,) the error at parameters (m + 4,) near each part; J for reflections.
+
+        Errors are areas of the mismatch [pixel]. ``J``: the objective at the parameters [pixel].
+        """
         errors = self.search.errors_near(self.problem, parameters)
         return np.append(errors, np.full(len(self._parts) - len(errors), J))
 

@@ -42,8 +42,8 @@ from drake_pose.workers import map_ordered
 class PoseAndMaskSettings:
     """Parameters of the alternating estimation of pose and mask.
 
-    The size of a silhouette is the root of its area. The error of a pose is given as a fraction of
-    the standard deviations of the initial poses.
+    The size of a silhouette is the square root of its area. The error of a pose is given as a
+    fraction of the standard deviations of the initial poses.
     """
 
     # Standard deviation of the initial poses: of each angle [rad], of each length with limits, as a
@@ -93,7 +93,10 @@ class FoundPose:
 
 
 class PictureLevel(NamedTuple):
-    """A pyramid level: cameras, and for each frame each camera's image (H, W, 3) or None."""
+    """A pyramid level: cameras, and for each frame each camera's image (H, W, 3).
+
+    An image is None where the camera has none of the frame.
+    """
 
     cameras: tuple[Camera, ...]
     pictures: Sequence[Sequence[Picture | None]]
@@ -130,9 +133,9 @@ class _Progress:
         start: (m,) initial values [rad or m].
         rng: the frame's generator of random numbers.
         error: error of the pose, as a fraction of the initial standard deviations.
-        probabilities: for each camera (H, W) the foreground probability.
+        probabilities: for each camera (H, W) the foreground probability at the round's level.
         cuts: for each camera (H, W) the mask by colours; None where there is no image.
-        drawn: for each camera (H, W) the model's silhouette.
+        drawn: for each camera (H, W) the model's silhouette; empty before the first round.
         agreements: as in ``FoundPose``.
         unchanged: whether the silhouettes are those of the previous round.
         settled: whether the frame is finished.
@@ -154,6 +157,9 @@ class PoseAndMask:
     """Estimates poses and masks of a body in the images of static cameras.
 
     Args:
+        kinematics: kinematics of the pose tree, with m values.
+        cameras: the static cameras.
+        settings: parameters of the estimation; None: the defaults.
         seed: seed of the random poses.
     """
 
@@ -184,11 +190,11 @@ class PoseAndMask:
         starts: Sequence[Array],
         on_round: Callable[[int], None] = lambda _: None,
     ) -> list[FoundPose]:
-        """Estimate the poses and masks of all frames.
+        """Estimate the poses and masks of all frames, and return those of each frame.
 
         Args:
             pictures: for each frame and camera the image (H, W, 3); None where there is none.
-            starts: for each frame (m,) an approximate pose [rad or m].
+            starts: for each frame (m,) values of an approximate pose [rad or m].
             on_round: called after each round with the number of rounds done.
         """
         values = [np.clip(one, self._kinematics.lower, self._kinematics.upper) for one in starts]
@@ -229,7 +235,13 @@ class PoseAndMask:
         ]
 
     def _round(self, level: PictureLevel, frames: Sequence[_Progress], searches: bool) -> None:
-        """Improve the frames that are not settled; ``searches``: by a search before the fit."""
+        """Run one round: update pose, masks and error of all frames that are not settled.
+
+        Args:
+            level: the pyramid level whose images are used.
+            frames: the estimates of all frames, changed in place.
+            searches: whether the cross-entropy search is run before the fit.
+        """
         moving = [k for k, one in enumerate(frames) if not one.settled]
 
         def sample(k: int) -> None:
@@ -265,19 +277,25 @@ class PoseAndMask:
         map_ordered(improve, moving)
 
     def _draw(self, values: Array, camera: Camera, few: bool = False) -> Mask:
-        """Return the body's silhouette (H, W) at values (m,); ``few``: with few triangles."""
+        """Return the body's silhouette (H, W) in a camera at values (m,) [rad or m].
+
+        ``few``: whether surfaces of very few triangles, without skin, are drawn.
+        """
         X_CN = camera.X_CW @ self._kinematics.poses(values)
         if few:
             return draw_mask(self._few, X_CN, camera)
         return draw_mask(self._surfaces.at(self._kinematics.split(values)), X_CN, camera)
 
     def _sample(self, rng: np.random.Generator, values: Array, spread: Array, count: int) -> Array:
-        """Draw (count, m) values around some (m,) with standard deviations (m,), within limits."""
+        """Draw (count, m) random values from normal distributions, clipped to their limits.
+
+        ``values``: (m,) their means; ``spread``: (m,) their standard deviations [rad or m].
+        """
         drawn = values + spread * rng.standard_normal((count, len(values)))
         return np.clip(drawn, self._kinematics.lower, self._kinematics.upper)
 
     def _probabilities(self, level: PictureLevel, frame: _Progress) -> list[Floats]:
-        """Return for each camera (H, W) the foreground probability of a frame."""
+        """Return for each camera (H, W) a frame's foreground probability at a pyramid level."""
         spread, found, count = frame.error * self._spread, [], self._settings.samples
         poses = self._sample(frame.rng, frame.values, spread, count)
         for camera in level.cameras:
@@ -292,7 +310,8 @@ class PoseAndMask:
     def _log_ratios(self, level: PictureLevel, frames: Sequence[_Progress]) -> list[list[Floats]]:
         """Return for each frame and camera (H, W) log-likelihood ratios by colour.
 
-        They are 0 where there is no image, and in settled frames.
+        They are of foreground against background, in the images of ``level``, and 0 where there is
+        no image, and in settled frames.
         """
         found = [[np.zeros_like(one) for one in frame.probabilities] for frame in frames]
         for c in range(len(level.cameras)):
@@ -310,7 +329,11 @@ class PoseAndMask:
         return found
 
     def _search(self, level: PictureLevel, frame: _Progress, log_ratios: Sequence[Floats]) -> Array:
-        """Return values (m,) near a frame's whose silhouette has the greatest sum of log ratios."""
+        """Return values (m,) near a frame's whose silhouette has the greatest sum of log ratios.
+
+        ``log_ratios``: for each camera (H, W), as ``_log_ratios`` returns for the frame; if all are
+        zero, the frame's values are returned.
+        """
         # Log ratios are summed as integers, in units of 1/64.
         parts, settings = 64.0, self._settings
         shown = [
@@ -338,7 +361,10 @@ class PoseAndMask:
         return best
 
     def _refine(self, level: PictureLevel, frame: _Progress) -> Array:
-        """Return values (m,) fitted to the edges of a frame's masks by colours."""
+        """Return values (m,) fitted to the edges of a frame's masks by colours, ``frame.cuts``.
+
+        Without a mask that shows the body, the frame's values are returned.
+        """
         masks, settings = frame.cuts, self._settings
         areas = [np.count_nonzero(mask) for mask in masks if mask is not None and mask.any()]
         if not areas:
@@ -369,10 +395,12 @@ def cut_by_foreground(
     The log-odds are log(p / (1 - p)) + log_ratio, with the foreground probability p by the pose.
 
     Args:
+        picture: (H, W, 3) the image.
         probability: (H, W) the foreground probability p.
         log_ratio: (H, W) log-likelihood ratio of foreground and background, by colour.
-        sure: log-odds above this are certainly foreground, below minus this background.
-        least: pixels with a probability up to this are certainly background.
+        sure: log-odds above this are certainly foreground, below minus this background; GrabCut
+            decides between, starting from the sign.
+        least: pixels with a probability up to this are certainly background, whatever the log-odds.
     """
     log_odds = np.log(probability / (1.0 - probability)) + log_ratio
     labels = np.where(log_odds > 0.0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
@@ -403,8 +431,13 @@ def follow_colours(silhouette: Mask, mask: Mask, band: float = 0.01) -> Mask:
 def next_error(error: float, agreements: Sequence[float], settings: PoseAndMaskSettings) -> float:
     """Return the error of a pose after a round, from the error before and the round's agreements.
 
-    The error is halved if the least agreement is above 0.9, multiplied by 0.7 if above 0.8, and
-    else unchanged; ``finest_error`` and ``searched_error`` are its minima.
+    It is max(error / 2, ``finest_error``) if the least agreement is above 0.9,
+    max(0.7 error, ``searched_error``) if it is above 0.8, and unchanged otherwise.
+
+    Args:
+        error: as a fraction of the standard deviations of the initial poses.
+        agreements: IoU of silhouette and mask by colours in each camera; NaN is ignored.
+        settings: the minima of the error.
     """
     agreement = float(np.nanmin(np.array(agreements)))
     if agreement > 0.9:

@@ -57,6 +57,7 @@ def estimate_joints(
     both sides, because the true value may lie between the grid's values.
 
     Args:
+        sampled: the tree and its grids.
         samples: for each node (n,) its samples that occur in the set.
         about: for each node (k,) the values of the answer; intervals of angles that turn around are
             given in the turn nearest to these [rad or m].
@@ -91,7 +92,10 @@ def estimate_joints(
 def cluster_samples(sampled: SampledTree, node: int, samples: np.ndarray) -> np.ndarray:
     """Return the cluster of each sample of a node, (all samples,) int64; -1 if it does not occur.
 
-    ``samples``: (n,) the samples that occur.
+    Args:
+        sampled: the tree and its grids.
+        node: index of the node.
+        samples: (n,) the node's samples that occur in a set of poses.
     """
     grid = sampled.values[node]
     labels = np.full(len(grid), -1, dtype=np.int64)
@@ -125,6 +129,7 @@ def split_into_modes(
     """Return the modes of a set of poses, sorted by J and, if equal, by size, largest first.
 
     Args:
+        graph: the set of poses.
         labels: for each node (all samples,) the cluster of each sample.
         most_pairs: above this number of pairs of a state and a mode, the clusters of later nodes
             are ignored.
@@ -165,6 +170,8 @@ class GridPoseSet(PoseSet):
     """A set of poses of a grid, with a test of membership.
 
     Args:
+        graph: the poses.
+        sampled: the tree and its grids.
         budget_spent: whether a limit of the search may have left out poses.
     """
 
@@ -196,13 +203,17 @@ def find_modes(
     """Find all poses of the grid that are as good as the best, and group them into modes.
 
     Args:
+        body: the sampled body.
+        views: the silhouettes, one per camera.
         samples: (nodes,) samples of the best known pose.
         J: its objective [pixel].
         tolerance: greatest excess of the objective of a pose that is as good [pixel]. None: if the
             best pose is within ``renderer_tolerance``, all poses within that; else 5 % of the
             contours' length.
         most: greatest number of modes that are described.
-        within: all exact poses, if they are known; the tolerance is then their limit of J.
+        limits: limits of the search; None: the defaults.
+        within: all exact poses, if they are known; they are then the set, up to their limit of J,
+            and ``tolerance`` is ignored. None: the set is searched.
 
     Returns:
         The set. If a better pose than the known one is found, the set holds the poses within the
@@ -248,7 +259,7 @@ def find_modes(
 def samples_at(sampled: SampledTree, node_values: Sequence[np.ndarray]) -> np.ndarray | None:
     """Return samples (nodes,) of a pose, given by each node's values (k,); None if not on the grid.
 
-    Values may differ from the grid's by 1e-6.
+    Values may differ from those of the grids of ``sampled`` by 1e-6 [rad or m].
     """
     samples = np.zeros(len(sampled.values), dtype=np.int64)
     for i, (grid, values) in enumerate(zip(sampled.values, node_values, strict=True)):
@@ -335,9 +346,13 @@ def examine(
     """Prove that a pose of the grid is optimal, and find all poses that are as good.
 
     Args:
+        body: the sampled body.
+        views: the silhouettes, one per camera.
         result: the pose that is examined.
+        settings: parameters of the proof and of the search.
         root_position: (3,) the root's position [m]; None: that of the tree.
-        within: all exact poses, if they are known.
+        within: all exact poses, if they are known; no proof is then tried, and they are the pose
+            set unless the settings have a tolerance.
 
     Returns:
         The result with ``lower_bound``, ``budget_spent`` and ``pose_set``; with a better pose, if

@@ -37,7 +37,7 @@ class Freedom(NamedTuple):
 
     Args:
         columns: (k,) int64 their indices.
-        moved: (nodes,) bool which nodes they move.
+        moved: (nodes,) bool whether they move each node.
     """
 
     columns: np.ndarray
@@ -53,8 +53,8 @@ class RefinementBody:
     Attributes:
         tree, kinematics: the pose tree and its kinematics.
         surfaces: the surfaces of all nodes.
-        skin: for each packed vertex the fraction of its motion that is its own node's (the rest is
-            that of the node's parent), and (nodes,) the parents of all nodes.
+        skin: (vertices,) for each packed vertex the fraction of its motion that is its own node's
+            (the rest is that of the node's parent), and (nodes,) int64 the nodes' parents.
         lower, upper: (m + 4,) limits of the parameters, infinite where an angle turns around.
     """
 
@@ -99,16 +99,18 @@ class RefinementBody:
     def nearest_turns(self, parameters: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
         """Return parameters (m + 4,) of the same pose, with angles in the turn nearest to ``near``.
 
-        ``near``: (m + 4,); None: the turn of ``TreeKinematics.nearest_turns``.
+        ``near``: (m + 4,) parameters; None: the turn that ``TreeKinematics.nearest_turns`` chooses.
         """
         values = None if near is None else near[:-4]
         turned = self.kinematics.nearest_turns(parameters[:-4], values)
         return np.concatenate([turned, parameters[-4:]])
 
     def freedom(self, nodes: Sequence[int] | None = None, extra: Sequence[int] = ()) -> Freedom:
-        """Return the parameters that may change: values of some nodes that have a range.
+        """Return the parameters that may change: some nodes' values that are not fixed by limits.
 
-        ``nodes``: these nodes; None: all. ``extra``: indices into ROOT_NAMES of further parameters.
+        Args:
+            nodes: indices of these nodes; None: all nodes.
+            extra: indices into ROOT_NAMES of further parameters.
         """
         kinematics = self.kinematics
         chosen = kinematics.upper > kinematics.lower
@@ -127,7 +129,7 @@ class RefinementBody:
         Args:
             parameters: (m + 4,) the pose.
             bent: whether the skin is deformed to the pose; else it keeps its last shape.
-            rooted: whether motions by ROOT_NAMES are included even if these are zero.
+            rooted: whether derivatives by ROOT_NAMES are included even if these are zero.
         """
         rooted = rooted or bool(parameters[-4:].any())
         values = parameters if rooted else parameters[:-4]
@@ -141,6 +143,10 @@ class RefinementBody:
 
 class RefinementProblem:
     """One body and the silhouettes of one frame, compared pixel by pixel.
+
+    Args:
+        body: the body.
+        views: the silhouettes, one per camera.
 
     Attributes:
         area: total area of the silhouettes [pixel].
@@ -174,11 +180,16 @@ class RefinementProblem:
         ]
 
     def J(self, parameters: np.ndarray) -> int:
-        """Return the objective (1) at parameters (m + 4,): the area of the mismatch [pixel]."""
+        """Return the objective J at parameters (m + 4,): the area of the mismatch [pixel]."""
         return sum(int(np.count_nonzero(one)) for one in self.mismatch(parameters))
 
     def fixed_borders(self, parameters: np.ndarray, moved: np.ndarray) -> list[Border]:
-        """Return for each view the border of all nodes that are not moved, (nodes,) bool."""
+        """Return for each view the border of the union of all nodes that do not move.
+
+        Args:
+            parameters: (m + 4,) the pose.
+            moved: (nodes,) bool whether each node moves; if all do, the borders are empty.
+        """
         if moved.all():
             return self._nothing
         placed = self.body.place(parameters)
@@ -242,6 +253,7 @@ def descend(
     """Refine some of the parameters of a pose by passes of Levenberg-Marquardt steps.
 
     Args:
+        problem: the silhouettes and the body.
         parameters: (m + 4,) the start.
         freedom: the parameters that may change.
         passes: the passes, run one after another.
@@ -250,8 +262,8 @@ def descend(
         damping: relative damping d of the normal equations, which makes them solvable.
 
     Returns:
-        The parameters of least cost in the last pass, this cost, an estimate of J from the compared
-        lines [pixel], and the number of steps.
+        The parameters (m + 4,) of least cost in the last pass; this cost, an estimate of J from the
+        compared lines [pixel]; and the number of steps of all passes.
     """
     free = freedom.columns
     limits = problem.body.lower[free], problem.body.upper[free]

@@ -71,8 +71,8 @@ def place_body(body: SampledBody, positions: np.ndarray, chosen: np.ndarray) -> 
     """Return a body whose root has samples at combinations of positions and its r rotations.
 
     Args:
-        body: the body, whose root has r samples.
-        positions: (n, 3) positions of the root [m].
+        body: the body, whose root has r samples, its rotations.
+        positions: (n, 3) positions of the root in the world [m].
         chosen: (m,) the new samples: i is rotation i % r at position i // r.
     """
     placed, sampled = copy.copy(body), copy.copy(body.sampled)
@@ -103,7 +103,9 @@ def choose_root_samples(
     once for each rotation and shifted by whole pixels. In several views all rotations are chosen.
 
     Args:
-        positions: (n, 3) positions of the root, of one depth [m].
+        body: the body, whose root has r samples, its rotations.
+        views: the silhouettes, one per camera.
+        positions: (n, 3) positions of the root in the world, of one depth [m].
         count: number of rotations at each position.
         outside_weight: cost of a pixel outside, relative to the gain of a covered one.
         farthest: the root is drawn only up to this distance from its origin [pixel].
@@ -161,7 +163,7 @@ class _PlacedPose:
         views: the silhouettes; a parallel camera has its estimated scale.
         scale: ratio of that scale to the given one.
         parameters: (m + 4,) parameters of the refinement, with log scale 0.
-        J: objective (1) [pixel].
+        J: the objective [pixel].
     """
 
     views: tuple[View, ...]
@@ -175,7 +177,7 @@ class RootPlacementSearch:
 
     Args:
         tree: the pose tree; its root position is not used.
-        settings: the grids and the time limit; the stages are not used.
+        settings: the grids and the time limit; the stages are not used. None: the defaults.
         scale_unknown: whether the ``pixels_per_metre`` of the one parallel camera is unknown.
 
     Raises:
@@ -214,7 +216,16 @@ class RootPlacementSearch:
         self._placement = RootPlacementSettings()
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
-        """Estimate the pose that the views show, and its root position; see ``PoseSearch``.
+        """Estimate the pose that the views show, and its root position.
+
+        Args:
+            views: the silhouettes, one per camera.
+            root_position: (3,) the root's position in the world [m], if it is known; None: it is
+                estimated.
+
+        Returns:
+            The best pose found, with ``root_position`` and ``scale``; ``stopped_by`` is "end" or
+            "time_limit".
 
         Raises:
             SettingsError: if there is no view, or a scale cannot be searched with these
@@ -279,7 +290,7 @@ class RootPlacementSearch:
         """Return the best whole poses of one scale or depth, at most one for each root sample.
 
         Args:
-            layer: the candidate positions.
+            layer: the candidate positions, and the views with the scale that is tried.
             width: beam width.
             outside_fraction: greatest area of a node outside, as in ``PoseStore``.
         """
@@ -328,7 +339,10 @@ class RootPlacementSearch:
     def _improve(self, starts: Sequence[_PlacedPose], moves: bool, deadline: float) -> _PlacedPose:
         """Return the best pose reached from some starts.
 
-        ``moves``: whether the root's position is refined, too.
+        Args:
+            starts: the starts, best first; at least one.
+            moves: whether the root's position is refined, too.
+            deadline: time.perf_counter() after which no further refinement is begun [s].
         """
 
         def before(step: Callable[[_PlacedPose], Any], one: _PlacedPose) -> Any:
@@ -378,7 +392,10 @@ class RootPlacementSearch:
         return best
 
     def _settle(self, start: _PlacedPose, passes: Sequence[Pass], moves: bool) -> _PlacedPose:
-        """Refine a pose with its root, and convert the body's log scale to the camera's scale."""
+        """Refine a pose by passes, and convert the body's log scale to the camera's scale.
+
+        ``moves``: whether the root's position is refined, too.
+        """
         problem = RefinementProblem(self._refined, start.views)
         parameters, _, _ = descend(problem, start.parameters, self._free[moves], passes)
         refined = replace(start, parameters=parameters, J=float(problem.J(parameters)))
@@ -399,7 +416,16 @@ class RootPlacementSearch:
         return np.array(self._refined.poses(placed.parameters)[0, :3, 3])
 
     def _finish(self, start: _PlacedPose, moves: bool, deadline: float) -> _PlacedPose:
-        """Refine a pose to the end, and place parts that fit badly anew."""
+        """Refine a pose to the end, and place parts that fit badly anew.
+
+        Args:
+            start: the pose.
+            moves: whether the root's position is refined, too.
+            deadline: time.perf_counter() after which no further part is placed anew [s].
+
+        Returns:
+            The pose of least J of the start and the poses reached.
+        """
         near = self._settle(start, PASSES.fine[:2], moves)
         problem = RefinementProblem(self._refined, near.views)
         good = self._placement.good_E_total * problem.area

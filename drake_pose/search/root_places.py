@@ -44,11 +44,16 @@ class RootPlaces(NamedTuple):
 def find_root_places(
     body: SampledBody, views: Sequence[View], scale_unknown: bool, known: np.ndarray | None
 ) -> list[RootPlaces]:
-    """Return the candidate positions of the root, sorted by likelihood of scale or depth.
+    """Return the candidate positions of the root, the likeliest scale or depth first.
 
     Args:
+        body: the sampled body.
+        views: the silhouettes, one per camera.
         scale_unknown: whether the ``pixels_per_metre`` of the one parallel camera is unknown.
-        known: (3,) the root's position [m] if it is known.
+        known: (3,) the root's position in the world [m]; None: it is unknown.
+
+    Returns:
+        One entry for each scale or depth; a single one if neither is unknown.
 
     Raises:
         SettingsError: if the scale is unknown, but the views are not one parallel view.
@@ -103,7 +108,7 @@ def find_root_places(
 
 
 def scale_camera(camera: ParallelCamera, scale: float) -> ParallelCamera:
-    """Return a camera with ``pixels_per_metre`` multiplied by a factor."""
+    """Return a camera with ``pixels_per_metre`` multiplied by ``scale``."""
     return dataclasses.replace(camera, pixels_per_metre=scale * camera.pixels_per_metre)
 
 
@@ -113,8 +118,12 @@ def slide_root(camera: ParallelCamera, p_WR: np.ndarray, factor: float) -> np.nd
     A camera whose scale is divided by the same factor sees the root at the same place.
 
     Args:
-        p_WR: (3,) the root's position [m].
+        camera: the camera.
+        p_WR: (3,) the root's position in the world [m].
         factor: factor of the distance.
+
+    Returns:
+        (3,) the position in the world [m].
     """
     p_CR = in_camera(camera, p_WR)
     p_CR[:2] *= factor
@@ -143,12 +152,14 @@ def root_steps(views: Sequence[View], p_WR: np.ndarray) -> np.ndarray:
 def _pixel_sizes(
     body: SampledBody, view: View, poses: int = 100, side: int = 240, rare: float = 0.03
 ) -> np.ndarray:
-    """Return possible numbers of pixels per metre at the body (n,), the likeliest first.
+    """Return possible numbers of pixels per metre at the body in a view (n,), the likeliest first.
 
     They are a geometric sequence. Its range follows from the silhouette's area and the areas of
     parallel projections of random poses of the grid along the camera's axis.
 
     Args:
+        body: the sampled body.
+        view: the silhouette.
         poses: number of random poses.
         side: side of the image in which they are drawn [pixel].
         rare: fraction of the smallest, and of the largest, areas that are disregarded.
@@ -196,7 +207,7 @@ def _extent(mask: np.ndarray) -> float:
 
 
 def _near(view: View, places: np.ndarray) -> np.ndarray:
-    """Return (n,) bool which places (n, 2) [pixel] the root may have.
+    """Return (n,) bool whether the root may be at each of n places (n, 2) in a view [pixel].
 
     A place must be near the silhouette; or, if it is outside the image, within the distance that a
     cut-off body may extend, and nearest to a border pixel that is near the silhouette.
@@ -211,7 +222,10 @@ def _near(view: View, places: np.ndarray) -> np.ndarray:
 
 
 def _lift(camera: Camera, places: np.ndarray, depth: float) -> np.ndarray:
-    """Return points (n, 3) in the world that project to (n, 2) [pixel] at a depth [m]."""
+    """Return points (n, 3) in the world [m] that a camera sees at places (n, 2) [pixel].
+
+    ``depth``: the points' z in the camera's frame [m].
+    """
     if isinstance(camera, ParallelCamera):
         scale = np.full(2, 1.0 / camera.pixels_per_metre)
     else:
@@ -223,7 +237,7 @@ def _lift(camera: Camera, places: np.ndarray, depth: float) -> np.ndarray:
 
 
 def in_camera(camera: Camera, p_W: np.ndarray) -> np.ndarray:
-    """Return a point (3,) of the world in the camera's frame [m]."""
+    """Return the point p_W (3,) of the world in the camera's frame [m]."""
     return np.asarray(camera.X_CW[:3, :3] @ p_W + camera.X_CW[:3, 3])
 
 
@@ -233,8 +247,9 @@ def _places_in_space(
     """Return the points of a grid in space that project into or near all silhouettes.
 
     Args:
-        main: the one with the largest area.
-        middle: (3,) centre of the grid [m].
+        views: the silhouettes, one per camera.
+        main: the view with the largest silhouette.
+        middle: (3,) centre of the grid in the world [m].
         size: likeliest number of pixels per metre at the body in ``main``.
     """
     settings, extent = RootPlacementSettings(), _extent(main.mask) / size

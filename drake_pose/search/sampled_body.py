@@ -26,8 +26,8 @@ from drake_pose.silhouette.scoring import (
     subtract_body,
 )
 
-# For each view: (H, W) uint8 the part of the silhouette that is not covered, and (2, H, W + 1)
-# row-wise prefix sums of the silhouette and of that part.
+# For each view: (H, W) uint8 mask of the part of the silhouette that no placed node covers, and
+# (2, H, W + 1) row-wise prefix sums of the silhouette and of that part.
 Regions = list[tuple[np.ndarray, np.ndarray]]
 
 
@@ -64,9 +64,11 @@ class SampledTree:
         self._bent_outline = lru_cache(maxsize=256)(self._bend)
 
     def outlines_at(self, nodes: Sequence[int], samples: np.ndarray) -> list[Outline]:
-        """Return the whole surface of each of the nodes at its sample, in the node's frame.
+        """Return the whole surface of each of some nodes at its sample, in the node's frame.
 
-        ``samples``: (len(nodes),) sample of each of these nodes.
+        Args:
+            nodes: (k,) indices of these nodes.
+            samples: (k,) sample of each of these nodes.
         """
         return [
             self.outlines[node]
@@ -93,8 +95,10 @@ class SampledTree:
         """Return areas of the union of some nodes' projections, for many poses.
 
         Args:
-            samples: (n, len(nodes)) their samples.
+            nodes: indices of these nodes.
+            samples: (n, len(nodes)) their samples; they place the skin bands only.
             X_CN: (n, len(nodes), 4, 4) their poses in the camera.
+            camera: the camera onto whose image the nodes are projected.
             prefixes: (k, H, W + 1) row-wise prefix sums of k sets of pixels.
 
         Returns:
@@ -130,7 +134,10 @@ class SampledTree:
         return [grid[t] for grid, t in zip(self.values, samples, strict=True)]
 
     def _sample(self, node: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return a node's values (n, k) and poses X_PN (n, 4, 4); k is 0 for a mimic joint."""
+        """Return a node's values (n, k) and poses X_PN (n, 4, 4) at its n grid samples.
+
+        For a node whose joints mimic its parent's, k is 0 and n the parent's number of samples.
+        """
         settings, source = self._settings, self.tree.source(node)
         values = self.tree.grid(
             source, settings.interval, settings.intervals, settings.length_interval
@@ -173,8 +180,9 @@ class Scoring:
             regions: the uncovered part of the silhouette in each view.
 
         Returns:
-            (views, n) area(P_i minus S) in each view (4), and (n,) area(region and P_i) summed over
-            the views (5), (7) [pixel].
+            outside: (views, n) area of P_i outside S in each view, equation (4) [pixel].
+            covered: (n,) area of P_i in the uncovered part of S, summed over the views, equations
+                (5) and (7) [pixel].
         """
         outside, covered = [], np.zeros(len(X_WN))
         for view, (_, prefixes), X_CW in zip(self.views, regions, self.X_CW, strict=True):
@@ -185,9 +193,11 @@ class Scoring:
         return np.array(outside), covered
 
     def uncovered(self, nodes: Sequence[int], samples: np.ndarray, X_WN: np.ndarray) -> Regions:
-        """Return S minus the projections of some nodes (3), (6).
+        """Return S minus the projections of some nodes, equations (3) and (6).
 
-        ``samples``: (nodes,), ``X_WN``: (nodes, 4, 4) of all nodes of the tree.
+        Args:
+            nodes: indices of these nodes; empty: all of S is returned.
+            samples, X_WN: (all nodes,) samples and (all nodes, 4, 4) poses of the whole tree.
         """
         regions = [
             (view.mask.astype(np.uint8), np.repeat(sums, 2, axis=0))
@@ -200,13 +210,16 @@ class Scoring:
     def subtract(
         self, regions: Regions, nodes: Sequence[int], samples: np.ndarray, X_WN: np.ndarray
     ) -> None:
-        """Remove the projections of k nodes, at samples (k,) and X_WN (k, 4, 4), from regions."""
+        """Remove the projections of k nodes, at samples (k,) and X_WN (k, 4, 4), from regions.
+
+        ``regions`` is changed in place.
+        """
         outlines = self.sampled.outlines_at(nodes, samples)
         for view, X_CW, (mask, prefixes) in zip(self.views, self.X_CW, regions, strict=True):
             subtract_body(mask, prefixes[1], outlines, X_CW @ X_WN, view.camera)
 
     def J(self, samples: np.ndarray) -> np.ndarray:
-        """Return the objective (1) of poses at samples (n, nodes): (n,) [pixel]."""
+        """Return (n,) the objective J of the poses at samples (n, nodes), equation (1) [pixel]."""
         total, X_WN = np.full(len(samples), self.silhouette_area), self.sampled.poses(samples)
         everything = range(len(self.sampled.outlines))
         for view, prefixes, X_CW in zip(
@@ -221,7 +234,7 @@ class Scoring:
     ) -> np.ndarray:
         """Return the union of k nodes' projections in one view, (H, W) bool.
 
-        ``samples``: (k,), ``X_WN``: (k, 4, 4), ``view``: index of the view.
+        ``samples``: (k,) and ``X_WN``: (k, 4, 4) of these nodes; ``view``: index of the view.
         """
         outlines = self.sampled.outlines_at(nodes, samples)
         return draw_mask(outlines, self.X_CW[view] @ X_WN, self.views[view].camera)
@@ -262,6 +275,7 @@ class PoseSearch(Protocol):
         """Estimate the pose of the body in the views of one frame.
 
         Args:
+            views: the silhouettes, one per camera.
             root_position: (3,) position of the root's origin in the world [m]; None: that of the
                 tree.
         """
@@ -270,14 +284,16 @@ class PoseSearch(Protocol):
 class SampledBody:
     """A sampled tree with precomputed balls and orders for the searches on grids.
 
+    A node's projection contains that of each of its inscribed balls, so a ball outside the
+    silhouette rejects a pose.
+
     Attributes:
         surface_areas: for each node the mean area of its parallel projections over all directions
             [m^2].
         order: the nodes in the order in which they are placed, ends of limbs last.
         limb_order: the nodes in the order in which they are placed limb by limb.
-        ball_radii: for each node (k,) radii of inscribed balls, whose projection the node's
-            projection contains [m]. They lie inside the node, or inside a child around a point
-            that the child's joint does not move.
+        ball_radii: for each node (k,) radii of its inscribed balls [m]. They lie in the node's
+            visual hull, or in a child's around a point that the child's joint does not move.
         p_PB: for each node (n, k, 3) the balls' centres in its parent's frame at each sample [m].
         forked: for each node whether it or a descendant has several children.
         reach_balls: (nodes, 4) centre in the parent's frame, and radius, of a ball that contains
@@ -318,9 +334,11 @@ class SampledBody:
         return moved
 
     def frontier(self, placed: frozenset[int]) -> tuple[np.ndarray, list[int]]:
-        """Return (m,) placed nodes with a child that is not placed, and nodes that can be placed.
+        """Return the open nodes, and the nodes that can be placed next, for a set of placed nodes.
 
-        A node can be placed if it is a root or its parent is placed.
+        Returns:
+            (m,) int64 indices of placed nodes with a child that is not placed; and the indices of
+            the nodes that are not placed and are roots or have a placed parent.
         """
         if placed not in self._frontiers:
             nodes = self.sampled.tree.nodes
@@ -373,7 +391,10 @@ class SampledBody:
         return np.asarray(np.linalg.norm(np.vstack(roots) - camera.X_WC[:3, 3], axis=1))
 
     def _find_balls(self, node: int, hulls: list[VisualHull]) -> np.ndarray:
-        """Return (k, 4) centre and radius of balls covered by a node's projection [m], frame N."""
+        """Return (k, 4) centres and radii of a node's inscribed balls in its frame N [m].
+
+        ``hulls``: the visual hulls of all nodes, at rest.
+        """
         balls = [hulls[node].spread_balls(10)]
         # A ball far from the parent's joint is most likely outside the silhouette: test it first.
         balls[0] = balls[0][np.argsort(-np.linalg.norm(balls[0][:, :3], axis=1), kind="stable")]
@@ -411,7 +432,11 @@ class SampledBody:
         return reaches
 
     def _find_order(self, limb_by_limb: bool) -> tuple[int, ...]:
-        """Return the nodes in placement order: the trunk, then limbs, larger ones first."""
+        """Return the nodes in placement order: the trunk, then limbs, larger ones first.
+
+        ``limb_by_limb``: True: each limb is placed to its end before the next; False: leaves, the
+        ends of limbs, are placed after all other nodes of the limbs.
+        """
         nodes, subtrees = self.sampled.tree.nodes, self.sampled.tree.subtrees
         sizes = [round(sum(self.surface_areas[j] for j in below), 5) for below in subtrees]
         placed: list[int] = []
@@ -428,10 +453,15 @@ class SampledBody:
 
 
 def _fixed_points(X_PN: np.ndarray, ball: np.ndarray) -> np.ndarray:
-    """Return points (n, 3) of frame N that have the same position in P at all samples X_PN [m].
+    """Return points (n, 3) in frame N that have the same position in the parent's frame P [m].
 
-    A single point if the rotations have no common axis; else 61 points of the common axis within
-    ``ball`` (4,), centre and radius [m]; (0, 3) if no point is fixed.
+    Args:
+        X_PN: (samples, 4, 4) poses of the node in its parent at all samples.
+        ball: (4,) centre and radius of the node's bounding ball in frame N [m].
+
+    Returns:
+        If the rotations have one common axis, 61 points of it over the ball's diameter; otherwise
+        one fixed point; (0, 3) if no point is fixed.
     """
     A = (X_PN[:, :3, :3] - X_PN[0, :3, :3]).reshape(-1, 3)
     b = (X_PN[0, :3, 3] - X_PN[:, :3, 3]).reshape(-1)
@@ -447,13 +477,13 @@ def _fixed_points(X_PN: np.ndarray, ball: np.ndarray) -> np.ndarray:
 
 
 def _ball_around(centers: np.ndarray, radii: np.ndarray) -> np.ndarray:
-    """Return a small ball (4,), centre and radius, that contains balls.
+    """Return a small ball (4,), centre and radius [m], that contains balls.
 
     It is nearly the smallest one, found by the iteration of Badoiu and Clarkson.
 
     Args:
-        centers: (n, 3) centres of the balls.
-        radii: (n,) their radii.
+        centers: (n, 3) centres of the balls [m].
+        radii: (n,) their radii [m].
     """
     center = 0.5 * (centers.min(axis=0) + centers.max(axis=0))
     best, best_radius = center, np.inf

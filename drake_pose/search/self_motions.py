@@ -36,7 +36,10 @@ def counter_turns(
 ) -> list[np.ndarray]:
     """Return poses (m,) in which two joints with nearly parallel axes turn by opposite angles.
 
+    Poses outside the limits are left out.
+
     Args:
+        kinematics: kinematics of the pose tree, with m values.
         values: (m,) the pose [rad or m].
         interval: the angles are multiples of this, up to a full turn [rad].
         parallel: least cosine of the angle between the axes.
@@ -63,6 +66,7 @@ def flips(kinematics: TreeKinematics, values: np.ndarray, count: int = 16) -> li
     """Return flipped poses within the limits in which the links behind the flipped joints stay.
 
     Args:
+        kinematics: kinematics of the pose tree, with m values.
         values: (m,) the pose [rad or m].
         count: greatest number of flips that are examined, those outside the limits included.
     """
@@ -100,8 +104,9 @@ def _single_flips(
     """Return poses with one more triple of joints flipped, regardless of limits.
 
     Args:
-        start: the pose.
-        triples: (n, 3) indices of angles.
+        kinematics: kinematics of the pose tree, with m values.
+        start: the pose, with what was changed by earlier flips.
+        triples: (n, 3) indices of the values (angles) of three joints of a chain, the first first.
         stays: greatest motion of the last link, as a fraction of the body's size, or in the entries
             of its rotation matrix.
         nearly: greatest error of the cosines by which triples are preselected.
@@ -134,9 +139,9 @@ def _single_flips(
 
 
 def _chained_pairs(kinematics: TreeKinematics, moves: np.ndarray) -> list[tuple[int, int]]:
-    """Return pairs of angles: the second is one or two movable angles behind the first.
+    """Return pairs of indices of angles: the second is one or two movable angles behind the first.
 
-    ``moves``: (nodes, m) which nodes each value moves.
+    ``moves``: (nodes, m) bool whether each of the m values moves each node.
     """
     movable = np.flatnonzero((kinematics.upper > kinematics.lower) & kinematics.is_angle)
     nodes = kinematics.value_nodes

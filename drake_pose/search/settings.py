@@ -42,6 +42,7 @@ class GridSettings:
                 raise SettingsError(f"{name} must be positive and finite, not {value}")
 
     def _require(self, least: float, *names: str) -> None:
+        """Raise SettingsError if a field of these names is less than ``least``; None passes."""
         for name in names:
             value = getattr(self, name)
             if value is not None and not value >= least:
@@ -140,7 +141,7 @@ class BeamSearchSettings(GridSettings):
 
 @dataclass(frozen=True)
 class Pass:
-    """One pass of a refinement by pixels."""
+    """One pass of a refinement by pixels (see ``refinement``)."""
 
     iterations: int  # Greatest number of steps.
     stride: int  # Every stride-th row and column is compared.
@@ -242,7 +243,7 @@ class ExactSearchSettings:
     starts: int = 4  # Number of poses of each beam search that are refined.
     overlap: float = 0.5  # See ``BeamSearch.best_poses``.
     # The search gives up if J after the coarse passes exceeds the larger of these two: the second
-    # is a fraction of the root of the mean silhouette area [pixel].
+    # is a fraction of the square root of the mean silhouette area [pixel].
     hopeless: float = 1.5
     hopeless_fraction: float = 0.017
     good: float = 0.03  # The search ends at a pose with a smaller J, which is pixel noise.
@@ -265,8 +266,9 @@ _MEDIUM = (AnnealingStage(0.05, 0.026, 4), AnnealingStage(0.025, 0.026, 4))
 
 @dataclass(frozen=True)
 class MultiStartSettings:
-    """Parameters of the search in damaged masks; lengths in units of the root of the mean area.
+    """Parameters of the search in damaged masks.
 
+    Lengths are fractions of the size: the square root of the silhouettes' mean area.
     In several views the cost of a wrong pose is higher from the first stage on, so starts are
     dropped early. In a single view the last stage may decide.
     """
@@ -327,7 +329,8 @@ class RobustSettings(NamedTuple):
     def widest(is_angle: np.ndarray) -> np.ndarray:
         """Return (m,) the greatest width of a determined value's interval [rad or m].
 
-        It is 10 degrees, or 2 cm, on each side. ``is_angle``: (m,) whether a value is an angle.
+        It is 10 degrees, or 2 cm, on each side. ``is_angle``: (m,) bool whether each of the pose
+        tree's m values is an angle.
         """
         return 2.0 * np.where(is_angle, math.radians(10.0), 0.02)
 

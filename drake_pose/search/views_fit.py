@@ -1,7 +1,7 @@
 """Fit a body robustly to the silhouettes of one frame, and compute modes and joint intervals.
 
-The unit of length in an image is the root of the silhouettes' mean area, since neither the scale
-nor the distance of the body may be known.
+The unit of length in an image is the square root of the silhouettes' mean area, since neither the
+scale nor the distance of the body may be known.
 
 The covariance of the fit gives intervals of the values around one optimum. Other optima that fit as
 well are further modes. ``RobustModes`` computes both for damaged masks and models that fit only
@@ -74,13 +74,15 @@ class ViewsFit:
     """The robust fit of one body to the silhouettes of one frame.
 
     Attributes:
-        size: root of the silhouettes' mean area [pixel], the unit of length of all stages.
+        size: square root of the silhouettes' mean area [pixel], the unit of length of all stages.
         edge_length: length of the silhouettes' edges [pixel].
         camera_count: number of views.
         evaluations: number of comparisons of contours until now.
 
     Args:
+        kinematics: kinematics of the pose tree, with m values.
         outlines: a surface for each node; few triangles suffice, see ``simplify_surfaces``.
+        views: the silhouettes, one per camera.
         rough: surfaces with fewer triangles, for stages of large spacing; None: ``outlines``.
     """
 
@@ -111,14 +113,14 @@ class ViewsFit:
         self.evaluations, self._counting = 0, Lock()
 
     def cost(self, values: np.ndarray, stage: AnnealingStage) -> float:
-        """Return the robust cost at values (m,) [pixel]."""
+        """Return the robust cost at values (m,), with a stage's scale and spacing [pixel]."""
         self._count(1)
         fit, views = self._level(stage)
         sums = fit.compare(views, values, stage).sums
         return float(sums[..., Sum.COST].sum()) / self._scale(stage) ** 2
 
     def distances(self, values: np.ndarray, stage: AnnealingStage) -> Distances:
-        """Return the residuals of the contours' distances at values (m,)."""
+        """Return the residuals of the contours' distances at values (m,) in a stage."""
         self._count(1)
         fit, views = self._level(stage)
         compared = fit.compare(views, values, stage)
@@ -126,10 +128,10 @@ class ViewsFit:
         return distances(fit.outlines, views.cameras, compared, moves, unit)
 
     def tile_costs(self, values: np.ndarray, stage: AnnealingStage) -> np.ndarray:
-        """Return the robust cost at values (m,) in each tile of the images [pixel].
+        """Return (cameras, 64, 64) the robust cost at values (m,) in each image tile [pixel].
 
         The errors of different tiles are regarded as independent. A tile's side is a fifth of the
-        silhouettes' size, about the size of usual defects of masks.
+        silhouettes' size, about the size of usual defects of masks. ``stage``: scale and spacing.
         """
         self._count(1)
         side = max(1.0, 0.2 * self.size)
@@ -159,6 +161,7 @@ class ViewsFit:
         return self._levels[stage.spacing < 0.026]
 
     def _count(self, evaluations: int) -> None:
+        """Add to the number of evaluations."""
         with self._counting:  # Threads fit side by side.
             self.evaluations += evaluations
 
@@ -176,7 +179,8 @@ def refine_best(
     """Refine many poses, and keep after each pass only the best distinct ones.
 
     Args:
-        starts: each (m,), best first.
+        fit: the robust fit.
+        starts: each (m,), best first; at least one.
         passes: for each pass its stages, and the number of poses kept after it.
         proceed: returns whether there is time left; if not, only the first pose is refined.
 
@@ -206,8 +210,10 @@ def distinct(
     """Return the best distinct poses, sorted by cost.
 
     Args:
+        poses: the poses, in any order.
         count: greatest number of poses that are returned.
-        covers_full_turn: (m,) whether each value is an angle that is the same after a full turn.
+        covers_full_turn: (m,) bool whether each value is an angle that is the same after a full
+            turn; False: none is.
         apart: a pose is distinct if some value differs by more than this from that of every better
             pose [rad or m].
     """
@@ -235,8 +241,10 @@ def describe_modes(
     """Return the pose set of some modes.
 
     Args:
+        kinematics: kinematics of the pose tree.
+        tree: the pose tree, with its root where the body is.
         modes: the modes with their intervals, best first.
-        Js: the objective (1) of each [pixel].
+        Js: the objective J of each [pixel].
         tolerance: as in ``PoseSet`` [pixel].
         is_known: whether intervals are reliable; if not, no value is determined.
     """
@@ -264,7 +272,9 @@ def covariance_pose_set(
     """Return the pose set of a single pose, with intervals from a covariance.
 
     Args:
-        covariance: (m, m) covariance of the tree's values.
+        tree: the pose tree, with m values.
+        pose: the pose.
+        covariance: (m, m) covariance of the tree's values [rad or m].
         image_count: number of images from which the sizes of errors were estimated; it sets the
             degrees of freedom of Student's distribution.
     """
@@ -293,7 +303,9 @@ class RobustModes:
     other values fitted, until the increase of the cost is significant (profile likelihood).
 
     Args:
+        fit: the robust fit to the match's views.
         proceed: returns whether there is time left.
+        settings: parameters of modes and intervals; None: the defaults.
     """
 
     def __init__(
@@ -309,7 +321,7 @@ class RobustModes:
 
         Args:
             poses: fitted poses; the first is the answer and the representative of the first mode.
-            J: returns the objective (1) at values (m,) [pixel].
+            J: returns the objective J at values (m,) [pixel].
         """
         stage = self._settings.comparison
         costs = map_ordered(lambda pose: self._fit.tile_costs(pose.values, stage), poses)
@@ -337,7 +349,10 @@ class RobustModes:
         return describe_modes(self._kinematics, tree, modes, Js, self._tolerance, known)
 
     def _is_as_good(self, costs: np.ndarray) -> bool:
-        """Return whether costs by tiles are not significantly above those of the best pose."""
+        """Return whether costs by ``tile_costs`` are not significantly above the best pose's.
+
+        If so, the pose set's tolerance grows to their excess.
+        """
         as_good = vuong_statistic(costs, self._best_costs) <= self._settings.significance
         if as_good:
             self._tolerance = max(self._tolerance, float((costs - self._best_costs).sum()))
@@ -363,7 +378,10 @@ class RobustModes:
         return False
 
     def _add_flipped(self, modes: list[FittedPose], mode: FittedPose) -> None:
-        """Add the flipped poses of a mode that fit as well as the best, with flipped intervals."""
+        """Add the flipped poses of a mode that fit as well as the best, with flipped intervals.
+
+        They are appended to ``modes``, or added to one of these if they belong to it.
+        """
         kinematics, stage = self._kinematics, self._settings.comparison
 
         def settle(flip: Flip) -> tuple[np.ndarray, np.ndarray]:
@@ -436,8 +454,8 @@ class RobustModes:
 
         Args:
             values: (m,) the pose from which the value is moved [rad or m].
-            index: the value that is moved.
-            along: (m,) change of all values per unit of the moved one.
+            index: index of the value that is moved.
+            along: (m,) change of all values per unit of the moved one; its sign is the direction.
             width: first step [rad or m].
 
         Returns:

@@ -76,8 +76,8 @@ def match_points(
         column = int((other_uv[j, 0] - left) * per_pixel)
         cells[j] = row * columns + column
         starts[cells[j] + 1] += 1
-    for square in range(rows * columns + 1):
-        starts[square + 1] += starts[square]
+    for cell in range(rows * columns + 1):
+        starts[cell + 1] += starts[cell]
     order, sorted_others = np.empty(len(other_uv), dtype=np.int64), np.empty((len(other_uv), 4))
     for j in range(len(other_uv) - 1, -1, -1):
         # The end index of a cell is decremented down to its start index.

@@ -100,7 +100,7 @@ class LinearPrior:
     mean: Array
     information: Array
 
-    def add_to(self, equations: Equations, own: Array) -> Equations:
+    def augment(self, equations: Equations, own: Array) -> Equations:
         """Return equations with the prior's gradient and cost added; H stays, see ``curvature``.
 
         Args:
@@ -143,7 +143,7 @@ def minimise(
 
     def evaluated(own: Array, shared: Array, stage: AnnealingStage) -> Equations:
         found = evaluate(own, shared, stage)
-        return found if coupling is None else coupling.add_to(found, own)
+        return found if coupling is None else coupling.augment(found, own)
 
     lower, upper = limits
     p = own.shape[1]

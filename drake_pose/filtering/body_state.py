@@ -41,7 +41,9 @@ _ROOT = (*ROOT_SHIFT, LOG_SCALE)
 
 
 class BodyState:
-    """The free values of a pose tree as a filter's state, with the cameras that observe them.
+    """The free values of a pose tree as a filter's state x (n,), with cameras that observe them.
+
+    A state holds the free values [rad or m], root shift and log scale, then the rates of all these.
 
     Args:
         root_moves: whether the root's position in the world is part of the state.
@@ -102,6 +104,7 @@ class BodyState:
         )
 
     def _joint_prior(self) -> JointPrior:
+        """Return ``prior``."""
         kinematics = self._kinematics
         lower, upper = kinematics.lower, kinematics.upper
         limited = kinematics.is_angle & ~kinematics.covers_full_turn & (lower < upper)
@@ -200,11 +203,11 @@ class BodyState:
         return self.tree.positions_from(values)
 
     def state(self, q: Array, X_WB: Array | None = None, scale: float = 1.0) -> Array:
-        """Return a state (n,) at rest.
+        """Return the state (n,) at rest of a pose of the plant.
 
         Args:
             q: (nq,) plant positions.
-            X_WB: (4, 4) pose of the plant's world; None: identity.
+            X_WB: (4, 4) pose of the plant's world in the world; None: identity.
             scale: image scale relative to the camera's.
         """
         values = self._kinematics.flatten(self.tree.values_from_positions(q, X_WB))
@@ -220,10 +223,10 @@ class BodyState:
         return self.state_of(np.r_[values, root])
 
     def turned(self, x: Array, rotation: Array) -> Array:
-        """Return the state (n,) with the root rotated about its own origin.
+        """Return the state x (n,) with the root rotated about its own origin.
 
         Args:
-            rotation: (3, 3) in the world.
+            rotation: (3, 3) rotation matrix, applied in the world frame.
 
         Raises:
             SettingsError: the tree's root does not turn freely.
@@ -244,7 +247,7 @@ class BodyState:
         return float(np.sum((off / self.prior.deviation) ** 2))
 
     def unwrapped(self, x: Array, last: Array) -> Array:
-        """Return the state (n,) with its periodic angles in the turns nearest to ``last`` (n,)."""
+        """Return the state x (n,) with periodic angles in the turns nearest to ``last`` (n,)."""
         values = self._split(x)[0]
         turns = self._kinematics.nearest_turns(values, self._split(last)[0]) - values
         turned = x.copy()
@@ -252,10 +255,10 @@ class BodyState:
         return turned
 
     def difference(self, x: Array, views: Iterable[tuple[Camera, Mask]]) -> tuple[int, int]:
-        """Compare the silhouettes of the body at a state with masks.
+        """Compare the silhouettes of the body at a state x (n,) with masks.
 
         Args:
-            views: cameras and masks (H, W).
+            views: pairs of a camera and its mask (H, W).
 
         Returns:
             The number of pixels that differ, and the number of mask pixels, over all masks.
@@ -267,7 +270,7 @@ class BodyState:
         return wrong, area
 
     def draw(self, x: Array, camera: Camera) -> Mask:
-        """Return the silhouette (H, W) of the body at a state (n,) in a camera."""
+        """Return the silhouette (H, W) of the body at a state x (n,) in a camera's image."""
         X_WN = self._body.place(self.parameters(x)).X_WN
         # A band of skin bends by a fraction of an angle, so that full turns would change it.
         values = self._kinematics.within_limits(self._split(x)[0])

@@ -78,8 +78,8 @@ class ContourEvidence(NamedTuple):
     """The evidence of a frame.
 
     Attributes:
-        views: edges of the masks.
-        pictures: by camera, the picture if there is no mask, else None.
+        views: the cameras, and the edge points of their masks.
+        pictures: for each camera, the picture if there is no mask, else None.
         colours: colour histograms of the body before this frame; None: pictures are not used.
     """
 
@@ -117,7 +117,10 @@ class ContourMeasurement(LinearObservation):
 
 
 class ContourObservation(BodyState):
-    """Turns masks and pictures into measurements of a pose tree's state."""
+    """Turns masks and pictures into measurements of a pose tree's state.
+
+    Colour histograms are arrays (cameras, nodes, 3, colours), see ``fit.colours``.
+    """
 
     def gather_evidence(
         self,
@@ -128,8 +131,9 @@ class ContourObservation(BodyState):
         """Return the evidence of a frame; edge points are found once for all its measurements.
 
         Args:
-            masks: by camera (H, W) or None, in the order of ``cameras``.
-            pictures: by camera (H, W, 3 or 4) or None; used for cameras without a mask.
+            masks: for each of ``cameras`` (H, W) or None.
+            pictures: for each camera (H, W, 3 or 4) or None; used for cameras without a mask. None:
+                no pictures.
             colours: colour histograms of the body; None: pictures are not used.
 
         Raises:
@@ -153,7 +157,10 @@ class ContourObservation(BodyState):
         return ContourEvidence(pack_views(self.cameras, edges), tuple(compared), colours)
 
     def is_finest(self, iteration: int) -> bool:
-        """Return whether search lines in pictures reach their finest spacing at this iteration."""
+        """Return whether search lines in pictures have their finest spacing at this iteration.
+
+        ``iteration``: number of measurements of the frame made before.
+        """
         return search_line_step(iteration) == search_line_step(iteration + 9)
 
     def uninformed_histograms(self) -> Floats:
@@ -171,11 +178,11 @@ class ContourObservation(BodyState):
         """Return the body's colour histograms updated by a frame.
 
         Args:
-            pictures: by camera (H, W, 3 or 4) or None.
+            pictures: for each camera (H, W, 3 or 4) or None.
             x: (n,) the state in this frame.
             colours: the histograms before this frame.
-            pose_is_known: whether the state is certain, so that the old ones are discarded.
-            excluded_parts: (nodes,) parts whose histograms are kept.
+            pose_is_known: whether the state is certain, so that the old histograms are discarded.
+            excluded_parts: (nodes,) parts whose histograms stay unchanged; None: none.
 
         Raises:
             SettingsError: a picture does not fit its camera.
@@ -201,11 +208,13 @@ class ContourObservation(BodyState):
         """Compare the model's contour at a state with a frame.
 
         Args:
+            evidence: the frame.
+            x: (n,) the state.
             distance: root mean square distance found by the previous measurement [pixel]; None:
                 edges are searched in the whole reach.
             iteration: number of measurements of this frame made before; search lines in pictures
                 become finer with it.
-            excluded_parts: (nodes,) parts that are not measured in pictures.
+            excluded_parts: (nodes,) parts that are not measured in pictures; None: none.
 
         Returns:
             The measurement; None if no edge is near the contour in any mask or picture.
@@ -225,7 +234,16 @@ class ContourObservation(BodyState):
     def _compare(
         self, evidence: ContourEvidence, x: Array, width: float, iteration: int
     ) -> tuple[Comparison, float] | None:
-        """Compare the contours with a robust scale [pixel]; also return their distance [pixel]."""
+        """Compare the contours of the body at a state x (n,) with a frame.
+
+        Args:
+            width: scale of the robust cost [pixel].
+            iteration: number of measurements of this frame made before.
+
+        Returns:
+            The comparison, and the weighted root mean square distance [pixel]; None: no edge is
+            near the contour.
+        """
         step = AnnealingStage(width, CONTOUR.spacing)
         placed = self._body.place(self.parameters(x))
         weights = camera_weights(evidence.views.cameras, placed, step, _PLAIN, 1.0)
@@ -246,7 +264,14 @@ class ContourObservation(BodyState):
     def _compress(
         self, x: Array, compared: Comparison, distance: float, parts: Array
     ) -> ContourMeasurement:
-        """Return the contours' information as at most n independent measurements of variance 1."""
+        """Return a comparison at a state as at most n independent measurements of variance 1.
+
+        Args:
+            x: (n,) the state.
+            compared: the comparison of the contours there.
+            distance: root mean square distance of the contours [pixel].
+            parts: ``ContourMeasurement.part_distances``.
+        """
         H, g = normal_equations(compared, len(self._body.names))
         index = self._parameter_index
         scale = max(CONTOUR.deviation, distance)
@@ -281,6 +306,7 @@ class ContourObservation(BodyState):
         Errors of surfaces, masks and cameras are correlated, see ``fit.covariance``.
 
         Args:
+            measured: the measurement.
             area: total area of all silhouettes [pixel].
         """
         unit = error_unit(math.sqrt(area / len(self.cameras)))
@@ -363,8 +389,10 @@ class Track:
     """The state of a ``ContourTracker`` after a frame.
 
     Attributes:
-        measurement: of the contour at the final state; None if the frame had no evidence.
-        lost: whether the contour is too far from the edges, or that of a part in pictures.
+        state: belief of the pose tree's state.
+        measurement: of the contour at the final state; None: no edge was near the contour.
+        lost: whether the contour is too far from the edges, or that of a part in pictures, or no
+            edge was near it in a frame with evidence. A frame without evidence keeps the value.
         colours: colour histograms of the body; None before the first picture.
     """
 
@@ -378,7 +406,9 @@ class ContourTracker:
     """Tracks a pose tree's state from frame to frame, inside its limits.
 
     Args:
+        observation: the body and the cameras.
         period: time between two frames [s].
+        settings: None: TrackingSettings().
 
     Raises:
         SettingsError: the period is not positive.
@@ -420,17 +450,17 @@ class ContourTracker:
         )
 
     def _of_kind(self, name: str, log_scale: float, angle: float, length: float) -> float:
-        """Return the one of three numbers that applies to a moving element."""
+        """Return ``log_scale``, ``angle`` or ``length``, whichever the element ``name`` is."""
         if name == LOG_SCALE:
             return log_scale
         return angle if self.observation.is_angle(name) else length
 
     def start(self, x: Array) -> Track:
-        """Return the track that starts at a state (n,), with the settings' uncertainty."""
+        """Return the track that starts at a state x (n,), with the settings' uncertainty."""
         return Track(self.filter.start(self.start_belief(x)), None, False)
 
     def start_belief(self, x: Array) -> Belief:
-        """Return the initial belief about a state (n,), before limits and measurements."""
+        """Return the initial belief with mean x (n,), before limits and measurements."""
         layout, settings = self.observation.layout, self.settings
         starts = (settings.start_log_scale, settings.start_angle, settings.start_length)
         # Standard deviation of a rate [unit/step] that accelerates during ``memory``.
@@ -452,11 +482,13 @@ class ContourTracker:
         """Return the track after the next frame.
 
         Args:
-            masks: by camera (H, W) or None, in the order of the cameras.
-            first: whether this is the frame that the start was made for, without prediction.
+            track: after the last frame, or ``start``.
+            masks: for each camera (H, W) or None.
+            first: whether ``track`` was started in this very frame, so that it is not predicted.
             root_position: (3,) known position of the root in the world [m]; None: as in the tree.
-            pictures: by camera (H, W, 3 or 4) or None. The colours along the contour are used for
-                cameras without a mask; they are learned from each frame, at first at the start.
+            pictures: for each camera (H, W, 3 or 4) or None; None: no pictures. The colours along
+                the contour are used for cameras without a mask; they are learned from each frame,
+                at first at the start.
 
         Raises:
             SettingsError: the number or size of masks or pictures does not fit the cameras.
@@ -489,7 +521,10 @@ class ContourTracker:
     def _fit(
         self, observation: ContourObservation, evidence: ContourEvidence, prediction: FilterState
     ) -> tuple[FilterState, ContourMeasurement | None]:
-        """Return a frame's state and the measurement there; None if no edge is near the contour."""
+        """Return a frame's state and the measurement there; None if no edge is near the contour.
+
+        ``prediction``: the state before the frame's evidence is used.
+        """
         moving, state = len(observation.layout.moving), prediction
         measurement = observation.measure(evidence, state.best.mean)
         rounds = self.settings.rounds
@@ -530,10 +565,11 @@ class ContourTracker:
         measurement: ContourMeasurement,
         lost_parts: Mask,
     ) -> FilterState:
-        """Return the state with the uncertainty it has without the lost parts' measurements.
+        """Return ``state`` with the uncertainty it has without the lost parts' measurements.
 
-        The shift that lost parts cause is added to the covariance. If more than half of the parts
-        are lost, return the prediction: their search lines are unreliable.
+        ``state`` and ``measurement`` are those of ``_fit`` from ``prediction``; ``lost_parts`` is
+        (nodes,). The shift that lost parts cause is added to the covariance. If more than half of
+        the parts are lost, return the prediction: their search lines are unreliable.
         """
         found, remaining = state.best.mean, None
         if 2 * np.count_nonzero(lost_parts) > len(lost_parts):

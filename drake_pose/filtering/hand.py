@@ -48,6 +48,7 @@ class HandObservation:
         shortest: segments shorter in the image have no line [pixel].
         scale_deviation: standard deviation of a known scale.
         prior_frames: number of frames in which the joints' prior counts as one measurement.
+        hand: the hand's fingers and palm.
 
     Raises:
         SettingsError: a number is not positive.
@@ -115,14 +116,17 @@ class HandObservation:
         return np.asarray(self._project(x)[2][:, :2])
 
     def _project(self, x: Array) -> tuple[Array, Array, Array, Array]:
+        """Return ``project_hand`` of a state x (n,)."""
         hand = self.hand
         return project_hand(x[hand.visible], hand.chains, self.pixels_per_metre, self.shortest)
 
     def mirrors(self, belief: Belief) -> list[Array]:
-        """Return states (n,) with one joint mirrored at the image plane, where (30) holds.
+        """Return states (n,), each the belief's mean with one joint mirrored at the image plane.
 
         A segment that points slightly towards the camera looks like one that points as much away
-        from it. Only the angle at the segment's root changes.
+        from it. Only the angle at the segment's root changes. A joint is mirrored if its rotation
+        moves the segment's end mostly in depth (``mirror_slope``) and the change is between
+        ``smallest_change`` and ``mirror_reach``.
         """
         hand, x, found = self.hand, belief.mean, []
         _, _, points, J = self._project(x)
@@ -149,7 +153,7 @@ def plant_positions(
 
     Args:
         x: (n,) the state. Its quaternion is normalised.
-        names: (nq) the plant's positions.
+        names: (nq) names of the plant's positions.
         pixels_per_metre: of the image at scale 1.
         distance: None: the palm's position is the wrist's image point at scale 1 and depth 0.
             Otherwise the distance of a pinhole camera on the z axis [m], in whose image the hand
@@ -184,7 +188,11 @@ def scaled_rotation(q: Array) -> tuple[Array, Array]:
 def _place_finger(x: Array, chains: Chains, finger: int, p: Array, dp: Array) -> None:
     """Compute a finger's base and segment ends p (k, 3) and derivatives dp (k, 3, n): (9), (10).
 
-    p and dp are written in place, in the palm's frame.
+    p and dp are written in place, in the palm's frame. dp must be 0 before.
+
+    Args:
+        x: (n,) as for ``project_hand``.
+        finger: index of the finger.
     """
     first, last = chains.firsts[finger], chains.firsts[finger + 1]
     R, origin, point = np.eye(3), np.zeros(3), 0
@@ -230,7 +238,12 @@ def _place_finger(x: Array, chains: Chains, finger: int, p: Array, dp: Array) ->
 
 @compiled
 def _palm_ends(M: Array, chains: Chains, sizes: Array) -> Array:
-    """Return the ends (8, 3) of PALM_EDGES, the palm's outer edges, as fractions of its sizes."""
+    """Return the ends (8, 3) of the four PALM_EDGES in the image, two each, as fractions of sizes.
+
+    Args:
+        M: (3, 3) ``|q|^2 R(q)`` of the palm.
+        sizes: (3,) height, thickness and width of the palm [m].
+    """
     ends = np.zeros((8, 3))
     x, y = M[0, 0], M[1, 0]
     # Across the palm's axis in the image. The left edge is on the side of positive z.
@@ -267,6 +280,7 @@ def project_hand(
 
     Args:
         x: (n,) the visible part of the state, in the order of ``HandModel.visible``.
+        chains: the hand.
         scale: pixels per metre for a quaternion of norm 1.
         shortest: lines shorter in the image are NaN [pixel].
 

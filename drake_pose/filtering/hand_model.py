@@ -35,8 +35,8 @@ class Chains(NamedTuple):
 
     Attributes:
         firsts: (F + 1,) index of each finger's first step.
-        kinds, elements: (S,) of all steps.
-        vectors: (S, 3) of all steps.
+        kinds, elements: (S,) kind and element of each ``Step``, finger by finger.
+        vectors: (S, 3) vector of each ``Step``.
         rings, rows: see ``HandModel``.
         palm: (3,) elements of the palm's height, thickness and width.
         lines: (L, 2) indices of the points that are the lines' ends.
@@ -72,15 +72,15 @@ class HandModel:
 
     Args:
         fingers: (F) names.
-        steps: of each finger, from the palm's origin to the centre of the fingertip.
-        radii: (F, J + 1) of the fingers at bases, joints and tips [m].
+        steps: steps of each finger, from the palm's origin to the centre of the fingertip.
+        radii: (F, J + 1) radii of the fingers at base, joints and tip [m].
         rings: (2, K, 3) outlines of the palm at the wrist and at the fingers, as fractions of its
             height, thickness and width along x, y and z. The palm is their convex hull.
         rows: (2, R, 2, 3) end points of candidates for its far and its near edge, as such
             fractions.
         sizes: lengths and sizes of the palm in the model's file [m].
         hidden: names among ``measured`` that silhouettes do not show.
-        prior: of the joints, over ``angles``; None: there is none.
+        prior: prior of the joints, over ``angles``; None: there is none.
     """
 
     fingers: tuple[str, ...]
@@ -205,7 +205,10 @@ TWO_FINGERS = _two_fingers()
 
 
 def palm_rotation(R_CL: Array) -> Array:
-    """Return R_CP (3, 3) of the palm's frame from R_CL of its link in a model for ``read_hand``."""
+    """Return the rotation R_CP (3, 3) of the palm's frame in a camera.
+
+    ``R_CL``: (3, 3) rotation of the palm's link L, of a model for ``read_hand``, in the camera.
+    """
     return np.asarray(R_CL @ _FROM_LINK.T)
 
 
@@ -277,7 +280,8 @@ def _read_finger(
     """Return a finger's steps and radii [m], and add its lengths to ``sizes``.
 
     Args:
-        chain: joints of the finger.
+        model: the hand.
+        chain: joints of the finger, from the palm outwards.
         frames: by joint, origin (3,) and rotation (3, 3) of its parent frame in the palm's link.
         size: (3,) height, thickness and width of the palm [m].
         sizes: receives the lengths [m].
@@ -307,12 +311,12 @@ def _read_finger(
 
 
 def _radius(model: ArticulatedModel, link: str, low: float, high: float) -> float:
-    """Return half of a link's extent along its x axis for low <= y <= high [m]."""
+    """Return half of the extent [m] along x of a link's vertices with low <= y <= high [m]."""
     return 0.5 * float(np.ptp(_band(model, link, low, high)[:, 0]))
 
 
 def _band(model: ArticulatedModel, link: str, low: float, high: float) -> Array:
-    """Return the vertices (n, 3) of a link with low <= y <= high [m].
+    """Return the vertices (n, 3) of a link's mesh with low <= y <= high in its frame [m].
 
     Raises:
         ModelError: there is none.
@@ -336,11 +340,12 @@ def _palm_rings(
     wrist: float = 0.07,
     knuckles: tuple[float, float, float] = (0.78, 0.84, 0.85),
 ) -> Array:
-    """Return a palm's outlines (2, count, 3) at the wrist and before the knuckles [m].
+    """Return a palm's outlines (2, count, 3) [m] at wrist and knuckles, in the palm's frame.
 
     Args:
+        model: the hand.
         palm: name of the palm's link.
-        height: of the palm [m].
+        height: height of the palm [m].
         count: number of points of an outline.
         wrist: the wrist's outline is that of the vertices up to this height.
         knuckles: the other outline is that of the vertices between the first two heights, placed at

@@ -74,8 +74,8 @@ class RoughBody(NamedTuple):
         ends: (L, 2, 2) start and end of each segment's axis, or of a palm edge.
         widths: (L,) half the width of a segment; 0 for a palm edge.
         sides: (L, 2) whether a side may be visible: that of the normal (-y, x), and the other.
-        tips: (T,) lines that end in a round tip of their width.
-        drawn: (H, W) the silhouette.
+        tips: (T,) indices of the segments that end in a round tip of their width.
+        drawn: (H, W) the silhouette; 0 outside.
     """
 
     ends: Array
@@ -86,14 +86,14 @@ class RoughBody(NamedTuple):
 
 
 class Axes(NamedTuple):
-    """Measured lines and tips, NaN where not visible.
+    """Measured lines and tips, NaN where not visible, in the order of ``RoughBody``.
 
     Attributes:
         lines: (L, 2) alpha, the angle from start to end [rad], and rho [pixel]; a line's points (u,
             v) satisfy rho = v cos(alpha) - u sin(alpha).
-        line_covariances: (L, 2, 2).
-        tips: (T, 2) [pixel].
-        tip_covariances: (T, 2, 2).
+        line_covariances: (L, 2, 2) covariances of alpha and rho.
+        tips: (T, 2) centres of the tips [pixel].
+        tip_covariances: (T, 2, 2) [pixel^2].
     """
 
     lines: Array
@@ -108,6 +108,7 @@ def match_axes(
     """Return the segments' axes and tips that a silhouette's edge shows, from both sides or one.
 
     Args:
+        edge: edge points of the silhouette.
         rough: image of a rough pose.
         gate: largest distance between an edge point and a rough side [pixel].
         origin: (2,) image point that is (0, 0) for lines and tips [pixel].
@@ -146,11 +147,18 @@ def match_axes(
 def _match(
     edge: EdgePoints, rough: RoughBody, gate: float, along: Array, normal: Array, size: Array
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array, Array]:
-    """Assign each edge point to the nearest visible side or tip within the gate.
+    """Assign each edge point to the nearest visible side or tip within the gate [pixel].
+
+    Args:
+        edge: edge points of the silhouette.
+        rough: image of a rough pose with L lines.
+        along, normal: (L, 2) unit vectors along each line and across it.
+        size: (L,) length of each line [pixel].
 
     Returns:
-        For the n assigned points: feature (n,), side (n,), slope (n, 2), offset (n,) and weight
-            (n,), where offset = slope @ (the two unknowns of the feature). A line's unknowns are
+        For the n assigned points: feature (n,), the index of a line, or L plus that of a tip; side
+            (n,), 0 or 1 as in ``RoughBody.sides``; slope (n, 2), offset (n,) and weight (n,), where
+            offset = slope @ (the two unknowns of the feature). A line's unknowns are
             its shift along the normal [pixel] and the tangent of its rotation, a tip's are its
             displacement [pixel].
     """
@@ -198,7 +206,10 @@ def _match(
 
 
 def _is_empty(drawn: NDArray[np.uint8] | Mask, uv: Array) -> Mask:
-    """Return whether an image is 0 at points (..., 2), clipped to the image."""
+    """Return (...,) bool, whether an image (H, W) is 0 at points uv (..., 2) [pixel].
+
+    Points outside the image are moved to its border.
+    """
     size = (drawn.shape[1] - 1, drawn.shape[0] - 1)
     u, v = np.moveaxis(np.clip(np.rint(uv).astype(np.intp), 0, size), -1, 0)
     return np.asarray(drawn[v, u] == 0)
@@ -216,9 +227,9 @@ def _solve(
     """Fit each feature's two unknowns by iteratively reweighted least squares.
 
     Args:
-        f, side: (n,) feature and side of each point.
-        g, e: (n, 2) slope and (n,) offset of each point.
-        weight: (n,) of each point.
+        f, side: (n,) feature and side of each point, see ``_match``.
+        g, e: (n, 2) slope and (n,) offset of each point, see ``_match``.
+        weight: (n,) weight of each point.
         count: number F of features.
         gate: initial scale of the Geman-McClure weight [pixel].
 
@@ -227,6 +238,7 @@ def _solve(
     """
 
     def total(values: Array) -> Array:
+        """Return the sums (F,) over each feature's points of values (n,)."""
         return np.asarray(np.bincount(f, values, count), dtype=np.float64)
 
     solution = np.zeros((count, 2))
@@ -329,7 +341,7 @@ class HandSilhouette:
     unmatched: float = 0.25
 
     def draw(self, x: Array, zoom: float = 1.0) -> NDArray[np.uint8]:
-        """Return the silhouette (zoom H, zoom W) of the hand at a state (n,): 1 inside, else 0.
+        """Return the silhouette (zoom H, zoom W) of the hand at a state x (n,): 1 inside, else 0.
 
         The palm is a convex hull, fingers are rods with round ends.
         """
@@ -354,8 +366,9 @@ class HandSilhouette:
         """Measure lines and tips in a silhouette, near a prediction.
 
         Args:
-            mask: (H, W).
-            scale: known image scale; None: unknown.
+            mask: (H, W) the hand's silhouette.
+            prediction: belief of the state before the measurement.
+            scale: known image scale, the squared norm of the quaternion; None: unknown.
 
         Raises:
             MaskError: the mask has another size.
@@ -381,7 +394,10 @@ class HandSilhouette:
         return found
 
     def _outline(self, x: Array) -> tuple[Array, Array, Array]:
-        """Return palm (2 K, 2), points (p, 2) and fingers' radii (F, J + 1) in the image."""
+        """Return palm (2 K, 2), points (p, 2) and fingers' radii (F, J + 1) in the image [pixel].
+
+        ``x``: (n,) the state. The points are those of ``HandObservation.drawing``.
+        """
         observation, hand = self._observation, self._hand
         width, height, thickness = x[hand.layout.indices(PALM)]
         quaternion, center = x[hand.layout.indices(QUATERNION)], np.array(self.center)
@@ -393,10 +409,12 @@ class HandSilhouette:
 
     @property
     def _hand(self) -> HandModel:
+        """The hand's fingers and palm."""
         return self._observation.hand
 
     @property
     def _observation(self) -> HandObservation:
+        """The filter's observation."""
         observation = self.belief_filter.observation
         assert isinstance(observation, HandObservation)
         return observation
@@ -411,6 +429,7 @@ class HandSilhouette:
         )
 
     def _rough(self, x: Array) -> RoughBody:
+        """Return the image of the hand at a state x (n,)."""
         palm, points, radii = self._outline(x)
         ends = points[self._hand.line_ends]
         count = len(self._hand.lengths)
@@ -431,7 +450,16 @@ class HandSilhouette:
         gates: Sequence[float],
         scale: float | None,
     ) -> HandMeasurement:
-        """Measure near a rough state (n,), which each gate's measurements correct."""
+        """Measure near a rough state x (n,), which the measurements of each gate correct.
+
+        Args:
+            mask: (H, W) the silhouette.
+            edge: its edge points.
+            prediction: belief of the state before the measurement.
+            gates: largest distance between edge points and the rough body, by iteration [pixel at
+                ``reference_radius``].
+            scale: as for ``measure``.
+        """
         observation, names = self._observation, self._observation.names
         at, prior = names.index("scale"), self._hand.prior
         lines = slice(at - 2 * len(self._hand.line_ends), at)
@@ -458,7 +486,11 @@ class HandSilhouette:
     def _add_hidden_points(
         self, x: Array, mask: Mask, edge: EdgePoints, y: Array, R: Array
     ) -> None:
-        """Add measurements to y and R that keep hidden joints and tips inside the silhouette."""
+        """Add measurements to y (m,) and R (m, m) that keep hidden joints inside the silhouette.
+
+        Joints and tips of the hand at x (n,) that are outside the mask and not measured yet are
+        measured inside its nearest edge point.
+        """
         _, points, radii = self._outline(x)
         for k, (point, radius) in enumerate(zip(points, radii.ravel(), strict=False)):
             rows = slice(2 + 2 * k, 4 + 2 * k)
@@ -475,7 +507,10 @@ class HandSilhouette:
             R[rows, rows] = radius**2 * along
 
     def _search(self, mask: Mask, prediction: Belief, seed: int) -> Array:
-        """Return poses (k, n) near a prediction with the best silhouettes: cross-entropy search."""
+        """Return states (k, n) near a prediction with the best silhouettes: cross-entropy search.
+
+        ``mask``: (H, W). ``seed``: seed of the random numbers.
+        """
         size = (round(SEARCH.zoom * self.width), round(SEARCH.zoom * self.height))
         small = cv2.resize(mask.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
         generator, mean = np.random.default_rng(seed), prediction.mean

@@ -26,8 +26,9 @@ class Inequalities:
     """Inequalities phi_k^T x <= b_k, k = 1 ... K: (18).
 
     Attributes:
+        columns: (n) names of the elements of x.
         rows: (K) text of each inequality, for messages and logs.
-        phi: (K, n), read-only.
+        phi: (K, n) coefficients, read-only.
         b: (K,) bounds, read-only.
     """
 
@@ -76,7 +77,13 @@ class Inequalities:
 def make_inequalities(
     columns: Sequence[str], rows: Sequence[str], phi: ArrayLike, b: ArrayLike
 ) -> Inequalities:
-    """Return checked inequalities from columns (n), row texts (K), phi (K, n) and bounds (K,).
+    """Return checked inequalities phi x <= b.
+
+    Args:
+        columns: (n) names of the elements of x.
+        rows: (K) text of each inequality, for messages.
+        phi: (K, n) coefficients.
+        b: (K,) bounds.
 
     Raises:
         SettingsError: the sizes do not fit, a number is not finite, or a row of phi is zero.
@@ -107,7 +114,9 @@ def two_sided(
     """Return lower <= phi^T x <= upper as two inequalities; infinite bounds are left out.
 
     Args:
-        name: begins the text of the rows.
+        columns: (n) names of the elements of x.
+        name: begins the text of both inequalities.
+        phi: (n,) coefficients.
 
     Raises:
         SettingsError: lower > upper, a bound is NaN, or phi is zero.
@@ -131,7 +140,9 @@ def two_sided(
 
 
 def stack(parts: Sequence[Inequalities], columns: Sequence[str] | None = None) -> Inequalities:
-    """Return all rows of several sets, over the union of their columns or over ``columns``.
+    """Return the rows of all ``parts`` as one set of inequalities.
+
+    ``columns``: names of its elements; None: the union of the parts' columns.
 
     Raises:
         UnknownNameError: a row uses an element that is not among ``columns``.
@@ -184,7 +195,10 @@ def from_model(model: ParsedModel) -> Inequalities:
 
 
 def warn_if_unlimited(inequalities: Inequalities, where: str) -> Inequalities:
-    """Return the inequalities unchanged; warn (UserWarning) if there are none."""
+    """Return the inequalities unchanged; warn (UserWarning) if there are none.
+
+    ``where``: the model file, which begins the warning.
+    """
     if not len(inequalities):
         warnings.warn(
             f"{where}: no joint has a limit, so that nothing is truncated",
@@ -195,7 +209,12 @@ def warn_if_unlimited(inequalities: Inequalities, where: str) -> Inequalities:
 
 
 def row_from_terms(columns: Sequence[str], terms: Mapping[str, float], where: str) -> NDArray:
-    """Return the coefficients (n,) of a row from a mapping of names to coefficients.
+    """Return the coefficients (n,) of an inequality; elements without a term have 0.
+
+    Args:
+        columns: (n) names of the elements.
+        terms: coefficients by name of an element.
+        where: place in a file, for messages.
 
     Raises:
         UnknownNameError: a name is not among the columns.
@@ -305,7 +324,7 @@ class PriorRow:
 
 @dataclass
 class Couplings:
-    """The schema of a couplings file."""
+    """The schema of a couplings file; ``load_couplings`` and ``load_joint_prior`` describe it."""
 
     differences: list[Difference] = field(default_factory=list)
     rows: list[GeneralRow] = field(default_factory=list)
@@ -314,7 +333,12 @@ class Couplings:
 
 @dataclass(frozen=True, eq=False)
 class JointPrior:
-    """A normal prior of a state x: phi (k, n) x has mean (k,) and standard deviation (k,)."""
+    """A normal prior of a state x: phi x is normally distributed, with independent components.
+
+    Attributes:
+        phi: (k, n) coefficients.
+        mean, deviation: (k,) mean and standard deviation of phi x.
+    """
 
     phi: Array
     mean: Array
@@ -333,7 +357,8 @@ def load_couplings(path: Path | str, columns: Sequence[str]) -> Inequalities:
           - {name: curl, terms: {flexion_11: 1, flexion_12: 1}, upper: 150, unit: deg}
 
     Args:
-        columns: (n) names of the state's elements.
+        path: the couplings file.
+        columns: (n) names of the elements that the inequalities are over.
 
     Raises:
         ModelError: the file cannot be read or an entry is invalid.
@@ -358,7 +383,15 @@ def load_couplings(path: Path | str, columns: Sequence[str]) -> Inequalities:
 
 
 def _difference(one: Difference, file: str) -> tuple[str, GeneralRow]:
-    """Return the place of a difference for messages, and the difference as a general row."""
+    """Return the place of a difference for messages, and the difference as a general row.
+
+    Args:
+        one: the entry of ``differences``.
+        file: begins the place: the file and ": ".
+
+    Raises:
+        ModelError: both joints are the same, or ``within`` is given with ``lower`` or ``upper``.
+    """
     name = f"{one.first} - {one.second}"
     where = f"{file}'{name}'"
     if one.first == one.second:
@@ -379,7 +412,7 @@ def load_joint_prior(path: Path | str, columns: Sequence[str]) -> JointPrior:
         usual:
           - {name: knuckle, terms: {flexion_11: 1}, mean: 30, deviation: 25, unit: deg}
 
-    Entries that use other elements than ``columns`` are skipped.
+    Entries that use other elements than ``columns`` (n) are skipped.
 
     Raises:
         ModelError: the file cannot be read or an entry is invalid.
@@ -423,6 +456,7 @@ def model_inequalities(model: ParsedModel) -> Inequalities:
 
 
 def _read(file: Path, largest: int = 1 << 20) -> Couplings:
+    """Read a couplings file of at most ``largest`` bytes; ModelError if that fails."""
     try:
         if file.stat().st_size > largest:
             raise ModelError(f"{file}: larger than {largest} bytes, so not a couplings file")
@@ -438,6 +472,7 @@ def _read(file: Path, largest: int = 1 << 20) -> Couplings:
 
 
 def _unit(unit: str, where: str) -> float:
+    """Return the factor from a unit to rad or m; ModelError, which begins with ``where``."""
     if unit not in _UNITS:
         known = ", ".join(key for key in _UNITS if key)
         raise ModelError(f"{where}: unit '{unit}' is unknown; use one of {known}")

@@ -23,10 +23,13 @@ FunctionWithJacobian = Callable[[Array], tuple[Array, Array]]
 
 
 class Linear(NamedTuple):
-    """A linearised function: value (m,) + slope (m, n) (x - at (n,)) + remainder.
+    """A linearised function: value + slope (x - at), with an error of covariance ``remainder``.
 
-    ``remainder`` is the covariance (m, m) of the linearisation error; None where it is not
-    estimated.
+    Attributes:
+        at: (n,) point of linearisation.
+        value: (m,) value there.
+        slope: (m, n) derivative, or slope over a belief.
+        remainder: (m, m) covariance of the linearisation error; None: not estimated.
     """
 
     at: Array
@@ -36,14 +39,21 @@ class Linear(NamedTuple):
 
 
 def wrapped_difference(values: Array, expected: Array, is_angle: Mask) -> Array:
-    """Return values - expected; components that are angles [rad] are wrapped to [-pi, pi)."""
+    """Return values (..., m) - expected (..., m), angles wrapped to [-pi, pi).
+
+    ``is_angle``: (m,) which components are angles [rad].
+    """
     residual = values - expected
     residual[..., is_angle] = np.remainder(residual[..., is_angle] + np.pi, 2 * np.pi) - np.pi
     return residual
 
 
 def function_without_jacobian(model: object) -> Function | None:
-    """Return a model's plain function if its Jacobian is numerical; None otherwise."""
+    """Return the attribute ``function`` of a model without a Jacobian of its own; else None.
+
+    ``model``: an ``ObservationModel`` or ``MotionModel``. Models that have ``function`` and
+    ``jacobian = None``, such as ``FunctionMotion``, differentiate numerically.
+    """
     function: Function | None = getattr(model, "function", None)
     return function if getattr(model, "jacobian", model) is None else None
 
@@ -60,8 +70,8 @@ def linearise_over(
         function: maps x (n,) to values (m,) and their Jacobian (m, n).
         belief: over which to linearise.
         is_angle: (m,) which values are angles [rad].
-        values: the function without its Jacobian, if that is expensive. Its values at n (n - 1) / 2
-            more points then replace the Jacobians at the sigma points.
+        values: the function without its Jacobian, if that is expensive: its values at n (n - 1) / 2
+            more points then replace the Jacobians at the sigma points. None: use the Jacobians.
     """
     distance, root, n = np.sqrt(3.0), belief.root, len(belief.mean)
     value, tangent = function(belief.mean)

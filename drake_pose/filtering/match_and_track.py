@@ -33,6 +33,7 @@ class TrackerState:
     """The state of ``MatchAndTrack`` after a frame.
 
     Attributes:
+        track: the contour track; None before the first pose.
         reference: E_total after the last match; a track with a much larger one is lost.
         matches: number of searches so far.
         unexplained: number of consecutive frames, up to this one, that no pose explains; the track
@@ -54,6 +55,7 @@ def make_tracker(
     """Return a tracker of a pose tree's contour.
 
     Args:
+        cameras: the cameras whose masks or pictures are given in each frame.
         period: time between two frames [s].
 
     Raises:
@@ -69,10 +71,15 @@ def make_tracker(
 
 @dataclass(frozen=True, eq=False)
 class _GivenFrame:
-    """The evidence of a frame, by camera.
+    """The evidence of a frame.
 
-    ``root_position`` (3,) is the root's known position [m], ``begin`` the time at which the
-    processing of the frame started [s].
+    Attributes:
+        views: the cameras that have a mask, with it; for the search.
+        root_position: (3,) the root's known position in the world [m]; None: as in the tree.
+        observation: the body with its root there.
+        masks: for each camera (H, W) or None.
+        pictures: for each camera (H, W, 3 or 4) or None; None: no pictures.
+        begin: time at which the processing of the frame started [s].
     """
 
     views: Sequence[View]
@@ -97,8 +104,10 @@ class MatchAndTrack:
     did, or after ``TrackingSettings.patience``.
 
     Args:
-        search: used in the first frame and when the track is lost.
+        search: used in the first frame and when the track is lost; it has the pose tree.
+        cameras: all cameras of the sequence.
         period: time between two frames [s].
+        settings: None: TrackingSettings().
         search_time: time limit of a ``MultiStartSearch`` [s]; None: the search's own. A search that
             reaches it is repeated in the next frames.
 
@@ -132,10 +141,11 @@ class MatchAndTrack:
         """Process the next frame.
 
         Args:
+            last: the state after the previous frame; TrackerState() before the first.
             views: the cameras' masks; may be empty if there are pictures.
-            root_position: (3,) known position of the root [m]; None: as in the tree.
-            pictures: by camera (H, W, 3 or 4); the colours along the contour are used for cameras
-                without a mask.
+            root_position: (3,) known position of the root in the world [m]; None: as in the tree.
+            pictures: pictures (H, W, 3 or 4) by name of the camera; the colours along the contour
+                are used for cameras without a mask. None: no pictures.
             start: (nq,) approximate positions in this frame, if known; the search is then used only
                 if the masks do not fit them.
 
@@ -173,7 +183,11 @@ class MatchAndTrack:
         return self._match(last, tracked, frame, start)
 
     def with_intervals(self, state: TrackerState, pose: PoseEstimate) -> PoseEstimate:
-        """Return a tracked pose with the joints' intervals from this frame's contours alone."""
+        """Return a tracked pose with the joints' intervals from this frame's contours alone.
+
+        ``state`` and ``pose`` are what ``next`` returned for the frame. Without a measurement the
+        pose is returned unchanged.
+        """
         track = state.track
         if track is None or track.measurement is None:
             return pose
@@ -189,9 +203,14 @@ class MatchAndTrack:
         frame: _GivenFrame,
         start: Array | None,
     ) -> tuple[TrackerState, PoseEstimate]:
-        """Return the better of the tracked pose, if any, and of the search's.
+        """Return the better of the tracked pose, if any, and the search's, and the state after it.
 
-        If neither explains the masks, return the given start or the prediction.
+        If neither explains the masks, return the given start or the prediction, as not found.
+
+        Args:
+            last: the state after the previous frame.
+            tracked: the track and its pose in this frame; None: there was no track.
+            start: (nq,) approximate positions in this frame; None: unknown.
         """
         settings, last_track = self.settings, last.track
         unexplained = last.unexplained + 1
@@ -229,7 +248,12 @@ class MatchAndTrack:
     def _search_candidates(
         self, matched: PoseEstimate, last: Track | None, frame: _GivenFrame
     ) -> list[tuple[Track, PoseEstimate]]:
-        """Return the pose of a search, as it is and tracked in its frame; empty if not found."""
+        """Return the pose of a search, tracked in its frame and as it is; empty if not found.
+
+        Args:
+            matched: the search's pose.
+            last: the track before this frame, whose turns the angles take; None: there is none.
+        """
         if not matched.found:
             return []
         x = frame.observation.state(matched.q, matched.X_WB, matched.scale)
@@ -247,7 +271,10 @@ class MatchAndTrack:
     def _begin(
         self, start: Array, last: TrackerState, frame: _GivenFrame
     ) -> tuple[TrackerState, PoseEstimate]:
-        """Return a track that starts at known positions."""
+        """Return the state and pose of a track that starts at positions ``start`` (nq,).
+
+        ``last``: the state after the previous frame. The pose is not ``found`` if it is lost.
+        """
         track = self._follow(self.tracker.start(self._state(start, last, frame)), frame, True)
         result = self._result(track, frame)
         reference = result.E_total if frame.views else UNEXPLAINED
@@ -255,7 +282,7 @@ class MatchAndTrack:
         return TrackerState(track, reference, last.matches), replace(result, found=found)
 
     def _state(self, start: Array, last: TrackerState, frame: _GivenFrame) -> Array:
-        """Return the tracker's state (n,) at positions (nq,), angles in the last track's turns."""
+        """Return the state (n,) at positions ``start`` (nq,), angles in the last track's turns."""
         x = frame.observation.state(start)
         if last.track is None:
             return x
@@ -264,7 +291,11 @@ class MatchAndTrack:
     def _without_evidence(
         self, last: TrackerState, tracked: tuple[Track, PoseEstimate] | None, frame: _GivenFrame
     ) -> tuple[TrackerState, PoseEstimate]:
-        """Return the state and pose for a frame without masks, start and valid track."""
+        """Return the state and pose for a frame without masks, start and valid track.
+
+        The pose is not ``found``. It is the tracked one, or the default positions if ``tracked``
+        (track and pose in this frame) is None.
+        """
         if tracked is None:
             default = self._search.tree.model.default_positions
             nowhere = self.tracker.observation.state(default)
@@ -288,7 +319,7 @@ class MatchAndTrack:
         return self.tracker.follow(track, frame.masks, first, frame.root_position, frame.pictures)
 
     def _unwrapped(self, matched: PoseEstimate, node_values: Sequence[Array]) -> PoseEstimate:
-        """Return a pose of a search with its angles in the turns of ``node_values``."""
+        """Return a pose of a search with its angles in the turns of each node's values (k_i,)."""
         turns = [
             2.0 * np.pi * np.round((now - then) / (2.0 * np.pi))
             for now, then in zip(node_values, matched.node_values, strict=True)
@@ -298,17 +329,28 @@ class MatchAndTrack:
     def _is_lost(
         self, track: Track, result: PoseEstimate, reference: float, frame: _GivenFrame
     ) -> bool:
-        """Return whether evidence is missing, the track left the contour, or E_total is high."""
+        """Return whether evidence is missing, the track left the contour, or E_total is high.
+
+        Args:
+            track: the track after the frame.
+            result: its pose.
+            reference: E_total after the last match.
+        """
         explains = not frame.views or result.E_total <= self._limit(reference)
         return frame.has_no_evidence or track.lost or not explains
 
     @staticmethod
     def _limit(reference: float) -> float:
-        """Return the largest E_total of a pose that explains the masks, given the reference's."""
+        """Return the largest E_total of a pose that explains the masks, given ``reference``."""
         return min(1.5 * reference + 0.1, UNEXPLAINED)
 
     def _difference(self, track: Track, frame: _GivenFrame) -> tuple[float, float]:
-        """Return the area where body and evidence differ, and the body's area [pixel]."""
+        """Return the area where body and evidence differ, and the silhouettes' area [pixel].
+
+        With masks these are areas of pixels. With pictures alone the first is the length of the
+        body's contours times their distance from edges (infinite without a measurement), and the
+        second the area of the drawn body.
+        """
         observation, x = frame.observation, track.state.best.mean
         if frame.views:
             return observation.difference(x, [(view.camera, view.mask) for view in frame.views])

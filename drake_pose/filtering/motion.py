@@ -92,6 +92,7 @@ def constant_velocity(
     prediction over a given time does not depend on the period.
 
     Args:
+        layout: the elements of the state; constants do not change.
         rate_changes: by moving element, the standard deviation of the change of its rate in one
             second without decay [unit/s]. It grows with the square root of time: over 16 s it is 4
             times as large.
@@ -157,6 +158,7 @@ def step_from(motion: MotionModel, belief: Belief, over_belief: bool) -> Linear:
     """Return a step linearised at a belief's mean, or over the belief (``linearise_over``).
 
     Args:
+        motion: the motion; a ``LinearMotion`` is returned as it is.
         belief: where to linearise.
         over_belief: whether to linearise over the belief instead of at its mean.
     """

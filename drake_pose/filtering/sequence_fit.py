@@ -85,10 +85,10 @@ class TrackedStart:
     """A start and its track through the following frames.
 
     Args:
-        states: state (n,) of each frame.
-        track: in the last frame.
-        errors: E_total of each frame.
-        prior_distances: of each frame, see ``BodyState.prior_distance``.
+        states: state (n,) in each frame.
+        track: the track after the last frame.
+        errors: E_total in each frame.
+        prior_distances: ``BodyState.prior_distance`` in each frame.
     """
 
     states: tuple[Array, ...]
@@ -110,10 +110,11 @@ class TrackedStart:
 
 
 def tilted(observation: ContourObservation, x: Array, tilt: Sequence[float]) -> Array:
-    """Return a state (n,) with its root rotated about the x and y axes of the first camera.
+    """Return a state x (n,) with its root rotated about the x and y axes of the first camera.
 
     Args:
-        tilt: rotation vector's x and y [rad].
+        observation: the body and the cameras.
+        tilt: x and y of the rotation vector in the camera's frame [rad].
 
     Raises:
         SettingsError: the tree's root does not turn freely.
@@ -130,9 +131,12 @@ def find_start(
 ) -> list[TrackedStart]:
     """Return tracked starts for a sequence fit, sorted by cost, ascending.
 
+    Nine tilted starts are fitted to the first frame. The best different ones are tracked through
+    the following frames.
+
     Args:
-        x: (n,) state about which starts are tilted.
-        masks: for each frame, all cameras' masks.
+        x: (n,) state in the first frame about which starts are tilted.
+        masks: for each frame, for each camera the mask (H, W) or None.
     """
     observation = tracker.observation
     steps = (0.0, SEQUENCE.tilt, -SEQUENCE.tilt)
@@ -166,7 +170,13 @@ def _evaluated(
     masks: Sequence[Mask | None],
     before: TrackedStart | None = None,
 ) -> TrackedStart:
-    """Return a start extended by one frame, evaluated on its masks."""
+    """Return a start extended by one frame, evaluated on its masks.
+
+    Args:
+        track: the track after the frame.
+        masks: the frame's mask (H, W) or None for each camera.
+        before: the start up to the frame before; None: this is the first frame.
+    """
     x = track.state.best.mean
     pairs = zip(observation.cameras, masks, strict=True)
     visible = [(camera, mask) for camera, mask in pairs if mask is not None]
@@ -184,6 +194,8 @@ class FittedSequence:
     """One explanation of a sequence: proportions and all poses.
 
     Attributes:
+        body: the body whose parameters were fitted.
+        fitted: the fit; ``parameters`` (frames, n) are those of ``body``.
         deviations: (frames, k) standard deviations of the tree's values and ROOT_NAMES.
     """
 
@@ -192,7 +204,10 @@ class FittedSequence:
     deviations: Array
 
     def estimates(self, frame: int) -> tuple[JointEstimate, ...]:
-        """Return the estimate of each of the tree's values in a frame, with 95 % intervals."""
+        """Return the estimate of each value of the tree in the frame of this index.
+
+        The intervals are 95 % intervals inside the limits, at most one turn of an angle.
+        """
         kinematics = self.body.kinematics
         count, around = len(kinematics.names), kinematics.covers_full_turn
         values = self.fitted.parameters[frame, :count]
@@ -211,9 +226,13 @@ def fit_sequence(
 ) -> list[FittedSequence]:
     """Return the explanations of one camera's masks, sorted by cost, ascending.
 
+    All starts are fitted to some of the frames; the different ones among the best are then fitted
+    to all frames.
+
     Args:
-        masks: of the frames, three or more.
-        starts: for each start the states (n,) in all frames.
+        tracker: the body, its first camera, which took the masks, and settings of the motion.
+        masks: (H, W) of each frame, three frames or more.
+        starts: for each start the states (n,) in all frames, best start first.
         period: time between two frames [s].
     """
     observation = tracker.observation
@@ -225,6 +244,7 @@ def fit_sequence(
     camera = observation.cameras[0]
 
     def fit(frames: Indices, begin: Array, last: bool) -> FittedSequence:
+        """Fit the frames from parameters (frames, k); ``last``: by the last stage only."""
         time_step = period * float(frames[1] - frames[0])
         weight = min(1.0, time_step / SEQUENCE.memory)
         noise = Noise(SEQUENCE.deviation, SEQUENCE.correlation / weight)
@@ -266,9 +286,10 @@ def pose_set(
     """Return the pose set of a frame: one mode per explanation, and joint intervals.
 
     Args:
-        explanations: best first.
+        explanations: the result of ``fit_sequence``, best first.
         poses: for each explanation q (nq,), X_WB (4, 4) and the objective (1) J [pixel] in this
             frame.
+        frame: index of the frame.
     """
     modes = []
     for one, (q, X_WB, J) in zip(explanations, poses, strict=True):
@@ -294,13 +315,16 @@ def _are_same(one: FittedSequence, other: FittedSequence) -> bool:
 
 
 def _are_determined(kinematics: TreeKinematics, low: Array, high: Array) -> Array:
-    """Return which intervals are shorter than half a value's range, for angles at most one turn."""
+    """Return (k,) bool, whether the interval from ``low`` to ``high`` (k,) determines its value.
+
+    It does if it is shorter than half of the value's limits, or of a full turn if they are wider.
+    """
     ranges = np.minimum(kinematics.upper - kinematics.lower, 2.0 * np.pi)
     return np.asarray(high - low < 0.5 * ranges)
 
 
 def _limits(observation: ContourObservation) -> tuple[Array, Array]:
-    """Return lower and upper limits (p,) of the moving elements."""
+    """Return lower and upper limits (p,) [rad or m] of the p moving elements of the state."""
     names, limits = list(observation.layout.moving), observation.inequalities()
     lower, upper = np.full(len(names), -np.inf), np.full(len(names), np.inf)
     for phi, b in zip(limits.for_columns(names).phi, limits.b, strict=True):
@@ -314,7 +338,7 @@ def _limits(observation: ContourObservation) -> tuple[Array, Array]:
 
 
 def _interpolated(every: Indices, picked: Indices, parameters: Array) -> Array:
-    """Interpolate parameters (frames, n) of the ``picked`` frames linearly at ``every`` frame.
+    """Interpolate parameters (p, n) of the p ``picked`` frames linearly at ``every`` frame's index.
 
     Beyond the last picked frame its parameters are repeated.
     """

@@ -46,7 +46,7 @@ def factor_of(covariance: Array, names: Sequence[str] = (), subject: str = "the 
 
 
 def covariance_from(factor: Array) -> Array:
-    """Return L L^T (n, n) of L (n, k), symmetric and if possible positive definite.
+    """Return L L^T (n, n) of L (n, k) = ``factor``, symmetric and if possible positive definite.
 
     The diagonal is inflated by up to about 1e-9, relative, until a Cholesky factorisation succeeds.
     """

@@ -53,10 +53,10 @@ class Hypothesis:
         belief: mean and covariance inside the limits.
         free: the belief without the limits of this step; the next step is predicted from it.
         log_weight: logarithm of its weight among all hypotheses.
-        log_evidence: the same without the probability of the limits in this step.
+        log_evidence: ``log_weight`` without the probability of the limits in this step.
         born: step in which it was made by mirroring; 0 for the first.
         number: index among the hypotheses made in that step; unique together with ``born``.
-        active: names of the inequalities that changed its belief in the last step.
+        active: texts of the inequalities that changed its belief in the last step.
         sites: of the last truncation, where the next one starts; see ``Truncated``.
         tangent: (n,) state at which the first frame of the current view was linearised.
         repeated: belief within a static view from its second frame on; None in its first.
@@ -87,8 +87,8 @@ class Rejection:
         step: number of the step.
         hypothesis: as it was then; for "constraint" with the belief before truncation.
         reason: "constraint", "weight", "twin" (a duplicate) or "cap".
-        row: name of the violated inequality, for "constraint".
-        c: c_k (24) of this inequality, for "constraint".
+        row: text of the violated inequality, for "constraint".
+        c: margin c_k (24) of the mean from this inequality [standard deviations], for "constraint".
     """
 
     step: int
@@ -158,6 +158,7 @@ def prune(
 Truncation = Literal["joint", "sequential", "clip", "none"]
 Linearisation = Literal["spread", "tangent"]
 Branch = tuple[Hypothesis, Updated]
+"""A hypothesis before an update, and its belief after it."""
 TRUNCATIONS: tuple[Truncation, ...] = get_args(Truncation)
 LINEARISATIONS: tuple[Linearisation, ...] = get_args(Linearisation)
 
@@ -265,6 +266,7 @@ class FilterState:
 
 
 def _require_class(given: object, kind: type, subject: str) -> None:
+    """Raise SettingsError, which begins with ``subject``, unless an object is a ``kind``."""
     if not isinstance(given, kind):
         raise SettingsError(f"{subject} {kind.__name__}, not {type(given).__name__}")
 
@@ -278,7 +280,11 @@ class TruncatedFilter:
     limits: these would otherwise count again in each step and make the filter overconfident.
 
     Args:
-        inequalities: over any elements of the state.
+        layout: the elements of the state.
+        observation: the measurement of the state, if ``update`` gets none.
+        inequalities: limits of any elements of the state.
+        motion: the state's motion over one step.
+        settings: None: FilterSettings().
 
     Attributes:
         novelty: of the settings, or 0 if the truncation does not support static views.
@@ -312,6 +318,7 @@ class TruncatedFilter:
         self._set(FilterSettings() if settings is None else settings)
 
     def _set(self, settings: FilterSettings) -> None:
+        """Store settings and what follows from them."""
         _require_class(settings, FilterSettings, "a filter's settings are")
         self.settings = settings
         # Offsets of a static view cannot be kept if the truncated belief is fed back.
@@ -333,7 +340,9 @@ class TruncatedFilter:
         return other
 
     def start(self, belief: Belief) -> FilterState:
-        """Return the state before the first measurement, truncated (except for "none").
+        """Return the state of one hypothesis before the first measurement.
+
+        Its belief is the given one, truncated unless ``FilterSettings.truncation`` is "none".
 
         The first call compares the models' Jacobians with central differences at the belief's mean.
 
@@ -373,14 +382,16 @@ class TruncatedFilter:
         return after_step(belief, self._step(belief), self._U)
 
     def _step(self, belief: Belief) -> Linear:
+        """Return the motion linearised at a belief, or over it with "spread"."""
         return step_from(self.motion, belief, self._remainder_weight > 0)
 
     def estimate_roughly(
         self, prediction: Belief, y: Array, variances: Array, start: Array
     ) -> Array:
-        """Return a rough state (n,): the mean after a measurement, from one hypothesis.
+        """Return a rough state (n,): the truncated mean of ``prediction`` after a measurement.
 
         Args:
+            prediction: the belief before the measurement.
             y, variances: as in ``update``.
             start: (n,) where to linearise first.
         """
@@ -400,6 +411,7 @@ class TruncatedFilter:
         """Return the state after a measurement: section 5, steps 2 to 6.
 
         Args:
+            state: the predicted state.
             y: (m,) measurement, NaN where occluded.
             observation: the measurement's model; None: that of the filter.
             variances: noise variances (m,) or covariance (m, m) of this measurement, finite where y
@@ -433,9 +445,16 @@ class TruncatedFilter:
     def _branches(
         self, hypothesis: Hypothesis, measurement: Measurement, step: int, numbers: Iterator[int]
     ) -> list[Branch]:
-        """Update a hypothesis from its prediction, and from each mirrored prediction.
+        """Update a predicted hypothesis, linearised at its own mean and at each mirrored one.
 
-        ``numbers`` counts the mirrored hypotheses of this step.
+        Args:
+            hypothesis: the prediction.
+            measurement: of a new view.
+            step: number of the step.
+            numbers: counts the mirrored hypotheses of this step.
+
+        Returns:
+            One branch for the hypothesis, then one for each mirrored state.
         """
         own = replace(hypothesis, repeated=None)
         iterations = self.settings.iterations
@@ -466,7 +485,7 @@ class TruncatedFilter:
         ]
 
     def _repeat(self, hypothesis: Hypothesis, measurement: Measurement) -> Branch:
-        """Update a hypothesis by another frame of the same static view."""
+        """Update a predicted hypothesis by a measurement of another frame of its static view."""
         repeated = hypothesis.repeated
         if repeated is None:
             repeated = begin_repeated_view(
@@ -485,7 +504,11 @@ class TruncatedFilter:
     def _reject(
         self, branches: Sequence[Branch], step: int
     ) -> tuple[list[Branch], list[Rejection]]:
-        """Remove branches far beyond a row, but never all of them: section 5, step 5."""
+        """Remove branches whose mean is far beyond a row, but never all: section 5, step 5.
+
+        Returns:
+            The branches that are kept, and the rejections, with the number ``step``.
+        """
         if len(branches) == 1 or self._limits is None:
             return list(branches), []
         alive, rejected, worst_c = [], [], []
@@ -507,7 +530,14 @@ class TruncatedFilter:
     def _finish(
         self, hypothesis: Hypothesis, free: Belief, result: Truncated, log_likelihood: float = 0.0
     ) -> Hypothesis:
-        """Return a hypothesis after its update, weighted by the likelihood and by the limits."""
+        """Return a hypothesis after its update, weighted by the likelihood and by the limits.
+
+        Args:
+            hypothesis: before the update.
+            free: the updated belief without limits.
+            result: the updated belief inside the limits.
+            log_likelihood: of the measurement.
+        """
         active = tuple(self.inequalities.rows[k] for k in np.flatnonzero(result.active))
         belief = Belief(result.mean, result.covariance)
         evidence = hypothesis.log_evidence + log_likelihood
@@ -527,10 +557,11 @@ class TruncatedFilter:
         )
 
     def _cut(self, belief: Belief, sites: Array) -> Truncated:
-        """Truncate a belief by the limits, if there are any."""
+        """Truncate a belief by the limits, if there are any; ``sites`` (S, 2) start the EP."""
         return untruncated(belief) if self._limits is None else self._limits(belief, sites)
 
     def _truncate(self, belief: Belief, sites: Array) -> Truncated:
+        """Truncate a belief by the limits in the settings' way."""
         if self.settings.truncation == "sequential":
             return truncate_sequential(belief, self.inequalities)
         if self.settings.truncation == "clip":

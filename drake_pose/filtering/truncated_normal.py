@@ -1,7 +1,7 @@
 """Mean and covariance of a normal distribution truncated by linear inequalities.
 
 ``truncate_joint`` uses expectation propagation (EP) over all rows; ``truncate_sequential`` is (21)
-to (29) of Shimada et al., one row after another.
+to (29) of Shimada et al., one row after another. A row is one inequality phi_k^T x <= b_k.
 
 A belief N(mean, L L^T) is represented by its factor L. A site (tau, nu) of EP multiplies its
 density by exp(-tau s^2 / 2 + nu s) with s = direction^T x, and changes mean and factor in place.
@@ -71,7 +71,10 @@ def interval_moments(lower: float, upper: float) -> tuple[float, float, float]:
 
 @compiled
 def project(mean: Array, factor: Array, direction: Array) -> tuple[float, Array]:
-    """Return direction^T mean, and direction^T L (k,), whose squared norm is the variance."""
+    """Return direction^T mean, and direction^T L (k,), whose squared norm is the variance.
+
+    ``mean`` (n,) and ``factor`` L (n, k) are those of a belief; ``direction`` is (n,).
+    """
     n, k = factor.shape
     projected = np.zeros(k)
     value = 0.0
@@ -126,7 +129,7 @@ def apply_sites(
 def interval_site(
     value: float, variance: float, lower: float, upper: float
 ) -> tuple[float, float, float]:
-    """Return the site that gives a normal belief along a line its moments between two bounds.
+    """Return the site that turns a scalar normal belief into one with its moments between bounds.
 
     Args:
         value, variance: mean and variance of the belief along the line.
@@ -156,14 +159,14 @@ def propagate(
     tolerance: float,
     sweep_limit: int,
 ) -> tuple[float, int]:
-    """Find the sites that represent lower <= directions x <= upper under a normal belief, by EP.
+    """Find the S sites that represent lower <= directions x <= upper under a normal belief, by EP.
 
     Each site is the normal factor that gives the belief without this site (the cavity) its mean and
     variance inside the site's own two bounds. The converged result does not depend on the order of
     the rows.
 
     Args:
-        base_mean, base_factor: (n,) and (n, n) of the belief without bounds.
+        base_mean, base_factor: (n,) and (n, n) L of the belief without bounds.
         directions, lower, upper: (S, n), (S,) and (S,); bounds may be infinite.
         sites: (S, 2) tau and nu to start from, changed in place.
         tolerance: largest change in a sweep of a marginal's mean [standard deviations] and,
@@ -293,6 +296,7 @@ class MergedRows:
     count once.
 
     Attributes:
+        inequalities: the K inequalities before merging.
         used: (m,) indices of the state's elements that occur in a row.
         directions: (S, m) unit vectors over the used elements.
         lower, upper: (S,) bounds along the directions; may be infinite.
@@ -345,7 +349,9 @@ def merge_rows(inequalities: Inequalities) -> MergedRows:
 
 
 def _margins(belief: Belief, inequalities: Inequalities) -> Array:
-    """Return c_k (K,) of (24), infinite for rows without variance.
+    """Return c_k (K,) of (24): the mean's margin from each row [standard deviations of the row].
+
+    It is negative where the row is violated, and infinite for rows without variance.
 
     Raises:
         SettingsError: the belief has another size, or a row without variance is violated.
@@ -380,7 +386,7 @@ def truncate_sequential(belief: Belief, inequalities: Inequalities) -> Truncated
     With s^2 = phi^T Q phi the rotations of (21) to (23) multiply out to the mean q + Q phi nu / s
     and the covariance Q - (Q phi)(Q phi)^T (1 - S) / s^2, where S = 1 + c nu - nu^2 of (26). The
     update is applied to the covariance's factor, which keeps it positive definite. The result
-    depends on the order of the rows.
+    depends on the order of the rows. Rows with a c_k above SKIP_ABOVE are skipped.
 
     Raises:
         SettingsError: the sizes do not fit, the covariance is indefinite, or a row without variance
@@ -408,7 +414,8 @@ def truncate_joint(
     Args:
         rows: the inequalities, or these merged by ``merge_rows``.
         tolerance: largest change of the marginals in the last sweep, see ``propagate``.
-        start: (S, 2) initial sites of a similar problem, which saves sweeps; may be empty.
+        start: (S, 2) final ``sites`` of a similar problem with the same rows, which saves sweeps;
+            None or empty: no initial sites.
 
     Raises:
         SettingsError: as for ``truncate_sequential``, or parallel rows exclude each other.
@@ -447,7 +454,8 @@ def clip(belief: Belief, inequalities: Inequalities) -> Truncated:
     """Move a belief's mean to a nearby point inside the rows; the covariance stays unchanged.
 
     A baseline for comparison. The mean is projected in the metric of the covariance onto the most
-    violated row, until no row is violated or 100 projections are made.
+    violated row, until no row is violated or 100 projections are made. ``active`` are the rows that
+    were violated.
 
     Raises:
         SettingsError: as for ``truncate_sequential``.

@@ -30,6 +30,7 @@ from drake_pose.filtering.state import Belief
 from drake_pose.filtering.truncated_normal import Truncated, untruncated
 
 Truncate = Callable[[Belief, Array], Truncated]
+"""Maps a belief and initial sites (S, 2) to the truncated belief."""
 
 
 class ObservationModel(Protocol):
@@ -51,7 +52,7 @@ class ObservationModel(Protocol):
         """Return h(x) (m,), NaN where occluded, and its Jacobian (m, n)."""
 
     def mirrors(self, belief: Belief) -> list[Array]:
-        """Return states (n,) that look like the mean: the mirrored predictions of section 5."""
+        """Return states (n,) whose measurement is about that of the belief's mean: section 5."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +141,13 @@ class FunctionObservation:
 
 
 class Measurement(NamedTuple):
-    """A measurement y (m,) of a model, NaN where occluded, and its noise covariance (m, m)."""
+    """A measurement of a state.
+
+    Attributes:
+        model: the observation that predicts it.
+        y: (m,) measured values, NaN where occluded.
+        covariance: (m, m) of the measurement noise.
+    """
 
     model: ObservationModel
     y: Array
@@ -173,6 +180,7 @@ def make_measurement(
     """Return a checked measurement.
 
     Args:
+        model: the observation that predicts y.
         y: (m,) NaN where occluded.
         variances: noise variances (m,) or covariance (m, m), finite where y is; None: the model's.
 
@@ -222,12 +230,14 @@ def update(
     converges, because a tangent at a state outside the limits may be useless inside.
 
     Args:
+        prediction: the belief before the measurement, without limits.
+        measurement: y, its noise, and the observation h.
         iterations: largest number of linearisations.
         start: (n,) point of the first linearisation; None: the predicted mean.
         tempered: whether the first iterations use inflated noise if the start fits badly. Not for a
             mirrored start, which inflated noise would draw back to the prediction.
         truncate: maps a belief and initial sites (S, 2) to the truncated belief; None: no limits.
-        sites: (S, 2) sites of the last truncation.
+        sites: (S, 2) sites of the last truncation; None: none.
         remainder_weight: 0: linearise at a point. Otherwise linearise over the belief (unless
             ``start`` is given), and add this multiple of the remainder's covariance to the noise;
             more than 1, as the remainder repeats from frame to frame. See ``linearise_over``.

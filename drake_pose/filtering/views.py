@@ -28,12 +28,16 @@ class StaticView:
 
 
 def next_view(view: StaticView | None, measurement: Measurement, significance: float) -> StaticView:
-    """Return the view that a measurement belongs to: the current one, or a new one.
+    """Return the static view that a measurement belongs to: the current one, or a new one.
+
+    A view is new if a measurement becomes visible, if no measurement is visible in both frames, or
+    if the difference from the view's reference is significant.
 
     Args:
         view: the current view; None: there is none.
-        significance: a view is new if noise alone exceeds its distance from the view's reference
-            with no more than this probability; 0: every view is new.
+        measurement: the next frame's measurement.
+        significance: p-value of the difference, under noise alone, below which a view is new; 0:
+            every view is new.
     """
     y = measurement.y
     if view is None or significance == 0 or len(view.reference) != len(y):
@@ -50,13 +54,15 @@ def next_view(view: StaticView | None, measurement: Measurement, significance: f
 
 @lru_cache(maxsize=1024)
 def _largest_change(significance: float, count: int) -> float:
+    """Return the chi-squared value of ``count`` degrees of freedom with this p-value."""
     return float(chdtri(count, significance))
 
 
 def measure_curvature(model: ObservationModel, belief: Belief) -> Array:
-    """Return the mean squares (m,) of the linearisation error of a measurement over a belief.
+    """Return the mean squares (m,) of the linearisation error of a model's measurements.
 
-    By second differences along the columns of the covariance's root.
+    The model is linearised at the mean of ``belief``, over which the mean is taken. By second
+    differences along the columns of the covariance's root.
     """
     h, H = model.predict(belief.mean)
     used = np.flatnonzero(np.abs(H).sum(axis=0) > 0)
@@ -73,7 +79,10 @@ def measure_curvature(model: ObservationModel, belief: Belief) -> Array:
 
 
 def after_step(belief: Belief, step: Linear, U: Array) -> Belief:
-    """Return the belief after a linearised step with process noise covariance U (n, n): (6)."""
+    """Return a belief after one step of a motion, with process noise covariance U (n, n): (6).
+
+    ``step``: the motion, linearised; the covariance of its remainder is added to U.
+    """
     noise = U if step.remainder is None else U + step.remainder
     P = step.slope @ belief.covariance @ step.slope.T + noise
     return Belief(step.value + step.slope @ (belief.mean - step.at), 0.5 * (P + P.T))
@@ -97,7 +106,7 @@ class RepeatedView:
         return Belief(self.belief.mean[:n].copy(), self.belief.covariance[:n, :n].copy())
 
     def after_step(self, step: Linear, U: Array) -> "RepeatedView":
-        """Return the view after a step with process noise covariance U (n, n); offsets stay."""
+        """Return the view after ``after_step`` of the state; the offsets keep their belief."""
         n, P = len(self.tangent), self.belief.covariance.copy()
         state = after_step(self.state(), step, U)
         mean = np.r_[state.mean, self.belief.mean[n:]]
@@ -113,6 +122,7 @@ def begin_repeated_view(
     """Return a view at its second frame; the offsets have mean 0 and the curvature as variance.
 
     Args:
+        model: the observation of both frames.
         free: the prediction for the second frame, without limits.
         state: belief whose covariance is the range over which the curvature is measured.
         tangent: (n,) state at which the first frame was linearised.
@@ -126,9 +136,9 @@ def begin_repeated_view(
 
 
 def anchored_observation(model: ObservationModel, tangent: Array) -> LinearObservation:
-    """Return a model linearised at ``tangent`` (n,), with an offset for each measurement.
+    """Return an observation h(tangent) + H (x - tangent) + offset, linear in (x, offset) (n + m,).
 
-    It is linear in (state, offsets) (n + m,).
+    ``model`` gives h and H; ``tangent``: (n,) state at which it is linearised.
     """
     h, H = model.predict(tangent)
     at, slope = np.r_[tangent, np.zeros(len(h))], np.hstack([H, np.eye(len(h))])

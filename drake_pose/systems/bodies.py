@@ -47,9 +47,12 @@ def add_posed_plant(
     """Add a body without dynamics that is posed by an output port; return its finalized plant.
 
     Args:
-        positions: port of the positions (nq,) in the plant's order.
-        name: of the MultibodyPositionToGeometryPose that is added.
-        prefix: of the body's name in the SceneGraph.
+        builder: the diagram to which the system is added.
+        scene_graph: a system of the diagram, to which the body's geometry is added.
+        model: the body.
+        positions: port of the positions (nq,) in the plant's order [rad or m].
+        name: name of the MultibodyPositionToGeometryPose that is added.
+        prefix: prefix of the body's name in the SceneGraph.
     """
     plant = MultibodyPlant(0.0)
     plant.RegisterAsSourceForSceneGraph(scene_graph)
@@ -76,6 +79,7 @@ def add_avatar(
     """Show a body in Meshcat from a SceneGraph of its own, which sensors do not see.
 
     Args:
+        builder: the diagram to which the systems are added.
         positions: port of the positions (nq,) in the plant's order; while they are NaN the body has
             the model's default positions.
         prefix: Meshcat path under which it is drawn.
@@ -135,9 +139,10 @@ class MeshcatSkin(LeafSystem):
         positions (nq): in the model's order [rad or m].
 
     Args:
+        skin: the skin bands.
         position_count: nq.
         path: Meshcat path of the skin.
-        colour: of all bands; None: the bands' own colours.
+        colour: colour of all bands; None: the bands' own colours.
         is_recorded: whether a Meshcat recording must show the motion. Meshcat records the motion of
             objects but not of vertices, so that each new shape becomes an object that is visible
             until the next one.
@@ -205,10 +210,12 @@ def add_skin(
     """Add a model's skin to a SceneGraph, so that sensors see it; do nothing if it has none.
 
     Args:
-        scene_graph: which contains the body's rigid parts.
-        positions: port of the positions (nq,) in the model's order.
-        name: of the new geometry source, and with ``_skin_poser`` of the new system.
-        labels: render label by link; Drake's own are the links' body indices.
+        builder: the diagram to which the system is added.
+        scene_graph: a system of the diagram, which contains the body's rigid parts.
+        positions: port of the positions (nq,) in the model's order [rad or m].
+        name: name of the new geometry source, and with ``_skin_poser`` of the new system.
+        labels: render label of each link, by name, which its skin takes; Drake's own are the links'
+            body indices. None: none.
     """
     if not model.skin:
         return
@@ -239,8 +246,9 @@ def add_meshcat_skin(
     """Show a model's skin in Meshcat; do nothing if it has none.
 
     Args:
-        positions: port of the positions (nq,) in the model's order.
-        name: of the skin in Meshcat, and with ``_meshcat_skin`` of the new system.
+        builder: the diagram to which the system is added.
+        positions: port of the positions (nq,) in the model's order [rad or m].
+        name: name of the skin in Meshcat, and with ``_meshcat_skin`` of the new system.
         colour, is_recorded: as in MeshcatSkin.
         prefix: Meshcat path under which it is drawn: that of the MeshcatVisualizer.
     """
@@ -261,7 +269,10 @@ def add_meshcat_skin(
 
 
 def held_positions(q: Array, period: float) -> Trajectory:
-    """Return positions (n, nq) as a zero-order hold: row k from k - 1/2 to k + 1/2 periods."""
+    """Return positions q (n, nq) as a zero-order hold: row k from k - 1/2 to k + 1/2 periods.
+
+    ``period``: time between two rows [s].
+    """
     times = period * (np.arange(len(q) + 1) - 0.5)
     return PiecewisePolynomial.ZeroOrderHold(times, np.vstack([q, q[-1:]]).T)
 

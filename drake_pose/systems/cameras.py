@@ -37,6 +37,11 @@ class CameraRig:
     The body is posed by the input port ``positions`` (nq) or by a trajectory. The output ports
     ``color_image_<camera>``, ``label_image_<camera>`` and ``depth_image_<camera>`` render when they
     are evaluated. Render in one thread only: Drake's engine gives wrong images in another thread.
+
+    Attributes:
+        diagram: the diagram.
+        cameras: the cameras by name.
+        sensors: the simulated cameras in the diagram, by name.
     """
 
     diagram: Diagram
@@ -44,26 +49,27 @@ class CameraRig:
     sensors: Mapping[str, RgbdSensor]
 
     def set_positions(self, context: Context, q: Array) -> None:
-        """Fix the body's positions (nq,) in a context [rad or m]."""
+        """Fix the body's positions q (nq,) [rad or m] in a context of the diagram."""
         self.diagram.GetInputPort("positions").FixValue(context, q)
 
     def picture(self, context: Context, camera: str) -> Picture:
-        """Return a camera's colour image (H, W, 3), red, green, blue.
+        """Return the colour image (H, W, 3), red, green, blue, of the camera of this name.
 
-        Raises:
+        ``context``: the diagram's. Raises:
             UnknownNameError: the rig has no such camera.
         """
         return colour_image_to_picture(self._port("color_image", camera).Eval(context))
 
     def mask(self, context: Context, camera: str) -> Mask:
-        """Return the body's silhouette (H, W) in a camera.
+        """Return the body's silhouette (H, W) in the camera of this name.
 
-        Raises:
+        ``context``: the diagram's. Raises:
             UnknownNameError: the rig has no such camera.
         """
         return label_image_to_mask(self._port("label_image", camera).Eval(context))
 
     def _port(self, kind: str, camera: str) -> OutputPort:
+        """Return the diagram's output port ``<kind>_<camera>``."""
         if camera not in self.cameras:
             raise UnknownNameError("camera", camera, self.cameras, "the rig")
         return self.diagram.GetOutputPort(f"{kind}_{camera}")
@@ -77,8 +83,9 @@ def build_camera_rig(
     """Build a diagram of a body and the cameras that see it.
 
     Args:
-        cameras: by name, from circle_of_cameras or load_cameras.
-        true_positions: positions (nq,) over time; None: the diagram has the input port
+        model: the body.
+        cameras: cameras by name, from circle_of_cameras or load_cameras.
+        true_positions: positions (nq,) [rad or m] over time; None: the diagram has the input port
             ``positions``.
 
     Raises:
@@ -121,7 +128,11 @@ def add_sensors(
     Call it after the models are added, because the renderer checks their files when it is added.
 
     Args:
-        depth_ranges: nearest and farthest depth [m] by camera, see camera_to_drake.
+        builder: the diagram to which the sensors are added.
+        scene_graph: a system of the diagram; it gets the renderer.
+        cameras: cameras by name.
+        depth_ranges: nearest and farthest depth [m] by name of the camera, see camera_to_drake.
+        parameters: settings of the renderer.
     """
     renderer = "rig_renderer"
     scene_graph.AddRenderer(renderer, MakeRenderEngineVtk(parameters))
@@ -187,7 +198,7 @@ def cameras_from_drake(
 
 
 def _systems_of(diagram: Diagram | DiagramBuilder, kind: type[_System]) -> list[_System]:
-    """Return all systems of a type in a diagram, recursively."""
+    """Return all systems of the type ``kind`` in a diagram, recursively."""
     found: list[_System] = []
     for system in diagram.GetSystems():
         if isinstance(system, kind):
@@ -222,7 +233,7 @@ class SilhouetteCamera(PortedSystem):
     but no far one. Unlike an RgbdSensor, the camera may be a parallel camera.
 
     Args:
-        plant: finalized, and registered with the SceneGraph.
+        plant: finalized, and registered with ``scene_graph``.
         camera: its X_WC is the pose in the parent's frame.
         parent: body that carries the camera; None: the world.
 

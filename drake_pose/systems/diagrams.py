@@ -87,6 +87,7 @@ class CameraRegistration(BeliefSystem[OnlineState]):
             union of body and mask over the kept frames, NaN before the camera is found.
 
     Args:
+        registration: the method, with the body, and the camera with its intrinsics.
         period: time between two updates [s].
         labels: render labels of the body; None: those of its model if made of a plant
             (``ArticulatedModel.from_plant``), else all but Drake's reserved ones.
@@ -119,12 +120,16 @@ class CameraRegistration(BeliefSystem[OnlineState]):
         self.add_belief_output("registration", len(REGISTRATION), _registration_numbers)
 
     def registered_camera(self, context: Context) -> PinholeCamera | None:
-        """Return the camera at its pose; None unless the status is 1."""
+        """Return the camera at its pose in the plant's world; None unless the status is 1."""
         valid = self._valid_camera(self.belief(context))
         return None if valid is None else valid.camera
 
     def next_belief(self, context: Context, last: OnlineState) -> OnlineState:
-        """Return the state after the current frame."""
+        """Return the state after the context's image and positions, given the last state.
+
+        Raises:
+            MaskError: the body's labels cover more than ``max_coverage`` of the image.
+        """
         image = self.eval_input(context, "label_image")
         if image is None:
             return last
@@ -149,13 +154,14 @@ class CameraRegistration(BeliefSystem[OnlineState]):
         return known.registered if is_believed else None
 
     def _covariance(self, known: OnlineState) -> Array:
+        """Return the output ``covariance`` (36,)."""
         valid = self._valid_camera(known)
         covariance = np.diag(np.full(6, np.inf)) if valid is None else valid.covariance
         return covariance.ravel()
 
 
 def _X_WC(known: OnlineState) -> RigidTransform:
-    """Return the camera's pose as it was last found."""
+    """Return the camera's pose as it was last found; its translation is NaN before."""
     if known.registered is None:
         return RigidTransform(np.full(3, np.nan))
     return RigidTransform(known.registered.camera.X_WC)
@@ -177,9 +183,11 @@ class MatchingDiagram:
     """A diagram that estimates poses from silhouettes, and its parts.
 
     Args:
+        diagram: the diagram.
+        matcher: the system that estimates the poses.
         positions_log, error_log: logs of ``estimated_positions`` and ``error``, one sample a
             period.
-        player: of the masks; None for a simulated camera.
+        player: source of recorded masks; None: the cameras are simulated.
     """
 
     diagram: Diagram
@@ -189,7 +197,10 @@ class MatchingDiagram:
     player: MaskPlayer | None = None
 
     def estimate(self, context: Context) -> PoseEstimate | None:
-        """Return the last update's estimate; None: no body was visible."""
+        """Return the last update's estimate; None: no body was visible.
+
+        ``context`` is the diagram's.
+        """
         own = self.matcher.GetMyContextFromRoot(context)
         estimate: PoseEstimate | None = self.matcher.GetOutputPort("pose_estimate").Eval(own)
         return estimate
@@ -204,7 +215,10 @@ class MatchingDiagram:
         return tracks and bool(self.matcher.GetOutputPort("track").Eval(own)[0])
 
     def with_intervals(self, context: Context) -> PoseEstimate:
-        """Return the last update's tracked pose with intervals from its contours."""
+        """Return the last update's tracked pose with intervals from its contours.
+
+        ``context`` is the diagram's. The matcher must be a SilhouetteTracker.
+        """
         assert isinstance(self.matcher, SilhouetteTracker)
         return self.matcher.with_intervals(self.matcher.GetMyContextFromRoot(context))
 
@@ -225,14 +239,17 @@ def build_recorded_matching(
     at time k times the player's period.
 
     Args:
+        scene: the recorded masks.
+        search: the search for the poses of a body.
         cameras: the cameras to use, matched together.
-        frames: the frames to play; None: all.
-        root_positions: by frame, the root's position (3,) in the world [m]; None: as in the pose
-            tree.
-        meshcat: where to show the estimated body.
-        tracking: of the tracker; None: each frame is matched on its own.
-        starts: by frame, approximate positions (nq,): a track starts there without a search, also
-            after a loss.
+        frames: names of the frames to play; None: all.
+        root_positions: the root's position (3,) in the world [m] by name of the frame; None: as in
+            the pose tree.
+        meshcat: where to show the estimated body; None: nowhere.
+        tracking: settings of a SilhouetteTracker; None: a SilhouetteMatcher matches each frame on
+            its own.
+        starts: approximate positions (nq,) [rad or m] by name of the frame: a track starts there
+            without a search, also after a loss. None: none are known.
     """
     player = MaskPlayer(scene, cameras, frames, positions=starts, root_positions=root_positions)
     matcher = _matcher(search, cameras, player.period, tracking, player.color_cameras)
@@ -261,9 +278,11 @@ def build_simulated_matching(
     sensors do not see.
 
     Args:
-        true_positions: the true body's positions (nq,), constant or over time.
+        search: the search for the poses of the body.
+        cameras: the cameras to simulate, matched together.
+        true_positions: the true body's positions (nq,) [rad or m], constant or over time.
         period: time between two images and updates [s].
-        meshcat: where to show both bodies.
+        meshcat: where to show both bodies; None: nowhere.
         tracking: as in ``build_recorded_matching``.
     """
     builder = DiagramBuilder()
@@ -289,7 +308,14 @@ def add_simulated_cameras(
     cameras: Sequence[Camera],
     true_positions: Trajectory | np.ndarray,
 ) -> tuple[OutputPort, list[OutputPort]]:
-    """Add a body at given positions (nq,), constant or over time, and RgbdSensors that see it.
+    """Add a body at given positions, and RgbdSensors that see it, to a diagram.
+
+    Args:
+        builder: the diagram.
+        scene_graph: a system of the diagram.
+        model: the body.
+        cameras: the cameras to simulate.
+        true_positions: the body's positions (nq,) [rad or m], constant or over time.
 
     Returns:
         The port of the positions, and that of each camera's label image.
@@ -317,7 +343,7 @@ def add_simulated_cameras(
 def _depth_range(
     camera: Camera, model: ParsedModel, true_positions: Trajectory
 ) -> tuple[float, float]:
-    """Return the nearest and farthest depth of a moving body, with margins [m]."""
+    """Return the nearest and farthest depth [m] of a moving body in a camera, with margins."""
     start, end = true_positions.start_time(), true_positions.end_time()
     # A constant trajectory has infinite times.
     times = np.linspace(start, end, 100) if np.isfinite([start, end]).all() else np.zeros(1)
@@ -341,6 +367,7 @@ def _matcher(
     tracking: TrackingSettings | None,
     color_cameras: Sequence[str] = (),
 ) -> SilhouetteMatcher:
+    """Return a SilhouetteMatcher if ``tracking`` is None, else a SilhouetteTracker."""
     if tracking is None:
         return SilhouetteMatcher(search, cameras, period)
     # Recordings and simulations need no time limit; without one the result is repeatable.
@@ -360,9 +387,11 @@ def show_estimate(
     """Show a SceneGraph in Meshcat, with a body at estimated positions that sensors do not see.
 
     Args:
-        positions: port of the estimated positions (nq,).
+        builder: the diagram that contains ``scene_graph``.
+        model: the body.
+        positions: port of the estimated positions (nq,) [rad or m].
         meshcat: where to show them.
-        colour: of the body; None: its own colours.
+        colour: colour of the body; None: its own colours.
     """
     plant = add_posed_plant(
         builder, scene_graph, model, positions, "estimated_geometry_pose", "estimated"
@@ -387,7 +416,10 @@ def show_estimate(
 def _finish(
     builder: DiagramBuilder, matcher: SilhouetteMatcher, period: float, player: MaskPlayer | None
 ) -> MatchingDiagram:
-    """Add the logs and build the diagram."""
+    """Add logs of a matcher's outputs, with one sample each ``period`` [s], and build the diagram.
+
+    ``player``: source of recorded masks; None: the cameras are simulated.
+    """
     # A log samples before the update at the same time: sample k + 1 has the estimate of frame k.
     positions_log = LogVectorOutput(
         matcher.GetOutputPort("estimated_positions"), builder, publish_period=period
@@ -401,6 +433,8 @@ class RegistrationDiagram:
     """A diagram that registers a simulated camera, and its parts.
 
     Args:
+        diagram: the diagram.
+        registration: the system that finds the camera's pose.
         sensor: the simulated camera; ``sensor.SetX_PB(context, X_WC)`` moves it.
         status_log: log of ``status``, one sample a period.
     """
@@ -421,8 +455,12 @@ def build_simulated_registration(
     """Build a diagram that registers a simulated camera; its pose is not an input.
 
     Args:
-        true_positions: the body's positions (nq,), constant or over time, measured without error.
+        registration: the method, with the body, and the camera with its intrinsics.
+        camera: the simulated camera, at its true pose.
+        true_positions: the body's positions (nq,) [rad or m], constant or over time, measured
+            without error.
         period: time between two images and updates [s].
+        meshcat: where to show the body; None: nowhere.
     """
     builder = DiagramBuilder()
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())

@@ -49,6 +49,8 @@ class ColourPorts:
     """Input ports for the colour images of some of a system's cameras.
 
     Args:
+        system: the system that gets the ports.
+        cameras: all cameras of the system.
         wanted: names of the cameras that get a port.
         port: maps a camera to its port's name.
 
@@ -77,10 +79,10 @@ class ColourPorts:
         )
 
     def pictures(self, context: Context) -> dict[str, Picture]:
-        """Return the available pictures (H, W, 4) by camera.
+        """Return the available pictures (H, W, 4) by name of the camera.
 
-        They are views of the images' writable data, as compiled kernels require, and are valid
-        until the context changes.
+        ``context`` is the system's. The pictures are views of the images' writable data, as
+        compiled kernels require, and are valid until the context changes.
         """
         images = self._given(context).items()
         return {name: image.mutable_data for name, image in images if image.size()}
@@ -112,13 +114,15 @@ class MaskPlayer(PortedSystem):
         frame_index (1): index of the frame in ``frames``.
 
     Args:
+        scene: the recorded masks and pictures.
         cameras: the cameras to play, in the order of the output ports.
-        frames: the frames to play; None: all of the scene's.
-        positions: (nq,) by frame, for ``measured_positions``.
-        root_positions: (3,) by frame [m], for ``root_position``.
+        frames: names of the frames to play; None: all of the scene's.
+        positions: (nq,) [rad or m] by name of the frame, for ``measured_positions``; None: no such
+            port.
+        root_positions: (3,) [m] by name of the frame, for ``root_position``; None: no such port.
 
     Attributes:
-        frames: the frames played.
+        frames: names of the frames played.
         period: time between two frames [s].
         color_cameras: names of the cameras that have pictures (``Scene.images``), and so a port.
     """
@@ -168,7 +172,10 @@ class MaskPlayer(PortedSystem):
         return min(max(index, 0), len(self.frames) - 1)
 
     def _play(self, port: str, model_value: Any, read: Callable[[str], Any]) -> None:
-        """Declare an output port that is a function of the name of the frame shown."""
+        """Declare an output port whose value is ``read`` of the name of the frame shown.
+
+        ``model_value``: a value of the port's type, or the size of its vector.
+        """
         self.add_output(
             port,
             model_value,
@@ -177,15 +184,18 @@ class MaskPlayer(PortedSystem):
         )
 
     def _label_image(self, camera: Camera, frame: str) -> ImageLabel16I:
+        """Return the mask of a frame; all background if there is none."""
         if (camera.name, frame) in self._scene.masks:
             return mask_to_label_image(self._scene.read(camera.name, frame))
         return mask_to_label_image(np.zeros((camera.height, camera.width), dtype=bool))
 
     def _color_image(self, camera: Camera, frame: str) -> ImageRgba8U:
+        """Return the picture of a frame; an image without pixels if there is none."""
         is_there = (camera.name, frame) in self._scene.images
         picture = self._scene.read_image(camera.name, frame) if is_there else None
         return picture_to_colour_image(picture)
 
 
 def _value_at(values: Mapping[str, Array], unknown: Array, frame: str) -> Array:
+    """Return the value of a frame, given values by name of the frame; ``unknown`` without one."""
     return values.get(frame, unknown)

@@ -70,7 +70,8 @@ class PictureCapture(PortedSystem):
         fresh (1): 1 if this update brought new frames, else 0.
 
     Args:
-        sources: opened sources of pictures, by camera.
+        sources: opened sources of pictures, by name of the camera.
+        cameras: cameras by name, which give the sizes of the images.
         period: time between two updates [s]; None: that of the fastest source.
         live: whether the pictures come by the computer's clock; None: whether a source is live.
         tolerance: largest difference of time stamps in synchronised frames [s]; None: half a
@@ -146,7 +147,7 @@ class PictureCapture(PortedSystem):
         self.DeclareForcedUnrestrictedUpdateEvent(self._update)
 
     def counts(self) -> dict[str, CameraCount]:
-        """Return the counters of each camera."""
+        """Return the counters of each camera, by name."""
         return {
             name: CameraCount(
                 self._used[name],
@@ -171,6 +172,7 @@ class PictureCapture(PortedSystem):
             source.close()
 
     def _update(self, context: Context, state: State) -> EventStatus:
+        """Read the sources, and show the next synchronised frames if there are any."""
         if self._begin is None:
             self._begin = self._start()
         if self._begin is None:
@@ -222,8 +224,9 @@ class PictureCapture(PortedSystem):
     def _feed(self, name: str, source: FrameSource, now: float, ahead: int = 8) -> None:
         """Pass the pictures of a source that are due at ``now`` [s] to the synchroniser.
 
-        The next picture of a recorded source is kept until it is due. ``ahead``: number of pictures
-        by which a recorded source is read ahead of the slowest.
+        The next picture of a recorded source is kept until it is due. Without ``live``, a source is
+        not read while ``ahead`` of its pictures wait in the synchroniser for other cameras.
+        ``name``: the camera.
         """
         origin, synchroniser = self._origins[name], self._synchroniser
         if source.specification.live:
@@ -248,6 +251,7 @@ class PictureCapture(PortedSystem):
             self._pending[name] = None
 
     def _note_changes(self) -> None:
+        """Count cameras that stopped or returned, and report them."""
         for change in self._synchroniser.take_changes():
             self._changes[change.camera].append(change)
             if not change.stopped:
@@ -261,6 +265,7 @@ class PictureCapture(PortedSystem):
     def _calc_image(
         self, name: str, fill: Callable[[Any, np.ndarray], None], _: Context, output: AbstractValue
     ) -> None:
+        """Write the shown picture of the camera ``name`` to an output; ``fill`` copies it."""
         image = output.get_mutable_value()
         one = None if self.frames is None else self.frames.items.get(name)
         if one is None:
@@ -290,7 +295,8 @@ class PersonRegion(PortedSystem):
             because the camera has no picture.
 
     Args:
-        background: background model of the camera; None if ``label_image`` is connected.
+        camera: the camera, which gives the size of the images.
+        background: background model of the camera; None: ``label_image`` must be connected.
 
     Attributes:
         wanted: names of the input ports that give the region.
@@ -318,7 +324,7 @@ class PersonRegion(PortedSystem):
         self.region = self.add_output("region", None, self._region)
 
     def _image(self, context: Context, name: str) -> Any:
-        """Return an input image; None if the camera has no picture.
+        """Return the image at the input port ``name``; None if the camera has no picture.
 
         Raises:
             CameraError: the image has another size than the camera.
@@ -362,8 +368,9 @@ def connect_images(
     """Connect input ports to a source's output ports by name, or export them from the diagram.
 
     Args:
-        source: of images; None: the inputs are exported.
-        wanted: input ports by the name of the output port.
+        builder: the diagram that contains the input ports and the source.
+        source: source of images; None: the input ports become inputs of the diagram.
+        wanted: input ports by the name of the source's output port, or of the diagram's input.
 
     Raises:
         SettingsError: the source lacks an output port.

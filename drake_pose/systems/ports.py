@@ -35,7 +35,10 @@ T = TypeVar("T")
 
 
 def require_period(owner: str, period: float) -> None:
-    """Raise SettingsError unless a period [s] is positive and finite."""
+    """Raise SettingsError unless a period [s] is positive and finite.
+
+    ``owner``: what has the period, for the message.
+    """
     if not 0.0 < period < math.inf:
         raise SettingsError(f"the {owner}'s period must be positive, not {period}")
 
@@ -51,7 +54,10 @@ def require_distinct_cameras(cameras: Sequence[Camera], fewest: int, message: st
 
 
 def require_time_forward(system: LeafSystem, context: Context, last: float) -> None:
-    """Raise SettingsError if the context's time precedes that of the last update [s]."""
+    """Raise SettingsError if the context's time precedes ``last``, that of the last update [s].
+
+    ``system`` is named in the message.
+    """
     now = context.get_time()
     if now < last:
         raise SettingsError(
@@ -61,14 +67,17 @@ def require_time_forward(system: LeafSystem, context: Context, last: float) -> N
 
 
 def camera_port(kind: str, camera: Camera, cameras: Sequence[Camera]) -> str:
-    """Return a camera's port name: ``kind`` for a single camera, else ``<kind>_<camera>``."""
+    """Return a camera's port name: ``kind`` for a single camera, else ``<kind>_<camera>``.
+
+    ``cameras``: all cameras of the system.
+    """
     return kind if len(cameras) == 1 else f"{kind}_{camera.name}"
 
 
 def connect_matching_ports(builder: DiagramBuilder, source: System, target: System) -> None:
     """Connect each output port of ``source`` to the input port of ``target`` with the same name.
 
-    Output ports without such an input port are not connected.
+    Both are systems in ``builder``. Output ports without such an input port are not connected.
     """
     for index in range(source.num_output_ports()):
         port = source.get_output_port(index)
@@ -90,10 +99,11 @@ def evaluate(port: OutputPort, context: Context) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class StagedDiagram(Generic[T]):
-    """A diagram with an estimator, owner computation can be timed by stages.
+    """A diagram with an estimator whose computation can be timed by stages.
 
     Args:
-        stages: output ports by stage, in the order of computation.
+        diagram: the diagram.
+        stages: output ports by name of the stage, in the order of computation.
         estimator: the system that computes the pose.
     """
 
@@ -111,7 +121,7 @@ class PortedSystem(LeafSystem):
     """A LeafSystem that declares ports from model values; an int n is a vector of size n."""
 
     def add_input(self, name: str, model_value: Any) -> InputPort:
-        """Declare an input port."""
+        """Declare an input port for values as ``model_value``, or for vectors of this size."""
         if isinstance(model_value, int):
             return self.DeclareVectorInputPort(name, model_value)
         return self.DeclareAbstractInputPort(name, AbstractValue.Make(model_value))
@@ -125,7 +135,11 @@ class PortedSystem(LeafSystem):
     ) -> OutputPort:
         """Declare an output port that a function of the context computes.
 
-        ``tickets`` are its prerequisites; None: all input ports.
+        Args:
+            name: name of the port.
+            model_value: a value of the port's type, or the size of its vector.
+            function: maps this system's context to the port's value.
+            tickets: what the value depends on; None: all input ports.
         """
         prerequisites = {self.all_input_ports_ticket()} if tickets is None else tickets
         if isinstance(model_value, int):
@@ -143,7 +157,7 @@ class PortedSystem(LeafSystem):
         )
 
     def add_cache(self, name: str, function: Callable[[Context], Any]) -> CacheEntry:
-        """Declare a cache entry that a function of the input ports computes."""
+        """Declare a cache entry ``name``; ``function`` computes it from a context's input ports."""
         return self.DeclareCacheEntry(
             name,
             ValueProducer(
@@ -159,12 +173,13 @@ class PortedSystem(LeafSystem):
         """Declare an input port for each camera.
 
         Args:
-            ports: port names by camera.
-            model_value: maps a camera's name to the model value of its port.
+            ports: name of the port by name of the camera.
+            model_value: maps a camera's name to the model value of its port; by default None, for a
+                port of any value.
 
         Returns:
-            A function that maps a context to the values by camera, without those that are None or
-                not connected.
+            A function that maps a context to the values by name of the camera, without those that
+                are None or not connected.
         """
         for name, port in ports.items():
             self.add_input(port, model_value(name))
@@ -184,7 +199,7 @@ class PortedSystem(LeafSystem):
         return lambda context: context.get_abstract_parameter(int(index)).get_value()
 
     def eval_input(self, context: Context, name: str) -> Any:
-        """Return the value at an input port, vectors as a copy; None if it is not connected."""
+        """Return the value at the input port ``name``, vectors as a copy; None: not connected."""
         port = self.GetInputPort(name)
         value = port.Eval(context) if port.HasValue(context) else None
         return np.array(value) if isinstance(value, np.ndarray) else value
@@ -201,7 +216,7 @@ class ImmutableValue:
 
 
 class BeliefSystem(PortedSystem, Generic[T]):
-    """A system owner state is one abstract value, the belief, replaced by a periodic update.
+    """A system whose state is one abstract value, the belief, replaced by a periodic update.
 
     The update is unrestricted, as abstract state requires.
     """
@@ -215,7 +230,10 @@ class BeliefSystem(PortedSystem, Generic[T]):
     def add_belief_output(
         self, name: str, model_value: Any, read: Callable[[T], Any]
     ) -> OutputPort:
-        """Declare an output port that is a function of the belief."""
+        """Declare an output port ``name`` whose value is ``read`` of the belief.
+
+        ``model_value``: a value of the port's type, or the size of its vector.
+        """
         ticket = {self.abstract_state_ticket(self._belief)}
         return self.add_output(
             name, model_value, lambda context: read(self.belief(context)), ticket
@@ -227,7 +245,10 @@ class BeliefSystem(PortedSystem, Generic[T]):
         return known
 
     def next_belief(self, context: Context, last: T) -> T:
-        """Return the belief after an update, given the last one; ``last`` itself if unchanged."""
+        """Return the belief after an update at the context's inputs, given the ``last`` one.
+
+        Return ``last`` itself if nothing changes. Subclasses implement this.
+        """
         raise NotImplementedError
 
     def _update(self, context: Context, state: State) -> EventStatus:
@@ -240,7 +261,7 @@ class BeliefSystem(PortedSystem, Generic[T]):
 
 
 class MemorySystem(PortedSystem):
-    """A system owner state is named vectors, replaced by a periodic update.
+    """A system whose state is named vectors, replaced by a periodic update.
 
     The update is discrete: it sees the results of unrestricted updates at the same time.
     """
@@ -251,7 +272,7 @@ class MemorySystem(PortedSystem):
         """Declare state vectors and their update.
 
         Args:
-            initial: initial values by name.
+            initial: initial vectors by name, which also give their sizes.
             output_names: names of the vectors that have an output port.
             period: time between two updates [s].
         """
@@ -269,12 +290,15 @@ class MemorySystem(PortedSystem):
         }
 
     def set_vectors(self, state: DiscreteValues, known: Mapping[str, Array]) -> None:
-        """Write state vectors by name."""
+        """Write arrays of any shape to the state vectors of their names; others stay unchanged."""
         for name, value in known.items():
             state.set_value(self._vectors[name], np.ravel(value))
 
     def next_vectors(self, context: Context, known: dict[str, Array]) -> Mapping[str, Array]:
-        """Return the vectors that an update changes; ``known``, a copy of all, may be modified."""
+        """Return the vectors that an update at the context's inputs changes, by name.
+
+        ``known``: a copy of all vectors by name, which may be modified. Subclasses implement this.
+        """
         raise NotImplementedError
 
     def _update(self, context: Context, state: DiscreteValues) -> EventStatus:

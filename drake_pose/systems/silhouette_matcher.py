@@ -39,8 +39,8 @@ class MatcherState(ImmutableValue):
     Args:
         q: (nq,) positions of the last pose found.
         X_WB: (4, 4) pose of its base.
-        estimate: of the last update; None: no camera saw the body.
-        memory: a subclass's own state.
+        estimate: estimate of the last update; None: no camera saw the body.
+        memory: a subclass's own state; None: it has none.
     """
 
     q: Array
@@ -85,6 +85,7 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
     its result.
 
     Args:
+        search: the search for the poses of a body.
         cameras: calibrated, in the order of the input ports, or by name.
         period: time between two updates [s].
         labels: render labels of the body; None: those of its model if made of a plant
@@ -134,6 +135,7 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
         self._declare_outputs(search.tree.model.plant)
 
     def _declare_outputs(self, plant: MultibodyPlant) -> None:
+        """Declare the output ports; ``plant`` is the model's."""
         nq = plant.num_positions()
         self.add_belief_output("estimated_positions", nq, lambda known: known.q)
         self.add_belief_output("error", 1, lambda known: _statistics(known.estimate)[2:3])
@@ -156,7 +158,7 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
             self.add_belief_output(name, size, read)
 
     def next_belief(self, context: Context, last: MatcherState) -> MatcherState:
-        """Return the state after matching the current images."""
+        """Return the state after matching the context's images, given the last state."""
         images, labels = self._images(context), self._labels(context)
         masks = {name: label_image_to_mask(image, labels) for name, image in images.items()}
         views = [
@@ -170,19 +172,23 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
         return MatcherState(estimate.q, estimate.X_WB, estimate, memory)
 
     def _is_predicted(self, memory: Any) -> bool:
-        """Return whether an estimate that was not found is a prediction."""
+        """Return whether an estimate that was not found is a prediction, given the next memory."""
         return False
 
     def _find(
         self, context: Context, memory: Any, views: Sequence[View]
     ) -> tuple[PoseEstimate | None, Any]:
-        """Return the pose that the views show, if any, and the next memory."""
+        """Return the pose that the views show, None if there is no view, and the next memory.
+
+        ``memory``: ``MatcherState.memory`` of the last update. ``views``: the cameras that see the
+        body, with its mask.
+        """
         if not views:
             return None, memory
         return self._search.match(views, self.eval_input(context, "root_position")), memory
 
     def _pose_set_values(self, estimate: PoseEstimate | None) -> dict[str, Array]:
-        """Return the outputs that come from the pose set, by port; empty without a pose set."""
+        """Return the outputs from an estimate's pose set, by name of the port; {} without one."""
         if estimate is None or not estimate.found or estimate.pose_set is None:
             return {}
         names = self._search.tree.model.position_names
@@ -200,7 +206,7 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
 
 
 def _statistics(estimate: PoseEstimate | None) -> Array:
-    """Return the elements of STATISTICS."""
+    """Return the elements of STATISTICS (7,): differences are infinite without a pose."""
     values = np.zeros(len(STATISTICS))
     values[1:4] = np.inf
     if estimate is not None:
@@ -218,7 +224,10 @@ TRACK = ("tracked", "matches", "distance")
 class _Memory(NamedTuple):
     """The state of a SilhouetteTracker.
 
-    ``track`` has the elements of TRACK; ``time`` is that of the last update [s].
+    Attributes:
+        tracker_state: state of the ``MatchAndTrack``.
+        track: elements of TRACK.
+        time: time of the last update [s].
     """
 
     tracker_state: TrackerState
@@ -268,8 +277,8 @@ class SilhouetteTracker(SilhouetteMatcher):
             from the edges [pixel].
 
     Args:
-        tracking: of the tracker: abstract parameter 1 of the context, where all but ``root_moves``
-            and ``scale_unknown`` can be changed.
+        tracking: settings of the tracker; None: TrackingSettings(). They are abstract parameter 1
+            of the context, where all but ``root_moves`` and ``scale_unknown`` can be changed.
         color_cameras: names of the cameras that have a port for a colour image.
         search_time: time limit of a ``MultiStartSearch`` [s]; a search that reaches it is repeated
             in the next updates. None: no limit.
@@ -317,6 +326,7 @@ class SilhouetteTracker(SilhouetteMatcher):
     def _find(
         self, context: Context, memory: _Memory, views: Sequence[View]
     ) -> tuple[PoseEstimate | None, _Memory]:
+        """Return the tracked or searched pose, and the next memory; None before any evidence."""
         pictures = self._colours.pictures(context)
         last, root_position = memory.tracker_state, self.eval_input(context, "root_position")
         if not views and not pictures and last.track is None:
@@ -334,6 +344,7 @@ class SilhouetteTracker(SilhouetteMatcher):
         return result, _Memory(now, track, context.get_time())
 
     def _is_predicted(self, memory: _Memory) -> bool:
+        """Return whether there is a track, which predicts a pose that is not found."""
         return memory.tracker_state.track is not None
 
     def with_intervals(self, context: Context) -> PoseEstimate:
@@ -361,6 +372,7 @@ class SilhouetteTracker(SilhouetteMatcher):
         return self._followers[tracking]
 
     def _deviations(self, known: MatcherState) -> Array:
+        """Return the output ``position_deviations`` (nq,)."""
         deviations, track = np.full(len(known.q), np.nan), known.memory.tracker_state.track
         if track is not None:
             seen = [*self._moving, *self._still]
@@ -371,6 +383,7 @@ class SilhouetteTracker(SilhouetteMatcher):
         return deviations
 
     def _state(self, known: MatcherState) -> Array:
+        """Return the output ``estimated_state`` (nq + nv,)."""
         plant = self._search.tree.model.plant
         qdot, track = np.full(len(known.q), np.nan), known.memory.tracker_state.track
         if track is not None:
@@ -384,4 +397,5 @@ class SilhouetteTracker(SilhouetteMatcher):
         return np.concatenate([known.q, plant.MapQDotToVelocity(plant_context, qdot)])
 
     def _indices(self, names: Sequence[str]) -> list[int]:
+        """Return the indices in q of named positions."""
         return [self._search.tree.model.position_index(name) for name in names]

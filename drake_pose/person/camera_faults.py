@@ -104,7 +104,9 @@ class CameraComparison:
     """Compares cameras with each other by a person that they see.
 
     Args:
-        held: (m,) values that stay fixed.
+        fit: the person's body with the noise of its contours.
+        cameras: calibrated cameras by name.
+        held: (m,) which values of the pose tree stay fixed; None: none.
     """
 
     def __init__(
@@ -114,7 +116,10 @@ class CameraComparison:
         self._without: dict[tuple[FrameEdges, str], tuple[Array, float]] = {}
 
     def pose_without(self, frame: FrameEdges, left_out: str) -> tuple[Array, float]:
-        """Return a frame's pose (m,) by all cameras but one, and these cameras' inlier ratio."""
+        """Return a frame's pose (m,) [rad, m] by all cameras but one, and their inlier ratio.
+
+        `left_out` is the name of that camera; "": all cameras are used. Results are cached.
+        """
         if (frame, left_out) in self._without:
             return self._without[frame, left_out]
         names = [name for name in frame.edges if name != left_out]
@@ -131,7 +136,10 @@ class CameraComparison:
         return found.values, found.inlier_ratio
 
     def inlier_ratio(self, camera: Camera, edge: EdgePoints, values: Array) -> float:
-        """Return the inlier ratio of the contours in one picture, for values (m,)."""
+        """Return the inlier ratio of a camera's edge points at values (m,), 0 to 1.
+
+        Inliers are nearer than about 5 cm, the fit's last scale.
+        """
         return self._fit.compare(
             pack_views([camera], [edge]), values, AnnealingStage(0.05, 0.05)
         ).inlier_ratio
@@ -143,11 +151,12 @@ class CameraComparison:
         poses: Sequence[Array],
         scales: Sequence[float] = FAULT.scales,
     ) -> CameraMotion:
-        """Fit the motion of a camera to its edges, for poses (m,) found without this camera.
+        """Fit the motion of a camera since its calibration to its edge points, for known poses.
 
         Args:
-            edges: edge points in each frame.
-            poses: (m,) pose in each frame [rad, m].
+            name: of the camera.
+            edges: edge points of the camera's silhouette in each frame.
+            poses: (m,) person's pose in each frame [rad, m], best found without this camera.
             scales: of the fit, coarse to fine [m].
         """
         camera, pairs = self._cameras[name], list(zip(edges, poses, strict=True))
@@ -184,7 +193,13 @@ class CameraComparison:
         pairs: Sequence[tuple[EdgePoints, Array]],
         points: Array,
     ) -> CameraMotion:
-        """Describe a camera's motion by what it does to points (n, 3) in its pictures [m]."""
+        """Describe a camera's motion by how it displaces points in the camera's pictures.
+
+        Args:
+            camera, moved: as calibrated, and after the motion.
+            pairs: edge points and pose (m,) of each frame, for the inlier ratios.
+            points: (n, 3) points on the person in all frames [m].
+        """
         before, after = camera.project(points)[0], moved.project(points)[0]
         pixels = float(np.sqrt(((after - before) ** 2).sum(axis=1).mean()))
         offsets_before, offsets_after = before - before.mean(axis=0), after - after.mean(axis=0)
@@ -205,9 +220,15 @@ class CameraComparison:
         )
 
     def find_fault(self, frames: Sequence[FrameEdges]) -> CameraFault | None:
-        """Return the camera that disagrees most with the others, or None.
+        """Return the camera that disagrees most with the others; None if none does.
 
-        Only frames that three or more cameras see are used.
+        A camera is at fault if its removal from the pose lowers the misfit, 1 - inlier ratio, to
+        `max_misfit` of what it was, and its own motion exceeds `min_metres` and `min_pixels`. With
+        three cameras twice `min_metres` is needed, and the fault is never explained. The result's
+        `first` and `is_left_out` are not set here.
+
+        Args:
+            frames: those that fewer than three cameras see are ignored.
         """
         frames = [frame for frame in frames if len(frame.edges) >= 3]
         names = [name for name in self._cameras if any(name in frame.edges for frame in frames)]
@@ -271,7 +292,12 @@ class CameraComparison:
 
 
 def _shift_to_regions(camera: Camera, edges: Sequence[EdgePoints], places: Array) -> Array:
-    """Return the mean shift (3,) from bodies' middles to the rays of regions' middles [m]."""
+    """Return the mean shift (3,) [m] from the body's middle to the ray of its region's middle.
+
+    Args:
+        edges: edge points of the camera's region in each frame; frames without any are skipped.
+        places: (frames, nodes, 3) origins of the body's nodes [m]; their mean is the middle.
+    """
     shifts = [np.zeros(3)]
     for edge, own in zip(edges, places, strict=True):
         if len(edge.uv):
@@ -282,7 +308,10 @@ def _shift_to_regions(camera: Camera, edges: Sequence[EdgePoints], places: Array
 
 
 def is_explained(motion: CameraMotion, others_inlier_ratio: float) -> bool:
-    """Return whether a camera's motion makes its silhouettes fit nearly as well as the others'."""
+    """Return whether a camera's silhouettes fit after its motion nearly as well as the others'.
+
+    The inlier ratio after the motion must exceed 0.9 of the others' inlier ratio.
+    """
     return motion.inlier_ratio_after > FAULT.explained_ratio * others_inlier_ratio
 
 

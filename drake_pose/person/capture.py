@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body import PoseTree
 from drake_pose.camera.models import Camera
-from drake_pose.errors import CameraError, MaskError, SettingsError
+from drake_pose.errors import SettingsError
 from drake_pose.fit.colours import PartColours
 from drake_pose.fit.contour_fit import ContourFit, PoseFit
 from drake_pose.fit.evidence import EdgePoints, find_edge_points
@@ -29,7 +29,7 @@ from drake_pose.person.camera_faults import (
 )
 from drake_pose.person.figures import PersonRecording, ReadFrame, ViewFaults
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
-from drake_pose.person.rig_faults import RigFault, find_rig_fault
+from drake_pose.person.rig_faults import RigFault, find_rig_fault, require_person
 from drake_pose.person.search import LENIENT
 from drake_pose.person.shape import NOISE, PersonShape, fit_shape, shape_values
 from drake_pose.person.views import (
@@ -70,7 +70,7 @@ class PersonCapture:
 
     @staticmethod
     def empty(count: int, shape: PersonShape | None, fit: ContourFit) -> "PersonCapture":
-        """Return a capture of `count` frames without poses."""
+        """Return a capture of `count` frames without poses, of the body and tree of `fit`."""
         q = np.full((count, len(fit.tree.model.position_names)), np.nan)
         return PersonCapture(q, np.zeros(count), shape, fit.outlines, fit.tree, q.copy())
 
@@ -81,7 +81,10 @@ class PersonCapture:
         state: TrackState,
         seen: FrameViews | ColourViews,
     ) -> None:
-        """Store the pose of a frame and its standard deviations, given what was seen."""
+        """Store the pose of a tracker's state in row `frame`, and its standard deviations.
+
+        `seen` are the views of the frame that the state was fitted to.
+        """
         lengths = None if self.shape is None else self.shape.covariance
         self.q[frame] = tracker.positions(state.values)
         self.inlier_ratios[frame] = state.inlier_ratio
@@ -102,10 +105,11 @@ def capture_person(
     Args:
         tree: of a model with a person's landmarks, best with shape joints, as
             urdf/person/person_shape.urdf has.
+        cameras: by name.
         read: returns the masks of a frame.
         frames: indices, in order, of the frames in which the person is seen. After a gap the
             person is also searched anew.
-        count: number of frames of the whole recording.
+        count: number of frames of the whole recording, rows of the result; None: that of `frames`.
         is_sequence: whether frames follow each other; if not, each is searched by itself.
         on_frame: called after each frame with its index.
 
@@ -139,7 +143,12 @@ class _Explanation(NamedTuple):
 
 
 class _Capture:
-    """A recording with the tracker that follows the person in it."""
+    """A recording with the tracker that follows the person in it; arguments as `capture_person`.
+
+    Attributes:
+        tracker: has the person's shape as far as known; the methods replace it.
+        alternatives: as in `PersonCapture`, of the frames searched so far.
+    """
 
     def __init__(
         self, tree: PoseTree, cameras: Mapping[str, Camera], read: ReadFrame, is_sequence: bool
@@ -170,10 +179,11 @@ class _Capture:
     def measure_shape(
         self, frames: Sequence[int], first: int = 40, fitted: int = 10
     ) -> tuple[PersonShape | None, dict[int, TrackState]]:
-        """Fit the shape to `fitted` of the `first` frames, and give it to the tracker.
+        """Fit the shape to `fitted` of the first `first` frames, and give it to the tracker.
 
         Returns:
-            The shape, None where the model has no shape joints; and the states in these frames.
+            The shape, and the tracker states in the fitted frames by frame; None and {} where the
+            model has no shape joints.
         """
         if not self._has_shape:
             return None, {}
@@ -197,7 +207,7 @@ class _Capture:
     def _fit_shape(
         self, frames: Sequence[int], poses: Sequence[Array]
     ) -> tuple[PersonShape, PersonPoseTracker]:
-        """Fit the shape to frames with these poses (m,); return it with a tracker that has it."""
+        """Fit the shape to frames, from initial poses (m,); return it and a tracker that has it."""
         fit, observed = self._bare, [self._see(k) for k in frames]
         views = [(one.cameras, [view.edge for view in one.views]) for one in observed]
         shape = fit_shape(fit, views, np.array(poses))
@@ -205,14 +215,15 @@ class _Capture:
         return shape, PersonPoseTracker(shaped, LENIENT, shape_values(fit.tree), shape.values, plan)
 
     def find_explanations(self, frame: int, start: PoseFit | None = None) -> list["_Explanation"]:
-        """Return the distinct poses that explain a frame, best first; empty if nobody is visible.
+        """Return the distinct poses that explain a frame, best first; [] if nobody is visible.
 
         Where the shape is unknown, the shape of a first fit is used in the search, and each
         explanation gets its own shape before they are compared: in a body of other proportions a
-        wrong pose may fit better than the right one.
+        wrong pose may fit better than the right one. Explanations that fit nearly as well as the
+        best one are stored in `alternatives`.
 
         Args:
-            start: the first fit, if it exists already.
+            start: the first fit; None: the best fresh start of a search.
         """
         seen, tracker = self._see(frame), self.tracker
         if self._has_shape:
@@ -236,7 +247,10 @@ class _Capture:
         return found
 
     def _with_shape(self, frame: int, values: Array) -> "_Explanation":
-        """Refine a pose (m,) of a frame together with the person's shape."""
+        """Refine a frame's pose and search its limbs with the shape that fits them best.
+
+        `values` (m,) is the pose from which the shape is fitted [rad, m].
+        """
         seen = self._see(frame)
         shape, shaped = self._fit_shape([frame], [values])
         refined = shaped.search.refine(shape.poses[0], seen)
@@ -248,7 +262,17 @@ class _Capture:
         known: Mapping[int, TrackState],
         finish: Callable[[int, TrackState | None, FrameViews], None] | None = None,
     ) -> dict[int, TrackState | None]:
-        """Return the states of all frames; tracking starts at a known or the best-fitting frame."""
+        """Track the person; return the state of each frame, None where no person is found.
+
+        A sequence is tracked from its first known frame, or the best-fitting one of a few, forwards
+        to the end, then from there backwards. Otherwise each frame is searched by itself.
+
+        Args:
+            frames: indices in order; after a gap the person is also searched anew.
+            known: states by frame that are known before; {}: none.
+            finish: called with each frame's index, state and views when the frame is done; None:
+                nothing is called.
+        """
         found: dict[int, TrackState | None] = {}
 
         def follow(state: TrackState | None, frame: int, last: int) -> TrackState | None:
@@ -284,7 +308,10 @@ class _Capture:
         return found
 
     def _search_frame(self, frame: int, known: TrackState | None) -> TrackState | None:
-        """Return the state in a frame by itself, with the tracker's shape."""
+        """Return the state in a frame by itself, with the tracker's shape; None: no person.
+
+        `known` is the state from which the pose is refined; None: the person is searched.
+        """
         if known is None:
             explained = self.find_explanations(frame)
             if not explained:
@@ -300,9 +327,10 @@ class _Capture:
     def _best_start(
         self, frames: Sequence[int], tried: int = 3, enough: float = 0.97
     ) -> tuple[int, TrackState]:
-        """Return which of the tried frames has the best-fitting fresh start, and its state.
+        """Return the index and the state of the frame with the best-fitting fresh start.
 
-        A frame whose inlier ratio exceeds `enough` ends the trials.
+        Of `frames`, `tried` are tried until an inlier ratio exceeds `enough`. The tracker gets the
+        shape that fits the best one. Raises SettingsError: two cameras see a person in none.
         """
         best: tuple[int, PoseFit] | None = None
         for frame in spread_over(frames, tried):
@@ -340,11 +368,15 @@ def capture_by_colour(
     Masks or given positions start the track, and start it again after a loss.
 
     Args:
+        tree: of a model with a person's landmarks.
+        cameras: by name.
+        count: number of frames, all of which are tracked as a sequence.
         pictures: returns a frame's pictures (H, W, 3) by camera.
-        starts: approximate positions (nq,) of the plant by frame [rad, m].
-        masked: masks by camera of each frame that has some.
-        known: the capture of the masked frames, which also gives the shape; None: there are no
-            masks, and shape joints stay as in the first start.
+        starts: approximate positions (nq,) of the plant by frame [rad, m]; they are used where no
+            mask is and the person is not tracked.
+        masked: masks (H, W) by frame and camera, for the frames that have some.
+        known: the capture of the masked frames, its rows in the order of `masked`, which also gives
+            the shape; None: there are no masks, and shape joints stay as in the start.
         on_frame: called after each frame with its index.
 
     Returns:
@@ -430,6 +462,9 @@ def capture_checked(
     """Capture a recording as `capture_person` does, and find its faults.
 
     Args:
+        tree, cameras, read, is_sequence: as of `capture_person`.
+        count: number of frames, all of which are read.
+        on_frame: called after each frame with the person, in the first capture only.
         hull_frames: number of frames whose visual hull is compared with the silhouettes.
         min_cameras: a camera is left out only if at least this number of others remains.
 
@@ -470,34 +505,14 @@ def capture_checked(
     return CheckedCapture(captured, recording.faults(), tuple(found), rig, recording.read)
 
 
-def require_person(recording: PersonRecording, count: int) -> PersonRecording:
-    """Return a recording of `count` frames if it shows a person.
-
-    A visible part of a person is 0.1 to 3 m tall, and fills the whole picture in at most half of
-    the masks.
-
-    Raises:
-        CameraError, MaskError, ModelError, SettingsError: as for `capture_checked`.
-    """
-    if not recording.seen:
-        raise SettingsError(
-            f"two cameras see no person in any of {count} frames: give masks that show one"
-        )
-    if recording.covering > 0.5:
-        raise MaskError(
-            f"in {100.0 * recording.covering:.0f} % of the masks the largest figure reaches all "
-            "four sides of the picture: the person must be white before a black background"
-        )
-    if not 0.1 < recording.height < 3.0:
-        raise CameraError(
-            f"a person {recording.height:.3g} m tall by the cameras' calibration: X_WC must be in "
-            "metres and the camera's pose in the world, not its inverse; focal lengths in pixels"
-        )
-    return recording
-
-
 class _CaptureComparison(CameraComparison):
-    """Compares the cameras of a captured recording with each other."""
+    """Compares the cameras of a captured recording with each other.
+
+    Args:
+        tree, cameras: as of `capture_person`.
+        recording: the masks.
+        captured: poses of the recording; frames without a pose are not compared.
+    """
 
     def __init__(
         self,
@@ -538,7 +553,10 @@ class _CaptureComparison(CameraComparison):
         return replace(fault, first=first)
 
     def reevaluate(self, fault: CameraFault) -> CameraFault:
-        """Evaluate a left-out camera again, by the poses captured without it."""
+        """Return a left-out camera's fault with motion and first frame estimated again.
+
+        The recording must have been captured without the camera since then.
+        """
         seen = {k: self._recording.read(k, with_all=True).get(fault.name) for k in self._values}
         frames = [k for k, mask in seen.items() if mask is not None]
         edges = [self._edge(fault.name, mask) for mask in seen.values() if mask is not None]
@@ -558,9 +576,12 @@ class _CaptureComparison(CameraComparison):
     def _first_frame(
         self, fault: CameraFault, edges: Sequence[EdgePoints], poses: Sequence[Array]
     ) -> int:
-        """Return the index of the first picture in which a camera is at fault.
+        """Return the index of the first picture in which a camera is at fault; their number: none.
 
         Its inlier ratio after the motion counts as at least 0.7 of the others' ratio.
+
+        Args:
+            edges, poses: edge points in the camera's picture, and pose (m,), of each frame.
         """
         camera = self._cameras[fault.name]
         before, after = (

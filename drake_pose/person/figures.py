@@ -50,7 +50,7 @@ class Person:
     Args:
         position: (3,) middle of the body [m].
         figures: index of the person's figure, by index of the camera.
-        area: median area of these figures, the smaller one of two [pixel^2].
+        area: median area of these figures, of an even number the lower one [pixel^2].
     """
 
     position: Array
@@ -69,7 +69,8 @@ def find_figures(
 
     Args:
         speck: figures below this fraction of the largest one's area are specks.
-        least_pixels, least_fraction: least area of a figure [pixel^2], and over the picture's.
+        least_pixels, least_fraction: a figure's area must exceed `least_pixels` [pixel^2] and
+            `least_fraction` of the picture's area.
     """
     small, step = _coarse(mask)
     left, top, width, height = cv2.boundingRect(small)
@@ -93,7 +94,7 @@ def find_figures(
 
 
 def cut_figures(mask: Mask, unwanted: Sequence[Figure]) -> Mask:
-    """Return a mask (H, W) without some of its figures."""
+    """Return a mask (H, W) without the unwanted ones of its figures, as of `find_figures`."""
     if not unwanted:
         return mask
     small, step = _coarse(mask)
@@ -110,7 +111,10 @@ def cut_figures(mask: Mask, unwanted: Sequence[Figure]) -> Mask:
 
 
 def _coarse(mask: Mask) -> tuple[Picture, int]:
-    """Return every step-th pixel of a mask, at least 240 on its shorter side, and the step."""
+    """Return every step-th pixel of a mask (H, W) as bytes 0 and 1, and the step.
+
+    240 to 479 pixels remain on the shorter side; smaller masks stay whole.
+    """
     step = max(1, min(mask.shape) // 240)
     return np.ascontiguousarray(mask[::step, ::step]).view(np.uint8), step
 
@@ -118,11 +122,11 @@ def _coarse(mask: Mask) -> tuple[Picture, int]:
 def find_persons(
     cameras: Sequence[Camera], figures: Sequence[Sequence[Figure]], examined: int = 8
 ) -> tuple[Person, ...]:
-    """Return the persons that two or more cameras see, the best supported first.
+    """Return the persons that two or more cameras see, the best supported first; () if none.
 
     Args:
-        figures: of each camera's mask.
-        examined: number of best supported positions that are examined in each round.
+        figures: of each camera's mask, in the order of `cameras`.
+        examined: number of best supported positions that are examined for each further person.
     """
     if all(len(own) <= 1 for own in figures):
         taken = {k: 0 for k, own in enumerate(figures) if own}
@@ -167,7 +171,10 @@ def find_persons(
 def _person(
     cameras: Sequence[Camera], figures: Sequence[Sequence[Figure]], taken: dict[int, int]
 ) -> Person:
-    """Return the person whose figures have these indices, by index of the camera."""
+    """Return the person seen as some figures: `taken` has a figure's index by the camera's index.
+
+    `figures` are those of each camera's mask.
+    """
     chosen = [figures[k][i] for k, i in taken.items()]
     areas = sorted(figure.area for figure in chosen)
     position = triangulate([cameras[k] for k in taken], [figure.middle for figure in chosen])
@@ -185,15 +192,17 @@ def _support(
 ) -> tuple[Array, Indices]:
     """Score positions (n, 3) by the figures that support a person there.
 
-    A figure adds 0.5 to 1 if its ray passes within 0.35 m.
+    A free figure adds 0.5 to 1 if its ray passes within 0.35 m.
 
     Args:
+        figures: of each camera's mask.
         free: indices of the figures of each camera that belong to no person yet.
         covers: score of a figure whose box only covers the position.
         misses: score of a camera that sees the position, but no figure there.
 
     Returns:
-        (n,) sums of the scores over cameras, and (n, cameras) index of the figure, or -1.
+        (n,) sums of the scores over the cameras whose picture contains the position; (n, cameras)
+        index of the nearest free figure, -1 where no ray passes within 0.35 m.
     """
     scores = np.zeros(len(positions))
     taken = np.full((len(positions), len(cameras)), -1)
@@ -224,10 +233,11 @@ def _support(
 def is_separate(
     person: Person, persons: Sequence[Person], least_area: float = 0.25, apart: float = 0.5
 ) -> bool:
-    """Return whether a person is separate from all others, and no part of their silhouettes.
+    """Return whether a person is large enough, and far enough from others, to be one of its own.
 
     Args:
-        least_area: least area of the figures, as a fraction of the largest person's.
+        persons: one or more others that were found already.
+        least_area: least `area` of the person, as a fraction of the others' largest.
         apart: least horizontal distance from all others [m].
     """
     if person.area < least_area * max(one.area for one in persons):
@@ -266,13 +276,16 @@ def sort_figures(
     """Find the figures of other persons, and where they merge with the followed person.
 
     Args:
-        figures: of each mask, in the order of the persons' camera indices.
-        person: the followed one; None: absent.
+        cameras: by name.
+        figures: of each mask by camera, in the order of the persons' camera indices.
+        persons: all persons found in the frame.
+        person: the followed one, without figures where hidden; None: absent.
         far, large: a figure of no known person is a stranger's if it is farther away [m] and
             larger than this fraction of the followed person's figure.
 
     Returns:
-        By camera: the figures of others; whether the person and another are one figure.
+        By camera: the figures of others, all figures where the person is absent; and whether the
+        person and another are one figure.
     """
 
     def covers(camera: Camera, figure: Figure, one: Person) -> bool:
@@ -317,13 +330,14 @@ def keep_person(
     """Keep one person in the masks of a frame, and cut out all others.
 
     Args:
+        cameras, masks: cameras, and masks (H, W) of those that have one, by name.
         position: (3,) where the person was in the last frame [m]. None: the person with the largest
             figures is kept, of equal ones the nearer one to the middle of the cameras' view.
 
     Returns:
         The masks without other persons, by camera; the person, None where fewer than two cameras
-        see anybody; the cameras whose masks others were cut out of; and the cameras in which the
-        person and another are one figure, which is left whole.
+        see anybody, and masks stay as they are; the cameras whose masks others were cut out of; and
+        the cameras in which the person and another are one figure, which is left whole.
     """
     used = {name: cameras[name] for name in masks}
     figures = {name: find_figures(mask) for name, mask in masks.items()}
@@ -347,7 +361,12 @@ def keep_person(
 def keep_views(
     frame: FrameViews, position: Array | None = None
 ) -> tuple[FrameViews, tuple[str, ...], tuple[str, ...]]:
-    """Keep one person in a frame's views; return them, and the cut and merged cameras' names."""
+    """Keep one person in a frame's views, as `keep_person` does in masks.
+
+    Returns:
+        The views; the names of the cameras whose regions others were cut out of; and of those in
+        which the person and another are one figure.
+    """
     cameras = {camera.name: camera for camera in frame.cameras}
     regions = {one.name: view.region for one, view in frame.pairs}
     masks, _, cut, merged = keep_person(cameras, regions, position)
@@ -364,7 +383,8 @@ def follow_one(
     """Choose the person to follow: the one seen longest and largest.
 
     Args:
-        middle: (3,) middle of the cameras' view [m].
+        frames: persons found in each frame.
+        middle: (3,) middle of the cameras' view [m]; of equally large persons the nearer is chosen.
         is_sequence: whether the frames follow each other; if not, the largest in each is chosen.
 
     Returns:
@@ -392,10 +412,15 @@ def follow_one(
 def find_tracks(
     frames: Sequence[Sequence[Person]], step: float = 0.4, more: float = 0.1
 ) -> list[dict[int, Person]]:
-    """Link persons from frame to frame, nearest ones first; return each one's track by frame.
+    """Link persons from frame to frame, nearest ones first.
 
-    A person's middle moves by at most `step` from one frame to the next, and by `more` in each
-    frame in which the person is hidden [m].
+    Args:
+        frames: persons found in each frame.
+        step: largest movement of a person's middle from one frame to the next [m].
+        more: added to `step` for each frame in which the person is hidden [m].
+
+    Returns:
+        The track of each person: positions and figures by index of the frame.
     """
     tracks: list[dict[int, Person]] = []
     for k, persons in enumerate(frames):
@@ -423,7 +448,7 @@ def _prominence(person: Person, middle: Array) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class ViewFaults:
-    """What was in view and what was not; frames count from 0.
+    """Frames in which persons were absent, merged or in company; frames count from 0.
 
     Args:
         no_person: frames in which fewer than two cameras see the person.
@@ -448,8 +473,9 @@ class PersonRecording:
             backgrounds do.
 
     Args:
+        cameras: by name.
         read: returns the masks of a frame; each of `count` frames is read once here.
-        is_sequence: whether frames follow each other.
+        is_sequence: whether frames follow each other; if not, the largest person in each is taken.
         measured: least number of frames in which the height is measured.
     """
 
@@ -501,7 +527,7 @@ class PersonRecording:
         return [k for k in range(self._count) if len(self.cameras_at(k)) >= 2]
 
     def cameras_at(self, frame: int) -> set[str]:
-        """Return the cameras that see the person in a frame and are not left out."""
+        """Return the names of the cameras that see the person in a frame and are not left out."""
         return {
             name for name in self._seeing[frame] if frame < self._left_out.get(name, self._count)
         }
@@ -511,7 +537,10 @@ class PersonRecording:
         self._left_out[name] = first
 
     def read(self, frame: int, with_all: bool = False) -> dict[str, Mask]:
-        """Return the masks of a frame by camera; `with_all`: left-out cameras' masks, too."""
+        """Return the masks (H, W) of a frame by camera, without other persons.
+
+        Cameras that do not see the person have none. `with_all`: left-out cameras have masks, too.
+        """
         wanted = self._seeing[frame] if with_all else self.cameras_at(frame)
         return {
             name: cut_figures(mask, self._others[frame][name][0])
@@ -520,7 +549,7 @@ class PersonRecording:
         }
 
     def faults(self) -> ViewFaults:
-        """Return what was in view and what was not."""
+        """Return where the person was absent, or others were in view, in all frames."""
         seen = set(self.seen)
         found: list[dict[str, list[int]]] = [{}, {}, {}]
         for frame, own in enumerate(self._others):

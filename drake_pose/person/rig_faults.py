@@ -1,4 +1,4 @@
-"""Detection of faults that concern all cameras: mirrored or exchanged pictures.
+"""Detection of faults that concern all cameras: mirrored or exchanged pictures, a wrong scale.
 
 The visual hull of a consistent rig fills all silhouettes (silhouette coherence, Hernandez, Schmitt
 and Cipolla 2007). A rig is at fault if mirroring or exchanging pictures makes the hull fill them.
@@ -13,8 +13,37 @@ import numpy as np
 
 from drake_pose.arrays import Array, Indices, Mask
 from drake_pose.camera.models import Camera
-from drake_pose.person.figures import find_figures, pixels_per_metre
+from drake_pose.errors import CameraError, MaskError, SettingsError
+from drake_pose.person.figures import PersonRecording, find_figures, pixels_per_metre
 from drake_pose.person.views import triangulate
+
+
+def require_person(recording: PersonRecording, count: int) -> PersonRecording:
+    """Return a recording of `count` frames if it shows a person; raise otherwise.
+
+    A visible part of a person is 0.1 to 3 m tall, and fills the whole picture in at most half of
+    the masks.
+
+    Raises:
+        SettingsError: two cameras see a person in no frame.
+        MaskError: the masks show the background.
+        CameraError: the person is smaller or taller than people are.
+    """
+    if not recording.seen:
+        raise SettingsError(
+            f"two cameras see no person in any of {count} frames: give masks that show one"
+        )
+    if recording.covering > 0.5:
+        raise MaskError(
+            f"in {100.0 * recording.covering:.0f} % of the masks the largest figure reaches all "
+            "four sides of the picture: the person must be white before a black background"
+        )
+    if not 0.1 < recording.height < 3.0:
+        raise CameraError(
+            f"a person {recording.height:.3g} m tall by the cameras' calibration: X_WC must be in "
+            "metres and the camera's pose in the world, not its inverse; focal lengths in pixels"
+        )
+    return recording
 
 
 @dataclass(frozen=True)
@@ -61,13 +90,16 @@ def find_rig_fault(
     """Find what is wrong with a rig as a whole, from one person's masks in some frames.
 
     Args:
+        cameras: by name.
+        frames: masks (H, W) of each frame by camera; frames with fewer than two are ignored.
         sound_below: the rig is sound if less than this fraction of the silhouettes is unfilled.
         remaining_below, remaining_fraction: a change is accepted if less than `remaining_below` of
             the silhouettes and less than `remaining_fraction` of the unfilled part stay unfilled.
         faulty_above: above this unfilled fraction a rig is at fault, even if no change helps.
 
     Returns:
-        The fault; None if there is none, or too little is unfilled.
+        The fault, without `mirrored` and `exchanged` if no change explains it; None if the rig is
+        sound, or no change explains an unfilled fraction of at most `faulty_above`.
     """
     frames = [masks for masks in frames if len(masks) >= 2]
     if not frames:
@@ -105,11 +137,13 @@ def _filled_fractions(
     height: float = 1.3,
     lattice: float = 0.25,
 ) -> dict[str, float]:
-    """Return the fraction of the silhouettes that a visual hull fills, by camera.
+    """Return the mean fraction of the silhouettes that a visual hull fills, by camera.
 
     Args:
+        cameras, frames: as of `find_rig_fault`.
         guess: change that is undone first.
-        first: cache of the cells in which cameras see grids, by camera and grid; changed.
+        first: cache of `_cell_indices` of each frame's first camera, by name and the grid's place
+            in the lattice; added to.
         spacing: of the hull's grid of points [m].
         side, height: half the grid's horizontal and vertical extent [m].
         lattice: spacing of the places where grids are put, so that frames can share them [m].
@@ -152,7 +186,13 @@ def _filled_fractions(
 
 
 def _cell_indices(camera: Camera, points: Array, size: float, shape: tuple[int, ...]) -> Indices:
-    """Return the index (n,) of the cell, `size` pixels wide, that shows each point; -1: none."""
+    """Return the index (n,) of the picture's cell that shows each point; -1: outside the picture.
+
+    Args:
+        points: (n, 3) points in the world [m].
+        size: side of a cell [pixel].
+        shape: numbers of rows and columns of cells, which are counted row by row.
+    """
     uv, depth = camera.project(points)
     with np.errstate(invalid="ignore"):
         column, row = np.floor((uv.T + 0.5) / size)
@@ -162,5 +202,5 @@ def _cell_indices(camera: Camera, points: Array, size: float, shape: tuple[int, 
 
 
 def _dilated(cells: Mask) -> Mask:
-    """Return cells grown by one to all eight sides."""
+    """Return cells (rows, columns) grown by one to all eight sides."""
     return np.asarray(cv2.dilate(cells.view(np.uint8), np.ones((3, 3), np.uint8)) > 0)

@@ -18,7 +18,6 @@ from drake_pose.person.camera_faults import (
     FrameEdges,
     first_moved_frame,
 )
-from drake_pose.person.capture import require_person
 from drake_pose.person.figures import (
     Figure,
     Person,
@@ -35,7 +34,7 @@ from drake_pose.person.figures import (
     sort_figures,
 )
 from drake_pose.person.pose_tracker import PersonPoseTracker
-from drake_pose.person.rig_faults import find_rig_fault
+from drake_pose.person.rig_faults import find_rig_fault, require_person
 from drake_pose.person.views import FrameViews, see_silhouette
 from tests.person.persons_in_view import see, stepping
 

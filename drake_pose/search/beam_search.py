@@ -54,8 +54,8 @@ def grow(
         spare: number of candidates from which distinct ones are chosen, as a multiple of ``width``.
 
     Returns:
-        The new partial poses, best first, or None if there is none within the limit; and whether
-        any partial pose within the limit was dropped.
+        The new partial poses, best first, or None if there is none within the limit; and whether a
+        partial pose within the limit may have been dropped.
     """
     pairs = store.pairs(partial, node)
     areas, added = store.score(partial, node, pairs)
@@ -335,7 +335,7 @@ class _BeamRun:
 
         Returns:
             The partial poses with all nodes placed (None: none was left, or the time is up), and
-            whether no partial pose within the limit was dropped.
+            whether certainly no partial pose within the limit was dropped.
         """
         complete = True
         for node in order:
@@ -352,8 +352,8 @@ class _BeamRun:
         """Run one stage and keep its best pose.
 
         Returns:
-            Whether no partial pose within the stage's limit was dropped, so that an exact stage
-            without a result proves that there is no exact pose.
+            Whether certainly no partial pose within the stage's limit was dropped, so that an exact
+            stage without a result proves that there is no exact pose.
         """
         exact = stage.outside_fraction == 0.0
         store = self._store(stage.outside_fraction)
@@ -490,7 +490,8 @@ class _BeamRun:
     def distinct(self, count: int, overlap: float) -> np.ndarray:
         """Return samples (m, nodes) of the best collected poses that differ, best first.
 
-        ``count`` and ``overlap`` as in ``BeamSearch.best_poses``.
+        Samples are indices in the nodes' grids. ``count`` and ``overlap`` as in
+        ``BeamSearch.best_poses``.
         """
         if not self._collected:
             return np.empty((0, len(self._body.sampled.values)), dtype=np.int32)

@@ -35,7 +35,7 @@ class Layer:
     Args:
         node: index of the node.
         origins: (m,) int64 states of this layer from which the edges start.
-        samples: (m,) int64 samples of the node.
+        samples: (m,) int64 the node's samples: indices in its grid.
         ends: (m,) int64 states of the next layer at which the edges end.
     """
 
@@ -89,7 +89,10 @@ class PartialPoseGraph:
 
     @classmethod
     def of_pose(cls, samples: np.ndarray, J: float) -> "PartialPoseGraph":
-        """Make the set of one pose, samples (nodes,), with objective J [pixel]."""
+        """Make the set of one pose with objective J [pixel].
+
+        ``samples``: (nodes,) index of each node's sample in its grid.
+        """
         zero = np.zeros(1, dtype=np.int64)
         layers = [Layer(node, zero, np.array([t]), zero) for node, t in enumerate(samples)]
         return cls(layers, np.array([J]))
@@ -105,7 +108,10 @@ class PartialPoseGraph:
         return float(self.Js.min(initial=np.inf))
 
     def objective(self, samples: np.ndarray) -> float | None:
-        """Return J of a pose, samples (nodes,) [pixel]; None if the pose is not in the set."""
+        """Return J of a pose [pixel]; None if the pose is not in the set.
+
+        ``samples``: (nodes,) index of each node's sample in its grid.
+        """
         state = 0
         for layer in self.layers:
             begin, end = np.searchsorted(layer.origins, [state, state + 1])
@@ -117,7 +123,7 @@ class PartialPoseGraph:
         return float(self.Js[state])
 
     def contains(self, samples: np.ndarray) -> bool:
-        """Return whether a pose, samples (nodes,), is in the set."""
+        """Return whether a pose is in the set, given by samples as for ``objective``."""
         return self.objective(samples) is not None
 
     def samples_used(self) -> list[np.ndarray]:
@@ -196,8 +202,8 @@ def branch_and_bound(
         views: the silhouettes, one per camera.
         J_limit: the greatest objective [pixel].
         limits: limits of time, memory and size; None: the defaults.
-        kept_samples: (nodes,) samples of a pose that is kept even if there are too many; None: no
-            pose is preferred.
+        kept_samples: (nodes,) samples (indices in the nodes' grids) of a pose that is kept even if
+            there are too many; None: no pose is preferred.
     """
     return _BranchAndBound(body, views, J_limit, limits or BoundLimits(), kept_samples).run()
 

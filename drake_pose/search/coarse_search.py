@@ -37,7 +37,7 @@ class CoarseView(NamedTuple):
     """One silhouette with the lookup tables of the coarse search.
 
     Attributes:
-        camera: (8,) kernel parameters.
+        camera: (8,) ``Camera.kernel_parameters()``.
         X_CW: (4, 4) pose of the world in the camera.
         origin: (2,) row and column of the corner of the first cell of the cover [pixel].
         cell: side of the cover's cells [pixel].

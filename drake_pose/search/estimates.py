@@ -159,7 +159,7 @@ class PoseMode:
         q: (nq,) the representative's positions in the plant's order [rad, m].
         X_WB: (4, 4) pose of the plant's world frame B in the world W.
         node_values: for each node (k_i,) the representative's values in the pose tree [rad or m].
-        J: the representative's objective, equation (1) [pixel].
+        J: the representative's objective, as in ``PoseEstimate`` [pixel].
         joints: the mode's interval of each value of the pose tree, in the order of the nodes.
         size: number of poses found in the mode.
     """

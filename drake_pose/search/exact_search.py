@@ -95,11 +95,11 @@ class ExactSearch:
     def _descend(
         self, problem: RefinementProblem, poses: Sequence[np.ndarray], deadline: float
     ) -> ExactPose | None:
-        """Refine poses (m + 4,) by the coarse passes, and the best of them by ``refine``.
+        """Refine some starts by the coarse passes, and the best of them by ``refine``.
 
         Args:
             problem: the silhouettes and the body.
-            poses: (m + 4,) parameters of each start.
+            poses: (m + 4,) parameters of each start, as in ``RefinementBody``.
             deadline: time.perf_counter() at which the search ends [s].
 
         Returns:
@@ -187,8 +187,8 @@ def find_intervals(
 
     Args:
         problem: the silhouettes and the body.
-        others: (m + 4,) each: alternative poses that are as good, best first.
-        parameters: (m + 4,) the best pose, refined.
+        others: alternative poses (m + 4,) that are as good, best first.
+        parameters: (m + 4,) the best pose, refined, as in ``RefinementBody``.
         tree: the pose tree, with its root where the body is; None: the body's.
         settings: parameters of the intervals; None: the defaults.
 

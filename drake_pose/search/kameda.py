@@ -24,7 +24,7 @@ class NodeList:
     """The candidate list of one node, best first: JAC_i(1), JAC_i(2), ...
 
     Args:
-        samples: (n,) the node's samples that are candidates.
+        samples: (n,) the candidates: indices in the node's grid.
         X_WN: (n, 4, 4) the node's poses at these.
         adopted: u_i, index of the adopted candidate, from 0.
     """

@@ -279,7 +279,10 @@ class _MultiStartRun:
         return refine_best(self._fit, self._values(starts), self._passes, self._proceed)
 
     def _looks_exact(self, values: np.ndarray) -> bool:
-        """Return whether masks may be exact: the border of the body at values (m,) coincides."""
+        """Return whether masks may be exact: their border coincides with the fitted body's.
+
+        ``values``: (m,) the tree's values of the fitted pose [rad or m].
+        """
         # Masks with many specks are not exact.
         if self._clean is not self._problem or not self._proceed():
             return False
@@ -427,12 +430,12 @@ class _MultiStartRun:
         return found
 
     def _parameters(self, values: np.ndarray) -> np.ndarray:
-        """Return the parameters (m + 4,) of a refinement by pixels at values (m,)."""
+        """Return the parameters (m + 4,), as in ``RefinementBody``, at the tree's values (m,)."""
         own = self._kinematics.split(values)
         return self._search.exact.body.parameters(own, self._root_position)
 
     def _J(self, values: np.ndarray) -> float:
-        """Return the objective J at values (m,), skin included [pixel]."""
+        """Return the objective J at the tree's values (m,), skin included [pixel]."""
         return float(self._problem.J(self._parameters(values)))
 
 

@@ -40,9 +40,10 @@ class LimitReached(Exception):
 
 
 def coarsen(view: View, pixels: int) -> View:
-    """Return the view reduced by an integer factor to about this silhouette area [pixel].
+    """Return the view, reduced by an integer factor to a silhouette of about ``pixels`` pixels.
 
-    A pixel belongs to the silhouette if at least half of the pixels that it replaces do.
+    A pixel belongs to the silhouette if at least half of the pixels that it replaces do. A view for
+    which the factor would be 1 is returned unchanged.
     """
     factor, camera = round(float(np.sqrt(view.mask.sum() / pixels))), view.camera
     if factor < 2:
@@ -63,9 +64,9 @@ def coarsen(view: View, pixels: int) -> View:
 class SilhouetteBits:
     """The silhouettes of one frame, and bands around them, as parts of one bit mask.
 
-    The parts are the silhouettes of all views, and after them their bands, if there are any. In the
-    silhouettes and bands the area of several nodes is that of their union; beyond the bands areas
-    of nodes are added.
+    A mask is W words of 64 bits, one bit for each pixel. Its parts are the silhouettes of all
+    views, and after them their bands, if there are any. In the silhouettes and bands the area of
+    several nodes is that of their union; beyond the bands areas of nodes are added.
 
     Attributes:
         has_bands: whether there are bands.

@@ -56,7 +56,8 @@ class Part:
 def find_parts(tree: PoseTree, longest: int = 3) -> tuple[Part, ...]:
     """Return the parts that are placed anew.
 
-    They are the ends of all limbs with one to ``longest`` nodes, and each node of the trunk alone.
+    They are the ends of all limbs with one to ``longest`` nodes, and each other node alone, with
+    its children held.
     """
     chains = []
     for leaf in tree.leaves:
@@ -179,7 +180,7 @@ class PartSearch:
 
         Args:
             problem: the silhouettes and the body.
-            parameters: (m + 4,) the pose, whose other nodes stay.
+            parameters: (m + 4,) the pose, as in ``RefinementBody``; its other nodes stay.
             part: the part that is placed anew.
             count: greatest number of placements.
             widths: number of hypotheses kept after the first, second, ... node of the part.
@@ -305,7 +306,7 @@ class PartSearch:
         is at the same place in the image.
 
         Args:
-            parameters: (m + 4,) the pose.
+            parameters: (m + 4,) the pose, as in ``RefinementBody``.
             view: the view whose optical axis is the direction of depth.
             steps: greatest number of Gauss-Newton steps.
         """
@@ -325,7 +326,7 @@ class PartSearch:
         """Return parameters with a part's left and right exchanged, and its first node turned.
 
         Args:
-            parameters: (m + 4,) the pose.
+            parameters: (m + 4,) the pose, as in ``RefinementBody``.
             part: the part, of k nodes.
             wanted: (k, 3) the wanted centres of its nodes in the world [m]. The first node takes
                 the sample that comes nearest to these.
@@ -368,10 +369,12 @@ class PartSearch:
         columns: np.ndarray,
         how: tuple[int, float, float],
     ) -> np.ndarray:
-        """Return parameters that bring points of nodes to wanted positions, by Gauss-Newton steps.
+        """Return parameters (m + 4,) that bring points of nodes to wanted positions.
+
+        They are found by Gauss-Newton steps.
 
         Args:
-            parameters: (m + 4,) the start.
+            parameters: (m + 4,) the start, as in ``RefinementBody``.
             nodes: (n,) the node of each point.
             p_N: (n, 3) the points in the nodes' frames [m].
             wanted: (n, 3) wanted positions in the world [m].
@@ -448,7 +451,7 @@ class NeighbourhoodSearch:
         """Place parts of a refined pose anew while J decreases.
 
         Args:
-            parameters: (m + 4,) the pose.
+            parameters: (m + 4,) the pose, as in ``RefinementBody``.
             enough: the search ends when J is at most this [pixel].
             deadline: time.perf_counter() at which the search ends [s].
             everywhere: whether each part is tried at least once, even without an error near it.
@@ -488,7 +491,7 @@ class NeighbourhoodSearch:
         """Return alternative poses with J up to a limit, refined to the end, best first.
 
         Args:
-            parameters: (m + 4,) the best pose.
+            parameters: (m + 4,) the best pose, as in ``RefinementBody``.
             limit: greatest J [pixel].
             same: poses are equal if no parameter differs by more [rad or m].
         """
@@ -536,7 +539,7 @@ class NeighbourhoodSearch:
         """Mirror a part, and place it anew, and store the alternatives that are nearly as good.
 
         Args:
-            parameters: (m + 4,) the current pose.
+            parameters: (m + 4,) the current pose, as in ``RefinementBody``.
             J: its objective [pixel].
             chosen: index of the part.
             erring: whether there is an error near the part; if not, the part is only mirrored.

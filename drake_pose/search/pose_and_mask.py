@@ -417,7 +417,7 @@ def follow_colours(silhouette: Mask, mask: Mask, band: float = 0.01) -> Mask:
     """Return a silhouette (H, W) whose edge is replaced by that of a mask (H, W) near to it.
 
     ``band``: half width of the band along the edge in which the mask decides, as a fraction of the
-    silhouette's size.
+    square root of the silhouette's area.
     """
     size = math.sqrt(max(1, int(np.count_nonzero(silhouette))))
     reach = max(1, round(band * size))

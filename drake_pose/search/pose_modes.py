@@ -58,7 +58,7 @@ def estimate_joints(
 
     Args:
         sampled: the tree and its grids.
-        samples: for each node (n,) its samples that occur in the set.
+        samples: for each node (n,) its samples (indices in its grid) that occur in the set.
         about: for each node (k,) the values of the answer; intervals of angles that turn around are
             given in the turn nearest to these [rad or m].
         complete: whether the set is complete; if not, only values that cannot move are determined.
@@ -205,7 +205,7 @@ def find_modes(
     Args:
         body: the sampled body.
         views: the silhouettes, one per camera.
-        samples: (nodes,) samples of the best known pose.
+        samples: (nodes,) samples (indices in the nodes' grids) of the best known pose.
         J: its objective [pixel].
         tolerance: greatest excess of the objective of a pose that is as good [pixel]. None: if the
             best pose is within ``renderer_tolerance``, all poses within that; else 5 % of the
@@ -257,9 +257,12 @@ def find_modes(
 
 
 def samples_at(sampled: SampledTree, node_values: Sequence[np.ndarray]) -> np.ndarray | None:
-    """Return samples (nodes,) of a pose, given by each node's values (k,); None if not on the grid.
+    """Return the index (nodes,) of each node's sample in its grid; None for a pose not on the grid.
 
-    Values may differ from those of the grids of ``sampled`` by 1e-6 [rad or m].
+    Args:
+        sampled: the tree and its grids.
+        node_values: for each node (k,) the pose's values [rad or m]. They may differ from the
+            grid's by 1e-6.
     """
     samples = np.zeros(len(sampled.values), dtype=np.int64)
     for i, (grid, values) in enumerate(zip(sampled.values, node_values, strict=True)):

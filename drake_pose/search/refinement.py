@@ -127,7 +127,7 @@ class RefinementBody:
         """Return the body placed at parameters (m + 4,), in arrays that the next call overwrites.
 
         Args:
-            parameters: (m + 4,) the pose.
+            parameters: (m + 4,) the pose, as in ``RefinementBody``.
             bent: whether the skin is deformed to the pose; else it keeps its last shape.
             rooted: whether derivatives by ROOT_NAMES are included even if these are zero.
         """
@@ -187,7 +187,7 @@ class RefinementProblem:
         """Return for each view the border of the union of all nodes that do not move.
 
         Args:
-            parameters: (m + 4,) the pose.
+            parameters: (m + 4,) the pose, as in ``RefinementBody``.
             moved: (nodes,) bool whether each node moves; if all do, the borders are empty.
         """
         if moved.all():
@@ -208,7 +208,7 @@ class RefinementProblem:
         """Return the normal equations of the distances along raster lines.
 
         Args:
-            parameters: (m + 4,) the pose.
+            parameters: (m + 4,) the pose, as in ``RefinementBody``.
             freedom: the k parameters that may change.
             part: stride, scale and slack of the comparison.
             offset: first raster line that is compared, below the stride.
@@ -254,7 +254,7 @@ def descend(
 
     Args:
         problem: the silhouettes and the body.
-        parameters: (m + 4,) the start.
+        parameters: (m + 4,) the start, as in ``RefinementBody``.
         freedom: the parameters that may change.
         passes: the passes, run one after another.
         fixed_borders: the border in each view of the nodes that do not move; None: computed here.

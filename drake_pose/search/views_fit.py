@@ -113,14 +113,18 @@ class ViewsFit:
         self.evaluations, self._counting = 0, Lock()
 
     def cost(self, values: np.ndarray, stage: AnnealingStage) -> float:
-        """Return the robust cost at values (m,), with a stage's scale and spacing [pixel]."""
+        """Return the robust cost at the tree's values (m,) in a stage [pixel].
+
+        ``stage`` sets the robust cost's scale and the spacing of contour points; its iterations are
+        not used.
+        """
         self._count(1)
         fit, views = self._level(stage)
         sums = fit.compare(views, values, stage).sums
         return float(sums[..., Sum.COST].sum()) / self._scale(stage) ** 2
 
     def distances(self, values: np.ndarray, stage: AnnealingStage) -> Distances:
-        """Return the residuals of the contours' distances at values (m,) in a stage."""
+        """Return the residuals of the contours' distances at values (m,); arguments as ``cost``."""
         self._count(1)
         fit, views = self._level(stage)
         compared = fit.compare(views, values, stage)
@@ -131,7 +135,7 @@ class ViewsFit:
         """Return (cameras, 64, 64) the robust cost at values (m,) in each image tile [pixel].
 
         The errors of different tiles are regarded as independent. A tile's side is a fifth of the
-        silhouettes' size, about the size of usual defects of masks. ``stage``: scale and spacing.
+        silhouettes' size, about the size of usual defects of masks. Arguments as ``cost``.
         """
         self._count(1)
         side = max(1.0, 0.2 * self.size)
@@ -180,7 +184,7 @@ def refine_best(
 
     Args:
         fit: the robust fit.
-        starts: each (m,), best first; at least one.
+        starts: the tree's values (m,) of each start, best first; at least one.
         passes: for each pass its stages, and the number of poses kept after it.
         proceed: returns whether there is time left; if not, only the first pose is refined.
 
@@ -238,7 +242,7 @@ def describe_modes(
     tolerance: float,
     is_known: bool,
 ) -> PoseSet:
-    """Return the pose set of some modes.
+    """Return the pose set of some modes, marked as incomplete.
 
     Args:
         kinematics: kinematics of the pose tree.
@@ -274,7 +278,7 @@ def covariance_pose_set(
     Args:
         tree: the pose tree, with m values.
         pose: the pose.
-        covariance: (m, m) covariance of the tree's values [rad or m].
+        covariance: (m, m) covariance of the tree's values [rad^2, rad m or m^2].
         image_count: number of images from which the sizes of errors were estimated; it sets the
             degrees of freedom of Student's distribution.
     """

@@ -35,7 +35,7 @@ class BitView(NamedTuple):
     """A silhouette and the margin around it, cropped to a window of the image.
 
     Attributes:
-        camera: (8,) kernel parameters.
+        camera: (8,) ``Camera.kernel_parameters()``.
         X_CW: (4, 4) pose of the world in the camera.
         window: (4,) int64 first row, first column, height h and width w [pixel].
         inside: (h, w + 1) int32 number of silhouette pixels before each pixel, row after row.
@@ -61,7 +61,7 @@ def make_bit_view(
 
     Args:
         mask: (H, W) bool, not empty.
-        camera_parameters: (8,) kernel parameters.
+        camera_parameters: (8,) ``Camera.kernel_parameters()``.
         X_CW: (4, 4) pose of the world in the camera.
         width: width of the margin around the silhouette [pixel]; 0: no margin, and only bodies that
             stay inside the silhouette are distinguished by their bits.
@@ -195,7 +195,7 @@ def _walk_cell(
     Args:
         celled: the surface.
         X: (3, 4) pose of the surface in the camera.
-        camera: (8,) kernel parameters.
+        camera: (8,) ``Camera.kernel_parameters()``.
         crossings: (height, capacity) output, as in ``add_surface``.
         rows: scratch of the span kernel; ``counts`` and ``row_range`` are updated.
         scratch: (4, e) int32 and (e, 4) float64 scratch for at least as many edges as the surface

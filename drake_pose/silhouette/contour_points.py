@@ -61,7 +61,7 @@ def find_segments(
     Args:
         packed: the surfaces of all nodes, each in its node's frame N.
         X_CN: (nodes, 4, 4) poses of the nodes in the camera.
-        camera: (8,) kernel parameters.
+        camera: (8,) ``Camera.kernel_parameters()``.
         selected: (nodes,) bool, whether each node's edges are returned.
     """
     rows, _ = make_rows(packed, camera)
@@ -259,7 +259,8 @@ def sample_contour(
         packed: the surfaces of all nodes, each in its node's frame N.
         X_CN: (nodes, 4, 4) poses of the nodes in the camera; rotations may be scaled uniformly for
             a parallel camera.
-        camera: (8,) kernel parameters. Triangles nearer than the near plane are left out.
+        camera: (8,) ``Camera.kernel_parameters()``. Triangles with a corner nearer than the near
+            plane are left out.
         spacing: distance between sampled rows and between columns [pixel]; the first row and column
             are pixel centres.
     """

@@ -57,7 +57,7 @@ class Outline:
 
     @cached_property
     def planes(self) -> np.ndarray:
-        """(m, 4) normals of length twice the area [m^2], and their products with a corner."""
+        """(m, 4) normals of length twice the area [m^2], and their products with a corner [m^3]."""
         corners = self.vertices[self.triangles]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         offsets = np.einsum("ij,ij->i", normals, corners[:, 0])
@@ -240,7 +240,7 @@ def viewpoint_in_node(X: np.ndarray, camera: np.ndarray) -> tuple[float, float, 
 
     Args:
         X: (3 or 4, 4) pose of the node in the camera, possibly scaled uniformly.
-        camera: (8,) kernel parameters.
+        camera: (8,) ``Camera.kernel_parameters()``.
     """
     if camera[0] != 0.0:
         return X[2, 0], X[2, 1], X[2, 2], 0.0
@@ -268,7 +268,7 @@ def project(
         packed: the surfaces of all nodes, each in its node's frame N.
         node: index of the surface.
         X_CN: (nodes, 3 or 4, 4) poses in the camera.
-        camera: (8,) kernel parameters.
+        camera: (8,) ``Camera.kernel_parameters()``.
         u, v: (points,) output.
     """
     fx, fy, cx, cy = camera[1], camera[2], camera[3], camera[4]
@@ -404,8 +404,11 @@ if TYPE_CHECKING:
 class BendingOutline:
     """A rigid surface and a skin band in its frame N, whose vertices move.
 
-    Attributes:
+    Args:
         rigid: the rigid surface.
+        band: the band at rest.
+
+    Attributes:
         rest: both parts with the band at rest; the rigid part's vertices and triangles come first.
     """
 

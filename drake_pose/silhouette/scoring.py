@@ -24,7 +24,10 @@ from drake_pose.silhouette.span_kernel import paint, paint_labels, score
 
 
 def prefix_sums(weights: np.ndarray) -> np.ndarray:
-    """Return (H, W + 1) int32 sums of a mask or of integers (H, W) left of each pixel."""
+    """Return (H, W + 1) int32 row-wise sums of a mask or of integers (H, W) left of each pixel.
+
+    The last column is the sum of the whole row.
+    """
     prefix = np.zeros((weights.shape[0], weights.shape[1] + 1), dtype=np.int32)
     np.cumsum(weights, axis=1, dtype=np.int32, out=prefix[:, 1:])
     return prefix
@@ -246,6 +249,7 @@ def _distance_image(
     """Draw a surface from one direction and measure distances to its silhouette's edge.
 
     Args:
+        outline: the surface.
         R_CN: (3, 3) rotation of the surface's frame N in the camera.
         camera: parallel camera, in the middle of whose image the surface's ball is drawn.
 

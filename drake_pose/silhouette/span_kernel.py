@@ -50,7 +50,7 @@ class Rows(NamedTuple):
 def make_rows(packed: PackedOutlines, camera: np.ndarray) -> tuple[Rows, np.ndarray]:
     """Return scratch for the largest of packed surfaces, and crossings (height, capacity) int32.
 
-    ``camera``: (8,) kernel parameters. The capacity is 8; ``fill_rows`` enlarges it.
+    ``camera``: (8,) ``Camera.kernel_parameters()``. The capacity is 8; ``fill_rows`` enlarges it.
     """
     width, height = int(camera[6]), int(camera[7])
     points, triangles = 0, 0
@@ -176,7 +176,7 @@ def add_surface(
         packed: the surfaces of all nodes, each in its node's frame N.
         node: index of the surface.
         X_CN: (nodes, 3, 4) poses of the nodes in the camera.
-        camera: (8,) kernel parameters.
+        camera: (8,) ``Camera.kernel_parameters()``.
         crossings: (height, capacity) int32 output, 8 * pixel + weight + BIAS. Crossings beyond the
             capacity are only counted, and ``rows.row_range[2]`` is set to 1.
         rows: scratch; ``counts`` and ``row_range`` are updated.
@@ -323,8 +323,8 @@ def score(
         parts: (b, 4) int64 the skin bands, as in ``bend``; b may be 0.
         bands: (n, v, 3) vertices of all bands, one band after the other, at each pose [m].
         X_CN: (n, nodes, 3, 4) poses of the surfaces in the camera.
-        camera: (8,) kernel parameters.
-        prefixes: (k, H, W + 1) int32 prefix sums of the sets.
+        camera: (8,) ``Camera.kernel_parameters()``.
+        prefixes: (k, H, W + 1) int32 row-wise ``prefix_sums`` of the pixel sets' masks.
 
     Returns:
         (n, 1 + k) int64 area inside the image, then area of the intersection with each set [pixel].
@@ -354,7 +354,7 @@ def paint(
     Args:
         packed: the surfaces of the body's nodes.
         X_CN: (nodes, 3, 4) poses of the nodes in the camera.
-        camera: (8,) kernel parameters.
+        camera: (8,) ``Camera.kernel_parameters()``.
         mask: (H, W) uint8, changed in place; pixels outside the body are kept.
         value: the value, 0 to 255.
 
@@ -394,7 +394,7 @@ def paint_labels(
         closed: (nodes,) bool, whether a surface is closed with outward normals; only its front
             faces are then drawn.
         X_CN: (nodes, 3, 4) poses of the surfaces in the camera.
-        camera: (8,) kernel parameters.
+        camera: (8,) ``Camera.kernel_parameters()``.
         empty: label of pixels without a surface.
         image: (H, W) int16 output.
     """

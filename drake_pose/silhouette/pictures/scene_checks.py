@@ -76,7 +76,7 @@ def check_scene(scene: Scene) -> Scene:
 
 
 def check_upright(cameras: Iterable[Camera], min_component: float = 0.5) -> tuple[str, ...]:
-    """Return a warning unless up in the pictures is the world's z, as persons require.
+    """Return no warning if up in the pictures is the world's z, as persons require, else one.
 
     ``min_component``: largest component of the mean up direction below which cameras look so
     steeply that up is undetermined.

@@ -76,7 +76,10 @@ class Scene:
     )
 
     def cameras_of(self, frame: str) -> tuple[str, ...]:
-        """Return the cameras with a mask of a frame; UnknownNameError for an unknown frame."""
+        """Return the names of the cameras with a mask of a frame.
+
+        Raises UnknownNameError: there is no such frame.
+        """
         names = tuple(camera for camera in self.cameras if (camera, frame) in self.masks)
         if not names and frame not in self.frames:
             raise UnknownNameError("frame", frame, self.frames, str(self.path))
@@ -310,7 +313,9 @@ def _unknown_cameras(folder: Path) -> tuple[dict[str, Camera], dict[tuple[str, s
 def common_rate(
     videos: Mapping[str, Path], max_ratio: float = 1.01
 ) -> tuple[float | None, tuple[str, ...]]:
-    """Return the common frame rate of videos [frames/s] or None, and a warning if they drift apart.
+    """Return the common frame rate of videos [frames/s], and a warning if they drift apart.
+
+    The rate is None if no video has one; without drift there are no warnings.
 
     Args:
         videos: video files by camera.

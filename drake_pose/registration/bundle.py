@@ -35,18 +35,21 @@ def adjust_bundle(
     lengths and radius scales are fitted together; cameras with known poses fix the world frame.
 
     Args:
-        outlines: a surface for each node.
+        kinematics: of the body's pose tree, with m values. Values with equal limits stay fixed.
+        outlines: a surface for each node of the tree.
         cameras: all cameras; the unknown ones near their poses.
-        unknown: names of the cameras whose poses are unknown.
-        frames: the masks, with approximate values of the body.
-        is_length: (m,) which of the pose tree's values are lengths, the same in all frames.
+        unknown: names of the c cameras whose poses are fitted.
+        frames: the masks, with approximate values of the tree: start and mean of the prior.
+        is_length: (m,) which of the tree's values are lengths, the same in all frames. They start
+            from the first frame's.
         parts: names of the parts that have a radius scale, a factor of the width across y.
-        groups: (nodes,) index of each node's part, or -1; None: no parts.
+        groups: (nodes,) index in `parts` of each node's part, or -1; None: no parts.
         covariance_frames: number of frames from which covariances are estimated.
 
     Returns:
-        the c unknown cameras at their poses; their (c, 6, 6) covariances, see ``RegisteredCamera``;
-        the values (frames, m) [rad or m]; and the radius scales (nodes,).
+        the unknown cameras at their fitted poses, in the order of `cameras`; their (c, 6, 6)
+        covariances, see ``RegisteredCamera``; the tree's fitted values (frames, m) [rad or m]; and
+        the radius scales (nodes,), 1 for nodes without a part.
 
     Raises:
         MaskError: a mask's size differs from its camera's, or no mask shows the body.

@@ -38,7 +38,7 @@ class DiagnosisSettings(NamedTuple):
         min_pixels: errors that move outlines by less get no finding [pixel].
         min_joint_pixels: the same for joint offsets in all frames, beside errors of the cameras.
         focal_sd_floor: minimum standard deviation of focal lengths [relative].
-        min_information: statistics use directions with more information [of the prior].
+        min_information: statistics use directions of x with more information [of x's prior].
     """
 
     significance: float = 1e-4
@@ -69,7 +69,7 @@ class _Information(NamedTuple):
     freedom: float
 
     def plus(self, info: "_Information", sign: float = 1.0) -> "_Information":
-        """Add another frame, divided by its variance factor, or remove it (sign -1)."""
+        """Return the sum with a frame's info over its variance factor; sign -1: without."""
         weight = sign / info.scale
         return self._replace(
             N=self.N + weight * info.N,
@@ -91,8 +91,8 @@ class _Cause(NamedTuple):
     """A possible cause of errors, and the result of its test.
 
     kind: "joint", "camera", "base", "focal" or "center"; name: of the joint or camera, or words.
-    jacobian: (p, d) derivative of x by the cause's d parameters. units: (d,) size of the parameters
-    in x: a joint's position [rad or m]; rotation vector [rad] and translation [m] of a camera along
+    jacobian: (p, d) derivative of x by the cause's d parameters. units: (d,) factors from amounts
+    to a joint's position [rad or m]; rotation vector [rad] and translation [m] of a camera along
     its axes, or of the base in the world; focal lengths [relative]; principal points [pixel].
     rank: of causes that explain errors equally well, the one with the lowest rank is reported.
     amount: (d,) the estimated parameters, with covariance (d, d). x: (p,) the errors they explain.
@@ -112,7 +112,7 @@ class _Cause(NamedTuple):
 
 
 class _Residual(NamedTuple):
-    """The residual r (p,) of N x = r with its covariance Q, and the frames' information."""
+    """Residual r (p,) of N x = r, with N (p, p), r's covariance Q (p, p), and frames' info."""
 
     info: _Information
     N: Array
@@ -124,7 +124,7 @@ class _Residual(NamedTuple):
         return np.asarray(np.linalg.solve(self.N + np.eye(len(r)), r))
 
     def pixels(self, without: float | Array = 0.0) -> float:
-        """Return how far the residual moves outlines [pixel], after subtraction of N x."""
+        """Return how far the residual less N x, with x = `without` (p,), moves outlines [pixel]."""
         x = np.broadcast_to(without, self.r.shape)
         return self.info.pixels(self.solved(self.r - self.N @ x))
 
@@ -134,7 +134,7 @@ class _Residual(NamedTuple):
         return _p_value(*_statistic(self.r, self.Q, self.N), self.info.freedom)
 
     def test(self, cause: _Cause) -> _Cause:
-        """Estimate and test a cause."""
+        """Return a cause with estimated amount, covariance and x, and with its p_value and gain."""
         M = cause.jacobian
         N, r, Q = M.T @ self.N @ M, M.T @ self.r, M.T @ self.Q @ M
         T, rank = _statistic(r, Q, N)
@@ -149,16 +149,17 @@ class _Residual(NamedTuple):
     def sufficient(
         self, tests: Sequence[_Cause], least: float, fraction: float = 0.25
     ) -> list[_Cause]:
-        """Return the causes that explain the residual by themselves, sorted by rank and gain.
+        """Return the tested causes that explain the residual by themselves, lowest rank first.
 
-        They leave less than a fraction of the residual, or less than `least` [pixel].
+        They leave less than a fraction of the residual's pixels, or less than `least` [pixel].
+        Among equal ranks, the cause with the largest gain comes first.
         """
         most = max(least, fraction * self.pixels())
         enough = [one for one in tests if self.pixels(one.x) < most]
         return sorted(enough, key=lambda one: (one.rank, -one.gain))
 
     def without(self, cause: _Cause) -> "_Residual":
-        """Return the residual after elimination of a cause's parameters."""
+        """Return the residual after elimination of a cause's parameters, whatever their amount."""
         M, N = cause.jacobian, self.N
         gain = np.eye(len(N)) - N @ M @ np.linalg.pinv(M.T @ N @ M) @ M.T
         return _Residual(self.info, gain @ N @ gain.T, gain @ self.r, gain @ self.Q @ gain.T)
@@ -173,9 +174,9 @@ def diagnose_frames(
     """Diagnose fitted frames, in time linear in their number.
 
     Args:
-        fit: the fit that was used.
-        frames: the fitted frames.
-        requested: (kind, name) of causes that are always reported for all inlier frames.
+        fit: the fit with which the frames were fitted.
+        requested: (kind, name) of causes, as of ``Finding``, that are always among the findings
+            common to all inlier frames.
         moved: whether cameras or the base may be far from their given poses, and intrinsics are
             right.
     """
@@ -224,9 +225,8 @@ class _Diagnoser:
             # In the second pass, outliers no longer enlarge the error sizes.
             inliers, together = likeliest_inliers(explained, evaluate, usual), 4
         total, frames = self._sum(inliers), list[FrameDiagnosis]()
-        for fitted, info, is_inlier, is_explained in zip(
-            self._frames, self._info, inliers, explained, strict=True
-        ):
+        rows = zip(self._frames, self._info, inliers, explained, strict=True)
+        for fitted, info, is_inlier, is_explained in rows:
             common = self._common(total.plus(info, -1.0) if is_inlier else total)
             residual = self._residual(info, *common)
             tests = [residual.test(cause) for cause in self._causes(fitted)]
@@ -237,18 +237,19 @@ class _Diagnoser:
                 finding = self._joints_finding("unexplained", residual)
             elif least <= DIAGNOSIS.significance and pixels >= DIAGNOSIS.min_pixels:
                 sufficient = residual.sufficient(tests, DIAGNOSIS.min_pixels)
-                finding = (
-                    self._finding(sufficient, info.pixels(sufficient[0].x))
-                    if sufficient
-                    else self._joints_finding("joints", residual)
-                )
+                finding = self._joints_finding("joints", residual)
+                if sufficient:
+                    finding = self._finding(sufficient, info.pixels(sufficient[0].x))
             frames.append(FrameDiagnosis(fitted.name, *fitted.inlier_ratios, pixels, finding))
         kept = np.array([one.finding is None for one in frames])
         common_findings = self._common_findings(kept) if kept.any() else ((), None, {})
         return Diagnosis(tuple(frames), common_findings[0], sizes, *common_findings[1:])
 
     def _pooled_sizes(self, indices: Sequence[int], together: int, most: int = 5) -> ErrorSizes:
-        """Return the median error sizes of up to `most` groups of `together` frames."""
+        """Return the median error sizes of up to `most` groups of `together` frames.
+
+        indices: of the frames that groups are drawn from; empty: sizes of a pixel are assumed.
+        """
         if not len(indices):
             # Contours err by about a pixel.
             return ErrorSizes(1.0, 0.0, 1.0, 1.0, 1.0)
@@ -289,17 +290,12 @@ class _Diagnoser:
             moves = one.moves * self._fit.deviations[:, None]
             outlines += moves @ one.A @ np.swapaxes(moves, 1, 2)
         return _Information(
-            N,
-            h,
-            PX.T @ distances.surface_derivatives,
-            outlines,
-            fitted.outline_lengths,
-            scale,
+            N, h, PX.T @ distances.surface_derivatives, outlines, fitted.outline_lengths, scale,
             freedom,
-        )
+        )  # fmt: skip
 
     def _sum(self, kept: Mask) -> _Information:
-        """Return the information of some frames together."""
+        """Return the sum of the information of the `kept` (frames,) ones."""
         return reduce(_Information.plus, compress(self._info, kept), self._empty)
 
     def _covariance(self, total: _Information) -> Array:
@@ -308,21 +304,21 @@ class _Diagnoser:
         return np.asarray(total.N + surface @ surface.T)
 
     def _common(self, total: _Information) -> tuple[Array, Array]:
-        """Return the errors x (p,) common to frames, and their covariance (p, p)."""
+        """Return the errors x (p,) common to the frames of a sum, and their covariance (p, p)."""
         # Without frames, the given values are right to within the tolerance.
         prior = np.eye(len(total.h)) if total.freedom else np.linalg.inv(self._tolerance)
         inverse = np.linalg.inv(total.N + prior)
         return inverse @ total.h, inverse @ (self._covariance(total) + prior) @ inverse
 
     def _residual(self, info: _Information, x: Array, covariance: Array) -> _Residual:
-        """Return a frame's residual from the common errors x (p,) with their covariance."""
+        """Return a frame's residual from the common errors x (p,), with their covariance (p, p)."""
         Q = info.scale * info.N + info.N @ (covariance + self._tolerance) @ info.N
         return _Residual(info, info.N, info.h - info.N @ x, Q)
 
     def _causes(self, fitted: FrameFit | None) -> list[_Cause]:
-        """Return the possible causes of errors in one frame, or in all (None).
+        """Return the possible causes, untested, of errors in one fitted frame, or in all (None).
 
-        A frame's cameras are those that see it. In all frames focal lengths and principal points
+        A frame's cameras are those with a mask. In all frames focal lengths and principal points
         are causes, too, of all cameras together and of each.
         """
         fit, six = self._fit, len(POSE_NAMES)
@@ -353,7 +349,10 @@ class _Diagnoser:
         return causes
 
     def _finding(self, sufficient: Sequence[_Cause], pixels: float) -> Finding:
-        """Return the finding of the first sufficient cause; the others are its alternatives."""
+        """Return the finding of the first sufficient cause; the others are its alternatives.
+
+        pixels: root mean square distance by which the cause moves outlines [pixel].
+        """
         best, *others = sufficient
         alternatives = [one.name for one in others]
         one_camera = len(self._fit.camera_names) == 1
@@ -384,7 +383,7 @@ class _Diagnoser:
         return Finding(kind, name, *off, at_body=at_body)
 
     def _joints_finding(self, kind: str, residual: _Residual) -> Finding:
-        """Return a finding of several joints, for a frame that no single cause explains."""
+        """Return a finding, "joints" or "unexplained", of a frame that no single cause explains."""
         x, names = residual.solved(residual.r), self._fit.joints
         sd = np.sqrt(residual.info.scale * np.diag(np.linalg.inv(residual.N + np.eye(len(x)))))
         joints = (x * self._fit.deviations)[: len(names)]
@@ -399,7 +398,7 @@ class _Diagnoser:
     def _common_findings(
         self, kept: Mask
     ) -> tuple[tuple[Finding, ...], tuple[list[float], list[float]] | None, dict[str, float]]:
-        """Return the common findings, center and minimum_detectable of a ``Diagnosis``."""
+        """Return common, center and minimum_detectable of a ``Diagnosis`` from `kept` (frames,)."""
         info, count = self._sum(kept), np.count_nonzero(kept)
         Q = self._covariance(info) + info.N @ self._tolerance @ info.N / count
         residual = _Residual(info, info.N, info.h, Q)
@@ -410,9 +409,8 @@ class _Diagnoser:
             alone = residual.sufficient(tests, DIAGNOSIS.min_pixels, 0.1)
             causes = [one for one in causes if one.kind != "base" or alone]
         every = range(len(self._fit.camera_names))
-        shifted = residual.test(
-            _Cause("center", "", self._fit.center_jacobian(every), np.ones(2), 2)
-        )
+        jacobian = self._fit.center_jacobian(every)
+        shifted = residual.test(_Cause("center", "", jacobian, np.ones(2), 2))
         others = [residual.test(one).gain for one in causes if one.kind != "center"]
         center = None
         if is_half_pixel(shifted.amount, shifted.covariance) and shifted.gain > max(others):
@@ -439,19 +437,15 @@ class _Diagnoser:
             # Final amounts are estimated jointly, beside the eliminated cameras.
             own = [best for best, *_ in found]
             names = {(one.kind, one.name) for one in own}
-            free = [
-                one
-                for one in freed
-                if (offsets or self._requested) and (one.kind, one.name) not in names
-            ]
+            freed = freed if offsets or self._requested else []
+            free = [one for one in freed if (one.kind, one.name) not in names]
             jacobian = np.hstack([one.jacobian for one in (*own, *free)])
             whole_test, first = whole.test(_Cause("", "", jacobian, np.ones(0), 0)), 0
             for best, *alternatives in found:
                 k = slice(first, first + len(best.amount))
                 first = k.stop
-                better = best._replace(
-                    amount=whole_test.amount[k], covariance=whole_test.covariance[k, k]
-                )
+                amount, covariance = whole_test.amount[k], whole_test.covariance[k, k]
+                better = best._replace(amount=amount, covariance=covariance)
                 pixels = whole.info.pixels(best.jacobian @ better.amount)
                 least = DIAGNOSIS.min_joint_pixels if best.kind == "joint" else DIAGNOSIS.min_pixels
                 # A cause may vanish in the joint estimate.
@@ -468,10 +462,11 @@ def _name(
     """Select significant causes one after another.
 
     Args:
+        causes: candidates, untested.
         least: minimum motion of outlines by a cause [pixel].
 
     Returns:
-        the residual without the selected causes; and each cause with its alternatives.
+        the residual without the selected causes; and for each a list of it and its alternatives.
     """
     left, named = list(causes), list[list[_Cause]]()
     while left:
@@ -493,7 +488,10 @@ def _name(
 
 
 def _minimum_detectable(residual: _Residual, causes: Sequence[_Cause]) -> dict[str, float]:
-    """Return the joint offsets detected with a probability of 95 % [rad or m]; inf: never."""
+    """Return by joint the offset detected with a probability of 95 % [rad or m]; inf: never.
+
+    causes: of kind "joint", without a finding in the residual.
+    """
     level = DIAGNOSIS.significance / max(1, len(causes))
     critical, found = fdtri(1, residual.info.freedom, 1.0 - level), {}
     for cause in causes:
@@ -581,7 +579,10 @@ def is_half_pixel(offset: Array, covariance: Array, near: float = 0.25) -> bool:
 
 
 def _statistic(r: Array, Q: Array, N: Array | None = None) -> tuple[float, int]:
-    """Return r^T Q^-1 r in the directions with enough information, and their number."""
+    """Return r^T Q^-1 r in the directions with enough information, and their number.
+
+    r (p,) has the covariance Q (p, p) and the information N (p, p); None: Q is both.
+    """
     known, turn = np.linalg.eigh(Q if N is None else N)
     turn = turn[:, known > DIAGNOSIS.min_information]
     if not turn.shape[1]:
@@ -591,5 +592,8 @@ def _statistic(r: Array, Q: Array, N: Array | None = None) -> tuple[float, int]:
 
 
 def _p_value(T: float, rank: int, freedom: float) -> float:
-    """Return the probability that the statistic T is exceeded by chance (F distribution)."""
+    """Return the probability that T, see `_statistic`, is exceeded by chance; rank 0: 1.
+
+    T / rank has an F distribution with `rank` and `freedom` degrees of freedom.
+    """
     return float(fdtrc(rank, freedom, max(T, 0.0) / rank)) if rank else 1.0

@@ -21,14 +21,14 @@ class Finding:
             [relative], principal points [pixel]; a camera's shift is that of its own centre. Clock
             [s]: how much later the pictures' joint positions are logged. Rate [s/s]: how much
             faster the log's clock runs.
-        angle_sd, shift_sd: their standard deviations.
+        angle_sd, shift_sd: their standard deviations; 0 for several joints.
         pixels: root mean square distance by which it moves the outlines it affects [pixel].
         p_value: probability of an error at least as large if nothing is wrong.
         alternatives: names of other causes that explain it equally well.
-        joints: corrections by joint, where several are wrong [rad or m].
-        at_body: how far a camera's error shifts the body [m].
-        link: the misplaced link; of a "moved" finding "camera" or "base".
-        text: details in words.
+        joints: significant corrections by joint, where several are wrong [rad or m].
+        at_body: how far a camera's error shifts the body [m]; 0 for other kinds.
+        link: of a "link" finding the misplaced link; of a "moved" finding "camera" or "base".
+        text: details in words; "" for none.
     """
 
     kind: str
@@ -52,7 +52,8 @@ class FrameDiagnosis:
 
     Args:
         frame: its name.
-        given_ratios, fitted_ratios: inlier ratios by camera, as given and with the frame fitted.
+        given_ratios, fitted_ratios: inlier ratios (the fraction of both contours that fits) by
+            name of each camera with a mask, at the given values and with the frame fitted.
         pixels: root mean square distance of the outlines from the pose common to all frames
             [pixel].
         finding: the error, for an outlier frame; None for an inlier.

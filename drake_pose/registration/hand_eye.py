@@ -30,13 +30,17 @@ def rotation_spread(R_WL: Array) -> Array:
 
 
 def hand_eye_starts(X_WL: Array, X_CT: Sequence[Array], turns: Array, triples: int = 24) -> Array:
-    """Return hypotheses (n, 2, 4, 4) from triples of frames, largest rotation of the link first.
+    """Return pairs of X_LC and X_WT (n, 2, 4, 4) from triples of frames.
+
+    The triple with the largest rotation of the link comes first. There may be no pair (n = 0).
 
     Args:
-        X_WL: (frames, 4, 4) the link's poses.
-        X_CT: for each frame (k, 4, 4) candidate poses of the target in the camera.
-        turns: (t, 4, 4) the target's symmetries.
-        triples: maximum number of triples.
+        X_WL: (frames, 4, 4) the link's poses, of three frames or more.
+        X_CT: for each frame (k, 4, 4) candidate poses of the target in the camera; k may vary.
+        turns: (t, 4, 4) motions in frame T that leave the target's shape unchanged, with the
+            identity.
+        triples: maximum number of triples. Among four times as many random ones, those with the
+            largest rotation about a second axis are used.
     """
     threes = list(combinations(range(len(X_WL)), 3))
     if len(threes) > triples:
@@ -54,10 +58,16 @@ def hand_eye_starts(X_WL: Array, X_CT: Sequence[Array], turns: Array, triples: i
 def _of_three(
     X_WL: Array, X_CT: Sequence[Array], most: int = 500, angle: float = float(np.radians(20.0))
 ) -> Array:
-    """Solve A X_LC = X_LC B for three frames' candidate poses; returns (n, 2, 4, 4).
+    """Solve A X_LC = X_LC B for each combination of three frames' candidate poses.
 
-    most: maximum number of combinations, best first; angle: maximum difference of the rotation
-    angles of A and B [rad].
+    Args:
+        X_WL: (3, 4, 4) the link's poses.
+        X_CT: for each of the three frames (k, 4, 4) candidate poses.
+        most: maximum number of combinations, those with the most similar angles of A and B first.
+        angle: maximum difference of the rotation angles of A and B [rad].
+
+    Returns:
+        (n, 2, 4, 4) X_LC and X_WT, the latter the mean of three frames.
     """
     pairs = ((0, 1), (0, 2), (1, 2))
     A = np.array([np.linalg.inv(X_WL[j]) @ X_WL[i] for i, j in pairs])
@@ -85,7 +95,7 @@ def _of_three(
 
 
 def _nearest_rotations(M: Array) -> Array:
-    """Return the rotations nearest to matrices M (n, 3, 3)."""
+    """Return the rotations (n, 3, 3) nearest to matrices M (n, 3, 3)."""
     U, _, V = np.linalg.svd(M)
     U[:, :, 2] *= np.sign(np.linalg.det(U @ V))[:, None]
     return np.asarray(U @ V)

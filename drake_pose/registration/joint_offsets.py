@@ -36,7 +36,7 @@ class KinematicParameter:
         significant: whether it differs from 0 at the 5 % level over all requested parameters
             (Bonferroni). Its 95 % interval may exclude 0 although it is not significant.
         gauge: names of the unknowns that it is strongly correlated with; for a determined
-            parameter, those that only static parts separate it from.
+            parameter, those that only static parts separate it from; often empty.
     """
 
     name: str
@@ -84,7 +84,7 @@ def scalable_links(tree: PoseTree) -> tuple[str, ...]:
 
 
 def require_parameters(tree: PoseTree, joints: Sequence[str], links: Sequence[str]) -> None:
-    """Refuse names that are no positions of the tree, or no scalable links.
+    """Refuse `joints` that are no positions of the tree, and `links` that are not scalable.
 
     Raises UnknownNameError: lists the known names.
     """
@@ -102,6 +102,10 @@ def require_parameters(tree: PoseTree, joints: Sequence[str], links: Sequence[st
 def require_frame_count(count: int, joints: int, links: int) -> None:
     """Refuse fewer frames than parameters, or fewer than two.
 
+    Args:
+        count: number of frames, all cameras together.
+        joints, links: number of joints with an offset, and of links with a scale.
+
     Raises RegistrationError: states the numbers.
     """
     if count < max(2, joints + links):
@@ -113,7 +117,7 @@ def require_frame_count(count: int, joints: int, links: int) -> None:
 
 
 def require_fit_kept(ratio: float, before: float, most_lost: float = 0.05) -> None:
-    """Refuse a fit whose mean inlier ratio fell by more than `most_lost`.
+    """Refuse a fit whose mean inlier ratio fell from `before` to `ratio`, by over `most_lost`.
 
     A fit that converged to another optimum loses 0.3 or more.
 
@@ -145,13 +149,14 @@ def calibrate_joints(
     (``shrink_constants``); the covariance stays that of the fit.
 
     Args:
+        body: the robot's surfaces and pose tree.
         cameras: as registered with the model's offsets and scales, with distinct names.
-        frames: the frames of each camera.
+        frames: for each camera its frames.
         joints: names of the positions whose offsets are fitted.
         focal: whether the cameras' focal lengths are fitted.
         links: the links whose scales are fitted.
         level: probability that anything is significant by chance.
-        start: initial offsets by name [rad or m].
+        start: initial offsets by name [rad or m]; None, and for other names: 0.
         still_factor: factor of the standard deviation of parameters correlated with a camera, such
             as a first joint's offset: only static parts separate the two, and pictures show these
             badly. 2.5 for pictures (six rooms with an SO-101, whose first offset was off by 0.1 to
@@ -236,6 +241,10 @@ def shrink_constants(
     Angular offsets, linear offsets and link scales each get a prior standard deviation, the most
     likely one given their estimates (empirical Bayes; Efron and Morris 1975). Correlated values,
     such as the cameras', follow.
+
+    Args:
+        fit, found, covariance: the fit, its values, and their covariance (u, u).
+        names: of the constants.
     """
     kinematics, information = fit.views[0].kinematics, np.zeros(len(fit.names))
     kinds = dict(zip(kinematics.names, kinematics.is_angle.tolist(), strict=True))
@@ -260,9 +269,10 @@ def shrink_constants(
 def significant_constants(
     fit: SharedFit, found: SharedValues, covariance: Array, names: Sequence[str], most: float
 ) -> list[str]:
-    """Return the constants that exceed `most` standard deviations when the others are held at 0.
+    """Return the names of the constants that exceed `most` standard deviations.
 
-    Backward elimination: the least significant constant is held at 0 first, and the others follow.
+    Backward elimination: the least significant constant is held at 0, correlated ones follow, and
+    the rest is tested again, until all that remain exceed the limit.
 
     Args:
         fit, found, covariance: the fit, its values, and their covariance (u, u).
@@ -289,6 +299,10 @@ def widen_to_cost_curvature(
 
     When a round base turns, the edges of its mesh's facets seem to move until others take their
     place. They add information to the normal equations which the cost itself does not have.
+
+    Args:
+        fit, found, covariance: the fit, its values, and their covariance (u, u).
+        included: (rows,) masks that entered the fit.
     """
     found_covariance = covariance.copy()
     for k in range(len(fit.names) - len(fit.constants), len(fit.names)):
@@ -308,11 +322,13 @@ def widen_with_cameras(
     """Enlarge the covariance (u, u) by a factor along constants correlated with a camera.
 
     Args:
-        factor: of the standard deviations; 1: nothing changes.
-        min_correlation: minimum correlation.
+        fit: the fit that the covariance belongs to.
+        factor: of the standard deviations; at most 1: nothing changes.
+        min_correlation: minimum absolute correlation with an unknown of a camera.
 
     Returns:
-        the covariance, and the correlated unknowns of cameras by constant.
+        the covariance (u, u); and by name of each widened constant the names of the cameras'
+        unknowns that it is correlated with.
     """
     deviations, cameras = np.sqrt(np.diag(covariance)), len(fit.names) - len(fit.constants)
     wider, gauges = covariance.copy(), dict[str, tuple[str, ...]]()

@@ -85,7 +85,7 @@ class Correction:
             in place of the log's; "focal": focal lengths; "reading": see the name.
         name: of the joint, or words for the cameras or for what is wrong.
         cameras: the corrected cameras.
-        apply: returns a corrected frame.
+        apply: returns the corrected frame of a given one, which it leaves unchanged.
         amount: what is added to a joint's positions [rad or m] or focal lengths [relative].
         rank: of corrections that explain equally well, the one with the lowest rank is chosen.
     """
@@ -116,7 +116,7 @@ class LargeErrorSearch:
     Args:
         body: the robot's surfaces.
         cameras: the cameras at their given poses.
-        frames: all frames.
+        frames: all frames; at most LARGE.frame_count of them, evenly spaced, are compared.
 
     Raises:
         MaskError: a mask's size differs from its camera's, or no mask shows the body.
@@ -140,9 +140,9 @@ class LargeErrorSearch:
         """Return the simplest correction that explains the silhouettes much better; None: none.
 
         Args:
-            corrections: of the whole scene.
-            joints: joints whose positions may be wrong.
-            max_remaining: maximum fraction of the unexplained area that remains.
+            corrections: candidates beside those of joints' positions, such as other cameras.
+            joints: names of the joints whose positions may be wrong.
+            max_remaining: maximum fraction of the area in body or silhouette alone that remains.
             likely: joints with a fitted offset: for them any improvement is enough, in half of the
                 frames.
         """
@@ -167,7 +167,10 @@ class LargeErrorSearch:
         return min(best, key=lambda one: (one[0].rank, one[1]))[0] if best else None
 
     def misfits(self, correction: Correction) -> Array:
-        """Return the area (frames,) in body or silhouette alone, over all cameras [pixel]."""
+        """Return the area (frames,) in body or silhouette alone, summed over cameras [pixel].
+
+        Frames are those compared, and pixels those of the downscaled pictures.
+        """
         frames = map(correction.apply, self._frames)
         rows = [self._compare(one, one.values[None], correction.cameras)[0] for one in frames]
         return np.array(rows)
@@ -175,7 +178,10 @@ class LargeErrorSearch:
     def _compare(
         self, frame: MultiViewFrame, values: Array, cameras: Sequence[Camera] | None = None
     ) -> Array:
-        """Return the misfits (n,) of a frame at values (n, m)."""
+        """Return the misfits (n,), see `misfits`, of a frame at values (n, m) of the pose tree.
+
+        cameras: the corrected cameras; None: those given.
+        """
         kinematics, left = self._body.kinematics, np.zeros(len(values))
         X_WN = np.array([kinematics.poses(one) for one in values])
         for camera in self._cameras if cameras is None else cameras:
@@ -191,7 +197,11 @@ class LargeErrorSearch:
         return left
 
     def _of_joint(self, name: str) -> list[tuple[Correction, Array]]:
-        """Return the corrections of a joint's positions, each with its misfits (frames,)."""
+        """Return candidate corrections of joint `name`, each with its misfits (frames,).
+
+        These are an offset, a sign, and a sign with an offset; and other positions in each frame
+        ("log"), if these do not differ from the log by a constant.
+        """
         kinematics = self._body.kinematics
         j, frames = kinematics.names.index(name), self._frames
         angle, q = bool(kinematics.is_angle[j]), np.array([one.values[j] for one in frames])
@@ -258,9 +268,9 @@ class LargeErrorSearch:
     def joint_correction(
         self, kind: str, name: str, sign: float, by: float, rank: float
     ) -> Correction:
-        """Return a correction to sign * q + by of a joint's positions q; by [rad or m].
+        """Return a correction to sign * q + by of the positions q of joint `name`.
 
-        kind, name, by and rank are those of the ``Correction``.
+        kind and rank are the ``Correction``'s; `by` [rad or m] is its amount.
         """
         j = self._body.kinematics.names.index(name)
 
@@ -274,7 +284,10 @@ class LargeErrorSearch:
     def _refound(
         self, j: int, grid: Array, beside: Array
     ) -> Callable[[MultiViewFrame], MultiViewFrame]:
-        """Return a function that moves joint j of a frame to where its silhouette shows it."""
+        """Return a function that moves value j of a frame to where its silhouettes show it.
+
+        The positions `grid` (k,) are tried, then those that differ from the best by `beside` (b,).
+        """
 
         def changed(frame: MultiViewFrame) -> MultiViewFrame:
             values = frame.values
@@ -289,7 +302,10 @@ class LargeErrorSearch:
 
 
 def downscaled(camera: Camera, scale: float) -> Camera:
-    """Return a camera with pictures scaled by a factor; a parallel camera is unchanged."""
+    """Return a camera with pictures scaled by a factor, of at least 8 x 8 pixels.
+
+    A parallel camera is returned unchanged.
+    """
     if not isinstance(camera, PinholeCamera):
         return camera
     width, height = (max(8, round(scale * side)) for side in (camera.width, camera.height))
@@ -304,10 +320,11 @@ def mask_excess_and_lack(
     size: float,
     band: float = 2.5,
 ) -> tuple[float, float]:
-    """Return the areas in silhouette and body alone, over the silhouette's area.
+    """Return the areas in the silhouette alone and in the body alone, over the silhouette's area.
 
     Args:
-        values: (m,) of the pose tree.
+        values: (m,) of the pose tree [rad or m].
+        mask: (H, W) the silhouette in the camera's picture.
         size: square root of the silhouettes' usual area [pixel], used for an empty mask.
         band: pixels nearer to the other's outline do not count [pixel].
     """
@@ -324,7 +341,7 @@ def mask_excess_and_lack(
 
 
 def _is_near(body: RegistrationBody, one: Correction) -> bool:
-    """Return whether an error is small enough for fits of single frames."""
+    """Return whether an offset or focal length is off so little that fits of frames find it."""
     if one.kind == "offset":
         j = body.kinematics.names.index(one.name)
         near = np.radians(LARGE.reach_angle) if body.kinematics.is_angle[j] else LARGE.reach_shift
@@ -333,7 +350,12 @@ def _is_near(body: RegistrationBody, one: Correction) -> bool:
 
 
 def joint_inlier_ratios(fits: Sequence[FrameFit], joints: Sequence[str]) -> dict[str, float]:
-    """Return, by joint, the inlier ratio of the outlines of all links that it moves."""
+    """Return, by joint, the inlier ratio of the outlines of all links that it moves.
+
+    Joints that move no compared outline are left out.
+
+    joints: names of the first unknowns of the fits, see ``PerFrameFit.joints``.
+    """
     moves = [mask.moves.any(axis=2) for one in fits for mask in one.compared_masks]
     if not moves:
         return {}
@@ -344,7 +366,7 @@ def joint_inlier_ratios(fits: Sequence[FrameFit], joints: Sequence[str]) -> dict
 
 
 def mismatched_links(fits: Sequence[FrameFit]) -> list[tuple[int, float]]:
-    """Return the nodes whose outlines hardly fit in any frame, with their inlier ratios."""
+    """Return index and inlier ratio, over all frames together, of nodes that hardly fit."""
     lengths, fitting = np.sum([one.matched_lengths for one in fits], axis=0).T
     ratios = fitting / np.maximum(lengths, 1e-9)
     shown = lengths >= LARGE.min_outline_fraction * max(float(lengths.sum()), 1e-9)

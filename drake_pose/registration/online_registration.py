@@ -49,8 +49,8 @@ class OnlineSettings:
             keyframes' median.
         bump: maximum rotation [rad] and shift [its distance from the body] of a camera that a local
             fit finds again. After larger motions all poses are searched.
-        trust: degrees of freedom of the prior of the covariance's scale. Successive sets of newest
-            keyframes overlap, so each new one adds fewer than the pose's six.
+        trust: degrees of freedom of the prior of the covariance's scale. Successive poses are
+            fitted to overlapping newest keyframes, so each adds fewer than the pose's six.
         novelty: a frame is a keyframe if the body's points are this far from every keyframe's, root
             mean square [extent of the body].
         tolerance: a frame in the pose of a keyframe is fitted, and replaces it, only if its E_total
@@ -129,7 +129,10 @@ class OnlineRegistration:
         self._search = search or CameraSearch(body)
 
     def status(self, state: OnlineState) -> CameraStatus:
-        """Return the status of the camera's pose."""
+        """Return the status of the camera's pose in a state.
+
+        It is CONTRADICTED after `newest` outlier frames in a row.
+        """
         if state.registered is None:
             return CameraStatus.NOT_REGISTERED
         if state.outlier_count >= self.settings.newest:
@@ -160,7 +163,13 @@ class OnlineRegistration:
     def _follow(
         self, state: OnlineState, registered: RegisteredCamera, frame: PosedFrame, near: int | None
     ) -> OnlineState:
-        """Update a known pose; near: index of the keyframe with the same pose of the body."""
+        """Return the state after one more frame, where the camera's pose is known.
+
+        Args:
+            registered: the state's known pose.
+            frame: the new frame.
+            near: index of the keyframe with the same pose of the body, see `_nearest`, or None.
+        """
         if near is not None:
             posed = PosedFrames(self.body.kinematics, self.body.medium, registered.camera, [frame])
             left = E_total(overlap_areas(posed, registered.camera.X_CW[None], np.inf))[0, 0]
@@ -187,7 +196,14 @@ class OnlineRegistration:
     def _add_outlier(
         self, state: OnlineState, registered: RegisteredCamera, frame: PosedFrame
     ) -> OnlineState:
-        """Add an outlier frame; register the camera anew if outliers agree with each other."""
+        """Return the state with one more outlier frame.
+
+        If the outlier frames agree with each other, the camera has the pose that fits them.
+
+        Args:
+            registered: the state's known pose, which the frame contradicts.
+            frame: the outlier frame.
+        """
         near, settings = self._nearest(frame, state.outlier_frames), self.settings
         frames = self._kept(state.outlier_frames, frame, near)
         state = replace(state, outlier_frames=frames, outlier_count=state.outlier_count + 1)
@@ -214,7 +230,10 @@ class OnlineRegistration:
     def _is_elsewhere(
         self, state: OnlineState, found: RegisteredCamera, registered: RegisteredCamera
     ) -> bool:
-        """Return whether two poses differ by more than the usual differences."""
+        """Return whether pose `found` differs from `registered` by more than the usual differences.
+
+        These are the state's `distances`, without the last `newest` - 1.
+        """
         newest, trust = self.settings.newest, self.settings.trust
         # The last distances may contain frames from after the motion.
         usual = state.distances[: max(0, len(state.distances) - newest + 1)]
@@ -224,7 +243,10 @@ class OnlineRegistration:
         return _distance(found, registered) > limit * max(1.0, scale)
 
     def _find(self, frames: Sequence[PosedFrame], least: float = 0.0) -> RegisteredCamera | None:
-        """Search the camera's pose without an initial guess; None if it is not determined."""
+        """Search the camera's pose in frames without an initial guess; None: not determined.
+
+        least: minimum median inlier ratio.
+        """
         try:
             found = self._search.register(self.camera, frames)
         except RegistrationError:
@@ -245,19 +267,25 @@ class OnlineRegistration:
         )
 
     def _least_inlier_ratio(self, registered: RegisteredCamera) -> float:
-        """Return the minimum inlier ratio of an inlier frame."""
+        """Return the minimum inlier ratio of an inlier frame, given the known pose's keyframes."""
         ratios = [frame.inlier_ratio for frame in registered.frames]
         return self.settings.min_inlier_ratio * float(np.median(ratios))
 
     def _kept(
         self, frames: Sequence[PosedFrame], frame: PosedFrame, instead_of: int | None = None
     ) -> tuple[PosedFrame, ...]:
-        """Return the newest frames and one more, which may replace one of them."""
+        """Return frames with one more, the newest, at the end; at most `most_frames`.
+
+        instead_of: index of the frame that it replaces; None: none.
+        """
         others = [one for k, one in enumerate(frames) if k != instead_of]
         return (*others, frame)[-self.settings.most_frames :]
 
     def _nearest(self, frame: PosedFrame, frames: Sequence[PosedFrame]) -> int | None:
-        """Return the index of the last frame with the same pose of the body; None: no frame."""
+        """Return the index of the last of `frames` with the body posed as in `frame`; None: none.
+
+        Poses are the same if the body's points are nearer than `novelty`.
+        """
         here = self._points(frame)
         extent = float(np.sqrt(((here - here.mean(axis=0)) ** 2).sum(axis=1).mean()))
         for k in reversed(range(len(frames))):
@@ -267,26 +295,40 @@ class OnlineRegistration:
         return None
 
     def _points(self, frame: PosedFrame) -> Array:
-        """Return points (n, 3) of the body's surface in the world."""
+        """Return points (n, 3) of the body's surface in a frame, in the world [m]."""
         return placed_points(self.body.coarse, self.body.kinematics.poses(frame.values))
 
 
 def pose_difference(X_WC: Array, from_X_WC: Array) -> Array:
-    """Return rotation vector and shift (6,) along the world's axes between poses (4, 4)."""
+    """Return rotation vector [rad] and shift [m] (6,) from one pose (4, 4) to another.
+
+    Both are along the world's axes; the shift is that of the camera's centre.
+
+    Args:
+        X_WC: the new pose.
+        from_X_WC: the pose from which the difference is measured.
+    """
     R = X_WC[:3, :3] @ from_X_WC[:3, :3].T
     turn = Rotation.from_matrix(R).as_rotvec()
     return np.concatenate([turn, X_WC[:3, 3] - from_X_WC[:3, 3]])
 
 
 def squared_distance(off: Array, covariance: Array) -> float:
-    """Return the squared Mahalanobis distance of a difference (6,) with covariance (6, 6)."""
+    """Return the squared Mahalanobis distance of a difference off (6,) with covariance (6, 6)."""
     return float(off @ np.linalg.solve(covariance, off))
 
 
 def _registered(
     state: OnlineState, found: RegisteredCamera, frames: Sequence[PosedFrame], moved: bool = False
 ) -> OnlineState:
-    """Return the state with the inlier frames as keyframes; moved: counts as a motion."""
+    """Return the state with a newly found pose and its inlier frames as keyframes.
+
+    Args:
+        state: the previous state; its outlier frames are dropped.
+        found: the pose.
+        frames: those that it was fitted to, in the order of ``found.frames``.
+        moved: whether the camera was moved, which increases `moves`.
+    """
     pairs = [
         (one, frame) for one, frame in zip(frames, found.frames, strict=True) if frame.is_inlier
     ]

@@ -33,9 +33,11 @@ class FrameFit:
         compared_masks: the comparison of the contours with each mask, linearised at the end of the
             fit. Distances are measured from the given values; the unknowns are the corrections of
             the joints and of the POSE_NAMES of each camera.
-        inlier_ratios: by camera, with given and with fitted values.
+        inlier_ratios: two mappings by name of each camera with a mask: the fraction of both
+            contours that fits, at given and at fitted values.
         outline_lengths: (nodes,) weighted length of each node's contours [pixel].
-        matched_lengths: (nodes, 2) lengths of each node's contours compared, and fitting [pixel].
+        matched_lengths: (nodes, 2) length of each node's contours that was compared with masks, and
+            the part of it that fits [pixel].
     """
 
     name: str
@@ -50,13 +52,17 @@ class PerFrameFit:
 
     Attributes:
         outlines: the full surface of each node.
-        cameras: the cameras at their given poses.
+        cameras, camera_names: the c cameras at their given poses, and their names.
+        joints: names of the tree's values that are not fixed.
         size: square root of the silhouettes' median area [pixel].
         names: names of the p unknowns: the joints, and POSE_NAMES of each camera.
+        is_angle: (p,) which unknowns are angles.
         deviations: (p,) prior standard deviations of the corrections [rad or m].
 
     Args:
-        outlines: surfaces of the nodes, simplified for the fit, and full for the final comparison.
+        kinematics: of the body's pose tree.
+        outlines: two surfaces for each node: all simplified ones, for the fit, and all full ones,
+            for the final comparison.
         cameras: the cameras at their given poses.
         frames: a sample of frames, for the silhouettes' size and the body's position.
 
@@ -104,7 +110,7 @@ class PerFrameFit:
         """Fit one frame.
 
         Args:
-            frame: the frame.
+            frame: the frame, whose values are the start and the mean of the prior.
             scales: scales of the annealing stages [square root of the silhouettes' area].
             already: if the cost at the given values is at most this multiple of the fitted cost,
                 distances are linearised about the given values: weakly observable unknowns may have
@@ -145,14 +151,21 @@ class PerFrameFit:
         )
 
     def _inlier_ratios(self, compared: Comparison, frame: MultiViewFrame) -> dict[str, float]:
-        """Return the inlier ratio of each camera that has a mask."""
+        """Return the inlier ratio by name of each camera that has a mask in the frame.
+
+        compared: the frame's contours compared with the masks of all cameras.
+        """
         sums = zip(self.camera_names, compared.sums, strict=True)
         return {name: inlier_ratio_of(one) for name, one in sums if name in frame.masks}
 
     def with_boundary_biases(self, observation: Observation, theta: Array) -> Array:
-        """Return all parameters (n,) with the cheapest boundary bias of each mask [pixel].
+        """Return theta (n,) with the boundary bias of least cost for each camera's mask.
 
         The cost is evaluated at biases from -3 to 3 pixels and interpolated by a parabola.
+
+        Args:
+            observation: evidence of one frame.
+            theta: (n,) all parameters of the ``Problem``; the last c are the biases [pixel].
         """
         biases, count = np.linspace(-3.0, 3.0, 5), len(self.cameras)
         found, costs = theta.copy(), np.full((len(biases), count), np.inf)
@@ -170,10 +183,11 @@ class PerFrameFit:
         return found
 
     def base_jacobian(self) -> Array:
-        """Return the derivative (p, 6) of the unknowns by a motion of the base [rad, m].
+        """Return the derivative (p, 6) of the unknowns by a motion of the robot's base.
 
-        All Jacobians are in units of the unknowns' standard deviations. A motion of the base moves
-        the body about its middle in every camera.
+        The motion is a rotation vector [rad] and a translation [m] in the world, about the body's
+        middle, and is seen by every camera. Rows are divided by the unknowns' `deviations`, as in
+        `center_jacobian` and `focal_jacobian`.
         """
         moves = np.zeros((len(self.names), 6))
         for c, camera in enumerate(self.cameras):
@@ -185,6 +199,8 @@ class PerFrameFit:
 
     def center_jacobian(self, cameras: Sequence[int]) -> Array:
         """Return the derivative (p, 2) of the unknowns by principal points along x and y [pixel].
+
+        cameras: indices of the cameras whose principal points change together.
 
         A pixel shifts a body at depth z by z over the focal length, and turns it by one over the
         focal length; the turn's effect on the depth is neglected.
@@ -201,6 +217,8 @@ class PerFrameFit:
     def focal_jacobian(self, cameras: Sequence[int]) -> Array:
         """Return the derivative (p, 1) of the unknowns by a relative change of focal lengths.
 
+        cameras: indices of the cameras whose focal lengths change together.
+
         A longer focal length makes the body seem nearer by that fraction of its depth; in a
         parallel camera nothing changes.
         """
@@ -213,6 +231,8 @@ class PerFrameFit:
     def camera_jacobian(self, camera: str) -> Array:
         """Return the derivative (3, 6) of a camera's centre by its POSE_NAMES, along its axes [m].
 
+        camera: its name.
+
         POSE_NAMES turn and shift the body about its middle, in the camera's frame.
         """
         X_CW = self.cameras[self.camera_names.index(camera)].X_CW
@@ -220,6 +240,6 @@ class PerFrameFit:
         return np.hstack([np.cross(np.eye(3), middle).T, -np.eye(3)])
 
     def _depth(self, camera: int) -> float:
-        """Return the depth of the body's middle in a camera [m]."""
+        """Return the depth of the body's middle in camera number `camera` [m]."""
         X_CW = self.cameras[camera].X_CW
         return float(X_CW[2, :3] @ self._middle + X_CW[2, 3])

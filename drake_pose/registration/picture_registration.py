@@ -8,6 +8,7 @@ frames and the fastest ones.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -48,7 +49,7 @@ class Recording:
     Args:
         names: names of the n pictures.
         values_at: returns the pose tree's values (n, m) at the pictures' times plus an offset [s],
-            one for all pictures or (n,).
+            one for all pictures or (n,); NaN for times without a log.
         read: returns picture k (H, W, 3).
         times: (n,) times of the pictures [s]; None: the log has no times, and the values do not
             depend on the offset.
@@ -60,7 +61,7 @@ class Recording:
     times: Array | None
 
     def rates_at(self, offset: float) -> Array | None:
-        """Return the values' velocities (n, m) [rad/s or m/s]; None: unknown."""
+        """Return the values' velocities (n, m) [rad/s or m/s] at an offset [s]; None: unknown."""
         if self.times is None:
             return None
         step = PICTURES.rate_step
@@ -80,7 +81,7 @@ class Recording:
         return replace(self, values_at=lambda offset: self.values_at(offset) + joint_offsets)
 
     def with_drift(self, drift: float, since: float) -> "Recording":
-        """Return the same recording with a log clock faster by a drift [s/s], right at `since`."""
+        """Return the recording with a log clock faster by a drift [s/s], right at `since` [s]."""
         if not drift or self.times is None:
             return self
         later = drift * (self.times - since)
@@ -96,7 +97,7 @@ class TimeOffset:
             infinite if the pictures do not determine it.
         scores: (k, 2) scanned offsets [s], and their scores over the best one's.
         drift, drift_deviation: growth of the offset and its standard deviation [s/s]; the drift is
-            0 where it is not significant.
+            0 where it is not significant, and its deviation infinite where it was not fitted.
     """
 
     value: float
@@ -150,7 +151,9 @@ def register_pictures(
     """Estimate a camera's pose and time offset from pictures of a moving robot.
 
     Args:
+        body: the robot's surfaces and pose tree.
         camera: the camera; its pose is not used.
+        recording: the camera's pictures and the joint log.
         focal: whether the focal length is fitted.
         offset_joints: joints whose offsets are fitted. Their significance is not tested here
             (``calibrate_joints`` does), but masks follow them.
@@ -184,7 +187,7 @@ def _register(
 ) -> PictureRegistration:
     """As register_pictures, without a test for mirrored pictures.
 
-    frames: indices of slow and of fast frames. most: number of hypotheses that are fitted.
+    frames: as of choose_pictures. most: maximum number of pose hypotheses that are fitted.
     """
     chosen, moving = frames
     search = PictureSearch(body, camera, posed_pictures(recording, chosen, 0.0))
@@ -213,8 +216,8 @@ def _register(
 class PictureStart(NamedTuple):
     """Result of a search.
 
-    camera: at its approximate pose. rows: indices of the frames to fit. clock: the time offset.
-    alternatives: other poses X_CW (4, 4).
+    camera: at its approximate pose. rows: indices of the recording's pictures to fit. clock: the
+    time offset. alternatives: other poses X_CW (4, 4) that explain the pictures about as well.
     """
 
     camera: PinholeCamera
@@ -257,17 +260,13 @@ def fit_pictures(
     """
     scanned_drift = start.clock.drift
     without = start._replace(clock=replace(start.clock, drift=0.0))
-    steady = best, as_now, start, assumed = _fit_until_stable(
-        body, without, recording, focal, offset_joints
-    )
+    fit = partial(_fit_until_stable, body, recording, focal, offset_joints)
+    steady = best, as_now, start, assumed = fit(without)
     if recording.times is None:
         return _describe(*steady, focal)
     if scanned_drift:
         clock = replace(without.clock, drift=scanned_drift)
-        start = without._replace(clock=clock)
-        best, as_now, start, assumed = _fit_until_stable(
-            body, start, recording, focal, offset_joints
-        )
+        best, as_now, start, assumed = fit(without._replace(clock=clock))
     since, span = _mean_time(recording, start.rows), float(np.ptp(recording.times))
     for left in range(most_fits, -1, -1):
         rows = [recording.names.index(frame.name) for frame in best.fit.views[0].frames]
@@ -279,29 +278,29 @@ def fit_pictures(
         start = start._replace(clock=clock)
         if abs(more) < max(deviation, min_drift / span) or not left:
             break
-        start = start._replace(clock=replace(clock, drift=clock.drift + more))
-        best, as_now, start, assumed = _fit_until_stable(
-            body, start, recording, focal, offset_joints
-        )
+        clock = replace(clock, drift=clock.drift + more)
+        best, as_now, start, assumed = fit(start._replace(clock=clock))
     drifts = abs(start.clock.drift) > drift_sds * start.clock.drift_deviation
     return _describe(*((best, as_now, start, assumed) if drifts else steady), focal)
 
 
 def _fit_until_stable(
     body: RegistrationBody,
-    start: PictureStart,
     recording: Recording,
     focal: bool,
     offset_joints: Sequence[str],
+    start: PictureStart,
 ) -> tuple[PictureFit, Recording, PictureStart, Array]:
     """Fit a camera with a known drift, and repeat with new masks until offsets settle.
 
     A fit is repeated, at most three times, if the time offset changed by 20 ms or more or a joint
     offset by 0.3 degrees or more; without joint offsets at most once.
 
+    start: the camera near its pose, and the clock, whose drift is held.
+
     Returns:
-        the fit; the recording without drift; the camera and time offset, without the latter's
-        standard deviation; and the joint offsets (m,) that the frames were segmented with.
+        the fit; the recording without drift; the start with the fitted camera and time offset; and
+        the joint offsets (m,) that the frames were segmented with.
     """
     camera, offset, names = start.camera, start.clock.value, body.kinematics.names
     constants = ((TIME_OFFSET,) if recording.times is not None else ()) + tuple(offset_joints)
@@ -324,7 +323,7 @@ def _fit_until_stable(
 
 
 def _mean_time(recording: Recording, rows: Sequence[int]) -> float:
-    """Return the mean time of some pictures [s]."""
+    """Return the mean time [s] of the pictures with indices `rows`; 0 if the log has no times."""
     return 0.0 if recording.times is None else float(recording.times[list(rows)].mean())
 
 
@@ -346,7 +345,7 @@ def choose_pictures(
         min_motion: minimum motion of any part [m].
 
     Returns:
-        the indices of both, most dissimilar frames first.
+        the indices of both, most dissimilar frames first; no fast ones without velocities.
 
     Raises RegistrationError: too few pictures have joint positions, or the robot does not move.
     """
@@ -382,7 +381,7 @@ def choose_pictures(
 def posed_pictures(
     recording: Recording, indices: Sequence[int], offset: float
 ) -> list[PosedPicture]:
-    """Return some frames with their pictures; frames without logged joints are left out."""
+    """Return pictures, by their indices, that have logged values at a time offset [s]."""
     values, rates = recording.values_at(offset), recording.rates_at(offset)
     return [
         PosedPicture(
@@ -403,12 +402,13 @@ def scan_time_offsets(
     start_within: float = 0.3,
     much_better: float = 1.01,
 ) -> TimeOffset:
-    """Scan the time offset of a camera at a known pose.
+    """Return the time offset that explains pictures best, for a camera at a known pose.
 
-    Offsets from -1 to 1 s are scanned, then drifts of the log's clock.
+    Offsets from -1 to 1 s are scanned, then drifts of the log's clock. Standard deviations are not
+    estimated (infinite).
 
     Args:
-        indices: the frames that are used.
+        indices: of the pictures that are used.
         rates: scanned drifts [s/s].
         start_within: for a drift both clocks start together within this time [s].
         much_better: minimum ratio of a drift's score to that of the best constant offset.
@@ -464,7 +464,9 @@ def _describe(
     max_sd: float = 0.04,
     max_clock_sd: float = 0.1,
 ) -> PictureRegistration:
-    """Return the registration, if it explains the pictures.
+    """Return the registration of a fit, if it explains the pictures.
+
+    The first four arguments are what `_fit_until_stable` returns.
 
     Args:
         min_explained: minimum explained fraction; correct poses have 0.2 or more, a wrong one that
@@ -483,12 +485,8 @@ def _describe(
     fit, (posed,) = best.fit, best.fit.views
     ratio = float(best.ratios[best.inliers].mean())
     score = evidence(best.explained, best.contour)
-    if (
-        best.explained < min_explained
-        or ratio < min_ratio
-        or best.contour < min_contour
-        or score < min_evidence
-    ):
+    least = (min_explained, min_ratio, min_contour, min_evidence)
+    if (np.array([best.explained, ratio, best.contour, score]) < least).any():
         raise _unexplained(
             start.camera,
             f"the best one explains {max(best.explained, 0.0):.0%} of all changes (minimum "
@@ -527,7 +525,7 @@ def _describe(
 
 
 def _unexplained(camera: PinholeCamera, why: str) -> RegistrationError:
-    """Return the error for pictures that no pose explains."""
+    """Return the error for pictures that no pose explains; why: words in its message."""
     return RegistrationError(
         f"camera '{camera.name}': no pose explains its pictures: {why}. Does the camera stand "
         "still, does the robot move much in its view, are the joint positions those at the "
@@ -549,6 +547,7 @@ def evaluate_pictures(
     """Evaluate all pictures of a recording with a registered camera.
 
     Args:
+        body: the robot's surfaces.
         one: the registration from some of them.
         found: the camera at its final pose.
         most, at_once: maximum number of pictures, evenly spaced, and of those in memory together.
@@ -557,8 +556,8 @@ def evaluate_pictures(
             fraction of the fit's median: dark and blurred contours fit badly even in correct poses.
 
     Returns:
-        the frames that show the body, with masks; their misfits; and the names of frames in which
-        nothing of the body is visible although it should be.
+        the frames that show the body, with masks; the misfit of each; and the names of frames in
+        which nothing of the body is visible although the body covers enough of the picture.
     """
     count = len(one.recording.names)
     rows = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()

@@ -69,7 +69,7 @@ class PosedPicture:
     Args:
         name: of the frame.
         values: (m,) values of the body's pose tree [rad or m].
-        picture: (H, W, 3) red, green, blue.
+        picture: (H, W, 3) uint8 red, green, blue.
         rates: (m,) velocities of the values [rad/s or m/s]; None: unknown.
     """
 
@@ -85,7 +85,7 @@ class PictureFit:
 
     Args:
         fit: the fit of frames with foreground log-odds, and masks derived from these.
-        found: its result.
+        found: the fitted values of its u shared unknowns.
         background: the estimated background, which segments further pictures.
         explained: explained fraction of the log-likelihood gain that is possible at most.
         contour: mean strength of edges along the outlines, beyond that of random lines.
@@ -119,7 +119,10 @@ class PictureFit:
 
 
 def node_places(body: RegistrationBody, values: Array) -> Array:
-    """Return the centres (f, n, 3) of the n visible nodes at values (f, m), in the world [m]."""
+    """Return the centres (f, n, 3) of the body's n visible nodes in the world [m].
+
+    values: (f, m) values of the body's pose tree in f frames.
+    """
     shown = [k for k, one in enumerate(body.coarse) if len(one.vertices)]
     X_WN = np.array([body.kinematics.poses(one)[shown] for one in values])
     middles = np.array([body.coarse[k].ball[:3] for k in shown])
@@ -129,7 +132,9 @@ def node_places(body: RegistrationBody, values: Array) -> Array:
 def choose_frames(places: Array, count: int) -> list[int]:
     """Return the indices of the most dissimilar frames, by farthest point sampling.
 
-    places: (f, n, 3), see ``node_places``. count: number of frames.
+    The frame farthest from the mean comes first.
+
+    places: (f, n, 3), see ``node_places``. count: maximum number of frames.
     """
 
     def off(other: Array) -> Array:
@@ -149,7 +154,7 @@ class PictureSearch:
     Args:
         body: the robot's surfaces.
         camera: the camera; its pose is not used.
-        frames: the pictures, the most informative first.
+        frames: f pictures, the most dissimilar first.
     """
 
     def __init__(
@@ -204,8 +209,8 @@ class PictureSearch:
         """Fit a camera roughly from a pose X_CW (4, 4).
 
         Returns:
-            the camera, and its scores in `compared` (see ``PyramidLevel.explained``); None if the
-            body leaves the pictures.
+            the camera at the fitted pose, with its pictures' original size; and its scores in
+            `compared` (see ``PyramidLevel.explained``). None: the body leaves the pictures.
         """
         frames, small = self._small
         stages = ((*(12.0,) * 4, *(8.0,) * 4, *(5.0,) * 4), (*(6.0,) * 3, *(4.0,) * 3))
@@ -225,6 +230,7 @@ class PictureSearch:
         """Fit a camera from near its pose, on search lines across the contours.
 
         Args:
+            camera: at the start's pose, with the pictures' original size.
             constants: further unknowns shared by all frames, see ``SharedFit``.
             focal: whether the focal length is fitted.
 
@@ -260,7 +266,7 @@ class PictureSearch:
 
     @cached_property
     def _small(self) -> tuple[list[PosedPicture], PinholeCamera]:
-        """The frames at the size in which backgrounds are estimated, and their camera."""
+        """The frames at the size in which backgrounds are estimated, and a camera of that size."""
         camera = self._level(PICTURES.background_width).camera
         size = camera.width, camera.height
         return [
@@ -276,7 +282,12 @@ class PictureSearch:
     def _learn(
         self, camera: PinholeCamera, frames: Sequence[PosedPicture]
     ) -> tuple[KnownBackground, Mask]:
-        """Return the background behind the body, and the pixels (f, H, W) that the body covers."""
+        """Return the background behind the body, and the pixels (f, H, W) that the body covers.
+
+        Args:
+            camera: at the pose from which the covered pixels follow.
+            frames: all frames, in pictures of the camera's size H x W.
+        """
         level = self._level(PICTURES.background_width)
         small = camera.resized(level.camera.width, level.camera.height)
         poses = camera.X_CW @ self._X_WN
@@ -296,11 +307,14 @@ class PictureSearch:
         covered: Mask,
         outlines: Sequence[Outline],
     ) -> PosedFrames | None:
-        """Segment frames; None if fewer than two show the body.
+        """Return the frames that show the body with masks; None if these are fewer than two.
 
         Args:
+            camera: the camera, with pictures of the frames' size H x W.
+            frames: all frames.
+            known: the background.
             covered: (f, H, W) the pixels that the body covers approximately.
-            outlines: the surfaces for later fits.
+            outlines: a surface for each node, for later fits.
         """
         gains = self._level(PICTURES.background_width).backgrounds.gains
 
@@ -327,6 +341,8 @@ class PictureSearch:
 def _stages(scales: Sequence[float], posed: PosedFrames) -> list[AnnealingStage]:
     """Return stages of single steps at scales [pixel of a picture 320 wide].
 
+    posed: the frames that are fitted, whose size converts the scales.
+
     Search lines are half a scale apart. Their costs are not comparable between poses, so each step
     is taken untried.
     """
@@ -337,11 +353,12 @@ def _stages(scales: Sequence[float], posed: PosedFrames) -> list[AnnealingStage]
 def segment_picture(
     one: PosedPicture, known: KnownBackground, gain: Floats, covered: Mask
 ) -> PosedFrame | None:
-    """Return a frame with foreground log-odds and a mask; None where no body is visible.
+    """Return the frame of a picture with log-odds and a mask; None where no body is visible.
 
     Args:
+        one: the picture, with values and rates that the frame takes over.
         known: the background.
-        gain: (3, 4) photometric gain of the picture.
+        gain: (3, 4) slopes and offset that map the picture's colours to the background's.
         covered: (H, W) the pixels that the body covers approximately.
     """
     if not covered.any():
@@ -356,7 +373,8 @@ def segment_picture(
 def evidence(explained: float, contour: float) -> float:
     """Return the score of a pose from its explained fraction and its edges' mean strength.
 
-    The mean over the contours is used: their sum would favour poses with longer contours.
+    Both are those of a ``PictureFit``. The mean over the contours is used: their sum would favour
+    poses with longer contours.
     """
     return explained + PICTURES.contour_weight * contour
 
@@ -373,7 +391,7 @@ class PyramidLevel:
         camera: the camera of the given pictures; its pose is not used.
         pictures: f pictures (H, W, 3).
         X_WN: (f, nodes, 4, 4) the nodes' poses.
-        width: width of this level's pictures [pixel].
+        width: width of this level's pictures [pixel]; at most that of the given ones.
     """
 
     def __init__(
@@ -406,24 +424,28 @@ class PyramidLevel:
         self._size = float(np.sqrt((off**2).sum(axis=1).mean()))
 
     def statistics(self, X_CW: Array, X_WN: Array | None = None) -> Array:
-        """Return the sums (4,) of ``fit.background.explain`` for a pose (4, 4).
+        """Return the sums (4,), see ``Explained``, over the pictures for a pose (4, 4).
 
-        X_WN: (f, nodes, 4, 4) other poses of the nodes.
+        X_WN: (f, nodes, 4, 4) other poses of the nodes; None: those of the pictures' values.
         """
         X_CN = X_CW[:3] @ (self._X_WN if X_WN is None else X_WN)
         sums = self.backgrounds.sums
         return explain(self._packed, X_CN, self._static, self._parameters, sums, 1.0, 0)[0]
 
     def explained(self, X_CW: Array) -> tuple[float, float]:
-        """Return a pose's explained fraction and the mean strength of edges along its outlines."""
+        """Return the explained fraction and mean edge strength of a pose (4, 4).
+
+        They are the `explained` and `contour` of a ``PictureFit``.
+        """
         sums = self.statistics(X_CW)
         fraction = float(sums[Explained.GAIN]) / max(self.backgrounds.max_gain, 1e-9)
         return fraction, float(sums[Explained.CONTOUR]) / max(float(sums[Explained.OUTLINE]), 1.0)
 
     def score(self, X_CW: Array, frames: int | None = None) -> float:
-        """Return the score of a pose; a constant is added to the outlines' length.
+        """Return the score, see `evidence`, of a pose (4, 4).
 
-        The constant limits the score of short outlines, whose edges are strong by chance.
+        A constant is added to the outlines' length. It limits the score of short outlines, whose
+        edges are strong by chance.
 
         frames: number of frames that are used, from the first on; None: all.
         """
@@ -437,7 +459,10 @@ class PyramidLevel:
         )
 
     def best(self, X_CW: Sequence[Array], frames: int, fraction: float) -> list[Array]:
-        """Return the fraction of the poses (4, 4) with the best scores, best first."""
+        """Return the given fraction of the poses (4, 4), those with the best scores, best first.
+
+        frames: number of frames that are used, from the first on.
+        """
 
         def scores(some: Sequence[Array]) -> list[float]:
             return [self.score(X, frames) for X in some]
@@ -447,7 +472,10 @@ class PyramidLevel:
         return [X_CW[k] for k in order[: math.ceil(fraction * len(order))]]
 
     def tile_gains(self, X_CW: Array, squares: int = 16) -> Array:
-        """Return a pose's log-likelihood gain (k, k) by square tiles, 16 along the longer side."""
+        """Return the log-likelihood gain of a pose (4, 4) by square image tiles.
+
+        The result is (squares, squares), with `squares` tiles along the picture's longer side.
+        """
         side = max(self.camera.width, self.camera.height) / squares
         _, gains = explain(
             self._packed, X_CW[:3] @ self._X_WN, self._static, self._parameters,
@@ -457,6 +485,8 @@ class PyramidLevel:
 
     def starts(self, rotations: int = 1200) -> list[Array]:
         """Return poses X_CW (4, 4) that show the body where pictures change.
+
+        rotations: number of rotations over the sphere, and again near upright.
 
         Each rotation is combined with three depths about that at which the body is as large as the
         changes, and with two positions in the picture: the changes' centre, and a random one.
@@ -494,7 +524,8 @@ class PyramidLevel:
         Args:
             numbered: a seed for the signs of the first simplex, and the pose (4, 4).
             evaluations: maximum number of scores.
-            turn: rotation of the first simplex [rad]; its other steps are proportional.
+            turn: rotation of the first simplex [rad]; its shifts [focal lengths] are 0.4 times, the
+                step of the log depth 0.6 times as large.
 
         Returns:
             the best score and its pose.
@@ -513,7 +544,10 @@ class PyramidLevel:
         return -float(found.fun), self._moved(X_CW, found.x)
 
     def distinct(self, X_CW: Sequence[Array], most: int | None = None) -> list[Array]:
-        """Return at most `most` poses that place the body apart from every pose kept before."""
+        """Return the poses (4, 4) that place the body apart from every pose kept before.
+
+        most: maximum number of poses; None: no limit.
+        """
         some = self._points[:: max(1, len(self._points) // 50)]
         kept, places = list[Array](), np.zeros((0, *some.shape))
         for X in X_CW:
@@ -527,7 +561,11 @@ class PyramidLevel:
         return kept
 
     def _moved(self, X_CW: Array, x: Array) -> Array:
-        """Return a pose moved by x (6,): rotation about the body's middle, shift, log depth."""
+        """Return a pose (4, 4) moved by x (6,) in the camera's frame.
+
+        x: rotation vector about the body's middle [rad], shift of the middle in the picture along u
+            and v [focal lengths], and change of the logarithm of the middle's depth.
+        """
         p_CM = X_CW[:3, :3] @ self._middle + X_CW[:3, 3]
         depth = p_CM[2] * np.exp(x[5])
         place = np.array([p_CM[0] / p_CM[2] + x[3], p_CM[1] / p_CM[2] + x[4], 1.0])

@@ -99,11 +99,14 @@ class PosedFrames:
 
     @cached_property
     def some_points(self) -> Array:
-        """Corners (n, 3) of the convex hulls in about five frames, in the world [m]."""
+        """Corners (n, 3) of the convex hulls in at most nine frames, in the world [m]."""
         return np.concatenate(self._corners(self.X_WN[:: max(1, len(self.X_WN) // 5)]))
 
     def _corners(self, poses: Array) -> list[Array]:
-        """Return the hull's corners (n, 3) for each of the nodes' poses (frames, nodes, 4, 4)."""
+        """Return for each frame the corners (n, 3) of the body's convex hull in the world [m].
+
+        poses: (frames, nodes, 4, 4) X_WN of the nodes.
+        """
         own = [_hull_of(outline) for outline in self.outlines]
         return [
             _hull(
@@ -124,7 +127,10 @@ class PosedFrames:
         return float(np.sqrt((off**2).sum(axis=1).mean()))
 
     def observations(self, camera: int, count: int) -> list[Observation]:
-        """Return the frames as observations of camera number `camera` of `count` cameras."""
+        """Return the frames as observations of `count` cameras, with evidence of one of them only.
+
+        camera: index, from 0, of the camera that took the frames.
+        """
         found = []
         for frame, edge in zip(self.frames, self._edges, strict=True):
             edges = pack_evidence([edge if c == camera else NO_EDGE for c in range(count)])
@@ -139,7 +145,7 @@ class PosedFrames:
 
     @cached_property
     def _edges(self) -> list[EdgePoints]:
-        """Edge points of the masks; none for frames with foreground log-odds."""
+        """Edge points of each frame's mask; none (NO_EDGE) for frames with foreground log-odds."""
         spacing = max(1.0, round(self.spacing * self.size))
         return [
             NO_EDGE if frame.foreground is not None else find_edge_points(frame.mask, spacing)
@@ -147,18 +153,24 @@ class PosedFrames:
         ]
 
     def downscaled(self, side: float) -> PinholeCamera:
-        """Return the camera with pictures in which the silhouettes' area is at most side^2."""
+        """Return the camera with pictures in which the silhouettes' median area is at most side^2.
+
+        Pictures are never enlarged, and have at least 8 x 8 pixels.
+        """
         camera, scale = self.camera, min(1.0, side / self.size)
         width, height = (max(8, round(scale * one)) for one in (camera.width, camera.height))
         return camera.resized(width, height)
 
     def sums(self, frame: int, camera: PinholeCamera) -> NDArray[np.int32]:
-        """Return prefix sums (H, W + 1) of a frame's mask in a downscaled camera's picture."""
+        """Return prefix sums (H, W + 1), see ``reduced_sums``, of the mask of frame number `frame`.
+
+        camera: the downscaled camera, with pictures of H x W pixels.
+        """
         return reduced_sums(self.frames[frame].mask, camera)
 
 
 def reduced_sums(mask: Mask, camera: Camera) -> NDArray[np.int32]:
-    """Return prefix sums (H, W + 1) of a mask downscaled to a camera's picture size."""
+    """Return prefix sums (H, W + 1) along the rows of a mask scaled to a camera's H x W pixels."""
     size = (camera.width, camera.height)
     small = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     return prefix_sums(small > 0.5)
@@ -178,14 +190,27 @@ def _hull(points: Array) -> Array:
 
 
 def placed_points(outlines: Sequence[Outline], X_WN: Array) -> Array:
-    """Return the vertices (n, 3) of surfaces in the world, with nodes at X_WN (nodes, 4, 4)."""
+    """Return the vertices (n, 3) of all surfaces, node after node, in the world [m].
+
+    Args:
+        outlines: a surface for each node.
+        X_WN: (nodes, 4, 4) the nodes' poses.
+    """
     placed = zip(outlines, X_WN, strict=True)
     return np.concatenate([one.vertices @ X[:3, :3].T + X[:3, 3] for one, X in placed])
 
 
 @dataclass(frozen=True, eq=False)
 class MultiViewFrame:
-    """A frame of several cameras: as ``PosedFrame``, with masks and log-odds by camera name."""
+    """Synchronised pictures of several cameras of a body at known joint positions.
+
+    Args:
+        name: the frame's name.
+        values: (m,) values of the body's pose tree [rad or m].
+        masks: silhouettes (H, W) by camera name; cameras without a mask are left out.
+        foreground: coded log-odds (H, W, 3) by camera name, see ``PosedFrame``.
+        rates: (m,) velocities of the values [rad/s or m/s]; None: unknown.
+    """
 
     name: str
     values: Array
@@ -194,12 +219,14 @@ class MultiViewFrame:
     rates: Array | None = None
 
     def of(self, camera: str) -> PosedFrame:
-        """Return the frame of a camera that has a mask."""
+        """Return the frame of one camera, given by its name, which must have a mask."""
         foreground = self.foreground.get(camera)
         return PosedFrame(self.name, self.values, self.masks[camera], foreground, self.rates)
 
     def edges(self, cameras: Sequence[Camera], spacing: float) -> Evidence:
-        """Return the silhouettes' edge points at a spacing [pixel].
+        """Return the edge points of each camera's mask; none for a camera without one.
+
+        spacing: distance of the points [pixel], rounded, at least 1.
 
         Raises MaskError: a mask's size differs from its camera's.
         """
@@ -212,7 +239,10 @@ class MultiViewFrame:
 
 
 def require_size(camera: Camera, frame: str, mask: Mask) -> None:
-    """Refuse (MaskError) a mask whose size differs from the camera's picture."""
+    """Refuse (MaskError) a mask (H, W) whose size differs from the camera's picture.
+
+    frame: the frame's name, for the message.
+    """
     if mask.shape != (camera.height, camera.width):
         raise MaskError(
             f"camera '{camera.name}', frame '{frame}': a mask of {camera.width} x {camera.height} "
@@ -222,6 +252,8 @@ def require_size(camera: Camera, frame: str, mask: Mask) -> None:
 
 def common_size(cameras: Sequence[Camera], frames: Sequence[MultiViewFrame]) -> float:
     """Return the square root of the silhouettes' median area [pixel].
+
+    Masks of cameras that are not among `cameras`, and empty masks, are ignored.
 
     Raises MaskError: a mask's size differs from its camera's, or no mask shows the body.
     """
@@ -236,6 +268,9 @@ def common_size(cameras: Sequence[Camera], frames: Sequence[MultiViewFrame]) -> 
 
 
 def middle_of(kinematics: TreeKinematics, frames: Sequence[MultiViewFrame]) -> Array:
-    """Return the mean position (3,) of the nodes in all frames, in the world [m]."""
+    """Return the mean position (3,) of the nodes' origins in all frames, in the world [m].
+
+    kinematics: of the pose tree that the frames' values belong to.
+    """
     places = [kinematics.poses(frame.values)[:, :3, 3].mean(axis=0) for frame in frames]
     return np.asarray(np.mean(places, axis=0))

@@ -42,7 +42,8 @@ class CameraSearchSettings(NamedTuple):
     """Stages and thresholds of the camera search.
 
     Args:
-        coarse, fine, last: stages of three successive fits.
+        coarse, fine, last: stages of three successive fits; scales and spacings are over the square
+            root of the silhouettes' area.
         coarse_spacing, fine_spacing: spacing of the silhouettes' edge points in the first two fits
             [square root of the silhouettes' area].
         start_side, refined_side: square root of the silhouettes' area in the downscaled pictures in
@@ -87,10 +88,12 @@ class RegistrationBody:
     """A body's surfaces at three levels of detail.
 
     Attributes:
+        tree, kinematics: the body's pose tree, with m values.
         coarse, medium, full: one surface for each node of the tree, with few, more, and all
             triangles.
 
     Args:
+        tree: the body's pose tree.
         visible_nodes: names of the nodes that the silhouettes show; None: all.
         coarse_triangles: number of triangles of each node at the coarse level.
         radius_scales: (nodes,) factors of the nodes' widths across their y axes; None: 1.
@@ -122,7 +125,7 @@ class RegistrationBody:
         return simplify_surfaces(self._surfaces, self._coarse_triangles)
 
     def with_tree(self, tree: PoseTree) -> "RegistrationBody":
-        """Return the same surfaces on another tree with the same nodes."""
+        """Return a copy with the same surfaces on another tree with the same nodes."""
         other = copy.copy(self)
         other.tree, other.kinematics = tree, TreeKinematics(tree)
         return other
@@ -225,7 +228,7 @@ class CameraSearch:
         return CameraSearch(self._body, rotations=2000, fitted=15)
 
     def register(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
-        """Estimate the camera's pose; its current pose is not used.
+        """Return the camera at its estimated pose; its current pose is not used.
 
         Raises:
             MaskError: a mask is empty, or its size differs from the camera's.
@@ -239,7 +242,9 @@ class CameraSearch:
         return self._fitted(camera, frames, self.search(camera, frames))
 
     def refine(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
-        """Refine the camera's current pose, which must be within some pixels; no alternatives.
+        """Return the camera with its current pose refined, without alternatives.
+
+        The body as drawn at the current pose must be within some pixels of the silhouettes.
 
         Raises MaskError: a mask is empty, or its size differs from the camera's.
         """
@@ -248,7 +253,7 @@ class CameraSearch:
     def _fitted(
         self, camera: PinholeCamera, frames: Sequence[PosedFrame], starts: Sequence[Array]
     ) -> RegisteredCamera:
-        """Return the best pose fitted from starts X_CW (4, 4), and those that fit equally well.
+        """Return the camera at the best pose fitted from starts X_CW (4, 4), see `select_best`.
 
         At most 24 frames narrow the starts down; all frames enter the final fit.
         """
@@ -274,7 +279,10 @@ class CameraSearch:
     def search(
         self, camera: PinholeCamera, frames: Sequence[PosedFrame], kept: int = 6
     ) -> list[Array]:
-        """Return up to `kept` pose hypotheses X_CW (4, 4), best first."""
+        """Return up to `kept` coarsely fitted pose hypotheses X_CW (4, 4), best first.
+
+        At most 8 frames, evenly spaced, are used, and not the camera's current pose.
+        """
         body = self._body
         posed = PosedFrames(
             body.kinematics, body.coarse, camera, evenly_spaced(frames), SEARCH.coarse_spacing
@@ -300,11 +308,15 @@ class CameraSearch:
 def select_best(
     fitted: Sequence[tuple[SharedFit, SharedValues]],
 ) -> tuple[RegisteredCamera, Array, list[int]]:
-    """Select the best of a camera's fitted poses.
+    """Select the best of one or more fits of a camera's pose to the same frames.
+
+    Args:
+        fitted: the fits, each of this camera only, with their fitted values.
 
     Returns:
         the camera, with distinct poses that fit equally well as alternatives; the (u, u) covariance
-        of the best fit's shared unknowns; and the indices of all equally good fits, best first.
+        of the best fit's shared unknowns; and the indices in `fitted` of all equally good fits,
+        best first.
     """
     side = max(1.0, SEARCH.tile_side * fitted[0][0].views[0].size)
     costs = [fit.tile_costs(found, side) for fit, found in fitted]
@@ -334,9 +346,10 @@ def select_best(
 def frame_misfits(
     posed: PosedFrames, X_CW: Array, ratios: Array, inliers: NDArray[np.bool_]
 ) -> tuple[FrameMisfit, ...]:
-    """Describe how well frames fit a camera's pose.
+    """Return how well each frame fits a camera's pose.
 
     Args:
+        posed: the camera's frames.
         X_CW: (4, 4) the world's pose in the camera.
         ratios: (frames,) inlier ratios.
         inliers: (frames,) which frames are inliers.
@@ -356,8 +369,11 @@ def evenly_spaced(frames: Sequence[T], most: int = 8) -> list[T]:
 def distinct_poses(frames: PosedFrames, X_CW: Sequence[Array], apart: float = 0.03) -> list[Array]:
     """Return the poses X_CW (4, 4) that place the body apart from every pose kept before.
 
-    apart: minimum root mean square distance of the body's points in the picture
-        [square root of the silhouettes' area].
+    Args:
+        frames: frames of the camera, in which the body's points are compared.
+        X_CW: the poses, the preferred ones first.
+        apart: minimum root mean square distance of the body's points in the picture
+            [square root of the silhouettes' area].
     """
     points = frames.some_points
     uv = [frames.camera.with_pose(np.linalg.inv(X)).project(points)[0] for X in X_CW]
@@ -374,6 +390,7 @@ def fit_to_inliers(fit: SharedFit, most: int = 5, settled: float = 1e-4) -> Shar
     """Fit camera and boundary biases to the inlier frames, reselecting them after each fit.
 
     Args:
+        fit: the fit, whose unknowns start from 0.
         most: maximum number of fits.
         settled: fits end once the inliers stay the same and no shared unknown changes by more
             [rad, m].
@@ -404,6 +421,8 @@ def suggest_pose(
     Random positions within the joint limits are tried (one full turn for a joint without limits).
 
     Args:
+        body: the robot's surfaces.
+        camera: its pose is not used.
         X_WC: two or more poses (4, 4) of the camera to distinguish.
         keep_out: boxes that no point of the body's coarse surfaces may enter.
         tried: number of random positions.
@@ -441,7 +460,10 @@ def suggest_pose(
 
 
 def keep_distinct(items: Iterable[T], differ: Callable[[T, T], bool]) -> list[T]:
-    """Return the items that differ from every item kept before them."""
+    """Return the items that differ from every item kept before them; the first is kept.
+
+    differ: returns whether an item differs from a kept one.
+    """
     kept: list[T] = []
     for item in items:
         if all(differ(item, one) for one in kept):
@@ -464,11 +486,10 @@ def uniform_rotations(count: int) -> Array:
 def positions_from_bounds(frames: PosedFrames, R_CW: Array) -> Array:
     """Return positions p_CW (n, 3) at which the body's bounds match the silhouettes' bounds.
 
-    The distances of the bounds are minimised by Gauss-Newton steps, the last ones with Geman and
-    McClure's weights. Sides at the picture's border are ignored.
+    The distances of the bounds in all frames are minimised by Gauss-Newton steps, the last ones
+    with Geman and McClure's weights. Sides at the picture's border are ignored.
 
-    Args:
-        R_CW: (n, 3, 3) the world's rotations in the camera.
+    R_CW: (n, 3, 3) the world's rotations in the camera.
     """
     bodies = [np.einsum("nij,pj->npi", R_CW, points) for points in frames.points]
     bounds, shown = zip(*[_mask_bounds(frame.mask) for frame in frames.frames], strict=True)
@@ -502,12 +523,14 @@ def add_bound_equations(
     H: Array,
     g: Array,
 ) -> None:
-    """Add one frame's normal equations of bounds to H (n, 3, 3) and g (n, 3).
+    """Add one frame's normal equations of n positions p_CW, from the bounds' distances.
 
     Args:
-        p_C: (n, points, 3) the body's points in the camera [m].
+        frames: the camera's frames, for its intrinsics and the body's size.
+        p_C: (n, points, 3) the body's points in the camera at each position [m].
         bound: the silhouette's bounds (2, 2), and which of them count, see `_mask_bounds`.
         robust: whether large distances are down-weighted.
+        H, g: (n, 3, 3) and (n, 3) sums over frames, which the equations are added to.
     """
     f, c = frames.intrinsics
     rows = np.arange(len(p_C))
@@ -529,7 +552,7 @@ def add_bound_equations(
 
 
 def _mask_bounds(mask: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
-    """Return least and greatest u, v (2, 2) of a silhouette, and which are off the border."""
+    """Return least u, v, then greatest u, v (2, 2) of a mask, and which are off the border."""
     v, u = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     bounds = np.array([[u[0] - 0.5, v[0] - 0.5], [u[-1] + 0.5, v[-1] + 0.5]])
     height, width = mask.shape
@@ -538,9 +561,10 @@ def _mask_bounds(mask: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def overlap_areas(frames: PosedFrames, X_CW: Array, side: float) -> Array:
-    """Return the areas of body, silhouette and their intersection in all frames.
+    """Return the areas of body, silhouette and their intersection at n poses in all frames.
 
     Args:
+        frames: the camera's frames; its own pose is not used.
         X_CW: (n, 4, 4) poses of the world in the camera.
         side: square root of the silhouettes' area in the downscaled pictures that are compared
             [pixel]; pictures are never enlarged.
@@ -561,12 +585,12 @@ def overlap_areas(frames: PosedFrames, X_CW: Array, side: float) -> Array:
 
 
 def E_total(found: Array) -> Array:
-    """Return the area in body or silhouette alone over the silhouette's; found (..., 3) areas."""
+    """Return the area (...) in body or mask alone over the mask's; found: ``overlap_areas``."""
     body, mask, both = np.moveaxis(found, -1, 0)
     return np.asarray((body + mask - 2.0 * both) / np.maximum(mask, 1.0))
 
 
 def intersection_over_union(found: Array) -> Array:
-    """Return the intersection over union of body and silhouette; found (..., 3) areas."""
+    """Return the intersection over union (...) of body and mask; found: ``overlap_areas``."""
     body, mask, both = np.moveaxis(found, -1, 0)
     return np.asarray(both / np.maximum(body + mask - both, 1.0))

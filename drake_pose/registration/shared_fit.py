@@ -49,12 +49,13 @@ class SharedFitSettings(NamedTuple):
     """Stages, priors and thresholds of fits of shared unknowns.
 
     Args:
-        stages_with_constants: stages of a fit of cameras and constants. The last one is repeated:
+        stages_with_constants: stages of a fit of cameras and constants; scales and spacings of all
+            stages are over the square root of the silhouettes' area. The last one is repeated:
             weakly observable constants, such as an offset correlated with the camera, converge
             slowly, and a stage ends when the cost hardly falls.
         inlier_stage: stage at which inliers and outliers are classified.
         final_stage: last stage of the fit of cameras.
-        steps: step control.
+        steps: limits and damping of a step.
         constant_deviation: prior standard deviation of joint offsets [rad or m] and of the
             logarithms of link scales.
         max_constant: largest joint offset [rad or m] or logarithm of a link scale; without it, the
@@ -114,7 +115,7 @@ class SharedFit:
     """Fits unknowns that the frames of one or several cameras share.
 
     Attributes:
-        views: the frames of each camera.
+        views: for each camera its frames.
         problem: the least-squares problem of all masks.
         rows: (rows,) index of each mask's camera, ascending; a row is one mask.
         names: of the u shared unknowns: those of each camera, then the constants.
@@ -123,10 +124,11 @@ class SharedFit:
             frames: values of the pose tree, and link scales.
 
     Args:
-        views: the frames of each camera.
-        X_CW: poses (4, 4) of the world in each camera at which the unknowns are 0.
+        views: for each camera its frames, all with the same pose tree and outlines.
+        X_CW: for each camera the pose (4, 4) of the world in it at which its unknowns are 0.
         constants: see the attribute.
-        offsets: vectors from links' joints to the joints that they carry, for link scales.
+        offsets: vectors from links' joints to the joints that they carry, for link scales; empty:
+            links cannot be scaled.
         camera_unknowns: number of unknowns of each camera, the first ones of CAMERA_NAMES.
         fit_biases: whether the masks' boundary biases are unknown.
     """
@@ -186,7 +188,13 @@ class SharedFit:
         start: SharedValues | None = None,
         included: Mask | None = None,
     ) -> SharedValues:
-        """Fit all unknowns to the included masks (rows,), from a start."""
+        """Return all unknowns fitted to the included masks (rows,); biases of others are 0.
+
+        Args:
+            rounds: stages of the fit.
+            start: None: all unknowns start from 0.
+            included: (rows,) which masks enter the fit; None: all.
+        """
         observations, at, expected, included = self._at(start or self.start, included)
         found = self.problem.solve(observations, rounds, at, expected=expected)
         biases = np.zeros(len(self.rows))
@@ -194,7 +202,11 @@ class SharedFit:
         return SharedValues(found.shared, biases)
 
     def from_found(self, found: SharedValues) -> tuple["SharedFit", SharedValues]:
-        """Return the same fit with the cameras' unknowns counted from their found poses."""
+        """Return the same fit with the cameras' unknowns counted from their found poses.
+
+        Returns:
+            the fit; and the found values with 0 for each camera's POSE_NAMES.
+        """
         X_CW = [camera.X_CW for camera in self.cameras(found)]
         count = self.per_camera * len(X_CW)
         shared = found.shared.copy()
@@ -205,7 +217,13 @@ class SharedFit:
     def equations(
         self, at: SharedValues, step: AnnealingStage, included: Mask | None = None
     ) -> Equations:
-        """Return the normal equations of the included masks (rows,), own unknowns first."""
+        """Return the normal equations at given values, boundary biases first.
+
+        Args:
+            at: the values.
+            step: the stage, whose scale weights the residuals.
+            included: (rows,) which masks enter; None: all.
+        """
         observations, unknowns, expected, _ = self._at(at, included)
         return self.problem.equations(observations, unknowns, step, expected)
 
@@ -213,6 +231,8 @@ class SharedFit:
         self, found: SharedValues, by: Array, step: AnnealingStage, included: Mask | None = None
     ) -> tuple[float, float]:
         """Return the cost's curvature along a step `by` (u,), without priors.
+
+        The other arguments are those of `equations`, with `found` for `at`.
 
         Returns:
             by^T H by from differences of the gradient at +-by, and from the normal equations.
@@ -237,12 +257,15 @@ class SharedFit:
         return np.array(map_ordered(ratio, masks))
 
     def inliers(self, ratios: Array) -> Mask:
-        """Return which masks (rows,) are inliers among those of their camera."""
+        """Return which masks (rows,) are inliers, from all masks' inlier ratios (rows,).
+
+        The threshold, `inlier_threshold`, is that of the mask's camera.
+        """
         own = [ratios[self.rows == c] for c in range(len(self.views))]
         return np.concatenate([one >= inlier_threshold(one) for one in own])
 
     def tile_costs(self, found: SharedValues, side: float) -> Array:
-        """Return the costs (rows, k, k) by square tiles of a side [pixel]."""
+        """Return the costs (rows, k, k) of each mask by square image tiles of a side [pixel]."""
 
         def costs(mask: tuple[Observation, Array, int]) -> Array:
             return self.problem.tile_costs(*mask[:2], SHARED.inlier_stage, side)[mask[2]]
@@ -261,8 +284,11 @@ class SharedFit:
     def covariances(self, found: SharedValues, included: Mask | None = None) -> tuple[Array, Array]:
         """Estimate the covariance of the shared unknowns from the included masks (rows,).
 
+        included: None: all masks.
+
         Returns:
-            two (u, u) parts: from contour errors, and from nuisance parameters and calibrations.
+            two (u, u) parts, whose sum is the covariance: from contour errors, and from nuisance
+            parameters and errors of the cameras' intrinsics.
         """
         distances = self._distances_with_nuisances(found, SHARED.final_stage, included)
         is_angle = np.zeros(distances.X.shape[1], bool)
@@ -298,11 +324,13 @@ class SharedFit:
         longer, offsets of 0.3 degrees and a focal length 1 % off give 0.7 degrees at most.
 
         Args:
+            found: the fitted values; joints with a fitted offset are not tested.
+            included: (rows,) masks that entered the fit.
             min_score: minimum ratio of a value to its standard deviation.
             smallest: minimum value [half a degree or two millimetres].
 
         Returns:
-            value and standard deviation by joint [rad or m], highest score first.
+            value and standard deviation by joint [rad or m], highest score first; {}: none.
         """
         distances = self._distances_with_nuisances(found, SHARED.inlier_stage, included)
         angles = np.zeros(distances.X.shape[1], bool)
@@ -331,12 +359,14 @@ class SharedFit:
         is made in all unknowns.
 
         Args:
+            found: the fitted values.
             name: of the constant, such as the time offset, whose slope over time is the drift.
-            weights: of the included masks.
+            weights: (n,) of the n included masks, such as their times.
+            included: (rows,) masks that entered the fit.
             covariance: (u, u) of the shared unknowns, which scales the standard deviation.
 
         Returns:
-            the slope and its standard deviation.
+            the slope and its standard deviation [unit of the constant over that of the weights].
         """
         p, at = self.problem.own_count, self.names.index(name)
         equations = self.equations(found, SHARED.final_stage, included)
@@ -355,7 +385,10 @@ class SharedFit:
         return -float(inverse[-1] @ left), float(np.sqrt(scale * inverse[-1, -1]))
 
     def camera_covariances(self, found: SharedValues, covariance: Array) -> Array:
-        """Return the poses' covariances (cameras, 6, 6) from that of the shared unknowns (u, u)."""
+        """Return the covariance of each camera's pose X_WC (cameras, 6, 6), see `pose_covariance`.
+
+        covariance: (u, u) of the shared unknowns, whose values are `found`.
+        """
         X_CW, _, motions = self.problem.place_cameras(self._parameters(found)[0])
         own = [slice(k, k + 6) for k in self.per_camera * np.arange(len(X_CW))]
         several = zip(X_CW, motions, own, strict=True)
@@ -364,7 +397,12 @@ class SharedFit:
     def _at(
         self, at: SharedValues, included: Mask | None
     ) -> tuple[list[Observation], tuple[Array, Array], tuple[Array, Array], Mask]:
-        """Return the included observations, their unknowns, the prior means, and which masks."""
+        """Return the arguments of ``Problem.solve`` for values and included masks.
+
+        Returns:
+            the n included observations; their own unknowns (n, cameras) and the shared ones (u,) at
+            the values; the prior means of both, 0; and which masks (rows,) are included.
+        """
         included = np.ones(len(self.rows), bool) if included is None else included
         own = self._own(at)[included]
         observations = [self._observations[k] for k in np.flatnonzero(included)]
@@ -376,20 +414,27 @@ class SharedFit:
         )
 
     def _own(self, at: SharedValues) -> Array:
-        """Return the own unknowns (rows, cameras): each mask's bias in its camera's column."""
+        """Return the own unknowns (rows, cameras): each mask's bias in its camera's column.
+
+        Without fitted biases they are (rows, 0).
+        """
         own = np.zeros((len(self.rows), self.problem.own_count))
         if own.size:
             own[np.arange(len(own)), self.rows] = at.biases
         return own
 
     def _parameters(self, at: SharedValues) -> Array:
-        """Return all parameters (rows, n) of the problem."""
+        """Return all parameters (rows, n) of the problem for each mask, at given values."""
         return self.problem.parameters(self._observations, self._own(at), at.shared)
 
     def distances(
         self, at: SharedValues, step: AnnealingStage, included: Mask | None = None
     ) -> Distances:
-        """Return the distances in the included masks, by shared unknowns, then boundary biases."""
+        """Return the contours' distances in the included masks, linearised at given values.
+
+        Their derivatives are by the shared unknowns, then by the included masks' boundary biases.
+        The arguments are those of `equations`.
+        """
         observations, _, _, included = self._at(at, included)
         masks = self.problem.compared_masks(observations, self._parameters(at)[included], step)
         return distances_in_masks(self.problem.body.outlines, masks, with_bias=True)
@@ -397,7 +442,7 @@ class SharedFit:
     def _distances_with_nuisances(
         self, found: SharedValues, step: AnnealingStage, included: Mask | None
     ) -> Distances:
-        """Return the distances in the included masks, with nuisance parameters.
+        """Return `distances`, with derivatives by up to three groups of nuisance parameters.
 
         Nuisances may be off in all frames alike and are not fitted: joint offsets [half a degree or
         2 mm], link scales, each and all together [1 %], focal lengths [1 %] and principal points
@@ -450,7 +495,10 @@ class SharedFit:
 
 
 def fit_pose(view: PosedFrames, X_CW: Array, rounds: Sequence[AnnealingStage]) -> Array:
-    """Return X_CW (4, 4) fitted to all frames from a start, without boundary biases."""
+    """Return a camera's pose X_CW (4, 4) fitted to all its frames from a start X_CW (4, 4).
+
+    Masks are taken to have no boundary bias. `rounds` are the stages of the fit.
+    """
     fit = SharedFit([view], [X_CW], fit_biases=False)
     return fit.cameras(fit.fit(rounds))[0].X_CW
 
@@ -475,11 +523,14 @@ def pose_covariance(X_CW: Array, motions: Array, covariance: Array) -> Array:
 def scatter_factor(distances: Distances, sizes: ErrorSizes, shared: int) -> float:
     """Return the factor, at least 1, by which frames scatter more than the error sizes predict.
 
-    Each frame's distances are projected onto the directions that inform about the shared values,
+    Each mask's distances are projected onto the directions that inform about the shared values,
     after removal of its boundary bias. There their covariance is known, and the weighted sum of
     squared residuals over the degrees of freedom estimates the factor of the variances.
 
-    shared: number of shared values, the first columns of ``distances.X``.
+    Args:
+        distances: of the masks, with derivatives by the shared values, then by boundary biases.
+        sizes: the estimated error sizes.
+        shared: number of shared values, the first columns of ``distances.X``.
     """
     V = distances_covariance(distances, sizes)
     designs, targets = [], []

@@ -56,6 +56,9 @@ class CalibrationTarget:
 
     Its frame T is the world frame of its own model file; in a URDF the frame of its root link.
 
+    Its pose tree leads from link L over the robot's joints and the world to the target. The tree's
+    values are positions of these joints and TARGET_POSITIONS.
+
     Attributes:
         in_own_frame: its surfaces, with T as the world.
         middle: (3,) centre of its bounding box in frame T [m].
@@ -64,8 +67,8 @@ class CalibrationTarget:
     Args:
         robot: the robot.
         link: the robot's link L that carries the camera.
-        held: joint positions of the robot that do not change [rad or m].
-        tree: the target's own pose tree.
+        held: joint positions of the robot that do not change, by name [rad or m].
+        tree: the target's own pose tree, with frame T as the world.
 
     Raises:
         SettingsError: a joint of the target is free, or no joint moves the link.
@@ -95,13 +98,13 @@ class CalibrationTarget:
         self._bodies = RegistrationBody(self.tree(np.eye(4)), (TARGET,), FEW)
 
     def with_robot(self, robot: ArticulatedModel) -> "CalibrationTarget":
-        """Return the same target seen by a robot with corrected joint origins."""
+        """Return a copy for the same robot with corrected joint origins."""
         other = copy.copy(self)
         other._robot = robot
         return other
 
     def tree(self, X_WT: Array) -> PoseTree:
-        """Return the pose tree from the link to the target at X_WT (4, 4).
+        """Return the pose tree from the link to the target, for TARGET_POSITIONS 0 at X_WT (4, 4).
 
         Raises SettingsError: no joint moves the link.
         """
@@ -122,22 +125,24 @@ class CalibrationTarget:
         return self._bodies.with_tree(self.tree(X_WT))
 
     def link_poses(self, values: Array) -> Array:
-        """Return the link's poses X_WL (frames, 4, 4) at the tree's values (frames, m)."""
+        """Return the link's poses X_WL (frames, 4, 4) at values (frames, m) of `tree`."""
         kinematics, world = self._bodies.kinematics, self._bodies.tree.model.link_names[0]
         node = self._bodies.tree.node_index(world)
         return inverse_transforms(np.array([kinematics.poses(one)[node] for one in values]))
 
     def moved(self, X_WT: Array, by: Array) -> Array:
-        """Return the pose (4, 4) at TARGET_POSITIONS `by` (6,), which are 0 at X_WT (4, 4)."""
+        """Return the target's pose (4, 4) at TARGET_POSITIONS `by` (6,), which are 0 at X_WT."""
         X = np.eye(4)
         X[:3, 3] = by[:3]
         X[:3, :3] = Rotation.from_euler("XYZ", by[3:]).as_matrix()
         return np.asarray(X_WT @ self._X_TO @ X @ inverse_transforms(self._X_TO))
 
     def pose_covariance(self, X_WT: Array, covariance: Array) -> Array:
-        """Return the (6, 6) covariance of the pose's error in the world [rad, m].
+        """Return the (6, 6) covariance of the pose's error, see ``TargetPose``.
 
-        covariance: (6, 6) covariance of TARGET_POSITIONS.
+        Args:
+            X_WT: (4, 4) the target's pose.
+            covariance: (6, 6) covariance of TARGET_POSITIONS, which are 0 at X_WT.
         """
         R = X_WT[:3, :3]
         covariance = covariance.copy()
@@ -151,7 +156,10 @@ class CalibrationTarget:
         return J @ covariance @ J.T
 
     def moved_pose(self, pose: TargetPose, by: Array, covariance: Array) -> TargetPose:
-        """Return pose and alternatives moved by TARGET_POSITIONS (6,) with covariance (6, 6)."""
+        """Return pose and alternatives moved by TARGET_POSITIONS `by` (6,).
+
+        covariance: (6, 6) of TARGET_POSITIONS.
+        """
         X_WT = self.moved(pose.X_WT, by)
         others = X_WT @ np.linalg.inv(pose.X_WT) @ pose.alternatives
         covariance = self.pose_covariance(X_WT, covariance)
@@ -200,7 +208,10 @@ class CalibrationTarget:
 
 
 def distinct_motions(turns: Array, axes: Array) -> Array:
-    """Return the motions (n, 4, 4) that differ by more than a rotation about axes (k, 3)."""
+    """Return the motions (n, 4, 4) that differ by more than a rotation about axes (k, 3).
+
+    turns: (t, 4, 4) motions, see ``CalibrationTarget.symmetry``; of alike ones the first is kept.
+    """
     if not len(axes):
         return turns
     points = axes @ np.swapaxes(turns[:, :3, :3], 1, 2)
@@ -230,10 +241,12 @@ def require_rotation(
 
     Args:
         camera: its name.
+        target: gives the link's poses.
+        frames: with values of the target's tree.
         which: words after the number of frames in the message.
         min_turn: minimum rotation of the link about a second axis [deg].
 
-    Raises RegistrationError: states how far the link rotates.
+    Raises RegistrationError: it rotates less, or there are fewer than three frames.
     """
     what, values = "are too few", np.array([one.values for one in frames])
     if len(frames) >= 3:
@@ -260,7 +273,7 @@ class TargetSearch:
 
     Args:
         target: the target.
-        single_search: finds the target's pose in a single frame.
+        single_search: finds the target's pose in a single frame; None: a thorough search.
     """
 
     def __init__(
@@ -276,7 +289,7 @@ class TargetSearch:
         return TargetSearch(self._target, self._single_search.rough())
 
     def register(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
-        """Estimate the camera's pose on the link and the target's pose in the world.
+        """Return the camera at its pose X_LC on the link, with the target's pose in the world.
 
         Args:
             camera: its pose is not used.
@@ -333,11 +346,12 @@ class TargetSearch:
         """Estimate both poses roughly from image regions, some of which show the target.
 
         Args:
-            choices: for each frame the regions that may be the target.
+            camera: its pose is not used.
+            choices: for each picture the masks of regions that may be the target; may be empty.
             explained: maximum E_total of a region that is taken for the target.
 
         Returns:
-            the poses, and the number of frames in which they explain a region.
+            the poses, and the number of pictures in which they explain a region.
 
         Raises RegistrationError: no three frames have regions that rotate as the link does.
         """
@@ -357,14 +371,17 @@ class TargetSearch:
         starts: int = 12,
         kept: int = 4,
     ) -> list[HandEye]:
-        """Return pose hypotheses, best first.
+        """Return hypotheses of both poses, best first; at least one.
 
         Args:
-            choices: for each frame the masks that may be the target's.
-            explained: maximum E_total of a mask, where a frame has several.
+            camera: its pose is not used.
+            choices: for each picture the masks that may be the target's; may be empty.
+            explained: maximum E_total of a mask, where a picture has several.
             single_poses, regions: maximum numbers of target poses of a mask, and of masks of a
-                frame.
+                picture.
             starts, kept: maximum numbers of hypotheses that are fitted, and that are returned.
+
+        Raises RegistrationError: no three pictures agree with the link's rotation.
         """
         turns = self._target.symmetry[0]
         likely_masks, X_CT = list[list[PosedFrame]](), list[Array]()
@@ -421,7 +438,13 @@ class TargetSearch:
         poses: Array,
         side: float,
     ) -> Array:
-        """Return the mean E_total (n,) of poses (n, 2, 4, 4), each frame by its best mask."""
+        """Return the mean E_total (n,) of n ``HandEye`` poses over pictures, each by its best mask.
+
+        Args:
+            choices: for each picture one or more masks that may be the target's.
+            poses: (n, 2, 4, 4).
+            side: see ``overlap_areas``.
+        """
         off = [
             np.min([self._misfit(camera, one, poses, side) for one in own], axis=0)
             for own in choices
@@ -435,7 +458,7 @@ class TargetSearch:
         poses: Array,
         side: float = SEARCH.refined_side,
     ) -> Array:
-        """Return E_total (n,) of poses (n, 2, 4, 4) in one frame, clipped at 1."""
+        """Return E_total (n,) of ``HandEye`` poses (n, 2, 4, 4) in one frame, clipped at 1."""
         body = self._target.in_own_frame
         alone = PosedFrame(one.name, np.zeros(0), one.mask)
         posed = PosedFrames(body.kinematics, body.coarse, camera, [alone])
@@ -443,7 +466,7 @@ class TargetSearch:
         return np.minimum(E_total(overlap_areas(posed, X_CT, side))[:, 0], 1.0)
 
     def poses_in_camera(self, poses: Array, values: Array) -> Array:
-        """Return X_CT (n, 4, 4) at the tree's values (m,), for poses (n, 2, 4, 4)."""
+        """Return X_CT (n, 4, 4) at the tree's values (m,), for ``HandEye`` poses (n, 2, 4, 4)."""
         X_WL = self._target.link_poses(values[None])[0]
         return np.asarray(inverse_transforms(X_WL @ poses[:, 0]) @ poses[:, 1])
 
@@ -455,33 +478,47 @@ class TargetSearch:
         spacing: float = LAST_SPACING,
         surfaces: str = "full",
     ) -> SharedFit:
-        """Return a fit of both poses from a start, on surfaces of a level of detail."""
+        """Return a fit of both poses, whose unknowns are 0 at a start; it is not solved here.
+
+        Args:
+            spacing: of the masks' edge points, see ``PosedFrames``.
+            surfaces: "coarse", "medium" or "full", see ``RegistrationBody``.
+        """
         body = self._target.body(start[1])
         posed = PosedFrames(body.kinematics, getattr(body, surfaces), camera, frames, spacing)
         return SharedFit([posed], [inverse_transforms(start[0])], TARGET_POSITIONS)
 
     def _fitted(self, fit: SharedFit, found: SharedValues, start: HandEye) -> HandEye:
-        """Return the poses that a fit found from a start."""
+        """Return both poses at the values that a fit found from a start."""
         moved = self._target.moved(start[1], found.shared[fit.per_camera :])
         return np.array([fit.cameras(found)[0].X_WC, moved])
 
     def _distinct(
         self, poses: Sequence[HandEye] | Array, frames: Sequence[PosedFrame]
     ) -> list[HandEye]:
-        """Return the poses that show the target apart from all before, up to its symmetries."""
+        """Return the poses that show the target apart from all kept before, up to its symmetries.
+
+        frames: those in which the target's poses in the camera are compared.
+        """
         X_WL = self._target.link_poses(np.array([one.values for one in frames]))
         X_CT = [inverse_transforms(X_WL @ X_LC) @ X_WT for X_LC, X_WT in poses]
         kept = self._apart(X_CT, self._target.symmetry[0])
         return [pose for pose, X in zip(poses, X_CT, strict=True) if any(X is one for one in kept)]
 
     def _apart(self, poses: Sequence[Array], turns: Array) -> list[Array]:
-        """Return the poses (n, 4, 4) that differ from all before, up to turns (t, 4, 4)."""
+        """Return the items of `poses`, each (n, 4, 4), that differ from all kept before.
+
+        turns: (t, 4, 4) symmetries; items that one of them maps to each other do not differ.
+        """
         return keep_distinct(
             poses, lambda X, other: all(self._differ(X, other @ turn) for turn in turns)
         )
 
     def _differ(self, X: Array, others: Array) -> bool:
-        """Return whether two sets of poses (n, 4, 4) differ by over 0.15 of the target's radius."""
+        """Return whether target poses X and others (n, 4, 4) differ by over 0.15 of its radius.
+
+        The difference is the root mean square distance of the target's points over the n pairs.
+        """
         by = np.asarray(X - others)[:, :3]
         shift = by[:, :, :3] @ self._target.middle + by[:, :, 3]
         turn = (by[:, :, :3] ** 2).sum(axis=(1, 2)) / 3.0 * self._target.radius**2
@@ -499,13 +536,14 @@ def find_target_frames(
     """Find the calibration target in pictures, and its mask in each.
 
     Args:
+        target: the target.
         camera: its pose is not used.
         pictures: with values of the target's tree; the first ones are searched.
         most: maximum number of regions of a picture that may be the target.
         min_iou: minimum intersection over union of a mask by colours and the target as found.
 
     Returns:
-        the frames that show the target.
+        the frames that show the target, with masks and values; without log-odds.
 
     Raises RegistrationError: the link hardly rotates, or no pose explains enough pictures.
     """
@@ -534,6 +572,8 @@ def require_detections(
     camera: str, count: int, of: int, least: int = 4, fraction: float = 0.5
 ) -> None:
     """Refuse a target pose that explains `count` of `of` pictures, if these are too few.
+
+    camera: its name.
 
     Raises RegistrationError: fewer than `least`, or than the fraction, are explained.
     """

@@ -61,13 +61,16 @@ class CaptureSetup:
     """The constants of a capture.
 
     Args:
-        cameras: on the circle, by name.
-        face_camera: sees the face; None: there is none.
-        backgrounds: background models by camera, including the face camera; a camera without one
-            needs masks.
+        skeleton: the person's model.
+        cameras: cameras on the circle around the person, by name.
+        face_camera: camera that sees the face; None: there is none.
+        faces: templates of the person's face; None: the face's direction is not measured.
+        registered: pose that is recognised without earlier frames; None: there is none.
+        backgrounds: background models by name of the camera, including the face camera; a camera
+            without one needs masks.
         skin: colour of the person's skin.
         search: whether elbows and knees are searched on their circles; see estimate_pose.
-        recognition: similarity from which the registered pose replaces the state.
+        recognition: smallest similarity at which the registered pose replaces the state.
         farthest_face: largest distance of a face from the eigenspace [grey levels].
 
     Raises:
@@ -104,7 +107,7 @@ def prepare_paper_capture(
     backgrounds: Mapping[str, Background],
     faces: FaceTemplates | None = None,
 ) -> CaptureSetup:
-    """Prepare a capture while the person shows the registered pose.
+    """Prepare a capture while the person, ``model``, shows the registered pose.
 
     The pictures show where the person's skin is visible; the registered pose is rendered.
 
@@ -112,9 +115,9 @@ def prepare_paper_capture(
         cameras: all cameras, by name.
         face_camera: name of the face camera; None: there is none.
         q: (nq,) the person's positions in the registered pose [rad or m].
-        pictures: (H, W, 3), red, green, blue, of the cameras on the circle.
-        backgrounds: background models by camera.
-        faces: templates of the person's face; None: rendered ones.
+        pictures: (H, W, 3), red, green, blue, by name of the camera, of the cameras on the circle.
+        backgrounds: background models by name of the camera.
+        faces: templates of the person's face; None: rendered ones if there is a face camera.
 
     Raises:
         UnknownNameError: there is no such face camera.
@@ -142,10 +145,7 @@ def prepare_paper_capture(
 def render_registered_pose(
     skeleton: Skeleton, q: Array, cameras: Mapping[str, PinholeCamera]
 ) -> RegisteredPose:
-    """Return the registered pose at q (nq,) [rad or m], rendered by Drake.
-
-    Raises as register_pose.
-    """
+    """Return the registered pose at q (nq,), rendered in cameras by name (see register_pose)."""
     rig = build_camera_rig(skeleton.model, cameras)
     context = rig.diagram.CreateDefaultContext()
 
@@ -159,7 +159,7 @@ def render_registered_pose(
 def learn_rendered_faces(
     model: ArticulatedModel, skeleton: Skeleton, q: Array, skin: SkinColour
 ) -> FaceTemplates:
-    """Return face templates from 300 rendered pictures, 20 turns times 15 nods, at q (nq,)."""
+    """Return face templates from 300 rendered pictures at q (nq,); ``skeleton`` is of ``model``."""
     head = skeleton.features(q)[0]
     view, size = math.radians(11.0), (200, 200)
     placed = circle_of_cameras(1, height=float(head[2]), target=head, field_of_view=view, size=size)
@@ -189,7 +189,7 @@ def _add_views(
     """Add the input ports ``person_view_<camera>`` to a system.
 
     Returns:
-        A function that maps a context to the cameras with a view, and their views.
+        A function that maps the system's context to the cameras with a view, and these views.
 
     Raises:
         SettingsError: there are fewer than two cameras, or two have the same name.
@@ -286,6 +286,7 @@ class FeatureFinder(PortedSystem):
         self.add_output("support", len(FEATURES), support)
 
     def _find(self, context: Context) -> Features | None:
+        """Return the features in the context's views; None while the last ones are unknown."""
         last = self.GetInputPort("last_features").Eval(context).reshape(-1, 3)
         if not np.isfinite(last).all():
             return None
@@ -313,6 +314,7 @@ class FaceDirectionFinder(PortedSystem):
             camera [rad]; NaN if no face is visible or an input is missing.
 
     Args:
+        templates: templates of the person's face.
         farthest: largest distance of a face from the eigenspace [grey levels].
     """
 
@@ -354,6 +356,7 @@ class PoseRecogniser(PortedSystem):
         similarity (1): of the contours; 0 if not recognised.
 
     Args:
+        registered: the registered pose of the person of ``skeleton``.
         cameras: in the order of the input ports, as in the registered pose.
         threshold: smallest similarity at which the pose is recognised.
     """
@@ -463,7 +466,7 @@ class PaperPoseEstimator(MemorySystem):
         self.set_vectors(context.get_mutable_discrete_state(), self._restarted(q, features))
 
     def next_vectors(self, context: Context, known: dict[str, Array]) -> Mapping[str, Array]:
-        """Return the state vectors that the current frame changes."""
+        """Return the state vectors, by name, that the context's inputs change; ``known``: all."""
         fresh = self._finite_input(context, "fresh")
         if fresh is not None and not fresh[0]:
             return {}
@@ -498,7 +501,7 @@ class PaperPoseEstimator(MemorySystem):
         }
 
     def _restarted(self, q: Array, features: Array | None) -> dict[str, Array]:
-        """Return state vectors that do not depend on earlier frames."""
+        """Return first state vectors by name at q (nq,); features (5, 3) [m], None: those at q."""
         places = self.setup.skeleton.features(q) if features is None else features
         return {
             "estimated_positions": q,
@@ -508,7 +511,7 @@ class PaperPoseEstimator(MemorySystem):
         }
 
     def _finite_input(self, context: Context, name: str) -> Array | None:
-        """Return the value at an input port; None if not connected or not finite."""
+        """Return the vector at the input port ``name``; None if not connected or not finite."""
         value: Array | None = self.eval_input(context, name)
         return value if value is not None and np.isfinite(value).all() else None
 
@@ -534,7 +537,7 @@ def build_paper_capture(
             pictures in each period has the output port ``fresh``. None: the images are inputs of
             the diagram.
         period: time between two frames [s].
-        meshcat: where to show the avatar.
+        meshcat: where to show the avatar; None: nowhere.
 
     Raises:
         SettingsError: the source lacks an output port, or the period is not positive.

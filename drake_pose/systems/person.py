@@ -75,7 +75,8 @@ class PersonTracker(MemorySystem):
         deviations (nq): standard deviations from pictures and limits alone [rad or m].
 
     Args:
-        cameras: calibrated, in the order of the input ports.
+        tracker: the method, with the person's model.
+        cameras: calibrated, in the order of the input ports, or by name.
         period: time between two updates [s].
         with_deviations: whether there is an output port ``deviations``.
         color_cameras: names of the cameras that have a port for a colour image.
@@ -142,17 +143,23 @@ class PersonTracker(MemorySystem):
         )
 
     def known_person(self, context: Context) -> TrackState | None:
-        """Return the tracked person's state, lost or not; None before a person was found."""
+        """Return the person's state in a context, tracked or lost; None before one was found."""
         return _person(self.vectors(context), 0.0)
 
     def set_person(self, context: Context, person: TrackState) -> None:
-        """Set the tracked person's state; the next pictures are expected within a period."""
+        """Set the tracked person's state in a context.
+
+        The next pictures are expected within a period.
+        """
         fresh = {"watched": np.zeros(1), "time": np.full(1, np.nan), "elapsed": np.zeros(1)}
         state = context.get_mutable_discrete_state()
         self.set_vectors(state, self._packed(person) | fresh)
 
     def next_vectors(self, context: Context, known: dict[str, Array]) -> Mapping[str, Array]:
-        """Return the state vectors that the current pictures change."""
+        """Return the state vectors that the context's pictures change, by name.
+
+        ``known``: copies of all state vectors by name. Empty if there are no new pictures.
+        """
         before, time = float(known["time"][0]), context.get_time()
         stamp = self.eval_input(context, "time")
         if stamp is not None:
@@ -213,7 +220,7 @@ class PersonTracker(MemorySystem):
         return changed
 
     def _packed(self, person: TrackState) -> dict[str, Array]:
-        """Return a person's state as vectors."""
+        """Return a person's state as state vectors by name."""
         q = self._tracker.positions(person.values)
         numbers = {
             "inlier_ratio": person.inlier_ratio,
@@ -228,7 +235,10 @@ class PersonTracker(MemorySystem):
         }
 
     def _colour_views(self, context: Context, colours: Array) -> ColourViews | None:
-        """Return the available pictures with the colours learned so far; None without a picture."""
+        """Return the context's pictures with the colours learned so far; None without a picture.
+
+        ``colours``: the state vector of that name.
+        """
         pictures = self._colours.pictures(context)
         if not pictures:
             return None
@@ -243,6 +253,10 @@ class PersonTracker(MemorySystem):
         """Return the person's next state, and the views without other persons.
 
         Others are looked for at first, while tracking is in trouble, and if ``is_watching``.
+
+        Args:
+            last: the person's last state; None: no person was found yet.
+            separated: all views of the frame.
         """
         is_separated = last is None or last.troubled_frames != 0 or is_watching
         if is_separated:
@@ -255,14 +269,17 @@ class PersonTracker(MemorySystem):
         return found, separated
 
     def _follow_one(self, last: TrackState | None, seen: FrameViews) -> TrackState | None:
-        """Return the person's next state; None if fewer than two cameras see somebody."""
+        """Return the person's next state in the views ``seen``, given the last state.
+
+        None if nobody was found or fewer than two cameras see somebody.
+        """
         return self._tracker.follow(last, seen) if len(seen.showing) >= 2 else None
 
     def _without_others(self, seen: FrameViews, last: TrackState | None) -> "_SeparatedViews":
-        """Return the views without other persons than the one in the last state.
+        """Return the views ``seen`` without other persons than the one in the last state.
 
-        Cameras in which the person and another are one figure are left out if three others see
-        somebody.
+        If ``last`` is None, the tracker chooses the person. Cameras in which the person and another
+        are one figure are left out if three others see somebody.
         """
         place = None if last is None else self._tracker.trunk_middle(last.values)
         single, cut, merged = keep_views(seen, place)
@@ -275,8 +292,10 @@ class PersonTracker(MemorySystem):
 class _SeparatedViews(NamedTuple):
     """Views of one person.
 
-    ``others``: whether other persons were cut out. ``merged``: cameras in which the person and
-    another are one figure.
+    Attributes:
+        views: the cameras that have a picture, and the silhouettes in them.
+        others: whether there were other persons.
+        merged: names of the cameras in which the person and another are one figure.
     """
 
     views: FrameViews
@@ -285,9 +304,12 @@ class _SeparatedViews(NamedTuple):
 
 
 def _person(known: Mapping[str, Array], elapsed: float, longest: float = 3.0) -> TrackState | None:
-    """Return the person's state with its motion scaled to ``elapsed`` [s]; None if not yet found.
+    """Return the person's state from state vectors; None if no person was found yet.
 
-    If frames were skipped, the motion continues for at most ``longest`` frames.
+    Args:
+        known: state vectors of a PersonTracker by name.
+        elapsed: time since the last frame [s], to which the motion is scaled; 0: not scaled.
+        longest: the motion is scaled by at most this number of frames.
     """
     inlier_ratio, usual_ratio, troubled_frames, period = (
         float(known[name][0])
@@ -341,11 +363,15 @@ def add_silhouette_sensors(
 ) -> dict[str, SilhouetteSensor]:
     """Add a SilhouetteSensor for each camera, and the source of their images; return the sensors.
 
+    The sensors are by name of the camera.
+
     Args:
+        builder: the diagram to which the systems are added.
         source: has an output port ``color_image_<camera>`` for each camera, or
             ``label_image_<camera>`` for a camera without background; None: the images are inputs of
             the diagram.
-        backgrounds: by camera.
+        cameras: cameras by name.
+        backgrounds: background models by name of the camera.
         edge_points: as in SilhouetteSensor.
 
     Raises:
@@ -384,14 +410,16 @@ def build_silhouette_capture(
     ``silhouette_<camera>``, and its stages ``region`` and ``edge``.
 
     Args:
+        tracker: the method, with the person's model.
         cameras: two or more, by name.
-        backgrounds: of all cameras, unless a source gives label images.
+        backgrounds: background models by name of the camera; a camera without one needs a source
+            with label images.
         period: time between two frames [s].
         edge_points: as in SilhouetteSensor.
         source: of the images instead of input ports, for example a rig's diagram or a
             PictureCapture; see add_silhouette_sensors. Without an output port ``time``, each update
             has new pictures.
-        meshcat: where to show the person.
+        meshcat: where to show the person; None: nowhere.
         with_deviations: whether there is an output port ``deviations``.
 
     Raises:
@@ -425,7 +453,11 @@ def add_person_tracker(
     source: System | None = None,
     with_deviations: bool = False,
 ) -> tuple[PersonTracker, dict[str, SilhouetteSensor]]:
-    """Add a PersonTracker, its sensors and their source; see build_silhouette_capture."""
+    """Add a PersonTracker, its sensors and their source to a diagram.
+
+    The arguments are those of ``build_silhouette_capture``. Returns the tracker, and the sensors by
+    name of the camera.
+    """
     sensors = add_silhouette_sensors(builder, source, cameras, backgrounds, edge_points)
     person = PersonTracker(tracker, list(cameras.values()), period, with_deviations)
     builder.AddNamedSystem("person_tracker", person)

@@ -46,8 +46,12 @@ STATISTICS = ("step", "hypotheses", "distance", "count", "lost")
 class _EkfState(ImmutableValue):
     """The state of a TruncatedEkf.
 
-    ``step`` is the number of updates, ``unlikely`` the number of consecutive unlikely measurements,
-    ``time`` that of the last update [s].
+    Attributes:
+        state: state of the filter.
+        step: number of updates.
+        unlikely: number of consecutive unlikely measurements.
+        lost: whether these are too many.
+        time: time of the last update [s].
     """
 
     state: FilterState
@@ -101,6 +105,7 @@ class TruncatedEkf(BeliefSystem[_EkfState]):
     is (patience, loss_probability).
 
     Args:
+        belief_filter: the filter, with its models of measurement and motion.
         start: belief before the first measurement.
         period: time between two updates, one step of the motion [s]; required if the motion's rates
             are per step. None: the motion's.
@@ -147,6 +152,8 @@ class TruncatedEkf(BeliefSystem[_EkfState]):
         rows = belief_filter.inequalities.rows
 
         def filled(size: int, read: Callable[[Hypothesis], Any], empty: float) -> Any:
+            """Return a function of the belief: ``read`` of each hypothesis, else ``empty``."""
+
             def read_all(known: _EkfState) -> Array:
                 found = np.full((cap, size), empty)
                 for k, one in enumerate(known.state.hypotheses):
@@ -183,7 +190,7 @@ class TruncatedEkf(BeliefSystem[_EkfState]):
         return self.belief(context).state
 
     def next_belief(self, context: Context, last: _EkfState) -> _EkfState:
-        """Return the state after one step of the filter."""
+        """Return the state after one step of the filter with the context's inputs."""
         require_time_forward(self, context, last.time)
         settings = self._settings(context)
         belief_filter = self.filter.with_settings(settings)
@@ -266,6 +273,7 @@ def plant_motion(
     rates = np.array([plant.num_positions() + one.velocity_start() for one in order])
 
     def after(x: Array) -> Array:
+        """Return the state (n,) one step after x (n,)."""
         state = plant.GetPositionsAndVelocities(own)
         state[places], state[rates] = x[:m], x[m : 2 * m]
         own.SetTime(0.0)
@@ -279,6 +287,7 @@ def plant_motion(
 
 
 def _require_loss(patience: float, probability: float) -> None:
+    """Raise SettingsError unless patience and loss probability are in range."""
     if not (patience >= 1 and 0.0 <= probability < 1.0):
         raise SettingsError(
             "patience must be 1 or more and loss_probability in [0, 1), not "
@@ -287,7 +296,7 @@ def _require_loss(patience: float, probability: float) -> None:
 
 
 def _period_of(motion: MotionModel, period: float | None) -> float:
-    """Return the time between two updates [s].
+    """Return the time between two updates [s]: ``period``, or the motion's if that is None.
 
     Raises:
         SettingsError: no period is known, or the given one differs from the motion's.
@@ -348,6 +357,7 @@ class HandSensor(PortedSystem):
         add_measured("difference", 1, lambda one: np.array([one.difference]))
 
     def _measure(self, context: Context) -> HandMeasurement:
+        """Measure the hand in the context's image, near the filter's prediction."""
         image, mean = (
             self.eval_input(context, "label_image"),
             self.eval_input(context, "estimated_state"),
@@ -379,8 +389,11 @@ def build_hand_estimation(
     It contains a posed plant, Drake's renderer, a ``HandSensor`` and a ``TruncatedEkf``.
 
     Args:
+        model: the true hand.
+        camera: the camera that sees it.
+        silhouette: makes the measurements, and has the filter.
         start: belief before the first image.
-        true_positions: the true hand's positions (nq,) over time.
+        true_positions: the true hand's positions (nq,) [rad or m] over time.
         period: time between two images [s].
 
     Returns:
@@ -395,10 +408,11 @@ def build_hand_estimation(
 def build_recorded_hand_estimation(
     scene: Scene, silhouette: HandSilhouette, start: Belief
 ) -> tuple[Diagram, TruncatedEkf, HandSensor]:
-    """Build the same diagram for recorded silhouettes, with a ``MaskPlayer``.
+    """Build the diagram of ``build_hand_estimation`` for recorded silhouettes, with a MaskPlayer.
 
     Args:
-        scene: of one camera.
+        scene: recorded masks of one camera.
+        silhouette: makes the measurements, and has the filter.
         start: belief before the first image.
 
     Returns:
@@ -414,6 +428,7 @@ def _add_hand_filter(
     builder: DiagramBuilder, image: OutputPort, silhouette: HandSilhouette, start: Belief,
     period: float,
 ) -> tuple[Diagram, TruncatedEkf, HandSensor]:  # fmt: skip
+    """Add filter and sensor for the label images at the port ``image``, and build the diagram."""
     ekf = TruncatedEkf(silhouette.belief_filter, start, period)
     builder.AddNamedSystem("truncated_ekf", ekf)
     sensor = builder.AddNamedSystem("hand_sensor", HandSensor(silhouette))

@@ -119,7 +119,10 @@ class Walker(MemorySystem):
         self.declare_vectors(outputs | inner, outputs, period)
 
     def next_vectors(self, context: Context, known: dict[str, Array]) -> Mapping[str, Array]:
-        """Return the state vectors after the next step of the walk."""
+        """Return the state vectors after the next step of the walk, by name.
+
+        ``known``: copies of the last ones by name, which are modified.
+        """
         q = self.GetInputPort("positions").Eval(context)
         turn, walk = 0, 0
         if np.isfinite(q).all():
@@ -145,11 +148,11 @@ class Walker(MemorySystem):
         facing: float = 0.25,
         around: float = math.radians(100.0),
     ) -> tuple[int, int]:
-        """Return the command (turn, walk) of a visible person, and update ``known``.
+        """Return the command (turn, walk), each -1, 0 or 1, of a visible person; update ``known``.
 
         Args:
             q: (nq,) the person's positions [rad or m].
-            known: state vectors by name.
+            known: state vectors by name; the person's stance and steps are overwritten.
             time: now [s].
             still, facing: a person who stands still moves head and feet by less [m], and turns the
                 face by less [rad].
@@ -194,6 +197,7 @@ class WalkKeys(MemorySystem):
         positions (nq): of a person who strides while a key is held, and stands otherwise.
 
     Args:
+        meshcat: where the buttons are added.
         stride: (n, nq) positions of one stride that ends standing [rad or m].
         period: time between two updates [s].
         held: time for which a press counts [s]. A key that is held down repeats its press, the
@@ -224,7 +228,10 @@ class WalkKeys(MemorySystem):
         )
 
     def next_vectors(self, context: Context, known: dict[str, Array]) -> Mapping[str, Array]:
-        """Return the state of the buttons, and the stride's next frame."""
+        """Return the state vectors ``pressed`` and ``left`` of the buttons, and ``frame``.
+
+        ``known``: the last state vectors by name. ``frame`` is the index of the stride's next row.
+        """
         pressed = np.array([float(self._meshcat.GetButtonClicks(name)) for name in KEYS])
         held = np.maximum(known["left"] - self._period, 0.0)
         left = np.where(pressed > known["pressed"], self._held, held)
@@ -286,6 +293,7 @@ def build_walk(
     Its output ports are ``walker_pose`` and ``command``.
 
     Args:
+        model: the person.
         meshcat: where to show the garden.
         positions: the person's positions (nq,) over time, in a room with z upward, NaN where
             unknown; or a function that adds systems which output them; None: keys only.
@@ -318,7 +326,10 @@ def build_walk(
 
 
 def add_garden(builder: DiagramBuilder, X_WG: RigidTransform | None = None) -> SceneGraph:
-    """Add urdf/garden/garden.sdf at a pose X_WG; return the SceneGraph that is added for it."""
+    """Add urdf/garden/garden.sdf to a diagram; return the SceneGraph that is added for it.
+
+    ``X_WG``: pose of the garden in the world; None: the identity.
+    """
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
     ModelSource(package_folder() / "garden" / "garden.sdf", {}).parse(plant, scene_graph)
     frame = plant.GetFrameByName("garden")

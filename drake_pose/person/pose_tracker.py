@@ -50,8 +50,9 @@ def pose_uncertainty(
     """Return the uncertainty of a fitted pose, given the pictures and the limits alone.
 
     Args:
-        compared: comparison of the pose with the cameras at the scale of the last step.
-        held: (m,) values that were held, for instance lengths.
+        fit: the fit that the pose is from.
+        compared: comparison of the pose with all cameras at the scale of the last step.
+        held: (m,) which values were held, for instance lengths; None: none.
         held_covariance: (h, h) covariance of the held values; None: they are exact.
         extent: of the region in which the person is [m].
     """
@@ -79,9 +80,14 @@ def pose_uncertainty(
     part_noise = _noise(A, residual, part_covariance)
 
     def with_surfaces(variance: float, surface_deviations: Array) -> tuple[Array, Array]:
-        """Return restricted log-likelihoods (k,) and informations (k, m, m) by deviation (k,) [m].
+        """Return log-likelihoods (k,) and informations (k, m, m), for k deviations of surfaces.
 
-        `variance` is that of the contours' distances.
+        Args:
+            variance: of the contours' distances, relative to the fit's noise.
+            surface_deviations: (k,) standard deviations of the parts' surfaces [m].
+
+        Returns:
+            Restricted log-likelihoods of the deviations, and the values' information at each.
         """
         H = (jacobians @ A_sum @ np.swapaxes(jacobians, 1, 2)).sum(axis=0) / variance
         # (m, k): information that couples each value with each direction of the parts.
@@ -119,10 +125,11 @@ def pose_uncertainty(
 
 
 def _noise(A: Array, b: Array, Q: Array, assumed: float = 4.0) -> float:
-    """Estimate the variance of contour distances from a comparison's A and b.
+    """Estimate the variance of contour distances, relative to the fit's noise.
 
     Args:
-        Q: (nodes, 12, 12) covariance of the fitted motions.
+        A, b: (cameras, nodes, 12, 12) symmetric and (cameras, nodes, 12), as of `Comparison`.
+        Q: (nodes, 12, 12) covariance of each node's fitted affine motion.
         assumed: weight of the fit's own noise in the estimate [number of distances].
     """
     gain = Q @ A
@@ -138,10 +145,12 @@ class TrackState:
 
     Args:
         values, step: (m,) values of the pose tree, and their change since the last frame [rad, m].
-        inlier_ratio, usual_ratio: inlier ratio of the contours, and the usual one.
+        inlier_ratio: inlier ratio of the contours, 0 to 1.
+        usual_ratio: the usual one: a running mean that follows higher ratios at once.
         troubled_frames: number of successive frames with a low inlier ratio. Negative: the person
             was found anew, and the remaining headings are tried in as many frames.
-        worst_part: lowest inlier ratio of a part, where the person is tracked by colours.
+        worst_part: lowest inlier ratio of a part, or lowest relative fraction of a limb's own
+            colours, where the person is tracked by colours; otherwise 1.
     """
 
     values: Array
@@ -164,6 +173,7 @@ class PersonPoseTracker:
     """Tracks a person from frame to frame.
 
     Args:
+        fit: the person's body with the noise of its contours.
         settings: EXACT, or LENIENT where the model only resembles the person.
         held: (m,) values that stay fixed, for instance lengths; None: none.
         rest: (m,) values of the person at rest, held values included; None: the tree's defaults.
@@ -196,14 +206,14 @@ class PersonPoseTracker:
         self.search = PersonSearch(fit, self.plan, settings, self._information, self._held, rest)
 
     def start(self, values: Array, inlier_ratio: float = 1.0) -> TrackState:
-        """Return the state of a motionless person at values (m,) with this inlier ratio."""
+        """Return the state of a motionless person at values (m,), with the usual ratio."""
         still = np.zeros(len(values))
         return TrackState(
             np.array(values, dtype=np.float64), still, inlier_ratio, self.settings.usual_ratio
         )
 
     def with_held(self, values: Array) -> Array:
-        """Return values (m,) in which held ones are the tracker's."""
+        """Return values (m,) with the held ones replaced by the tracker's."""
         return np.where(self._held, self._rest, values)
 
     def positions(self, values: Array) -> Array:
@@ -225,10 +235,10 @@ class PersonPoseTracker:
     def deviations(
         self, values: Array, seen: FrameViews | ColourViews, held_covariance: Array | None = None
     ) -> Array:
-        """Return standard deviations (nq,) of the plant's positions [rad, m], by this frame alone.
+        """Return standard deviations (nq,) of the plant's positions [rad, m], by one frame alone.
 
         Args:
-            values: (m,) of a frame's state; positions that are not among them get 0.
+            values: (m,) of a frame's state; the plant's other positions get 0.
             seen: silhouettes or colours that the frame was fitted to.
             held_covariance: (h, h) covariance of the held values; None: they are exact.
         """
@@ -240,9 +250,20 @@ class PersonPoseTracker:
         return deviations
 
     def follow(self, last: TrackState | None, frame: FrameViews) -> TrackState | None:
-        """Return the state after a frame.
+        """Return the state after a frame of silhouettes.
 
-        None where there is no last state and fewer than two cameras see a person.
+        The frame is fitted from the predicted pose. Where the inlier ratio is `retry_below` under
+        the usual one, doubtful limbs are searched again, in the first four of such frames and then
+        in every eighth. Below `lost_below` of the usual ratio, where the limbs' search does not
+        help after the first frame, and while a newly found person is unconfirmed, the person is
+        also searched anew in a few headings, and replaced if that fits better.
+
+        Args:
+            last: state after the last frame; None: the person is searched in all headings.
+            frame: silhouettes of the frame.
+
+        Returns:
+            The state; None if `last` is None and fewer than two cameras see a person.
         """
         settings = self.settings
         if last is None:
@@ -287,13 +308,19 @@ class PersonPoseTracker:
     ) -> TrackState:
         """Return the state after a frame of colour pictures.
 
-        A limb that does not show its own colours is searched again. If none of its new placements
-        shows them, the person is lost.
+        A limb that does not show its own colours is placed anew where they show. If no placement
+        shows enough of them, `worst_part` says so, and the person is lost.
+
+        Args:
+            last: state after the last frame.
+            colours: pictures of the frame, and the colours known by camera.
+            part_colours: own colours of each part; None: unknown, and no limb is searched.
         """
         fitted, shown = self._fit_predicted(last, colours), 1.0
         if part_colours is not None:
 
             def shows(values: Array) -> Array:
+                """Return each node's fraction (nodes,) of own colours, over the usual; or nan."""
                 seen = zip(colours.cameras, colours.pictures, strict=True)
                 return part_colours.relative_fractions(
                     self.fit.outlines, self.fit.kinematics.poses(values), seen
@@ -321,14 +348,17 @@ class PersonPoseTracker:
         )
 
     def distance_by_colour(self, values: Array, colours: ColourViews) -> float:
-        """Return the RMS distance of contour and colours' edge at values (m,) [pixel], or nan."""
+        """Return the RMS distance of the contour at values (m,) from the colours' edge [pixel].
+
+        nan where no edge is found in any picture.
+        """
         placement = self.fit.body.place(values)
         sums = colours.compare(self.fit, placement, self.settings.follow[-1]).sums
         squares, weight = sums[:, :, [Sum.SQUARES, Sum.WEIGHT]].sum(axis=(0, 1))
         return float(np.sqrt(squares / weight)) if weight > 0.0 else float("nan")
 
     def _fit_predicted(self, last: TrackState, seen: FrameViews | ColourViews) -> PoseFit:
-        """Fit a frame from the pose that the last frames predict."""
+        """Fit a frame's silhouettes or colours from the pose that the last state predicts."""
         expected = last.values + self.settings.step_fraction * last.step
         prior = Prior(expected, self._information)
         compare = partial(seen.compare, self.fit)

@@ -106,7 +106,10 @@ class PersonSettings:
         return self.headings // self.headings_per_frame
 
     def headings_of(self, frame: int) -> list[int]:
-        """Return the indices of the headings tried in a troubled frame, spread all around."""
+        """Return the indices of the headings tried in a troubled frame, spread all around.
+
+        `frame` counts troubled frames from 0; after `cycle` frames the headings repeat.
+        """
         # The bit-reversed order puts neighbouring headings late.
         order = sorted(range(self.cycle), key=lambda k: f"{k:032b}"[::-1])
         return list(range(order[frame % self.cycle], self.headings, self.cycle))
@@ -138,10 +141,10 @@ class PlannedLimb(NamedTuple):
     """An arm or leg of a pose tree.
 
     Args:
-        nodes: (j,) nodes that only this limb has.
-        values: (k,) values that move these nodes alone.
+        nodes: (j,) indices of the nodes that only this limb has.
+        values: (k,) indices of the pose tree's values that move these nodes alone.
         joints: (3,) indices of root, middle joint and end among the landmarks.
-        poses: (n, k) values that cover the limits; the first is at rest [rad].
+        poses: (n, k) these values in n poses between their limits; the first is at rest [rad].
         samples_T: (n, m, 3) points along the limb in the trunk's frame in each pose [m].
         weights: (n, m) weights of the points.
         length: from root to end, stretched out [m].
@@ -214,7 +217,10 @@ class BodyPlan:
         return int(self.landmarks.nodes[self.landmarks.names.index(landmark)])
 
     def _plan(self, names: Sequence[str], count: int = 2048) -> PlannedLimb:
-        """Plan a limb from its three landmarks, in `count` poses, one of eight stretched."""
+        """Plan a limb from its three landmarks' names, from root to end, in `count` poses.
+
+        The middle joint is at rest, mostly stretched, in one of eight poses.
+        """
         from scipy.stats import qmc  # Slow to import, and needed for persons alone.
 
         kinematics, tree = self.kinematics, self.kinematics.tree
@@ -249,11 +255,14 @@ class BodyPlan:
         return PlannedLimb(nodes, values, joints, poses, samples_T, weights, length)
 
     def samples(self, limb: PlannedLimb, X_WN: Array) -> Array:
-        """Return points (m, 3) along a limb in the world [m] where the nodes are at X_WN."""
+        """Return points (m, 3) along a limb in the world [m], nodes at X_WN (nodes, 4, 4)."""
         return self._samples(limb.joints, X_WN[None])[0]
 
     def _samples(self, joints: Indices, X_WN: Array) -> Array:
-        """Return points (n, m, 3) along a limb by its landmarks, nodes at X_WN (n, nodes, 4, 4)."""
+        """Return points (n, m, 3) along a limb in the world [m], nodes at X_WN (n, nodes, 4, 4).
+
+        `joints` (3,) are the indices of its landmarks.
+        """
         a, b, c = np.moveaxis(self.landmarks.positions(X_WN)[:, joints], 1, 0)
         upper = np.minimum(self.along, 1.0)[:, None]
         lower = np.maximum(self.along - 1.0, 0.0)[:, None]
@@ -262,9 +271,9 @@ class BodyPlan:
 
 
 def crowding_weights(samples: Array, apart: float = 0.08) -> Array:
-    """Return weights (n, m) of points (n, m, 3): 1 / (m times the number of points nearby).
+    """Return weights (n, m) of m points along a limb in n poses: 1 / (m times the number nearby).
 
-    Points of a limb that are nearer to each other than `apart` [m] fill the same space.
+    `samples` (n, m, 3) [m] of a pose that are nearer than `apart` [m] fill the same space.
     """
     x, y, z = (own[:, :, None] - own[:, None] for own in np.moveaxis(samples, 2, 0))
     near = x * x + y * y + z * z < apart**2
@@ -275,9 +284,12 @@ class PersonSearch:
     """Searches limbs and persons by fits from coarse guesses.
 
     Args:
-        information: (m,) inverse variances of the values about a guess.
-        held: (m,) values that stay fixed.
-        rest: (m,) values of the person at rest.
+        fit: the person's body with the noise of its contours.
+        plan: its limbs.
+        information: (m,) inverse variances of the values about a prediction [1/rad^2, 1/m^2]; a
+            tenth counts about a guess.
+        held: (m,) which values stay fixed.
+        rest: (m,) values of the person at rest, held values included [rad, m].
     """
 
     def __init__(
@@ -303,8 +315,10 @@ class PersonSearch:
         """Refine a fit and search its doubtful limbs again; keep what is better.
 
         Args:
+            fitted: fit of the frame to begin with.
+            frame: silhouettes.
             enough: the search ends at this inlier ratio.
-            first: index of the doubtful limb to begin with; 0 is the worst.
+            first: index of the doubtful limb to begin with, modulo their number; 0 is the worst.
             limbs: number of limbs searched; None: all doubtful ones.
         """
         best = _better(fitted, self.refine(fitted.values, frame))
@@ -318,7 +332,10 @@ class PersonSearch:
     def _search_limbs(
         self, best: PoseFit, limbs: Iterable[PlannedLimb], frame: FrameViews, enough: float
     ) -> PoseFit:
-        """Search limbs again, one after another, until the inlier ratio is enough."""
+        """Search limbs again, one after another, until the inlier ratio is `enough`.
+
+        `best` is the fit to begin with; the fit with the highest closeness is returned.
+        """
         for limb in limbs:
             scores, _ = self._score_poses(best.values, limb, frame)
             guesses = self._distinct_poses(best.values, limb, scores, 2)
@@ -346,9 +363,10 @@ class PersonSearch:
         """Return the best fit from fresh starts; None where fewer than two cameras see a person.
 
         Args:
+            frame: silhouettes.
             headings: indices of headings; if not all, only the best start's limbs are searched.
             known: (m,) values from which held ones are taken; None: the person's at rest.
-            enough: inlier ratio at which no more limbs are searched.
+            enough: inlier ratio at which no more limbs are searched, unless all headings are tried.
         """
         if len(headings) == self._settings.headings:
             return next(iter(self.find_explanations(frame, known)), None)
@@ -373,12 +391,18 @@ class PersonSearch:
         return self.distinct(found)
 
     def find_starts(self, frame: FrameViews, known: Array | None = None) -> list[PoseFit]:
-        """Return the best fresh starts of all headings, after a search of their doubtful limbs."""
+        """Return the best fresh starts of all headings, after a search of their doubtful limbs.
+
+        At most `searched_starts`; [] where fewer than two cameras see a person.
+        """
         starts = self._fresh_starts(frame, range(self._settings.headings), known)
         return [self.improve_limbs(one, frame) for one in starts[: self._settings.searched_starts]]
 
     def distinct(self, fits: Iterable[PoseFit]) -> list[PoseFit]:
-        """Return the fits that differ in some joint's place from all better ones, best first."""
+        """Return the fits that differ from all better ones, best first.
+
+        Some landmark must be more than `distinct_distance` away.
+        """
         found: list[PoseFit] = []
         kept: list[Array] = []
         for one in sorted(fits, key=lambda one: -one.closeness):
@@ -392,7 +416,10 @@ class PersonSearch:
     def _fresh_starts(
         self, frame: FrameViews, headings: Sequence[int], known: Array | None
     ) -> list[PoseFit]:
-        """Fit the most promising fresh starts with some headings; best first."""
+        """Fit the most promising fresh starts with some headings (indices), best first.
+
+        Arguments as of `find_person`. [] where fewer than two cameras see a person.
+        """
         middle = frame.middle()
         if middle is None:
             return []
@@ -405,7 +432,11 @@ class PersonSearch:
     def _guess(
         self, frame: FrameViews, heading: int, middle: Array, known: Array | None
     ) -> PoseFit:
-        """Guess a pose in a heading: fit the trunk roughly, then place each limb."""
+        """Guess a pose in a heading: fit the trunk roughly, then place each limb.
+
+        `heading` is its index out of `headings`; `middle` (3,) is where the trunk's middle is put
+        first [m]; `known` as in `find_person`.
+        """
         values = self._rest.copy() if known is None else np.where(self._held, known, self._rest)
         if self._plan.heading is not None:
             values[self._plan.heading] = 2.0 * np.pi * heading / self._settings.headings
@@ -420,7 +451,7 @@ class PersonSearch:
         return self._fit_coarsely(values, frame)
 
     def _fit_coarsely(self, values: Array, frame: FrameViews) -> PoseFit:
-        """Fit by a few stages to the scoring cameras."""
+        """Fit from values (m,) to the scoring cameras, by a few stages with fewer points."""
         prior, coarser = Prior(values, 0.1 * self._information), self._settings.ranking_spacing
         stages = [
             replace(one, spacing=coarser * one.spacing)
@@ -429,14 +460,14 @@ class PersonSearch:
         return self._fit.fit(frame.scoring_edges, values, stages, prior, self._held)
 
     def refine(self, values: Array, frame: FrameViews | ColourViews) -> PoseFit:
-        """Fit from a coarse guess, with a weak prior."""
+        """Fit a frame from a coarse guess (m,), with a weak prior about it."""
         prior, stages = Prior(values, 0.1 * self._information), self._settings.search
         return self._fit.fit(partial(frame.compare, self._fit), values, stages, prior, self._held)
 
     def _doubtful_limbs(self, fitted: PoseFit, frame: FrameViews) -> list[PlannedLimb]:
         """Return the limbs that fit badly, hardly show or would cover more elsewhere, worst first.
 
-        The worst limb is always among them.
+        The worst limb is always among them. `fitted` is a fit to `frame`.
         """
         settings = self._settings
         lengths, fitting = fitted.sums[:, [Sum.COMPARED, Sum.FITTING]].T
@@ -458,6 +489,8 @@ class PersonSearch:
         """Score a limb's poses by the unexplained silhouette that they cover, -1 to 1.
 
         Args:
+            values: (m,) pose of the rest of the body.
+            limb, frame: the limb, and silhouettes.
             placed: (nodes,) nodes that explain silhouettes; None: all but the limb's.
 
         Returns:
@@ -481,7 +514,10 @@ class PersonSearch:
     def _distinct_poses(
         self, values: Array, limb: PlannedLimb, scores: Array, count: int
     ) -> list[Array]:
-        """Return values (m,) for the `count` distinct poses of a limb with the best scores (n,)."""
+        """Return values (m,) for the `count` distinct poses of a limb with the best scores (n,).
+
+        Other values are those of `values` (m,). Fewer are returned if fewer are distinct.
+        """
         found: list[Array] = []
         tips: list[Array] = []
         for index in np.argsort(-scores):
@@ -498,7 +534,11 @@ class PersonSearch:
     def place_by_colour(
         self, values: Array, limb: PlannedLimb, views: ColourViews, own: Mask
     ) -> list[PoseFit]:
-        """Fit after placing a limb where its own colours (nodes, COLOURS) show most."""
+        """Place a limb where its own colours show most, and fit; return at most `placements` fits.
+
+        `values` (m,) is the pose of the rest of the body; `own` (nodes, COLOURS), which colours are
+        each node's own.
+        """
         places = limb.points_at(self._fit.kinematics.poses(values)[self._plan.trunk])
         half, first, scores = len(limb.nodes) // 2, self._plan.upper_samples, np.zeros(len(places))
         for camera, picture in zip(views.cameras, views.pictures, strict=True):
@@ -515,7 +555,7 @@ class PersonSearch:
         return [self.refine(one, views) for one in chosen]
 
     def _similar_poses(self, values: Array) -> list[Array]:
-        """Return values (m,) of similar silhouettes: arms or legs exchanged, or turned about."""
+        """Return values (m,) of similar silhouettes: arms, legs, or front and back exchanged."""
         plan, found = self._plan, []
         X_WN = self._fit.kinematics.poses(values)
         for turn, parts in ((0.0, ("arm",)), (0.0, ("leg",)), (math.pi, ("arm", "leg"))):
@@ -535,13 +575,16 @@ class PersonSearch:
         return found
 
     def _distances(self, values: Array, limb: PlannedLimb, samples_W: Array) -> Array:
-        """Return each limb pose's largest distance (n,) from points along a limb (m, 3) [m]."""
+        """Return the largest distances (n,) [m] of a limb's points in its n poses from others.
+
+        `values` place the trunk; the others are `samples_W` (m, 3), along any limb from its root.
+        """
         X_WT = self._fit.kinematics.poses(values)[self._plan.trunk]
         samples_T = (samples_W - X_WT[:3, 3]) @ X_WT[:3, :3]
         return np.asarray(np.linalg.norm(limb.samples_T - samples_T, axis=2).max(axis=1))
 
     def _move_trunk(self, values: Array, middle: Array) -> Array:
-        """Return values (m,) shifted so that the trunk's middle is at a place (3,) [m]."""
+        """Shift values (m,), in place, so that the trunk's middle is at a place (3,) [m]."""
         kinematics = self._fit.kinematics
         off = middle - self._plan.trunk_middle(kinematics.poses(values))
         motions = kinematics.motions(values)

@@ -66,7 +66,7 @@ class PersonShape:
 
 
 def shape_values(tree: PoseTree) -> Mask:
-    """Return which of a tree's values are shape joints (m,): lengths not of the root."""
+    """Return whether each of a tree's values is a shape joint (m,): a length not of the root."""
     root = set(tree.nodes[0].value_names)
     kinds = tree.model.position_kinds
     return np.array(
@@ -80,7 +80,10 @@ def shape_values(tree: PoseTree) -> Mask:
 
 
 def shape_parts(tree: PoseTree) -> tuple[list[str], list[int]]:
-    """Return the names of parts with a radius scale, and the index of each node's part."""
+    """Return the names of parts with a radius scale, and the index of each node's part.
+
+    Left and right nodes, and the ends of a segment, share a part.
+    """
     names = [
         node.name.removeprefix("left_").removeprefix("right_").removesuffix("_end")
         for node in tree.nodes
@@ -90,7 +93,9 @@ def shape_parts(tree: PoseTree) -> tuple[list[str], list[int]]:
 
 
 def tracker_of_person(tree: PoseTree, shape: KnownShape | None) -> PersonPoseTracker:
-    """Return a tracker of a person of known shape, or of the model's own; lengths are held.
+    """Return a tracker of a person of known shape; its lengths are held.
+
+    `shape` None: the model's own shape.
 
     Raises:
         ModelError: the model has no landmarks of trunk, arms and legs.
@@ -119,6 +124,7 @@ def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
     """Fit lengths, radius scales and the poses of all frames.
 
     Args:
+        fit: the model's body, without radius scales, and the noise of its contours.
         frames: cameras and edge points of each frame.
         poses: (frames, m) initial values [rad, m].
 
@@ -182,7 +188,12 @@ def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
 
 
 def _sides_information(names: Sequence[str], scale_count: int) -> Array:
-    """Return the prior information that left and right lengths are alike; radius scales last."""
+    """Return the prior information (n, n) that left and right lengths are alike.
+
+    Args:
+        names: shape joints, the first of the n parameters.
+        scale_count: number of radius scales, which follow and get no information.
+    """
     information = np.zeros((len(names) + scale_count, len(names) + scale_count))
     for k, name in enumerate(names):
         other = name.replace("left_", "right_", 1)

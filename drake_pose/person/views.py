@@ -74,8 +74,13 @@ class ColourViews:
         """Compare a body's contour with the edges that the colours show.
 
         Args:
-            step: scale of the fit [m].
+            fit: weighs contours by its noise.
+            placement: the body at a pose.
+            step: its scale counts; the spacing is that of the search lines.
             offset: distance between candidate edges on a search line, over the fit's scale.
+
+        Returns:
+            The comparison; 0 for cameras without known colours.
         """
         count, nodes = len(self.cameras), len(placement.X_WN)
         weights = fit.weights(self._packed, placement, replace(step, spacing=self._spacing))
@@ -103,9 +108,10 @@ class ColourViews:
         least_widths: tuple[float, float] = (6.0, 12.0),
         least_agreeing: float = 2.5,
     ) -> KnownColours:
-        """Return the colour histograms, updated by this frame's pictures.
+        """Return the colour histograms by camera, updated by this frame's pictures.
 
         Args:
+            fit: the body.
             values: (m,) values of the pose tree in this frame [rad or m].
             regions: (H, W) region of the person by camera, where known. A camera without a region
                 and without histograms learns from both sides of the body's contour.
@@ -140,6 +146,7 @@ class ColourViews:
         return learned
 
     def _camera(self, c: int) -> tuple[Array, Array]:
+        """Return X_CW (4, 4) and kernel parameters (8,) of the camera with index c."""
         return self._packed[0][c], self._packed[1][c]
 
 
@@ -168,7 +175,8 @@ def edge_spacing(camera: Camera, edge_points: float = EDGE_POINTS) -> float:
 def shows_somebody(view: SilhouetteView | None, least: float = 0.15) -> bool:
     """Return whether a view shows more than a speck: searching a person in specks takes seconds.
 
-    The silhouette's edge must be longer than the fraction `least` of the picture's height.
+    The silhouette's edge must be at least as long as the fraction `least` of the picture's height.
+    None, a camera without a view, shows nobody.
     """
     return view is not None and float(view.edge.lengths.sum()) >= least * len(view.region)
 
@@ -196,7 +204,10 @@ class FrameViews:
         return FrameViews([camera for camera, _ in pairs], [view for _, view in pairs])
 
     def compare(self, fit: ContourFit, placement: Placement, step: AnnealingStage) -> Comparison:
-        """Compare a body's contours with the silhouettes' edges in all cameras."""
+        """Compare a body's contours with the silhouettes' edges in all cameras.
+
+        `fit` weighs them by its noise, at the scale and spacing of `step`.
+        """
         weights = fit.weights(self._packed.cameras, placement, step)
         return compare_views(self._packed, placement, weights)
 
@@ -251,7 +262,7 @@ class FrameViews:
 
 
 def _coarser(camera: Camera, stride: int) -> Camera:
-    """Return the camera of a picture reduced to every stride-th row and column."""
+    """Return a camera whose pictures are reduced to every stride-th row and column."""
     smaller = replace(
         camera,
         width=-(-camera.width // stride),
@@ -265,7 +276,10 @@ def _coarser(camera: Camera, stride: int) -> Camera:
 
 
 def viewing_rays(camera: Camera, uv: Array) -> tuple[Array, Array]:
-    """Return origins (n, 3) [m] and unit directions (n, 3) of pixels' rays (n, 2) in the world."""
+    """Return origins (n, 3) [m] and unit directions (n, 3) in the world of the rays of pixels.
+
+    `uv` (n, 2) are the pixels. A pinhole camera's rays all begin at the camera.
+    """
     pixels = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
     R, p = camera.X_WC[:3, :3], camera.X_WC[:3, 3]
     off = pixels - [camera.center_x, camera.center_y]
@@ -289,9 +303,11 @@ def meeting_points(
     All pairs of pixels of all pairs of views are tried.
 
     Args:
+        cameras: of the views.
         pixels: (n_k, 2) pixels in each camera's picture.
         threshold: largest distance of two rays [m].
-        free: (n_k,) which pixels are free; pairs without a free pixel are left out. None: all are.
+        free: (n_k,) which pixels of each camera may form a pair; the other one of the pair may be
+            any. None: all may.
     """
     rays = [viewing_rays(camera, uv) for camera, uv in zip(cameras, pixels, strict=True)]
     sides: list[list[Array]] = [[], [], [], []]
@@ -322,7 +338,10 @@ def meeting_points(
 
 
 def triangulate(cameras: Sequence[Camera], pixels: Sequence[Array]) -> Array:
-    """Return the point nearest to the rays of one pixel (2,) in each camera (3,) [m]; skip nan."""
+    """Return the point (3,) [m] nearest to the rays of one pixel (2,) in each camera; skip nan.
+
+    At least two cameras must have a pixel.
+    """
     seen = [k for k, uv in enumerate(pixels) if not np.isnan(uv).any()]
     rays = [viewing_rays(cameras[k], pixels[k]) for k in seen]
     origins, directions = np.array(rays).reshape(-1, 2, 3).transpose(1, 0, 2)
@@ -335,9 +354,10 @@ def triangulate(cameras: Sequence[Camera], pixels: Sequence[Array]) -> Array:
 def sum_at_points(
     camera: Camera, picture: NDArray[np.int8], points: Array, weights: Array
 ) -> tuple[Array, Array]:
-    """Sum a picture (H, W) at projected points.
+    """Sum a picture's values at projected points.
 
     Args:
+        picture: (H, W) values of the camera's pixels.
         points: (n, m, 3) n sets of m points in the world [m].
         weights: (n, m) weights of the points.
 
@@ -356,6 +376,7 @@ def sum_at_points(
 def _sum_at_points(
     camera: Array, X_CW: Array, picture: NDArray[np.int8], points: Array, weights: Array
 ) -> tuple[Array, Array]:
+    """`sum_at_points` for a camera with kernel parameters (8,) and pose X_CW (4, 4)."""
     height, width = picture.shape
     sums, seen, P = np.zeros(points.shape[0]), np.zeros(points.shape[0]), np.empty((3, 4))
     # P maps a point to (column, row, 1) times its depth: lens and camera pose in one matrix.

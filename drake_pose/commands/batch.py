@@ -57,7 +57,7 @@ def batch(
           walker: {scene: recordings/walker}
           robot: {scene: recordings/robot, model: arm.urdf, audit: recordings/robot/joints.csv}
 
-    A scene with the key audit is audited; all errors are listed in contradictions.csv.
+    A scene with the key audit is audited; all errors are listed in findings.csv.
 
         drake-pose batch jobs.yaml --out results/all --workers 2
 
@@ -118,7 +118,7 @@ def _print_batch(result: Batch, most: int = 4) -> None:
             chunks = f"{len(state.done)} of {len(state.tasks)}"
             estimates.add_row(*row, percent(totals.get("mean_E_total")), chunks, seconds)
         else:
-            named = [f"{one['what']} {one['name']}" for one in totals.get("contradictions", ())]
+            named = [f"{one['what']} {one['name']}" for one in totals.get("findings", ())]
             audits.add_row(*row, escape(listed(named, most)), seconds)
     console = output_console()
     for table in (estimates, audits):

@@ -155,10 +155,10 @@ def _print_estimate(result: SceneEstimate) -> None:
     if compared:
         # Estimate minus measured position, by joint (rows) and frame (columns).
         few = list(compared)[:8]
-        table = Table("joint", "mean", "greatest", *map(escape, few), title="Joint errors")
+        table = Table("joint", "mean", "largest", *map(escape, few), title="Joint errors")
         for name, errors in result.summary["joint_errors"].items():
             unit, digits = ("deg", 1) if name in angles else ("m", 3)
-            ends = (f"{errors[key]:.{digits}f} {unit}" for key in ("mean", "greatest"))
+            ends = (f"{errors[key]:.{digits}f} {unit}" for key in ("mean", "largest"))
             each = (f"{compared[frame][name]:+.{digits}f}" for frame in few)
             table.add_row(escape(name), *ends, *each)
         console.print(table)

@@ -236,15 +236,15 @@ def _say_target(target: Mapping[str, Any]) -> str:
 def _print_audit(result: SceneAudit) -> None:
     """Print the errors, the number of consistent frames, and minimum detectable offsets."""
     console = output_console()
-    contradictions = result.summary["contradictions"]
-    if contradictions:
+    findings = result.summary["findings"]
+    if findings:
         table = Table("error", title="Errors in joint positions, cameras and frames")
-        for one in contradictions:
+        for one in findings:
             table.add_row(escape(one["text"]))
         console.print(table)
     count, agree = result.summary["frame_count"], result.summary["agreeing_count"]
     console.print(f"{agree} of {count} frames are consistent")
-    if not contradictions:
+    if not findings:
         but = ", but see the warnings" if result.warnings else ""
         say(f"drake-pose: no error found{but}")
     if result.summary["minimum_detectable"]:

@@ -67,7 +67,7 @@ class FrameRecord:
         modes: the same for each of the first modes; a mode is a set of poses that fit equally well.
         mode_count: number of modes; None if the search does not count them.
         ious: intersection over union of silhouette and body by camera, of the cameras used.
-        share: inlier ratio of the contours, by length; only with the method person.
+        inlier_ratio: inlier ratio of the contours, by length; only with the method person.
         masks: digest of the mask file by camera (``mask_digests``).
     """
 
@@ -87,7 +87,7 @@ class FrameRecord:
     modes: Sequence[Joints] = ()
     mode_count: int | None = None
     ious: Mapping[str, float] = field(default_factory=dict)
-    share: float | None = None
+    inlier_ratio: float | None = None
     masks: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -445,7 +445,7 @@ def summarize(
         "compared_count": sum(bool(record.ious) for record in records.values()),
         "median_seconds": float(np.median(seconds)) if seconds else None,
         "joint_errors": {
-            name: {"mean": float(np.mean(off)), "greatest": float(np.max(off))}
+            name: {"mean": float(np.mean(off)), "largest": float(np.max(off))}
             for name, off in joint_errors.items()
         },
         "cameras": describe_cameras(records),
@@ -495,7 +495,7 @@ def frame_warnings(records: Mapping[str, FrameRecord]) -> tuple[str, ...]:
     limits = {"run_limit": "run limit", "time_limit": "time limit; raise it (time_limit)"}
     for frame, record in records.items():
         # The method person explains frames without a pose itself.
-        if not record.found and record.share is None:
+        if not record.found and record.inlier_ratio is None:
             found.setdefault("no pose was found; check masks and pictures", []).append(frame)
         elif record.found and record.stopped_by in limits:
             text = f"the search was stopped by the {limits[record.stopped_by]}"
@@ -523,7 +523,7 @@ def poor_fit_warnings(
     errors = {
         frame: one.E_total
         for frame, one in records.items()
-        if one.E_total is not None and one.share is None
+        if one.E_total is not None and one.inlier_ratio is None
     }
     bad = [frame for frame, error in errors.items() if error >= BADLY_EXPLAINED]
     if not bad:

@@ -184,7 +184,7 @@ def _joint_rows(
             "any_determined": sure > 0, "any_open": has_interval.any() and sure < count,
             "measured": _range(_ends(measured[:, k]), digits), "limits": _limits_text(own),
             "mean_error": f"{scale[k] * errors['mean']:.{digits}f}" if errors else "–",
-            "largest_error": f"{scale[k] * errors['greatest']:.{digits}f}" if errors else "–",
+            "largest_error": f"{scale[k] * errors['largest']:.{digits}f}" if errors else "–",
             "bar": _bar(own, ends, _ends(low, high), is_open=sure < count),
             "plot": plot, "warnings": _warnings_of(estimate, name),
         })  # fmt: skip

@@ -166,7 +166,7 @@ class SceneState:
         """Return the scene's entry of batch.json."""
         totals = ("found_count", "mean_E_total")
         if self.job.audit is not None:
-            totals = ("agreeing_count", "contradictions")
+            totals = ("agreeing_count", "findings")
         return {
             "state": self.state,
             "errors": [{"error": text, "frames": frames} for text, frames in self.errors.items()],
@@ -324,7 +324,7 @@ def _totals(task: Task) -> Mapping[str, Any] | None:
     summary = read_summary(task.place)
     if task.job.audit is None:
         return {name: summary.get(name) for name in ("frame_count", "found_count", "mean_E_total")}
-    found = summary["contradictions"]
+    found = summary["findings"]
     off = {one["name"]: one for one in found if one["what"] == "camera"}
     cameras = {
         name: one
@@ -336,7 +336,7 @@ def _totals(task: Task) -> Mapping[str, Any] | None:
         "cameras": cameras,
         "frame_count": summary["frame_count"] + len(summary["unseen"]),
         "agreeing_count": summary["agreeing_count"],
-        "contradictions": [{name: one[name] for name in ("what", "name", "text")} for one in found],
+        "findings": [{name: one[name] for name in ("what", "name", "text")} for one in found],
     }
 
 
@@ -429,10 +429,10 @@ class Batch:
             rows = [
                 (name, one["what"], one["name"], one["text"])
                 for name, state in self.scenes.items()
-                for one in state.totals.get("contradictions", ())
+                for one in state.totals.get("findings", ())
             ]
             table = csv_text([("scene", "what", "name", "text"), *rows])
-            write_file(self.out, "contradictions.csv", table)
+            write_file(self.out, "findings.csv", table)
         table, files = episodes_table({name: one.totals for name, one in self.scenes.items()})
         if files:
             write_file(self.out, "episodes.csv", table)

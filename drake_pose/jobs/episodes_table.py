@@ -38,7 +38,7 @@ def episodes_table(episodes: Mapping[str, Mapping[str, Any]]) -> tuple[str, dict
     rows = list[list[Any]]()
     files: list[dict[str, _Standing]] = [{}]
     for scene, totals in episodes.items():
-        named = totals.get("contradictions", ())
+        named = totals.get("findings", ())
         joints = " ".join(one["name"] for one in named if one["what"] == "joint")
         stand, moves = files[-1], dict[str, tuple[Any, ...]]()
         for name, one in totals.get("cameras", {}).items():

@@ -274,7 +274,7 @@ def _recorded_rows(data: Path) -> Iterator[list[str]]:
                 posed = PosedFrames(body.kinematics, body.full, camera, frames)
                 seen, mask, both = overlap_areas(posed, camera.X_CW[None], np.inf)[0].T
                 iou += f" ({np.mean(both / (seen + mask - both)):.3f})"
-            named = f"{', '.join(found.contradictions) or 'none'} of {len(frames)}"
+            named = f"{', '.join(found.outliers) or 'none'} of {len(frames)}"
             yield [f"{name} ({joints}), {camera.name}", distance, iou, named, f"{seconds:.1f} s"]
 
 

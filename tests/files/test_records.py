@@ -93,7 +93,7 @@ def test_summary_counts_and_averages_frames_with_a_pose():
     assert (told["frame_count"], told["found_count"], told["compared_count"]) == (3, 2, 2)
     assert told["mean_E_total"] == pytest.approx(0.2)
     assert told["mean_iou"] == pytest.approx(0.7)
-    assert told["joint_errors"] == {"bend": {"mean": 2.0, "greatest": 3.0}}
+    assert told["joint_errors"] == {"bend": {"mean": 2.0, "largest": 3.0}}
     left, right = told["cameras"]["left"], told["cameras"]["right"]
     assert (left["frames"], right["frames"]) == (2, 1)
     assert (left["mean_iou"], right["mean_iou"]) == pytest.approx((0.7, 0.7))
@@ -114,7 +114,7 @@ def test_frames_without_a_pose_share_a_warning():
     records = {name: record() for name in ("0", "1", "2", "3", "4")}
     records |= {"1": record(None), "2": record(None), "4": record(stopped_by="time_limit")}
     # The method person warns of its frames without a pose itself.
-    records["3"] = record(None, share=0.2)
+    records["3"] = record(None, inlier_ratio=0.2)
     lost, stopped = frame_warnings(records)
     assert lost.startswith("frame 1-2 (2 of 5): ")
     assert stopped.startswith("frame 4 (1 of 5): ")

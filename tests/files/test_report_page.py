@@ -178,9 +178,7 @@ def part(whole, frames, errors=None, **changes):
     records = {frame: whole.records[frame] for frame in frames}
     for frame, off in (errors or {}).items():
         records[frame] = replace(records[frame], joint_errors=off)
-    names = {
-        name: {"mean": 3.0, "greatest": 3.0} for off in (errors or {}).values() for name in off
-    }
+    names = {name: {"mean": 3.0, "largest": 3.0} for off in (errors or {}).values() for name in off}
     return replace(whole, records=records, summary=whole.summary | {"joint_errors": names})
 
 

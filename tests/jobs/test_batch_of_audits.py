@@ -38,11 +38,11 @@ def test_errors_are_listed_by_scene_and_finished_audits_are_kept(tmp_path: Path,
     assert "frame 0002" in audited.stdout
     told = json.loads((out / "batch.json").read_text())["scenes"]
     assert [one["state"] for one in told.values()] == ["finished", "finished", "failed"]
-    assert told["right"]["contradictions"] == []
+    assert told["right"]["findings"] == []
     assert told["right"]["agreeing_count"] == told["right"]["frame_count"] == 5
-    (row,) = read_rows(out / "contradictions.csv")
-    (found,) = json.loads((out / "wrong" / "summary.json").read_text())["contradictions"]
-    (named,) = told["wrong"]["contradictions"]
+    (row,) = read_rows(out / "findings.csv")
+    (found,) = json.loads((out / "wrong" / "summary.json").read_text())["findings"]
+    (named,) = told["wrong"]["findings"]
     assert row == {"scene": "wrong", "what": "frame", "name": "0002", "text": found["text"]}
     assert named == {name: row[name] for name in ("what", "name", "text")}
 
@@ -54,7 +54,7 @@ def test_errors_are_listed_by_scene_and_finished_audits_are_kept(tmp_path: Path,
     told = run_json(*words)["scenes"]
     assert told["found"]["state"] == "finished"
     assert [file.stat().st_mtime_ns for file in written] == before
-    assert told["wrong"]["contradictions"] == [named]
+    assert told["wrong"]["findings"] == [named]
     # A finished audit whose masks have changed is refused.
     masks = right.folder / "masks" / "left"
     (masks / "0000.png").write_bytes((masks / "0001.png").read_bytes())

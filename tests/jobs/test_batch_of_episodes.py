@@ -35,7 +35,7 @@ def totals(place, turn_deg=0.0, sd=0.001):
     }  # fmt: skip
     named = [{"what": "joint", "name": "A4", "text": ""}]
     return {
-        "frame_count": 9, "agreeing_count": 8, "contradictions": named, "cameras": {"left": camera}
+        "frame_count": 9, "agreeing_count": 8, "findings": named, "cameras": {"left": camera}
     }  # fmt: skip
 
 

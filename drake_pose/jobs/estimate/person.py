@@ -216,7 +216,7 @@ def _record_frame(
     answers = ((q, captured.deviations[index]), *captured.alternatives.get(index, ()))
     known = record_modes(inputs.model, answers if found else answers[:1])
     return inputs.record_frame(
-        frame, pose, masks, parts, shown, share=float(captured.inlier_ratios[index]), **known
+        frame, pose, masks, parts, shown, inlier_ratio=float(captured.inlier_ratios[index]), **known
     )
 
 

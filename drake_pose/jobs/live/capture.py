@@ -398,7 +398,7 @@ class _FrameWriter:
             stopped_by=FOLLOWED,
             joints=record_deviations(self._writer.model, q, deviations),
             ious=ious,
-            share=inlier_ratio if np.isfinite(inlier_ratio) else None,
+            inlier_ratio=inlier_ratio if np.isfinite(inlier_ratio) else None,
         )
         self._writer.add(record)
         self._times[name] = now
@@ -463,7 +463,7 @@ class _FrameWriter:
             ]
             known = {"kind": given.kind, "location": given.location, **asdict(count)}
             sources[name] = known | {"changes": changes}
-        writer.more |= {"sources": sources, "skipped_moments": sensors.skipped}
+        writer.more |= {"sources": sources, "skipped_frames": sensors.skipped}
         writer.warnings += capture_warnings(counts, sensors.skipped)
         if writer.records:
             writer.finish(replay)

@@ -134,7 +134,7 @@ def audit_scene(
     }
     center = found.center
     summary = {
-        "contradictions": _describe_contradictions(found),
+        "findings": _describe_findings(found),
         "frame_count": len(found.frames),
         "agreeing_count": len(found.frames) - len(found.outliers),
         "frames": {
@@ -308,7 +308,7 @@ def _write_result(
     write_audit_page(path, inputs, found, summary, overlay)
 
 
-def _describe_contradictions(found: Diagnosis) -> list[dict[str, Any]]:
+def _describe_findings(found: Diagnosis) -> list[dict[str, Any]]:
     """Return all findings for summary.json: common ones, then frames, largest error first."""
     rows = [(one, one.kind, one.name, describe_common_finding(one)) for one in found.common]
     rows += [
@@ -337,7 +337,7 @@ def _describe_contradictions(found: Diagnosis) -> list[dict[str, Any]]:
                 f"shift_sd_{unit}": factor * one.shift_sd,
                 "pixels": one.pixels,
                 "p_value": one.p_value,
-                "rivals": list(one.alternatives),
+                "alternatives": list(one.alternatives),
                 "joints": dict(one.joints),
             }
         )

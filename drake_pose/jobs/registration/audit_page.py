@@ -60,7 +60,7 @@ def write_audit_page(
         kind="audit",
         title=Path(str(summary["scene"])).resolve().name,
         model=Path(str(summary["model"])).name,
-        corrections=[correction_row(one) for one in summary["contradictions"]],
+        corrections=[correction_row(one) for one in summary["findings"]],
         cameras=[_camera_row(name, summary) for name in _cameras(summary)],
         joints=_joint_rows(inputs.tree, kinds, summary),
         pairs=pictures[AS_GIVEN],
@@ -76,7 +76,7 @@ def audit_answer(summary: Mapping[str, Any], kinds: Mapping[str, str]) -> str:
         summary: as summary.json.
         kinds: kind of each position by name: "angle", "length" or "quaternion".
     """
-    found = summary["contradictions"]
+    found = summary["findings"]
     common = [one for one in found if one["what"] != "frame"]
     outliers = [one["name"] for one in found if one["what"] == "frame"]
     texts = []
@@ -111,7 +111,7 @@ def detectable_offset(offset: float, kind: str) -> str:
 
 
 def correction_row(one: Mapping[str, Any], normal: float = 1.96) -> dict[str, Any]:
-    """Return an entry of ``contradictions`` with ``parts``: texts of value and 95 % interval.
+    """Return an entry of ``findings`` with ``parts``: texts of value and 95 % interval.
 
     ``normal``: half-width of an interval in standard deviations.
     """
@@ -166,7 +166,7 @@ def _joint_rows(
 
 def _errors_of(kinds: Sequence[str], name: str, summary: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the errors in all frames of this kind and name."""
-    told = [one for one in summary["contradictions"] if one["what"] != "frame"]
+    told = [one for one in summary["findings"] if one["what"] != "frame"]
     return [
         correction_row(one) for one in told if one["cause"] in kinds and one["cause_name"] == name
     ]

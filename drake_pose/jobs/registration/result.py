@@ -62,7 +62,7 @@ def describe_camera(
             ],
             "determined": not len(target_pose.symmetry_axes),
             "covariance": target_pose.covariance.tolist(),
-            "round_about": target_pose.symmetry_axes.tolist(),
+            "symmetry_axes": target_pose.symmetry_axes.tolist(),
         }
     return {
         **({} if link is None else {"link": link}),
@@ -72,13 +72,13 @@ def describe_camera(
         "suggestion": suggestion,
         **({"target": target} if target else {}),
         "seconds": seconds,
-        "contradictions": list(found.outliers),
+        "outliers": list(found.outliers),
         "frames": {
             frame.frame: {
                 "agrees": frame.is_inlier,
                 "E_total": frame.E_total,
                 "iou": frame.iou,
-                "share": frame.inlier_ratio,
+                "inlier_ratio": frame.inlier_ratio,
             }
             for frame in found.frames
         },
@@ -242,7 +242,7 @@ def write_result(
                 "errors": ["turn_x", "turn_y", "turn_z", "x", "y", "z"],
                 "covariance": found.covariance,
                 "alternatives": found.alternatives,
-                "contradictions": list(found.outliers),
+                "outliers": list(found.outliers),
                 **{key: one[key] for key in ("zeros", "lengths", "target") if one.get(key)},
             }
         )
@@ -399,7 +399,7 @@ def registration_answer(cameras: Mapping[str, Mapping[str, Any]]) -> str:
     shift, turn = (
         max(one[key] for one in parts) for key in ("translation_sd_mm", "rotation_sd_deg")
     )
-    outliers = sum(len(one["contradictions"]) for one in parts)
+    outliers = sum(len(one["outliers"]) for one in parts)
     count = sum(len(one["frames"]) for one in parts)
     what = "frame" if len(parts) == 1 else "picture" if parts[0]["masks"] == "found" else "mask"
     words = "Camera found" if len(parts) == 1 else f"{len(parts)} cameras found"

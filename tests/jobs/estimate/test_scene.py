@@ -137,7 +137,7 @@ def test_estimates_are_compared_with_measured_positions_of_the_scene(own_scene: 
     result, summary = run_estimate(own_scene, folder / "out", *held)
     assert "Joint errors" in result.stdout
     assert summary["frames"]["0000"]["joint_errors"]["lift"] == pytest.approx(7.0)
-    assert summary["joint_errors"]["lift"]["greatest"] == pytest.approx(7.0)
+    assert summary["joint_errors"]["lift"]["largest"] == pytest.approx(7.0)
     # A table of another model is ignored.
     (own_scene.folder / "joint_angles.csv").write_text("frame,A1\n0,0.5\n")
     _, summary = run_estimate(own_scene, folder / "other", *held)

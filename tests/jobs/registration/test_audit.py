@@ -57,9 +57,9 @@ def audit_with(scene: ArmScene, cameras: dict[str, Camera], folder: Path) -> Sce
 class TestAudit:
     def test_frame_with_wrong_positions_is_an_outlier(self, found) -> None:
         out, summary = found
-        assert [one["name"] for one in summary["contradictions"]] == ["0002"]
-        assert summary["contradictions"][0]["what"] == "frame"
-        assert "'0002'" in summary["contradictions"][0]["text"]
+        assert [one["name"] for one in summary["findings"]] == ["0002"]
+        assert summary["findings"][0]["what"] == "frame"
+        assert "'0002'" in summary["findings"][0]["text"]
         assert (summary["frame_count"], summary["agreeing_count"]) == (8, 7)
         assert summary["frames"]["0003"]["agrees"]
         assert summary["principal_point_px"] is None
@@ -69,7 +69,7 @@ class TestAudit:
         own, (_, summary) = audited.copy(tmp_path), found
         table = own.joints.rename(own.folder / "joint_angles.csv")
         again = audit_scene(own.folder, own.model)
-        assert again.summary["contradictions"] == summary["contradictions"]
+        assert again.summary["findings"] == summary["findings"]
         lines = table.read_text().splitlines()
         without_a_joint = [line.rpartition(",")[0] for line in lines]
         of_another = [lines[0].replace(JOINTS[0], "elsewhere"), *lines[1:]]
@@ -120,9 +120,9 @@ class TestAudit:
         X_WC[:3, 3] += 0.02 * X_WC[:3, 0]
         moved = {**audited.cameras, "left": left.with_pose(X_WC)}
         result = audit_with(audited, moved, tmp_path)
-        named = [(one["what"], one["name"]) for one in result.summary["contradictions"]]
+        named = [(one["what"], one["name"]) for one in result.summary["findings"]]
         assert named == [("camera", "left"), ("frame", "0002")]
-        assert result.summary["contradictions"][0]["shift_mm"] == pytest.approx(20.0, abs=5.0)
+        assert result.summary["findings"][0]["shift_mm"] == pytest.approx(20.0, abs=5.0)
         assert result.folder is None
 
     @pytest.mark.parametrize(("degrees", "word"), [(2.0, "high"), (-2.0, "low")])
@@ -132,7 +132,7 @@ class TestAudit:
         """The log is the true position plus an error."""
         own = audited.copy(tmp_path)
         own.add_to("elbow_turn", np.radians(degrees))
-        (found, *_) = audit_scene(own.folder, own.model, own.joints).summary["contradictions"]
+        (found, *_) = audit_scene(own.folder, own.model, own.joints).summary["findings"]
         text = (
             r"joint 'elbow_turn' reads (\d\.\d\d) \+- 0\.\d\d degrees too (high|low) in all frames"
         )
@@ -158,7 +158,7 @@ class TestAudit:
         }
         result = audit_with(audited, moved, tmp_path)
         told, warnings = result.summary["principal_point_px"], "\n".join(result.warnings)
-        assert [one["name"] for one in result.summary["contradictions"]] == ["0002"]
+        assert [one["name"] for one in result.summary["findings"]] == ["0002"]
         np.testing.assert_allclose(told["offset"], -half, atol=0.15)
         assert "half a pixel" in warnings
         assert ("CameraInfo's numbers" in warnings) == (half > 0.0)
@@ -197,7 +197,7 @@ class TestAudit:
             write_mask(own.folder / "masks" / name / "0001.png", corner)
             write_mask(own.folder / "masks" / name / "0003.png", nothing)
         result = audit_scene(own.folder, own.model, own.joints)
-        kinds = {one["name"]: one["cause"] for one in result.summary["contradictions"]}
+        kinds = {one["name"]: one["cause"] for one in result.summary["findings"]}
         assert kinds["0001"] == "unexplained"
         assert [text for text in result.warnings if "0003" in text and "nothing" in text]
         assert result.summary["frame_count"] == 7

@@ -229,7 +229,7 @@ def test_an_episode_becomes_a_calibrated_scene(episode, out):
 def test_audit_of_an_episode_finds_wrong_clock_and_camera(episode, tmp_path):
     _, painted = episode
     summary = run("audit", episode, tmp_path / "audit")
-    (clock,) = summary["contradictions"]
+    (clock,) = summary["findings"]
     assert clock["cause"] == "clock"
     assert clock["shift_ms"] == pytest.approx(1e3 * LATE, abs=5.0)
     assert f"{1e3 * LATE:.0f}"[0] in clock["text"]
@@ -238,7 +238,7 @@ def test_audit_of_an_episode_finds_wrong_clock_and_camera(episode, tmp_path):
     moved[:3, 3] += [0.15, -0.1, 0.05]
     save_cameras(tmp_path / "moved.yaml", [painted.camera.with_pose(moved)])
     summary = run("audit", episode, tmp_path / "again", "--cameras", tmp_path / "moved.yaml")
-    camera = next(one for one in summary["contradictions"] if one["cause"] == "camera")
+    camera = next(one for one in summary["findings"] if one["cause"] == "camera")
     assert camera["shift_mm"] == pytest.approx(1e3 * np.linalg.norm([0.15, 0.1, 0.05]), abs=15.0)
-    assert camera["rivals"] == ["base"]
+    assert camera["alternatives"] == ["base"]
     assert any((tmp_path / "again" / "overlay_as_given" / "camera").glob("*.png"))

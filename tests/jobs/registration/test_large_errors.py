@@ -63,7 +63,7 @@ def masks(scene: ArmScene, spoilt: Callable[[np.ndarray], np.ndarray], frames: s
 
 
 def told(result: SceneAudit) -> list[tuple[str, str]]:
-    return [(one["cause"], one["cause_name"]) for one in result.summary["contradictions"]]
+    return [(one["cause"], one["cause_name"]) for one in result.summary["findings"]]
 
 
 def test_correct_scene_gives_no_findings(right: ArmScene) -> None:
@@ -78,7 +78,7 @@ def test_large_joint_offset_is_measured(scene, joint, degrees) -> None:
     change(scene, joint, lambda q: q + np.radians(degrees))
     result = audit(scene)
     assert told(result) == [("joint", joint)]
-    off = result.summary["contradictions"][0]
+    off = result.summary["findings"][0]
     # The correction of the log.
     assert abs(off["angle_deg"] + degrees) < max(4.0 * off["angle_sd_deg"], 0.3)
     assert off["angle_sd_deg"] < 1.0
@@ -90,7 +90,7 @@ def test_wrong_sign_is_found(scene, joint) -> None:
     change(scene, joint, lambda q: -q)
     result = audit(scene)
     assert told(result) == [("sign", joint)]
-    assert f"'{joint}' is logged with the other sign" in result.summary["contradictions"][0]["text"]
+    assert f"'{joint}' is logged with the other sign" in result.summary["findings"][0]["text"]
     assert result.summary["agreeing_count"] == 0
 
 
@@ -98,7 +98,7 @@ def test_constant_column_is_a_wrong_log(scene) -> None:
     off = change(scene, "hand_turn", lambda _: 0.0)
     result = audit(scene)
     assert told(result) == [("log", "hand_turn")]
-    one = result.summary["contradictions"][0]
+    one = result.summary["findings"][0]
     assert "link 'hand' is not where the log says" in one["text"]
     assert one["angle_deg"] == pytest.approx(off.max(), abs=4.0)
     assert result.summary["agreeing_count"] == 0
@@ -141,7 +141,7 @@ def test_pose_convention_is_recognised(scene, spoil, text) -> None:
     except CameraError as error:
         found = str(error)
     else:
-        (one,) = result.summary["contradictions"]
+        (one,) = result.summary["findings"]
         found = one["text"]
         assert result.summary["agreeing_count"] == COUNT
     assert re.search(text, found)
@@ -154,12 +154,12 @@ def test_large_focal_length_error_is_measured(scene) -> None:
     ]
     result = audit(scene, cameras)
     assert told(result) == [("focal", "focal lengths")]
-    assert result.summary["contradictions"][0]["shift_percent"] == pytest.approx(-13.0, abs=1.0)
+    assert result.summary["findings"][0]["shift_percent"] == pytest.approx(-13.0, abs=1.0)
 
 
 def test_mirrored_masks_are_found(scene) -> None:
     masks(scene, lambda mask: mask[:, ::-1])
-    (one,) = audit(scene).summary["contradictions"]
+    (one,) = audit(scene).summary["findings"]
     assert "masks of all cameras seem to be mirrored" in one["text"]
 
 
@@ -178,7 +178,7 @@ def test_moved_cameras_are_found_with_the_frame(scene) -> None:
             write_mask(scene.folder / "masks" / name / f"{k:04d}.png", mask)
     result = audit(scene)
     assert {*told(result)} == {("moved", "left"), ("moved", "right")}
-    for one in result.summary["contradictions"]:
+    for one in result.summary["findings"]:
         assert "was moved after frame '0003'" in one["text"]
         assert one["angle_deg"] == pytest.approx(2.0, abs=max(0.3, 3.0 * one["angle_sd_deg"]))
         # The shift of the camera's centre, not of the robot in its view.
@@ -190,7 +190,7 @@ def test_rotated_camera_has_no_shift(scene) -> None:
     left, right = scene.cameras.values()
     X_WC = left.X_WC.copy()
     X_WC[:3, :3] = Rotation.from_euler("z", 0.5, degrees=True).as_matrix() @ X_WC[:3, :3]
-    (one, *_) = audit(scene, [left.with_pose(X_WC), right]).summary["contradictions"]
+    (one, *_) = audit(scene, [left.with_pose(X_WC), right]).summary["findings"]
     assert one["cause_name"] == "left"
     assert one["angle_deg"] == pytest.approx(0.5, abs=3.0 * one["angle_sd_deg"])
     assert one["shift_mm"] < 3.0 * one["shift_sd_mm"]
@@ -229,7 +229,7 @@ def test_positions_of_the_next_frame_are_recognised(scene) -> None:
     header, *rows = scene.rows()
     shifted = [[row[0], *other[1:]] for row, other in zip(rows, rows[-1:] + rows[:-1], strict=True)]
     scene.write_rows([header, *shifted])
-    texts = [one["text"] for one in audit(scene).summary["contradictions"]]
+    texts = [one["text"] for one in audit(scene).summary["findings"]]
     assert any("fit with the joint positions of the next frame" in text for text in texts)
     assert JOINTS[0] in header
 
@@ -241,7 +241,7 @@ def test_cameras_far_from_their_given_poses_are_found(scene) -> None:
     X_WC[:3, :3] = Rotation.from_euler("z", 30.0, degrees=True).as_matrix()
     X_WC = X_WC @ left.X_WC
     result = audit(scene, [left.with_pose(X_WC), right])
-    (one,) = result.summary["contradictions"]
+    (one,) = result.summary["findings"]
     assert (one["what"], one["name"]) == ("camera", "left")
     assert one["angle_deg"] == pytest.approx(30.0, abs=1.0)
 

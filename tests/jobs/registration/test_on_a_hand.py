@@ -91,7 +91,7 @@ def test_damaged_masks_and_an_outlier(tmp_path: Path, out: Path) -> None:
     scene = write_hand_scene(tmp_path, BRACKET, SIX, seed=3, width=640)
     damage_masks(scene.arm.folder / "masks" / "wrist", 3, "0005.png")
     found = run_json(*scene.register(out), "--no-overlay")
-    assert found["contradictions"] == ["0005"]
+    assert found["outliers"] == ["0005"]
     assert any("are outliers" in text for text in found["warnings"])
     require_near(found, 5.0, 0.5)
 
@@ -106,7 +106,7 @@ def test_pictures_of_a_target_are_segmented(tmp_path: Path, out: Path) -> None:
     require_near(found, 2.0, 0.2)
     poses = [np.array(one["X_WT"]) for one in found["target"]["modes"]]
     assert min(pose_errors(X, scene.X_WT)[0] for X in poses) < 2.0
-    assert (found["masks"], found["contradictions"]) == ("found", [])
+    assert (found["masks"], found["outliers"]) == ("found", [])
     # The result is a scene of masks like Drake's, except for the noise of the pictures.
     for name, mask in drawn.items():
         assert intersection_over_union(read_mask(out / "masks" / "wrist" / name), mask) > 0.97

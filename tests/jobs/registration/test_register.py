@@ -60,7 +60,7 @@ class TestRegister:
             assert found[name] == found["cameras"]["left"][name]
         assert found["modes"] == [{"X_WC": found["X_WC"]}]
         assert found["mean_iou"] > 0.98
-        assert (found["zeros"], found["lengths"], found["contradictions"]) == ({}, {}, [])
+        assert (found["zeros"], found["lengths"], found["outliers"]) == ({}, {}, [])
         assert 0.0 < found["seconds"]
         assert list(found["frames"]) == [f"{k:04d}" for k in range(5)]
         one = yaml.safe_load((out / "registration.yaml").read_text())["left"]

@@ -17,10 +17,10 @@ from tests.search.arms import arm_cameras
 def summary(**camera):
     one = {
         "X_WC": np.eye(4).tolist(), "translation_sd_mm": 1.0, "rotation_sd_deg": 0.1,
-        "modes": [{}], "mean_iou": 0.9, "seconds": 1.0, "contradictions": [], "zeros": {},
+        "modes": [{}], "mean_iou": 0.9, "seconds": 1.0, "outliers": [], "zeros": {},
         "lengths": {}, "masks": "found", "focal_px": 500.0, "focal_sd_px": None,
         "time_offset_s": None, "time_offset_sd_s": None, "time_offset_scores": [],
-        "frames": {"0000": {"agrees": True, "E_total": 0.1, "iou": 0.9, "share": 0.8}},
+        "frames": {"0000": {"agrees": True, "E_total": 0.1, "iou": 0.9, "inlier_ratio": 0.8}},
     }  # fmt: skip
     return {
         "scene": "episode", "model": "arm.urdf", "warnings": [], "cameras": {"front": one | camera}

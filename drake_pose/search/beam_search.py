@@ -44,7 +44,8 @@ def grow(
     """Place one more node in every partial pose and keep the best results.
 
     Args:
-        store: the poses of nodes, which draws the node's.
+        store: the poses of nodes within its limit of the area outside. All the node's poses at its
+            parent's pose in a partial pose are tried; those not yet in the store are drawn.
         partial: the partial poses that are extended.
         node: index of the node that is placed.
         width: beam width: greatest number of partial poses that are kept.
@@ -114,7 +115,11 @@ class BeamSearch:
         self.sampled = self.body.sampled
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
-        """Estimate the pose that the views show; see ``PoseSearch.match`` for the arguments.
+        """Estimate the pose that the views show.
+
+        Args:
+            views: the silhouettes, one per camera.
+            root_position: (3,) the root's position in the world [m]; None: that of the tree.
 
         Returns:
             The best pose found; ``stopped_by`` is "exact" (J is within the tolerance), "end" or
@@ -330,7 +335,10 @@ class _BeamRun:
             store: the poses of nodes.
             partial: the partial poses that are extended.
             order: the nodes, in the order in which they are placed.
-            width, outside_weight, limit: as in ``grow``.
+            width: beam width: greatest number of partial poses kept after each node.
+            outside_weight: cost of a pixel outside, relative to the gain of a newly covered one.
+            limit: greatest objective of completions, beyond which partial poses are dropped
+                [pixel].
             limited: whether the time limit ends the search.
 
         Returns:

@@ -506,7 +506,9 @@ class CoarseSearch:
     ) -> np.ndarray:
         """Return indices of the hypotheses whose open nodes differ in pose from all better ones.
 
-        Open nodes have children that are still to be placed.
+        Open nodes have children that are still to be placed. Two of a node's poses are equal if its
+        origin and a point on its x and z axis round to equal cells of ``settings.same`` times the
+        body's reach.
 
         Args:
             X_WN: (B, nodes, 4, 4) poses before the node was placed.

@@ -185,7 +185,9 @@ class PoseMode:
         Args:
             tree: the pose tree.
             node_values: for each node (k_i,) its values [rad or m].
-            J, joints, size: as in the class.
+            J: its objective [pixel].
+            joints: the mode's interval of each value.
+            size: number of poses in the mode.
         """
         return cls(*tree.positions_from(node_values), tuple(node_values), J, joints, size)
 
@@ -284,7 +286,8 @@ class PoseEstimate:
         Args:
             tree: the pose tree.
             node_values: for each node (k_i,) its values [rad or m].
-            J, area: as in the class [pixel].
+            J: objective of the pose [pixel].
+            area: total area of the silhouettes [pixel].
             more: other fields of the class; ``stopped_by`` is required.
         """
         q, X_WB = tree.positions_from(node_values)

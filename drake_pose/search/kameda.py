@@ -53,7 +53,11 @@ class PaperSearch:
         self.sampled = SampledTree(tree, self.settings)
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
-        """Estimate the pose that the views show; see ``PoseSearch.match`` for the arguments.
+        """Estimate the pose that the views show.
+
+        Args:
+            views: the silhouettes, one per camera.
+            root_position: (3,) the root's position in the world [m]; None: that of the tree.
 
         Returns:
             The best pose found; ``stopped_by`` is "end" or "run_limit".

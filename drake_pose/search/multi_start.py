@@ -100,7 +100,11 @@ class MultiStartSearch:
         return other
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
-        """Estimate the pose that the views show; see ``PoseSearch.match`` for the arguments.
+        """Estimate the pose that the views show.
+
+        Args:
+            views: the silhouettes, one per camera.
+            root_position: (3,) the root's position in the world [m]; None: that of the tree.
 
         Returns:
             The best pose found; ``stopped_by`` is "end" or "time_limit".
@@ -300,9 +304,11 @@ class _MultiStartRun:
         return met >= self._search.exact_settings.coinciding * length
 
     def _search_robustly(self, pool: list[FittedPose], rounds: int) -> list[FittedPose]:
-        """Return the best poses by robust costs, refined to the end.
+        """Return the best poses by robust costs, refined to the end, best first.
 
-        ``pool``: poses refined by all stages but the final; ``rounds``: as in ``search``.
+        Args:
+            pool: poses refined by all stages but the final, best first.
+            rounds: number of rounds of the search for alternative poses.
         """
         settings, turns = self._settings, self._kinematics.covers_full_turn
         pool = self._explore(pool, rounds)

@@ -41,8 +41,9 @@ class ReachablePixels(NamedTuple):
     """Pixels of the silhouettes that nodes still to be placed can cover at most.
 
     Attributes:
-        runs: (r, V, 3) int64 as in ``score_pairs``, for V views.
-        words: (n,) uint64 as in ``score_pairs``.
+        runs: (r, V, 3) int64 for each of r sets of pixels and each of V views: index of the set's
+            first word in a mask, number of its words, and index of the first in ``words``.
+        words: (n,) uint64 the words of all sets.
         rows: (m, p) int64 the row of ``runs`` for each of m nodes that can be placed next, and each
             of p pairs.
     """
@@ -125,7 +126,9 @@ def choose_pairs(
     """Choose the first distinct pairs, and compute the area that no later node can cover.
 
     Args:
-        masks, pairs, runs, words: as in ``score_pairs``.
+        masks: (B, W) uint64 bit masks of the partial poses.
+        pairs: (p, 2) int32 indices of partial pose and pose of the next node, best first.
+        runs, words: bit masks of the next node's poses, as in ``score_pairs``.
         all_pixels: (w,) uint64 bit mask of all pixels of the silhouettes, which are the first w of
             a mask's W words.
         reachable: the pixels that the nodes still to be placed can cover.
@@ -218,8 +221,8 @@ def unite(
     Args:
         table: (r, w) uint64 bit masks, changed in place.
         rows: (n,) int64 the rows that are changed.
-        groups: (n, 2) int64 first pose and end of the group of each row.
-        runs, words: as in ``score_pairs``.
+        groups: (n, 2) int64 the range [first, end) of the node's poses that are added to each row.
+        runs, words: bit masks of the node's poses, as in ``score_pairs``.
         parts: number of parts of a mask that are used, from the first.
         child_rows: (children, poses) int64 the row of the table with the pixels of each child and
             its descendants, for each pose of the node.
@@ -244,8 +247,10 @@ NO_CHILDREN = np.zeros((0, 0), dtype=np.int64)
 def unite_poses(masks: np.ndarray, poses: np.ndarray, runs: np.ndarray, words: np.ndarray) -> None:
     """Add the pixels of one pose to each mask, in place.
 
-    ``masks``: (n, W) uint64; ``poses``: (n,) rows of ``runs``; ``runs``, ``words``: as in
-    ``score_pairs``.
+    Args:
+        masks: (n, W) uint64 bit masks, changed in place.
+        poses: (n,) index of the pose that is added to each.
+        runs, words: bit masks of the poses, as in ``score_pairs``.
     """
     groups = np.column_stack([poses, poses + 1]).astype(np.int64)
     unite(masks, np.arange(len(masks)), groups, runs, words, runs.shape[1], NO_CHILDREN)
@@ -262,14 +267,19 @@ def prune_pairs(
     child_rows: np.ndarray,
     table: np.ndarray,
 ) -> np.ndarray:
-    """Return which pairs leave few enough pixels uncovered, (p,) bool.
+    """Return (p,) bool whether each pair leaves few enough pixels uncovered.
+
+    A pair covers what its pose of the node, and at most the node's descendants then, can cover.
 
     Args:
         uncovered: (B, w) uint64 pixels of the silhouettes that no other node can cover, for each
             partial pose.
         room: (B,) int64 greatest number of these that may stay uncovered.
-        pairs, runs, words, silhouettes: as in ``score_pairs``.
-        child_rows, table: as in ``unite``.
+        pairs: (p, 2) int32 indices of partial pose and pose of the node; fastest if sorted.
+        runs, words: bit masks of the node's poses, as in ``score_pairs``.
+        silhouettes: number of parts of a mask that are silhouettes, which come first.
+        child_rows: (children, poses) int64 row of ``table`` for each child and pose of the node.
+        table: (r, w) uint64 bit masks of what the children and their descendants can cover.
     """
     good = np.ones(pairs.shape[0], dtype=np.bool_)
     places = np.empty(uncovered.shape[1], dtype=np.int64)

@@ -546,7 +546,7 @@ class NeighbourhoodSearch:
 
         Returns:
             The parameters of the best pose and its J [pixel]; the given parameters and infinity if
-            J does not decrease.
+            J does not decrease by more than ``least_decrease``.
         """
         problem, length, settings = self.problem, self.problem.border_length, self._settings
         part, freedom = self._parts[chosen], self._freedoms[chosen]

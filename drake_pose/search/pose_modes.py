@@ -311,7 +311,8 @@ class ExaminationSettings:
         memory: memory limit of each of the two; reaching it has the effect of the time limit
             [byte].
         modes: greatest number of modes that are described.
-        tolerance: as in ``find_modes`` [pixel].
+        tolerance: greatest excess of J of a pose that is as good [pixel]; None: chosen by
+            ``find_modes``.
 
     Raises:
         SettingsError: if a value is out of its range.

@@ -292,7 +292,8 @@ class RootPlacementSearch:
         Args:
             layer: the candidate positions, and the views with the scale that is tried.
             width: beam width.
-            outside_fraction: greatest area of a node outside, as in ``PoseStore``.
+            outside_fraction: greatest area of a node outside the silhouettes, as a fraction of its
+                mean projected area; infinite: no limit.
         """
         if len(layer.positions) == 0:
             return []

@@ -375,7 +375,10 @@ class SampledBody:
         return self._celled[key]
 
     def mean_area(self, node: int, camera: Camera) -> float:
-        """Return the node's projected area in a camera, averaged over all directions [pixel]."""
+        """Return the node's projected area in a camera, averaged over all directions [pixel].
+
+        In a pinhole camera the node is at the mean distance of the roots' samples.
+        """
         scale = float(camera.kernel_parameters()[1])
         if not isinstance(camera, ParallelCamera):
             scale /= float(self.root_distances(camera).mean())

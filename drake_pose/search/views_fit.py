@@ -249,7 +249,7 @@ def describe_modes(
         tree: the pose tree, with its root where the body is.
         modes: the modes with their intervals, best first.
         Js: the objective J of each [pixel].
-        tolerance: as in ``PoseSet`` [pixel].
+        tolerance: greatest excess of the modes' costs, stored in the set [pixel].
         is_known: whether intervals are reliable; if not, no value is determined.
     """
 
@@ -321,7 +321,7 @@ class RobustModes:
         self._sizes: ErrorSizes | None = None
 
     def find(self, poses: Sequence[FittedPose], J: Callable[[np.ndarray], float]) -> PoseSet:
-        """Return the set of poses that fit as well as the best of some.
+        """Return the set of poses that fit as well as the best of some, flipped poses included.
 
         Args:
             poses: fitted poses; the first is the answer and the representative of the first mode.
@@ -464,7 +464,8 @@ class RobustModes:
 
         Returns:
             Values (m,) of the poses, the first the given one. The last is interpolated to where the
-            increase of the cost becomes significant.
+            increase of the cost becomes significant, unless the value's limit or the end of the
+            time comes first.
         """
         settings = self._settings
         longest = settings.longest_steps[0 if self._kinematics.is_angle[index] else 1]

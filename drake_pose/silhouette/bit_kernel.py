@@ -198,8 +198,7 @@ def _walk_cell(
         camera: (8,) ``Camera.kernel_parameters()``.
         crossings: (height, capacity) output, as in ``add_surface``.
         rows: scratch of the span kernel; ``counts`` and ``row_range`` are updated.
-        scratch: (4, e) int32 and (e, 4) float64 scratch for at least as many edges as the surface
-            has.
+        scratch: (4, e + 1) int32 and (e + 1, 4) float64 scratch, for e edges of the surface.
 
     Returns:
         Whether the cells are valid at this pose; if not, nothing is written.
@@ -448,7 +447,7 @@ def _square_outside(
     """Return the number of image pixels in a square that are outside the silhouette.
 
     Args:
-        sums, window, camera: as in ``BitView``.
+        sums, window, camera: the silhouette's fields of ``BitView``.
         u, v: middle of the square [pixel].
         half: half its side [pixel].
     """

@@ -202,8 +202,9 @@ def find_line_spans(
     """Write the covered spans of one line as index pairs of crossings; return the number of spans.
 
     Args:
-        segments, across: as for ``find_crossings``.
-        starts, places, owners: the result of ``find_crossings``.
+        segments: the contour edges.
+        across: 0: the lines are rows; 1: columns.
+        starts, places, owners: the crossings, as ``find_crossings`` returns.
         line: index of the line.
         spans: (k, 2) output, indices of the crossings at which each span begins and ends.
     """
@@ -406,7 +407,8 @@ def _find_cell_edges(
     Args:
         packed: the one surface.
         side: number of cells along each side of a face.
-        spread: as for ``divide_outline`` [rad].
+        spread: largest angle between the viewing directions of the surface's points and of its
+            ball's centre [rad].
         margin: tolerance for rounding errors of directions [rad].
     """
     normals, edges = packed.planes[:3].T, packed.edges

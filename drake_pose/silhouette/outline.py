@@ -301,7 +301,10 @@ def find_facings(
     it is the opposite.
 
     Args:
-        packed, node, X_CN, camera: as for ``project``.
+        packed: the surfaces of all nodes, each in its node's frame N.
+        node: index of the surface.
+        X_CN: (nodes, 3 or 4, 4) poses in the camera.
+        camera: (8,) ``Camera.kernel_parameters()``.
         facings: (at least triangles + 1,) int8 output, with 0 after the last triangle: the facing
             of a missing second triangle.
     """
@@ -327,7 +330,10 @@ def clip_triangle(
     """Write u, v [pixel] and 1 / depth [1/m] of a triangle's part beyond a pinhole's near plane.
 
     Args:
-        packed, node, X_CN, camera: as for ``project``.
+        packed: the surfaces of all nodes, each in its node's frame N.
+        node: index of the surface.
+        X_CN: (nodes, 3 or 4, 4) poses in the camera.
+        camera: (8,) ``Camera.kernel_parameters()``.
         t: index of the triangle within its surface.
         corners: (4, 3) output, one corner a row.
 

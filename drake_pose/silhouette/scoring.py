@@ -94,7 +94,7 @@ def draw_mask(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camera) -> 
 
 
 def draw_packed(packed: PackedOutlines, X_CN: np.ndarray, camera: Camera) -> np.ndarray:
-    """As ``draw_mask``, for packed surfaces such as ``PackedSurfaces`` returns."""
+    """As ``draw_mask``, for packed surfaces of all nodes, such as ``PackedSurfaces`` returns."""
     poses = np.ascontiguousarray(X_CN[:, :3], dtype=np.float64)
     mask = np.zeros((camera.height, camera.width), dtype=np.uint8)
     paint(packed, poses, camera.kernel_parameters(), mask, 1)
@@ -111,7 +111,9 @@ def draw_labels(
     """Return the label (H, W) int16 of the nearest surface in each pixel.
 
     Args:
-        outlines, X_CN, camera: as for ``draw_mask``.
+        outlines: the surfaces, one per node, each in its node's frame N.
+        X_CN: (nodes, 4, 4) poses of the nodes in the camera.
+        camera: the camera whose image is drawn.
         labels: (nodes,) non-negative labels of the surfaces.
         empty: label of pixels without a surface, different from all labels.
     """
@@ -134,8 +136,10 @@ def subtract_body(
 
     Args:
         mask: (H, W) bool, changed in place.
-        prefix: (H, W + 1) int32 prefix sums of the mask, changed in place.
-        outlines, X_CN, camera: as for ``draw_mask``.
+        prefix: (H, W + 1) int32 ``prefix_sums`` of the mask, changed in place.
+        outlines: the body's surfaces, one per node, each in its node's frame N.
+        X_CN: (nodes, 4, 4) poses of the nodes in the camera.
+        camera: the camera that the mask is of.
     """
     packed, poses = _check_body(outlines, np.asarray(X_CN)[None])
     first, end = paint(packed, poses[0], camera.kernel_parameters(), mask.view(np.uint8), 0)
@@ -276,7 +280,9 @@ def require_visible(
     far larger than the image, or if the body is outside the image.
 
     Args:
-        outlines, X_CN, camera: as for ``draw_mask``.
+        outlines: the body's surfaces, one per node, each in its node's frame N.
+        X_CN: (nodes, 4, 4) poses of the nodes in the camera.
+        camera: the camera.
         max_pictures: largest size of the body, as a multiple of the image's diagonal.
     """
     solid = [

@@ -161,7 +161,8 @@ def _differs(picture: Picture, mean: Picture, tolerance: Picture) -> NDArray[Any
 
     Args:
         picture: (H, W, 3 or 4) uint8; a fourth channel is ignored.
-        mean, tolerance: (H, W, 3) uint8 as in ``Background`` [grey levels].
+        mean: (H, W, 3) uint8 mean colour of the background [grey levels].
+        tolerance: (H, W, 3) uint8 largest difference of the background's colours [grey levels].
     """
     colours = cv2.cvtColor(picture, cv2.COLOR_RGBA2RGB) if picture.shape[2] == 4 else picture
     exceeds = cv2.compare(cv2.absdiff(colours, mean), tolerance, cv2.CMP_GT)
@@ -331,7 +332,7 @@ class _Region(NamedTuple):
 
     Attributes:
         mask: (h, w) the region.
-        strength: strength of its outline, as ``_strength``.
+        strength: strength of its outline, a quantile of gradient magnitudes times sqrt(area).
         sign: 1 if the region's channel is above the threshold, -1 if below.
         level: the threshold [grey levels].
     """

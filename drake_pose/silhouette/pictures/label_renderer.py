@@ -173,13 +173,16 @@ class LabelRenderer:
         return label_data(image).copy()
 
     def mask(self, q: np.ndarray, X_WB: np.ndarray | None = None) -> np.ndarray:
-        """Return the model's mask (H, W) bool; q and X_WB as for ``label_image``."""
+        """Return the model's mask (H, W) bool at q (nq,).
+
+        ``X_WB``: (4, 4) pose of the plant's world frame B in the world; None: the identity.
+        """
         return self.label_image(q, X_WB) != EMPTY
 
     def segments(self, q: np.ndarray, X_WB: np.ndarray | None = None) -> np.ndarray:
-        """Return (H, W) int16 the label (see ``link_names``) of each pixel; -1 if none.
+        """Return (H, W) int16 the label (see ``link_names``) of each pixel at q (nq,); -1 if none.
 
-        Arguments q and X_WB are those of ``label_image``.
+        ``X_WB``: (4, 4) pose of the plant's world frame B in the world; None: the identity.
         """
         labels = self.label_image(q, X_WB)
         return np.where(labels == EMPTY, np.int16(-1), labels)

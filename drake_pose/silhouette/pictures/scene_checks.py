@@ -24,15 +24,17 @@ def read_scene(
     sequence: bool = False,
     every: int = 1,
 ) -> tuple[Scene, tuple[str, ...]]:
-    """Return a checked scene of the wanted cameras, and its wanted frames.
+    """Return a checked scene of the wanted cameras, and the names of its frames.
+
+    These are the wanted frames that are kept and have a mask or a picture, in the scene's order.
 
     Args:
         path: the scene's folder.
         wanted: names of cameras; empty: all that have files.
-        frames: names or ranges of frames, as for ``select_frames``; empty: all.
+        frames: names of frames, or ranges ``FIRST:LAST``; empty: all.
         cameras: cameras by name that replace those of the folder; None: the folder's.
-        sequence: as for ``load_scene``.
-        every: keep every n-th frame, as ``Scene.every``.
+        sequence: whether the scene is a sequence if its scene.yaml does not say.
+        every: every n-th frame is kept, the first wanted one included.
 
     Raises DrakePoseError, which names the file, camera or frame that is invalid or missing.
     """
@@ -42,7 +44,10 @@ def read_scene(
 
 
 def check_scene(scene: Scene) -> Scene:
-    """Return a scene with warnings about its files, and without masks of cameras that froze."""
+    """Return a scene with warnings about its files, and without masks of cameras that froze.
+
+    A scene of uncalibrated cameras (``scale_unknown``) is returned unchanged.
+    """
     if scene.scale_unknown:
         return scene
     warnings, known, files = list(scene.warnings), scene.frames, {*scene.masks, *scene.images}
@@ -78,8 +83,8 @@ def check_scene(scene: Scene) -> Scene:
 def check_upright(cameras: Iterable[Camera], min_component: float = 0.5) -> tuple[str, ...]:
     """Return no warning if up in the pictures is the world's z, as persons require, else one.
 
-    ``min_component``: largest component of the mean up direction below which cameras look so
-    steeply that up is undetermined.
+    ``min_component``: there is no warning if all components of the mean up direction are smaller,
+    since the cameras then look so steeply that up is undetermined.
     """
     up = -np.mean([camera.X_WC[:3, 1] for camera in cameras], axis=0)
     axis = int(np.argmax(np.abs(up)))
@@ -204,6 +209,8 @@ def _repeated_files(scene: Scene) -> set[tuple[str, str]]:
 
 def _check_gaps(frames: Sequence[str], max_gaps: int = 6) -> list[str]:
     """Return one warning about numbers missing between consecutively numbered frames, or none.
+
+    Numbers are missing where a step between frames is larger than the median step.
 
     Args:
         frames: names of the frames, in order.

@@ -102,9 +102,9 @@ class Scene:
         )
 
     def frames_with_files(self, wanted: Sequence[str]) -> tuple[str, ...]:
-        """Return the wanted frames that have a mask or a picture.
+        """Return the names of the wanted frames that have a mask or a picture.
 
-        ``wanted``: names or ranges of frames, as for ``select_frames``; empty: all.
+        ``wanted``: names of frames, or ranges ``FIRST:LAST``; empty: all.
 
         Raises:
             SceneError: there is no such frame with a file.
@@ -123,7 +123,7 @@ class Scene:
         The first wanted frame is kept. The frame rate of a sequence is divided by ``step``. With a
         step of 1, ``wanted`` is returned as given.
 
-        ``wanted``: names or ranges of frames, as for ``select_frames``; empty: all.
+        ``wanted``: names of frames, or ranges ``FIRST:LAST``; empty: all.
 
         Raises:
             SettingsError: the step is below 1.
@@ -225,7 +225,7 @@ def load_scene(
     - ``cameras.yaml``,
     - ``masks/<camera>/<frame>.png``,
     - optionally ``scene.yaml`` with ``sequence: true|false`` and ``frame_rate_hz``,
-    - for a sequence without masks, ``images/<camera>/<frame>.png`` or ``.jpg``, or
+    - for a sequence with masks of few or no frames, ``images/<camera>/<frame>.png`` or ``.jpg``, or
       ``videos/<camera>.mp4``.
 
     Masks of a single camera may lie in ``masks/<frame>.png``. Without a camera file, such masks
@@ -315,13 +315,14 @@ def common_rate(
 ) -> tuple[float | None, tuple[str, ...]]:
     """Return the common frame rate of videos [frames/s], and a warning if they drift apart.
 
-    The rate is None if no video has one; without drift there are no warnings.
+    The rate is None if no video has one. There is a warning if videos are a picture or more apart
+    at the end of the shortest; otherwise the tuple is empty.
 
     Args:
         videos: video files by camera.
         max_ratio: largest ratio of the highest to the lowest rate.
 
-    Raises SceneError: a video cannot be read, or the rates differ.
+    Raises SceneError: a video cannot be read, or the ratio is larger.
     """
     opened = {name: VideoPictures(path) for name, path in videos.items()}
     rates = {name: video.rate_hz for name, video in opened.items() if video.rate_hz is not None}
@@ -381,7 +382,8 @@ def find_masks(
 ) -> tuple[dict[tuple[str, str], Path], tuple[str, ...], tuple[str, ...]]:
     """Find ``masks/<camera>/<frame>.png``, or ``masks/<frame>.png`` of a single camera.
 
-    Hidden files are ignored. Frames of equal number are the same, with or without leading zeros.
+    Hidden files are ignored. If several cameras have masks, frames of equal number are the same,
+    with or without leading zeros.
 
     ``cameras``: names of the cameras.
 
@@ -501,6 +503,8 @@ def _join_frames(
     files: Mapping[str, Sequence[Path]],
 ) -> tuple[dict[tuple[str, str], Path], list[str]]:
     """Merge the cameras' frames; a frame is named by its longest spelling.
+
+    If several cameras have masks, frames of equal number are the same.
 
     ``files``: mask files by camera, named by frame.
 

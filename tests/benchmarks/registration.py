@@ -262,7 +262,7 @@ def _recorded_rows(data: Path) -> Iterator[list[str]]:
         settings = RegistrationSettings(cameras=cameras)
         inputs = read_inputs(scene, model, scene / f"{joints}.csv", None, settings)
         body = RegistrationBody(inputs.tree)
-        for camera in inputs.searched:
+        for camera in inputs.searched_cameras:
             frames = inputs.of(camera.name)
             start = time.process_time()
             found = CameraSearch(body).register(camera, frames)

@@ -76,7 +76,8 @@ def skin_blobs(
     """Find skin-coloured blobs of a picture (H, W, 3) in the person's region (H, W) (3.1.1).
 
     Args:
-        min_area: least area [pixel^2].
+        colour: range of skin colours.
+        min_area: least area of a blob [pixel^2].
         max_count: largest number of blobs; the largest blobs are kept.
     """
     # The bounding box of an empty region is empty; one pixel keeps OpenCV's functions working.
@@ -148,7 +149,10 @@ def measure_contour(region: Mask) -> Contour | None:
 
 
 def similarity(first: Array, second: Array) -> float:
-    """Return the similarity of two contour shapes (DIRECTIONS,), 0 to 1 for equal ones."""
+    """Return the similarity of two contour shapes (DIRECTIONS,): 0 to 1, nan if one is nan.
+
+    It is 1 - the sum of absolute differences over the sum of the larger distances; 1: equal.
+    """
     return float(1.0 - np.abs(first - second).sum() / np.maximum(first, second).sum())
 
 
@@ -186,7 +190,7 @@ def find_features(
     of its densest points.
 
     Args:
-        views: of each camera.
+        cameras, views: the cameras, and the person as each of them sees it.
         last: (k, 3) the last frame's features [m].
         ray_distance: largest distance of two rays of the same skin [m].
         dense_radius: radius of the densest part of a feature's points [m].
@@ -246,7 +250,10 @@ class RegisteredPose:
 def place_registered(
     skeleton: Skeleton, cameras: Sequence[Camera], middles: Sequence[Array]
 ) -> Array:
-    """Return the registered pose (nq,) in the place of boxes' middles (2,) in cameras [pixel]."""
+    """Return q (nq,) [rad, m] of the registered pose at the place where cameras see the person.
+
+    `middles` are the middles (2,) of the person's bounding box in each camera's picture [pixel].
+    """
     q = registered_positions(skeleton)
     head, _, _, left_foot, right_foot = skeleton.features(q)
     middle = 0.5 * head + 0.25 * (left_foot + right_foot)
@@ -261,7 +268,15 @@ def register_pose(
     draw: Callable[[Camera, Array], Mask],
     heading_count: int = 36,
 ) -> RegisteredPose:
-    """Make the templates of a pose q (nq,) at its place; `draw` renders a camera's mask of a q."""
+    """Make the templates of a pose at its place, in all headings.
+
+    Args:
+        skeleton: of the person; the head's first angle is the heading.
+        q: (nq,) the pose [rad, m].
+        cameras: that get templates.
+        draw: returns the mask (H, W) of the person in a camera's picture, for positions (nq,).
+        heading_count: number of headings, evenly spread.
+    """
     index = int(skeleton.head_angles[0])
     turns = np.arange(heading_count) * 2.0 * np.pi / heading_count
     headings = np.array([math.remainder(turn, 2.0 * math.pi) for turn in turns])
@@ -287,7 +302,8 @@ def recognise(
     """Recognise the registered pose in all cameras' contours (5).
 
     Args:
-        registered: templates for these cameras.
+        skeleton: of the person.
+        registered: templates; cameras without any are ignored.
         contours: of each camera; None where the person is not whole. Two are needed.
         threshold: least mean similarity.
 
@@ -337,7 +353,11 @@ class FaceTemplates:
 
 
 def cut_face(picture: Picture, blobs: Blobs) -> Picture | None:
-    """Return a picture's largest skin blob, scaled to (130, 80, 3); None if none or not whole."""
+    """Return the largest skin blob of a picture (H, W, 3), scaled to (130, 80, 3).
+
+    Other pixels of its box are black. None where there is no blob, or its box touches the picture's
+    edge.
+    """
     if not len(blobs.areas):
         return None
     left, top, width, height = (int(side) for side in blobs.boxes[0])
@@ -353,10 +373,11 @@ def cut_face(picture: Picture, blobs: Blobs) -> Picture | None:
 
 
 def learn_faces(faces: Sequence[Picture], directions: Array, dimensions: int = 60) -> FaceTemplates:
-    """Return the eigenspace of faces (130, 80, 3) of known directions (n, 2) [rad].
+    """Return the eigenspace of n faces of known directions.
 
     Args:
-        directions: see FaceTemplates.
+        faces: (130, 80, 3) pictures, as of `cut_face`.
+        directions: (n, 2) turn and nod of each, as in FaceTemplates [rad].
         dimensions: largest number of eigenvectors; 60 in section 3.2.2.
 
     Raises:
@@ -383,8 +404,9 @@ def head_angles(direction: Array, head: Array, camera: Camera) -> Array:
     """Return the head's turn and nod in the world (2,) [rad] from a face's direction (2,) [rad].
 
     Args:
-        direction: turn and nod from facing the camera.
-        head: (3,) position of the head [m].
+        direction: turn to the person's left and nod down, from facing the camera.
+        head: (3,) position of the head in the world [m].
+        camera: that sees the face.
 
     Returns:
         Turn, 0 along the world's x axis, and nod, positive downwards.
@@ -405,8 +427,8 @@ def head_angles(direction: Array, head: Array, camera: Camera) -> Array:
 def nearest_template(face: Picture, templates: FaceTemplates) -> tuple[int, float]:
     """Return the index of the template nearest to a face (130, 80, 3), and the face's residual.
 
-    The residual is the RMS distance of the face from the eigenspace [grey levels]; a picture with
-    a large one shows no face.
+    Faces are compared in the templates' eigenspace. The residual is the RMS distance of the face
+    from the eigenspace [grey levels]; a picture with a large one shows no face.
     """
     distances = face.reshape(-1).astype(np.float32) - templates.mean
     coordinates = templates.basis @ distances
@@ -418,9 +440,13 @@ def nearest_template(face: Picture, templates: FaceTemplates) -> tuple[int, floa
 def find_face(
     picture: Picture, blobs: Blobs, templates: FaceTemplates, max_residual: float
 ) -> Array:
-    """Return the direction (2,) of the face in a picture (H, W, 3) [rad]; nan where there is none.
+    """Return the direction (2,) of the face in a picture [rad]; nan where there is none.
 
-    A face's residual must be at most `max_residual` [grey levels].
+    Args:
+        picture: (H, W, 3) of the face camera.
+        blobs: skin-coloured blobs of the picture; the largest one may be the face.
+        templates: faces of known directions; the direction of the nearest one is returned.
+        max_residual: a picture with a larger residual shows no face [grey levels].
     """
     face = cut_face(picture, blobs)
     if face is not None:
@@ -437,6 +463,8 @@ def learn_recorded_faces(folder: Path, skin: SkinColour | None = None) -> FaceTe
     it (.png or .jpg), and where the face looks relative to the camera [deg]: turn to the person's
     left, nod downwards. The largest skin-coloured blob of a whole picture is the face. Where other
     things have the colour of skin, a subfolder `empty` must hold pictures without the person.
+
+    `skin` is the range of skin colours; None: the default.
 
     Raises:
         SceneError: a file, line or picture is wrong; the message names it.

@@ -72,11 +72,16 @@ _TINY = 1e-9
 def move_upper_body(skeleton: Skeleton, q: Array, features: Array, *, face_known: bool) -> Array:
     """Move neck base and arms of q (nq,) until the hands are at those of features (5, 3) [m].
 
-    The head must be in place already. Each side's chain is head 2, neck base 2, shoulder 3, elbow 1
-    (4.1.1). Both chains share head and neck base, so they take turns of a few steps each.
+    The head must be in place already. Each side's chain has 2 angles of the head, 2 of the neck
+    base, 3 of the shoulder and 1 of the elbow (4.1.1). Both chains share head and neck base, so
+    they take turns of a few steps each.
 
     Args:
+        features: (5, 3) positions of FEATURES; only the hands count.
         face_known: whether the head's angles were measured and stay.
+
+    Returns:
+        (nq,) positions; a hand out of reach is only near its target.
     """
     shared = () if face_known else skeleton.head_angles
     for name in LIMBS[:2]:
@@ -97,14 +102,17 @@ def move_upper_body(skeleton: Skeleton, q: Array, features: Array, *, face_known
 
 
 def move_limb(skeleton: Skeleton, q: Array, name: str, target: Array) -> Array:
-    """Move a limb of q (nq,) until its end is at a target (3,) [m]; other positions stay."""
+    """Move a limb of q (nq,) until its end is at a target (3,) [m]; return the new positions.
+
+    `name` is one of LIMBS. The other limbs' positions stay.
+    """
     limb = skeleton.limbs[name]
     part = limb.lower_node, limb.end_L
     return reach(skeleton, _with_bent_joint(q, limb), limb.positions, part, target)[0]
 
 
 def _with_bent_joint(q: Array, limb: Limb) -> Array:
-    """Return q with a limb's middle joint bent by `min_bend` or more."""
+    """Return q (nq,) with a limb's middle joint bent by `min_bend` or more."""
     q, least = np.array(q), SETTINGS.min_bend
     if abs(q[limb.positions[3]]) < least:
         q[limb.positions[3]] = least if limb.upper[3] > -limb.lower[3] else -least
@@ -156,7 +164,21 @@ def _reach(
     steps: int,
     numbers: tuple[float, float, float, float],
 ) -> tuple[Array, float]:
-    """`reach` for the values (m,) of a chain of nodes whose last one carries the point."""
+    """`reach` for a chain of nodes from the root, whose last one carries the point.
+
+    Args:
+        packed: the chain.
+        values: (m,) the chain's values [rad, m]; changed.
+        index: (n,) indices in `values` of the angles that may change.
+        point: (3,) in the last node's frame [m].
+        limits: (n,) lower and (n,) upper limits of these angles [rad].
+        target: (3,) in the world [m].
+        steps: largest number of steps.
+        numbers: damping [m^2], max_step [rad], tolerance [m] and min_step [rad] of the settings.
+
+    Returns:
+        The values, and the remaining distance [m].
+    """
     damping, max_step, tolerance, min_step = numbers
     n, distance = len(index), np.inf
     tip, J, M = np.empty(3), np.empty((n, 3)), np.empty((3, 4))
@@ -206,11 +228,12 @@ def estimate_pose(
     """Estimate a frame's pose by the paper's method.
 
     Args:
-        last: (nq,) positions in the last frame.
+        skeleton: of the person.
+        last: (nq,) positions in the last frame [rad, m].
         features: (5, 3) positions of FEATURES: head, hands and feet [m].
         head_angles: (2,) turn and nod of the head [rad]; None: unknown, start at the last frame's.
-        cameras: on the circle.
-        regions: (H, W) region of the person in each camera's picture.
+        cameras: whose silhouettes score elbows and knees.
+        regions: (H, W) region of the person in each camera's picture; empty ones are skipped.
         search: whether elbows and knees are searched on their circles; if not, they stay where
             inverse kinematics puts them.
         waist: (3,) half-way between the hips [m]; None: by the formula of section 4.2.
@@ -283,6 +306,7 @@ def joint_circle(limb: Limb, root: Array, end: Array, outward: Array, degrees: A
     Args:
         root, end: (3,) shoulder and hand, or hip and foot [m].
         outward: (3,) from neck base to shoulder, or from waist to hip [m].
+        degrees: (n,) theta of each place.
     """
     z, distance = _directions(root, end)
     a, b = limb.lengths
@@ -307,7 +331,7 @@ def rectangles(root: Array, middles: Array, end: Array, half_widths: Array) -> A
 
     Args:
         root, middles, end: (3,), (n, 3) and (3,) the limb's joints [m].
-        half_widths: (2,) of the rectangles [m].
+        half_widths: (2,) of the rectangles before and after the middle joint [m].
     """
     normal = np.cross(middles - root, end - root)
     along = ((np.arange(SETTINGS.along) + 0.5) / SETTINGS.along)[:, None, None]
@@ -325,7 +349,15 @@ def rectangles(root: Array, middles: Array, end: Array, half_widths: Array) -> A
 
 
 def correlation(samples: Array, cameras: Sequence[Camera], regions: Sequence[Mask]) -> Array:
-    """Return C (n,): mean fraction of samples (n, m, 3) inside silhouettes; skip empty ones."""
+    """Return the correlation C (n,) of n limbs with the silhouettes, 0 to 1.
+
+    C is the mean, over cameras with a silhouette, of the fraction of a limb's points in the picture
+    that lie inside the silhouette; 0 where no camera has one.
+
+    Args:
+        samples: (n, m, 3) points of each limb, from `rectangles` [m].
+        regions: (H, W) silhouette in each camera's picture.
+    """
     total, seers, weights = np.zeros(len(samples)), 0, np.ones(samples.shape[:2])
     for camera, region in zip(cameras, regions, strict=True):
         if region.any():
@@ -338,17 +370,18 @@ def correlation(samples: Array, cameras: Sequence[Camera], regions: Sequence[Mas
 def limb_angles(
     limb: Limb, R_WT: Array, root: Array, middles: Array, end: Array, last: Array
 ) -> tuple[Array, Array]:
-    """Return the joint angles that put a limb's joints in given places, for n middle joints.
+    """Return a limb's joint angles that put its joints in given places, for n middle joints.
 
     A nearly straight limb has the same length for two bends: limits decide.
 
     Args:
         R_WT: (3, 3) axes of the trunk in the world.
-        root, middles, end: (3,), (n, 3) and (3,) [m].
+        root, middles, end: (3,), (n, 3) and (3,) the limb's joints [m].
         last: (4,) angles to stay near where several solutions exist [rad].
 
     Returns:
-        (n, 4) angles, and (n,) how far the worst of the root's angles exceeds its limits [rad].
+        (n, 4) angles, three at the root and the bend; and (n,) how far the worst of the root's
+        angles exceeds its limits, 0 if none does [rad]. The bend is inside its limits.
     """
     letters = "".join("XYZ"[axis] for axis in limb.axes)
     towards, distances = _directions(root, np.broadcast_to(end, middles.shape))
@@ -412,11 +445,13 @@ def _directions(root: Array, ends: Array) -> tuple[Array, Array]:
 
 
 def _triads(x: Array, others: Array) -> tuple[Array, Array]:
-    """Return axes (n, 3, 3) with first axis x and second towards others; distances of others to x.
+    """Return right-handed axes in columns (n, 3, 3), the first along x, the second towards others.
+
+    Also return the distances (n,) of the others' ends from the lines along x [m].
 
     Args:
         x: (n, 3) unit vectors.
-        others: (n, 3) vectors [m].
+        others: (n, 3) vectors [m]; of one along x, the second axis is any perpendicular one.
     """
     across = others - (others * x).sum(axis=1, keepdims=True) * x
     length = np.sqrt((across**2).sum(axis=1))
@@ -427,7 +462,7 @@ def _triads(x: Array, others: Array) -> tuple[Array, Array]:
 
 
 def _smallest_rotations(starts: Array, ends: Array) -> Array:
-    """Return the smallest rotations (n, 3, 3) that turn directions (n, 3) to others (n, 3)."""
+    """Return the smallest rotations (n, 3, 3) that turn unit vectors (n, 3) into others (n, 3)."""
     quaternions = np.column_stack([np.cross(starts, ends), 1.0 + (starts * ends).sum(axis=1)])
     turned_about = np.sqrt((quaternions**2).sum(axis=1)) < _TINY
     quaternions[turned_about, :3] = _perpendicular(starts[turned_about])

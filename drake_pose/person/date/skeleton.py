@@ -109,7 +109,7 @@ class Skeleton:
         return np.ascontiguousarray(X_WT[:3, :3]), X_WT[:3, 3]
 
     def limb_points(self, q: Array, name: str) -> Array:
-        """Return a limb's root, middle joint and end (3, 3) in the world at q (nq,) [m]."""
+        """Return root, middle joint and end (3, 3) [m] of limb `name` in the world at q (nq,)."""
         limb, X_WN = self.limbs[name], self.poses(q)
         X_WL = X_WN[limb.lower_node]
         return np.array([X_WN[limb.upper_node, :3, 3], X_WL[:3, 3], _moved(X_WL, limb.end_L)])
@@ -189,7 +189,10 @@ def load_skeleton(model: ArticulatedModel) -> Skeleton:
 
 
 def registered_positions(skeleton: Skeleton, spread_deg: float = 80.0) -> Array:
-    """Return q (nq,) of the registered pose (3.1.1): upright, both arms spread by `spread_deg`."""
+    """Return q (nq,) [rad, m] of the registered pose (3.1.1): upright, head at the origin.
+
+    Both arms are spread sideways by `spread_deg` [deg], as far as their limits allow.
+    """
     q = np.zeros(len(skeleton.lower))
     for name in LIMBS[:2]:
         limb = skeleton.limbs[name]
@@ -198,7 +201,11 @@ def registered_positions(skeleton: Skeleton, spread_deg: float = 80.0) -> Array:
 
 
 def _chain(packed: PackedTree, node: int) -> tuple[PackedTree, Indices]:
-    """Pack the chain of nodes from the root to a node; return it with its values' indices."""
+    """Pack the chain of nodes from the root to a node.
+
+    `packed` is the whole tree. The indices of the chain's values among the tree's are returned,
+    too.
+    """
     path: list[int] = []
     while node >= 0:
         path, node = [node, *path], int(packed.parents[node])
@@ -225,7 +232,16 @@ def _limb(
     lower: str,
     end: str,
 ) -> Limb:
-    """Read a limb from its two segments and its end, which the lower segment carries."""
+    """Read a limb from its two segments and its end, which the lower segment carries.
+
+    Args:
+        nodes: indices of the tree's nodes by name.
+        name: one of LIMBS.
+        upper, lower, end: names of upper and lower segment and of the hand's or foot's link.
+
+    Raises:
+        ModelError: positions or links are not those of a limb.
+    """
     tree = kinematics.tree
     model = tree.model
     positions = [*tree.nodes[nodes[upper]].positions, *tree.nodes[nodes[lower]].positions]
@@ -266,12 +282,12 @@ def _limb(
 
 
 def _moved(X_AB: Array, p_B: Array) -> Array:
-    """Return a point of frame B in frame A (3,)."""
+    """Return a point p_B (3,), given in frame B, in frame A (3,)."""
     return np.asarray(X_AB[:3, :3] @ p_B + X_AB[:3, 3])
 
 
 def _offset(X_WA: Array, X_WB: Array) -> Array:
-    """Return the origin of frame B in frame A (3,)."""
+    """Return the origin of frame B in frame A (3,), from the poses (4, 4) of both."""
     return np.asarray(X_WA[:3, :3].T @ (X_WB[:3, 3] - X_WA[:3, 3]))
 
 

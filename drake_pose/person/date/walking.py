@@ -17,7 +17,7 @@ from drake_pose.person.date.skeleton import Skeleton, registered_positions
 class WalkSettings:
     """Thresholds of the gestures, and what their commands do.
 
-    A command begins at the first threshold of a pair and ends below the second, lower one, so that
+    A command begins at the first threshold of a pair and ends at the second, lower one, so that
     noise does not toggle it.
 
     Args:
@@ -77,7 +77,7 @@ def recognise_command(stance: Array, rest: Array, last: tuple[int, int]) -> tupl
 
     Args:
         stance, rest: (5,) from stance_of, now and at rest.
-        last: the previous command.
+        last: the previous command; (0, 0) at first.
 
     Returns:
         Turning: 1 left, -1 right, 0 none; walking: 1 forward, -1 backward, 0 none.
@@ -96,7 +96,7 @@ def count_steps(lift: float, steps: Array, seconds: float) -> Array:
         steps: (3,) foot lifted last (1 left, -1 right, 0 none), time since then [s], and number of
             steps with alternating feet since the last pause; zeros at first. Two steps are walking
             on the spot.
-        seconds: since the last frame.
+        seconds: time since the last frame [s].
 
     Returns:
         (3,) the new steps.
@@ -123,6 +123,7 @@ def apply_command(
     Args:
         pose: (3,) x, y [m] and heading [rad].
         command: from recognise_command.
+        seconds: for which the command was followed [s].
         obstacles: (n, 3) x, y and radius of round obstacles [m].
         half_size: half the side of the place [m].
     """
@@ -141,7 +142,10 @@ def apply_command(
 
 
 def _switch(value: float, last: int, begin: float, end: float) -> int:
-    """Return the sign of a value beyond the threshold `begin`, or `end` if it is the last sign."""
+    """Return the sign, -1 or 1, of a value whose magnitude reaches `begin`; otherwise 0.
+
+    If its sign is `last`, -1 or 1, it needs to exceed `end` only.
+    """
     if last and value * last > end:
         return last
     return int(math.copysign(1, value)) if abs(value) >= begin else 0
@@ -158,7 +162,10 @@ FEWEST_FRAMES = 40
 
 
 def _sides(left: float = 1.0, right: float = 1.0, **degrees: float) -> dict[str, float]:
-    """Return angles [deg] of joints on both sides, multiplied by each side's factor."""
+    """Return angles [deg] by joint on both sides, from those without a side, `degrees`.
+
+    `left` and `right` are the factors of each side.
+    """
     sides = {"left": left, "right": right}
     return {f"{side}_{joint}": k * a for joint, a in degrees.items() for side, k in sides.items()}
 
@@ -209,6 +216,8 @@ def make_motion(skeleton: Skeleton, frames: int, seed: int) -> Motion:
     are asked for, the first ones are returned.
 
     Args:
+        skeleton: of the person.
+        frames: number of frames.
         seed: draws the size of each motion, 0.85 to 1.15, and where the person stands.
 
     Raises:
@@ -274,7 +283,10 @@ def make_gestures(skeleton: Skeleton, frames: int = 84) -> Motion:
 
 
 def _positions(skeleton: Skeleton, key: dict[str, float], size: float) -> Array:
-    """Return q (nq,) of a key pose whose angles are multiplied by a size."""
+    """Return q (nq,) [rad, m] of a key pose: angles [deg] by joint, multiplied by a size.
+
+    Joints that are not in `key` are relaxed.
+    """
     q = np.zeros(len(skeleton.lower))
     relaxed = _sides(forearm_x=-10.0) | _sides(right=-1.0, upper_arm_z=8.0)
     for name, degrees in {**relaxed, **{n: size * d for n, d in key.items()}}.items():
@@ -283,7 +295,10 @@ def _positions(skeleton: Skeleton, key: dict[str, float], size: float) -> Array:
 
 
 def _through(keys: list[Array], count: int) -> Array:
-    """Return positions (count, nq) from key pose to key pose, slowing down at each."""
+    """Return positions (count, nq) from key pose (nq,) to key pose, slowing down at each.
+
+    The first key pose itself is left out; the last is the last row.
+    """
     place = np.linspace(0.0, len(keys) - 1.0, count + 1)[1:]
     index = np.minimum(place.astype(int), len(keys) - 2)
     weight = 0.5 - 0.5 * np.cos(np.pi * (place - index))
@@ -292,7 +307,10 @@ def _through(keys: list[Array], count: int) -> Array:
 
 
 def _stand_on_floor(skeleton: Skeleton, q: Array) -> None:
-    """Moves the head up or down so that the lower foot's middle is 4 cm above the floor."""
+    """Move the head of q (nq,), in place, so that the lower foot's middle is 4 cm above the floor.
+
+    The head stays at most 20 cm above its height in the upright pose.
+    """
     height, standing = 0.04, skeleton.features(np.zeros(len(q)))
     head = float(-standing[3:, 2].mean()) + height
     q[skeleton.head_positions[2]] = 0.0

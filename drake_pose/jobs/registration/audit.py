@@ -89,7 +89,7 @@ def audit_scene(
     overlay: bool = True,
     on_frame: OnFrame | None = None,
 ) -> SceneAudit:
-    """Find errors common to all frames, and outlier frames, in time linear in the frames.
+    """Return errors common to all frames, and outlier frames, in time linear in their number.
 
     Args:
         scene: a folder with masks and cameras.yaml; or an episode of pictures, in which the robot
@@ -178,7 +178,7 @@ class _Pictures:
     Args:
         found: registrations by camera.
         findings: errors of cameras and clocks.
-        names: by frame of the inputs, the camera and the frame's name in it.
+        names: by name of each audited frame, the camera, and the picture's name in its recording.
     """
 
     found: Mapping[str, PictureRegistration] = field(default_factory=dict)
@@ -195,10 +195,15 @@ def _find_cameras(
     """Register each camera of an episode from its pictures, and segment all of them.
 
     Args:
-        before: an earlier result, from which fits start.
-        offset_joints: joints whose offsets are fitted.
+        inputs: the episode, with given cameras.
+        before: an earlier result, from which fits start; None: poses are searched.
+        offset_joints: names of the joints whose offsets are fitted.
         near: a given camera is used for comparisons if it shows the body at less than this distance
             from the registered one [square root of the silhouettes' area].
+
+    Returns:
+        the inputs as a scene of masks: each picture is a frame of its camera only, compared with
+        `known_cameras`; `given_cameras` are those with a finding. And the registrations.
 
     Raises:
         SceneError: no camera has a pose.
@@ -253,7 +258,12 @@ def _find_cameras(
 def _audit_warnings(
     inputs: RegistrationInputs, found: Diagnosis, empty_frames: Sequence[str]
 ) -> list[str]:
-    """Return warnings about the camera file, empty masks, and few inlier frames."""
+    """Return warnings about the camera file, empty masks, and few inlier frames.
+
+    Args:
+        found: the diagnosis of all other frames.
+        empty_frames: names of frames whose masks are all empty.
+    """
     warnings = list[str]()
     if found.center is not None:
         (x, y), (x_sd, y_sd) = found.center
@@ -288,7 +298,16 @@ def _write_result(
     overlay: bool,
     summary: Mapping[str, Any],
 ) -> None:
-    """Write summary, page, overlays of outlier frames, and comparisons of wrong cameras."""
+    """Write summary, page, overlays of outlier frames, and comparisons of wrong cameras.
+
+    Args:
+        path: the result folder.
+        inputs: as audited, after `_find_cameras` for an episode.
+        found: the diagnosis.
+        pictures: results from an episode's pictures; empty for a scene of masks.
+        overlay: whether overlays and comparisons are drawn.
+        summary: contents of summary.json.
+    """
     named, shown = found.outliers if overlay else (), {}
     for frame in named if pictures.names else ():
         camera_name, name = pictures.names[frame]
@@ -309,7 +328,10 @@ def _write_result(
 
 
 def _describe_findings(found: Diagnosis) -> list[dict[str, Any]]:
-    """Return all findings for summary.json: common ones, then frames, largest error first."""
+    """Return all findings as ``findings`` of summary.json.
+
+    Common ones come first, then those of frames, the frame with the largest error [pixel] first.
+    """
     rows = [(one, one.kind, one.name, describe_common_finding(one)) for one in found.common]
     rows += [
         (

@@ -20,7 +20,7 @@ from drake_pose.registration.findings import Diagnosis, Finding
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 
 OnePicture = tuple[str, str, list[Finding]]
-"""A frame to draw: its name, words for its title, and the findings to be corrected."""
+"""A frame to draw: its name, words for its title, and the findings that correct its joints."""
 
 
 def write_audit_page(
@@ -73,7 +73,7 @@ def audit_answer(summary: Mapping[str, Any], kinds: Mapping[str, str]) -> str:
     """Return the result in a few sentences.
 
     Args:
-        summary: as summary.json.
+        summary: content of summary.json.
         kinds: kind of each position by name: "angle", "length" or "quaternion".
     """
     found = summary["findings"]
@@ -106,14 +106,20 @@ def audit_answer(summary: Mapping[str, Any], kinds: Mapping[str, str]) -> str:
 
 
 def detectable_offset(offset: float, kind: str) -> str:
-    """Return a joint offset [deg or m], as summary.json has it, in degrees or mm to a tenth."""
+    """Return a joint offset, in deg or m as in summary.json, as text in deg or mm to a tenth.
+
+    kind: "angle" or "length".
+    """
     return f"{offset:.1f} deg" if kind == "angle" else f"{1e3 * offset:.1f} mm"
 
 
 def correction_row(one: Mapping[str, Any], normal: float = 1.96) -> dict[str, Any]:
-    """Return an entry of ``findings`` with ``parts``: texts of value and 95 % interval.
+    """Return an entry of ``findings`` with ``parts`` for the page's tables.
 
-    ``normal``: half-width of an interval in standard deviations.
+    Each part is the text of an angle or a shift with a known standard deviation, and that of its
+    95 % interval.
+
+    normal: half-width of an interval in standard deviations.
     """
     parts = []
     for key in (key for key in one if key.startswith(("angle_deg", "shift_"))):
@@ -126,17 +132,22 @@ def correction_row(one: Mapping[str, Any], normal: float = 1.96) -> dict[str, An
 
 
 def _sd_key(key: str) -> str:
+    """Return the key of a value's standard deviation: "shift_sd_mm" for "shift_mm"."""
     name, _, unit = key.rpartition("_")
     return f"{name}_sd_{unit}"
 
 
 def _cameras(summary: Mapping[str, Any]) -> list[str]:
-    """Return the names of the cameras that were compared."""
+    """Return the names of the cameras that were compared; summary: content of summary.json."""
     return list(dict.fromkeys(name for one in summary["frames"].values() for name in one["fits"]))
 
 
 def _camera_row(name: str, summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row of the table of cameras: mean inlier ratios as given and refined, and errors."""
+    """Return a camera's row of the page's table: number of frames, mean inlier ratios, errors.
+
+    "given" and "freed" are the inlier ratios at the given values and with frames fitted by
+    themselves (None: unknown), "off" the camera's errors common to all frames.
+    """
     frames = [one for one in summary["frames"].values() if name in one["fits"]]
     freed = [one["fits_when_freed"][name] for one in frames if name in one["fits_when_freed"]]
     return {
@@ -151,7 +162,16 @@ def _camera_row(name: str, summary: Mapping[str, Any]) -> dict[str, Any]:
 def _joint_rows(
     tree: PoseTree, kinds: Mapping[str, str], summary: Mapping[str, Any]
 ) -> list[dict[str, Any]]:
-    """Return the table of joints: errors found, and the minimum detectable offset."""
+    """Return the rows of the page's table of joints.
+
+    Each has the joint's errors common to all frames ("off"), or else its minimum detectable offset
+    as text.
+
+    Args:
+        tree: the robot's pose tree; each of its joints in `kinds` has a row.
+        kinds: kind of each position by name: "angle", "length" or "quaternion".
+        summary: content of summary.json.
+    """
     rows = []
     for name in (one for one in TreeKinematics(tree).names if one in kinds):
         off, detectable = _errors_of(("joint", "sign", "log", "link"), name, summary), "–"
@@ -165,7 +185,10 @@ def _joint_rows(
 
 
 def _errors_of(kinds: Sequence[str], name: str, summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the errors in all frames of this kind and name."""
+    """Return the errors common to all frames that have one of the kinds, and the name.
+
+    The result is as of `correction_row`; name: of a joint or camera.
+    """
     told = [one for one in summary["findings"] if one["what"] != "frame"]
     return [
         correction_row(one) for one in told if one["cause"] in kinds and one["cause_name"] == name
@@ -173,7 +196,10 @@ def _errors_of(kinds: Sequence[str], name: str, summary: Mapping[str, Any]) -> l
 
 
 def _draw_outlines(folder: Path, inputs: RegistrationInputs, found: Diagnosis, most: int) -> None:
-    """Draw the robot as given and as found in at most ``most`` frames with errors of joints."""
+    """Draw the robot as given and as found in at most `most` frames with errors of joints.
+
+    Pictures are written to the folder AS_GIVEN in the result folder, the largest errors first.
+    """
     names = TreeKinematics(inputs.tree).names
     common = [one for one in found.common if corrected(np.zeros(len(names)), names, one)]
     draw, chosen = body_drawer(inputs.tree, inputs.visible_nodes), list[OnePicture]()
@@ -196,7 +222,7 @@ def _draw_outlines(folder: Path, inputs: RegistrationInputs, found: Diagnosis, m
 
 
 def corrected(values: Array, names: Sequence[str], one: Finding) -> tuple[Array, ...]:
-    """Return joint values (m,) corrected by a finding; empty if it does not correct joints.
+    """Return a tuple of the joint values (m,) corrected by a finding, () if it corrects no joint.
 
     Args:
         values: (m,) joint values [rad or m].

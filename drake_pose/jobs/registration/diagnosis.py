@@ -49,9 +49,9 @@ Search = CameraSearch | TargetSearch
 def explain_misfit(found: RegisteredCamera, min_inlier_ratio: float = 0.65) -> str | None:
     """Return in words why a pose does not explain the masks; None: it does.
 
-    min_inlier_ratio: minimum mean of the two best frames. A correct robot has 0.83 or more, even
-        with holes and tools in the masks; mirrored masks, another robot's masks or exchanged frames
-        have 0.6 at most.
+    min_inlier_ratio: minimum mean inlier ratio of the two best frames. A correct robot has 0.83 or
+        more, even with holes and tools in the masks; mirrored masks, another robot's masks or
+        exchanged frames have 0.6 at most.
     """
     inliers = [frame for frame in found.frames if frame.is_inlier]
     left = _left(found)
@@ -77,9 +77,14 @@ def _left(found: RegisteredCamera) -> float:
 def require_explained(
     search: Search, found: RegisteredCamera, frames: Sequence[PosedFrame], much_better: float = 0.6
 ) -> None:
-    """Refuse a pose that does not explain its best frames.
+    """Refuse a pose that does not explain its best frames, see `explain_misfit`.
 
-    much_better: an alternative cause is named if less than this fraction of E_total remains.
+    Args:
+        search: searches again, roughly, with alternative causes of the misfit.
+        found: the camera at the pose that is checked.
+        frames: the frames that it was registered from.
+        much_better: an alternative cause is named if it explains the masks, and less than this
+            fraction of the inliers' median E_total remains.
 
     Raises RegistrationError: states the misfit and alternative causes, or what to check.
     """
@@ -108,7 +113,10 @@ def require_explained(
 def _alternatives(
     camera: PinholeCamera, frames: Sequence[PosedFrame], most: int = 5
 ) -> Iterator[tuple[str, PinholeCamera, list[PosedFrame]]]:
-    """Yield alternative causes: words, and the camera and some frames corrected accordingly."""
+    """Yield alternative causes: words, and the camera and some frames corrected accordingly.
+
+    most: maximum number of frames for each cause.
+    """
     some = evenly_spaced(frames, most)
     mirrored = [
         PosedFrame(frame.name, frame.values, np.ascontiguousarray(frame.mask[:, ::-1]))
@@ -139,6 +147,8 @@ def require_seen_by(
 ) -> None:
     """Refuse a camera that cannot show the robot in any frame for which it has a mask.
 
+    Cameras without a mask in `frames` are accepted.
+
     Raises CameraError: see ``require_visible``.
     """
     for camera in cameras:
@@ -157,7 +167,10 @@ def require_seen_by(
 def known_camera_warnings(
     body: RegistrationBody, camera: PinholeCamera, frames: Sequence[PosedFrame]
 ) -> list[str]:
-    """Warn if the robot is not visible where a camera with a given X_WC should see it."""
+    """Return a warning if the robot is not visible where a camera with known X_WC should see it.
+
+    frames: of this camera. An empty list: the robot is visible, or there are no frames.
+    """
     if not frames:
         return []
     posed = PosedFrames(body.kinematics, body.full, camera, frames)
@@ -172,7 +185,7 @@ def known_camera_warnings(
 
 
 def require_determined(found: RegisteredCamera, max_sd: float = 0.04) -> None:
-    """Refuse a pose on a link with a larger standard deviation along any axis [rad, m].
+    """Refuse a pose on a link whose standard deviation along any axis exceeds `max_sd` [rad, m].
 
     Raises RegistrationError: states the standard deviations.
     """
@@ -202,15 +215,17 @@ def check_focal_length(
     """Compare a camera's focal length with that estimated from its masks.
 
     Args:
-        body, found, frames: the body, the registered camera, and its frames.
+        body: the robot's surfaces.
+        found: the registered camera, with one misfit for each of `frames`.
+        frames: its frames, of which the inliers are used.
         off_by, off_by_sds: minimum difference of the logarithms, absolute and in standard
             deviations. Published focal lengths of recorded arms differ by 2 % at most.
         wrong_by: a larger difference is an error.
         most: maximum number of frames in a first, quick estimate.
 
     Returns:
-        the pose's covariance (6, 6), and warnings. With a small difference the covariance includes
-        the difference between the poses with both focal lengths.
+        the pose's covariance (6, 6), and a warning or none. With a warning, the covariance is that
+        with a fitted focal length, plus the difference between the poses with both focal lengths.
 
     Raises:
         RegistrationError: the focal length is wrong, and with it the camera's distance.
@@ -252,7 +267,10 @@ def compare_camera(
     """Return the difference of a given pose from the registered one as a finding.
 
     Args:
-        values: (f, m) the body's values in some frames.
+        body: the robot's surfaces.
+        given: the camera at its given pose.
+        found: the same camera at its registered pose.
+        values: (f, m) the pose tree's values in the frames in which outlines are compared.
         alone: whether it is the only camera, so that the base may have moved instead.
     """
     off = pose_difference(found.camera.X_WC, given.X_WC)
@@ -268,10 +286,12 @@ def compare_camera(
 def compare_clock(
     body: RegistrationBody, one: PictureRegistration, recording: Recording, clock_sd: float = 0.002
 ) -> list[Finding]:
-    """Return findings of a camera's clock that is off the joint log's, or drifts.
+    """Return significant findings "clock" and "rate" of a camera's clock; often none.
 
     Args:
-        recording: the recording as it is.
+        body: the robot's surfaces.
+        one: the camera's registration; its clock's offset may be unknown.
+        recording: the recording as it is, with any drift of its clock.
         clock_sd: standard deviation of well synchronised clocks [s].
     """
     clock, camera = one.time_offset, one.found.camera
@@ -303,11 +323,11 @@ def compare_clock(
 def _picture_shift(
     body: RegistrationBody, one: tuple[PinholeCamera, Array], other: tuple[PinholeCamera, Array]
 ) -> float:
-    """Return the root mean square distance of a body's points in two pictures [pixel].
+    """Return the root mean square distance of the body's points between pictures [pixel].
 
     Distances are clipped at a picture's diagonal.
 
-    one, other: camera, and values (f, m) of the body.
+    one, other: a camera, and values (f, m) of the body's pose tree in f frames; f is equal in both.
     """
     places = []
     for camera, values in (one, other):
@@ -321,7 +341,16 @@ def _picture_shift(
 def likely_offset_warnings(
     body: RegistrationBody, found: RegisteredCamera, frames: Sequence[PosedFrame]
 ) -> list[str]:
-    """Warn of a joint offset that would explain what all frames have in common."""
+    """Return a warning of the likeliest joint offset that would explain all frames' residuals.
+
+    Args:
+        body: the robot's surfaces.
+        found: the registered camera.
+        frames: its frames; at most 24 inliers are used.
+
+    Returns:
+        one warning, or none.
+    """
     names = {one.frame for one in found.frames if one.is_inlier}
     some = evenly_spaced([one for one in frames if one.name in names], 24)
     if not some:
@@ -345,7 +374,14 @@ def likely_offset_warnings(
 def lost_frames_warning(
     camera: str, lost: Sequence[str], names: Sequence[str], what: str = "robot"
 ) -> str:
-    """Warn of pictures without the robot where it should be; names: of all pictures."""
+    """Return a warning of pictures without the robot where it should be.
+
+    Args:
+        camera: its name.
+        lost: names of these pictures.
+        names: names of all pictures, in order.
+        what: what is not visible.
+    """
     return (
         f"camera '{camera}': the {what} is not visible where it should be in frames "
         f"{frame_ranges(lost, names)}: is something in front of it, or do the joint positions "
@@ -354,11 +390,14 @@ def lost_frames_warning(
 
 
 def last_before_change(wrong: Sequence[bool], least: int = 2) -> int | None:
-    """Return the last frame before a change, after or before which all frames are outliers.
+    """Return the index of the last frame before a change between only inliers and only outliers.
 
     Args:
         wrong: for each frame, whether it is an outlier.
-        least: minimum numbers of outliers and of inliers; with fewer there is no change (None).
+        least: minimum numbers of outliers and of inliers.
+
+    Returns:
+        None: outliers and inliers alternate more than once or never, or there are too few.
     """
     turns = np.flatnonzero(np.diff(np.array(wrong, int)))
     if len(turns) != 1 or min(sum(wrong), len(wrong) - sum(wrong)) < least:
@@ -367,7 +406,9 @@ def last_before_change(wrong: Sequence[bool], least: int = 2) -> int | None:
 
 
 def outlier_warnings(found: RegisteredCamera, from_pictures: bool = False) -> list[str]:
-    """Warn of a camera's outlier frames, and of alternative poses.
+    """Return warnings of a camera's outlier frames, and of alternative poses.
+
+    from_pictures: whether it was registered from pictures.
 
     Raises RegistrationError: half of the masks or more are outliers. In pictures this is a warning:
         the frames of the fit agree, and the others may be dark or blurred.
@@ -409,7 +450,11 @@ def outlier_warnings(found: RegisteredCamera, from_pictures: bool = False) -> li
 
 
 def parameter_warnings(found: JointCalibration) -> list[str]:
-    """Warn of joint offsets and link scales that are not significant or not determined."""
+    """Return warnings of joint offsets and link scales that are uncertain.
+
+    If none is significant, this is the only warning. Otherwise they are those that only static
+    parts separate from a camera, and those that are not determined.
+    """
     requested = [(f"joint '{one.name}': its offset", one) for one in found.offsets]
     requested += [(f"link '{one.name}': its length", one) for one in found.link_scales]
     if requested and not any(one.significant for _, one in requested):
@@ -435,7 +480,7 @@ def parameter_warnings(found: JointCalibration) -> list[str]:
 
 
 def target_warnings(pose: TargetPose) -> list[str]:
-    """Warn of symmetries of the calibration target."""
+    """Return warnings of symmetries of the calibration target."""
     texts = []
     if len(pose.symmetry_axes):
         axes = "; ".join(", ".join(f"{x:.3f}" for x in axis) for axis in pose.symmetry_axes)
@@ -454,7 +499,11 @@ def target_warnings(pose: TargetPose) -> list[str]:
 def common_outlier_warnings(
     registered: Iterable[RegisteredCamera], *, from_pictures: bool = False
 ) -> list[str]:
-    """Warn of frames that are outliers in one or in all cameras, and of cameras without overlap."""
+    """Return warnings that compare several cameras' inliers.
+
+    They name frames that are outliers in all cameras, or in one but not in another, and pairs of
+    cameras with common frames but without a common inlier frame (only if registered from masks).
+    """
     is_inlier: dict[str, dict[str, bool]] = {}
     sets, frames_of = dict[str, list[str]](), dict[str, set[str]]()
     for found in registered:

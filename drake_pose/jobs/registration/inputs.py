@@ -61,8 +61,8 @@ class RegistrationInputs:
             the world's origin.
         model: the robot.
         tree: its pose tree in the world, or in the frame of the link that carries the cameras.
-        positions: joint positions in each frame.
-        joints, cameras: the given table of positions and the given camera file, if any.
+        positions: joint positions in each frame; none for an episode, whose log is in `recordings`.
+        joints, cameras: the table of positions and the camera file that were given; None: none.
         warnings: for the user.
         known_cameras: cameras with known poses.
         searched_cameras: cameras to be registered; all cameras of an episode.
@@ -71,7 +71,7 @@ class RegistrationInputs:
         left_out: names of cameras without X_WC that are not to be registered.
         recordings: an episode's pictures with the joint log, by camera; empty for masks.
         audited_frames: names of the frames to be audited.
-        frames: frames that have been read.
+        frames: frames that have been read, with the masks of searched and known cameras.
         visible_nodes: names of the tree's nodes that masks show; None: all.
         target: the calibration target of cameras on a link; at the world's origin in the tree until
             its pose is estimated. None: the masks show the robot.
@@ -100,11 +100,11 @@ class RegistrationInputs:
 
     @property
     def camera_file(self) -> Path:
-        """The camera file that was used."""
+        """The given camera file, or the scene's own."""
         return self.cameras or self.scene.path / CAMERA_FILE
 
     def read(self, frame: str) -> MultiViewFrame:
-        """Return a frame with the known cameras' masks that are not empty."""
+        """Return a frame, by its name, with the known cameras' masks that are not empty."""
         if frame in self._known:
             return self._known[frame]
         names = [one.name for one in self.known_cameras if (one.name, frame) in self.scene.masks]
@@ -118,11 +118,11 @@ class RegistrationInputs:
         return {one.name: one for one in self.frames}
 
     def of(self, camera: str) -> list[PosedFrame]:
-        """Return the frames of a camera."""
+        """Return those of `frames` in which a camera, given by name, has a mask."""
         return [one.of(camera) for one in self.frames if camera in one.masks]
 
     def with_values(self, values: Iterable[Array]) -> tuple[MultiViewFrame, ...]:
-        """Return the frames at other values (m,) of the tree."""
+        """Return `frames` at other values (m,) of the tree, one array for each frame."""
         frames = zip(self.frames, values, strict=True)
         return tuple(replace(one, values=own) for one, own in frames)
 
@@ -136,9 +136,13 @@ def read_mask_of(
     most: float = 0.5,
     most_of_edge: float = 0.75,
 ) -> Mask:
-    """Read a camera's mask of a frame.
+    """Return a camera's mask (H, W) of a frame.
 
-    most, most_of_edge: no body fills more than these fractions of both the picture and its edge.
+    Args:
+        camera, frame: their names.
+        may_be_empty: whether a mask without the body is accepted.
+        most, most_of_edge: a mask is inverted if the body fills more than these fractions of both
+            the picture and its edge.
 
     Raises MaskError: the mask cannot be read, is empty and must not be, or is inverted.
     """
@@ -163,7 +167,7 @@ def read_inputs(
     """Read and check all inputs.
 
     Args:
-        scene: a scene of masks, or an episode, whose pictures are read later.
+        scene: folder of a scene of masks, or path of an episode, whose pictures are read later.
         model: the robot's model file.
         joints: a table of joint positions; None: the recording's own. If a scene of masks has none,
             a registration estimates the positions from the known cameras.
@@ -210,7 +214,7 @@ def read_inputs(
 
 
 def _own_joints(scene: Path, robot: ArticulatedModel, settings: AuditSettings) -> Path | None:
-    """Return the scene's own table of joint positions, if it has all joints of the robot."""
+    """Return the scene's joint table; None: it has none with all joints that are not held."""
     path = scene / JOINT_TABLE
     if not path.is_file():
         return None
@@ -226,7 +230,7 @@ def _own_joints(scene: Path, robot: ArticulatedModel, settings: AuditSettings) -
 def _read_episode(
     path: Path, model: Path, joints: Path | None, cameras: Path | None, settings: AuditSettings
 ) -> RegistrationInputs:
-    """Read an episode; its pictures are read while cameras are registered."""
+    """Return the inputs of an episode, see `read_inputs`; its pictures are read later."""
     episode = open_episode(path, joints=joints, episode=settings.episode)
     if episode.joints is None:
         raise SceneError(
@@ -284,7 +288,13 @@ def _known_camera(one: EpisodeCamera) -> PinholeCamera:
 def _recording(
     camera: EpisodeCamera, mapped: TreeLog, default: Array, settings: AuditSettings
 ) -> Recording:
-    """Return the pictures of a camera's selected frames, with the joint log."""
+    """Return the pictures of a camera's selected frames, with the joint log.
+
+    Args:
+        mapped: the joint log, with the columns of the tree's values.
+        default: (m,) values of the tree that are not logged [rad or m].
+        settings: select the frames.
+    """
     kept = kept_pictures(camera, settings)
 
     def values_at(offset: float | Array) -> Array:
@@ -305,7 +315,12 @@ def _recording(
 def _read_target(
     model: ArticulatedModel, settings: RegistrationSettings
 ) -> CalibrationTarget | None:
-    """Return the calibration target, before the robot; None: the cameras see the robot."""
+    """Return the calibration target that a camera on the robot's link sees.
+
+    None: no target is set, so the cameras see the robot `model`.
+
+    Raises SettingsError: the target is unusable, or no link carries the cameras.
+    """
     if settings.target is None:
         return None
     if settings.on is None:
@@ -326,7 +341,7 @@ def _read_masks(
     cameras: Path | None,
     settings: RegistrationSettings,
 ) -> RegistrationInputs:
-    """Read a scene of masks; missing joint positions are estimated from the known cameras."""
+    """Return the inputs of a scene of masks, see `read_inputs`; joints None: they are estimated."""
     if cameras is None and not (path / CAMERA_FILE).exists():
         raise SceneError(
             f"{path}: has no {CAMERA_FILE}; a registration needs a camera file with picture size "
@@ -385,7 +400,11 @@ def _read_masks(
 def _select_cameras(
     scene: Scene, file: CameraFile, settings: RegistrationSettings
 ) -> tuple[tuple[PinholeCamera, ...], tuple[PinholeCamera, ...]]:
-    """Return the cameras to be registered, and the cameras with known poses."""
+    """Return the cameras to be registered, and the other cameras that have an X_WC.
+
+    Those set are registered; if none is set, those with masks but without X_WC. With cameras on a
+    link, no other pose is known.
+    """
     path, wanted = scene.path / CAMERA_FILE, settings.cameras
     unplaced = {*file.unplaced, *file.links}
     for name, link in file.links.items():
@@ -432,7 +451,12 @@ def make_registration_tree(
 ) -> tuple[PoseTree, tuple[str, ...] | None]:
     """Return the pose tree, and the names of its nodes that masks show; None: all.
 
-    A camera on a link sees the robot's static base, or the target.
+    The tree of a camera on a link starts at this link; the masks show the robot's static base, or
+    the target. Without a link, the tree starts in the world.
+
+    target: None: the masks show the robot.
+
+    Raises SettingsError: no part that masks show stands still, or no joint moves the link.
     """
     if target is not None:
         return target.tree(np.eye(4)), (TARGET,)
@@ -458,7 +482,7 @@ def make_registration_tree(
 def _select_parameters(
     model: ArticulatedModel, kinematics: TreeKinematics, settings: RegistrationSettings
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the joints and links whose offsets and scales are to be estimated."""
+    """Return the names of the joints with offsets, and of the links with scales, to estimate."""
     joints, links = settings.zeros, settings.lengths
     if ALL in joints:
         free = np.flatnonzero(kinematics.lower < kinematics.upper)
@@ -477,12 +501,14 @@ def _select_parameters(
 def _read_frames(
     inputs: RegistrationInputs, wanted: Sequence[str], most: int = 12
 ) -> tuple[MultiViewFrame, ...]:
-    """Read the searched cameras' frames, with the known cameras' masks of the same frames.
+    """Return the searched cameras' frames, with the known cameras' masks of the same frames.
 
     With estimated positions at most `most` frames are used: the model's errors are the same in all
-    of them, so more frames add little.
+    of them, so more frames add little. Empty masks are left out.
 
-    Raises MaskError: a searched camera's mask is bad.
+    wanted: names of the frames to read; empty: all.
+
+    Raises DrakePoseError: a searched camera's mask is bad, or no usable frame shows the body.
     """
     scene, positions = inputs.scene, inputs.positions
     names, estimated = [one.name for one in inputs.searched_cameras], positions.is_estimate

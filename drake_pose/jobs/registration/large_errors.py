@@ -46,13 +46,14 @@ class SceneFit:
 
     Args:
         cameras: the corrected cameras.
-        corrections: the corrections, in order.
-        fit: the fit of single frames.
+        corrections: the corrections, in the order in which they are applied; () for none.
+        fit: fits single frames with these cameras.
         fits: the fitted frames, those with a mask that is not empty.
-        mask_areas: by camera and frame, excess and lack of the mask, see ``mask_excess_and_lack``.
+        mask_areas: by camera and frame name, excess and lack of the mask over its area, see
+            ``mask_excess_and_lack``.
         empty_frames: names of frames whose masks are all empty.
         found: the diagnosis of the fitted frames.
-        findings: the corrections as findings.
+        findings: the corrections as findings; () in a final result, whose diagnosis has them.
         warnings: for the user.
     """
 
@@ -67,17 +68,17 @@ class SceneFit:
     warnings: tuple[str, ...] = ()
 
     def corrected(self, frame: MultiViewFrame) -> MultiViewFrame:
-        """Return a frame with all corrections."""
+        """Return a frame of the given scene with all corrections applied."""
         return apply_corrections(self.corrections, frame)
 
     def joint_off(self, name: str) -> Finding | None:
-        """Return a joint's finding if its offset is so large that fits should restart from it."""
+        """Return a joint's finding if fits should restart from its large offset, else None."""
         off = [one for one in self.found.common if (one.kind, one.name) == ("joint", name)]
         return next((one for one in off if abs(one.angle) > np.radians(LARGE.restart_angle)), None)
 
     @property
     def focal_off(self) -> Finding | None:
-        """The same for focal lengths."""
+        """The finding of a focal length from which fits should restart; None: there is none."""
         off = [one for one in self.found.common if one.kind == "focal"]
         return next((one for one in off if abs(one.shift) > LARGE.restart_focal), None)
 
@@ -102,8 +103,9 @@ class SceneComparison:
 
     Args:
         inputs: the scene.
-        on_frame: called with the number of frames that are done.
-        sample_size: number of frames for the silhouettes' size, and for the search of errors.
+        on_frame: called with the number of frames that are done in the first comparison.
+        sample_size: maximum number of frames, evenly spaced, for the silhouettes' size and for the
+            search of errors.
     """
 
     def __init__(
@@ -149,7 +151,7 @@ class SceneComparison:
         return self._finish(given if now.is_doubtful else now)
 
     def _correct(self, now: SceneFit, most: int) -> SceneFit:
-        """Return the fit with as many large errors corrected as are found, at most `most`."""
+        """Return the fit `now` with large errors corrected, at most `most`, and recorded."""
         for _ in range(most):
             correction = self._find_correction(now)
             if correction is None:
@@ -174,7 +176,10 @@ class SceneComparison:
         return now
 
     def _finish(self, now: SceneFit) -> SceneFit:
-        """Return the fit with findings of corrections, links, motions and masks added."""
+        """Return the fit with all findings in its diagnosis, and warnings of masks.
+
+        Added are findings of corrections, of misplaced links, and of moved cameras or bases.
+        """
         found = now.found
         remaining = {(one.kind, one.name): one for one in found.common}
         findings = [
@@ -220,10 +225,13 @@ class SceneComparison:
         A motion is found if the first or the last ones of the frames of the same cameras are
         outliers, and agree with each other except for the pose of a camera or the base.
 
-        least: minimum number of frames before and after.
+        Args:
+            now: the scene's fit.
+            found: its diagnosis, with the findings that are known so far.
+            least: minimum number of frames before and after.
 
         Returns:
-            the motions, and the diagnosis with them as the outliers' findings.
+            the motions, of kind "moved"; and the diagnosis with them as the outliers' findings.
         """
         moved, explained = list[Finding](), dict[str, Finding]()
         for cameras in dict.fromkeys(tuple(one.given_ratios) for one in found.frames):
@@ -260,7 +268,13 @@ class SceneComparison:
     ) -> dict[str, tuple[RegisteredCamera, Finding]]:
         """Register cameras from frames, and return those that differ from their given poses.
 
-        least: minimum number of frames of each camera.
+        Args:
+            frames: with masks of the cameras.
+            cameras: at their given poses.
+            least: minimum number of frames of each camera; others are left out.
+
+        Returns:
+            by name the registered camera, and a finding of its difference from the given pose.
         """
         search, placed = CameraSearch(self.body), dict[str, tuple[RegisteredCamera, Finding]]()
         for camera in cameras:
@@ -284,7 +298,7 @@ class SceneComparison:
     def _mask_warnings(
         self, now: SceneFit, more: float = 0.08, more_in_one: float = 0.15, less: float = 0.25
     ) -> list[str]:
-        """Warn of masks that show more or less than the robot in inlier frames.
+        """Return warnings of masks that show more or less than the robot in inlier frames.
 
         Args:
             more, more_in_one, less: minimum fractions of the mask's area, for excess in half of the
@@ -316,7 +330,10 @@ class SceneComparison:
         return texts
 
     def _compare(self, cameras: Sequence[Camera], corrections: tuple[Correction, ...]) -> SceneFit:
-        """Fit and diagnose all frames with corrections."""
+        """Return all frames fitted and diagnosed with corrections.
+
+        cameras: the corrected cameras. Raises MaskError: no mask shows the body.
+        """
         inputs, fitted, empty = self._inputs, list[FrameFit](), list[str]()
         if not self._sample:
             raise MaskError(
@@ -348,7 +365,7 @@ class SceneComparison:
         )
 
     def _find_correction(self, now: SceneFit) -> Correction | None:
-        """Return the correction of a large error; None: nothing is doubtful, or none is found."""
+        """Return a correction to add to the fit's; None: nothing is doubtful, or none is found."""
         sample = [now.corrected(one) for one in self._sample]
         if now.is_doubtful:
             of_scene = not now.corrections
@@ -376,7 +393,10 @@ class SceneComparison:
         return focal_correction(now.cameras, group, lens.name, 1.0 + lens.shift)
 
     def _search_cameras(self, now: SceneFit) -> SceneFit | None:
-        """Return the fit with registered cameras, where they differ; None: none does."""
+        """Return the fit with cameras registered where they differ from their poses, as findings.
+
+        None: none differs, or the cameras were registered from pictures before.
+        """
         if self._inputs.recordings:
             return None
         placed = self._register([now.corrected(one) for one in self._sample], now.cameras)
@@ -395,7 +415,14 @@ class SceneComparison:
         scene: bool = True,
         likely: Collection[str] = (),
     ) -> Correction | None:
-        """Search a large error of the scene, or of some joints; see ``LargeErrorSearch.find``."""
+        """Return the correction found by ``LargeErrorSearch.find``, or None.
+
+        Args:
+            cameras: the cameras as corrected so far.
+            joints, left, likely: as its `joints`, `max_remaining` and `likely`.
+            sample: frames as corrected so far; None: those given.
+            scene: whether ``scene_corrections`` are tried, too; never with pictures.
+        """
         inputs = self._inputs
         corrections = list[Correction]()
         if scene and not inputs.recordings:
@@ -407,7 +434,14 @@ class SceneComparison:
     def _record(
         self, before: SceneFit, now: SceneFit, correction: Correction, fitted: Finding | None = None
     ) -> SceneFit:
-        """Return a fit with a correction recorded as a finding; fitted: an estimate by fits."""
+        """Return the fit `now` with its last correction recorded as a finding, or as a warning.
+
+        Args:
+            before: the fit without the correction.
+            now: the fit with it.
+            fitted: the finding of fits of frames that the correction restarts from; None: it was
+                searched.
+        """
         kind, name = _KINDS.get(correction.kind, correction.kind), correction.name
         warnings = before.warnings
         off = Finding(kind, name, 0.0, 0.0, 0.0, 0.0, self._pixels(before, now), 0.0)
@@ -444,7 +478,12 @@ class SceneComparison:
         return bool(kinematics.is_angle[kinematics.names.index(joint)])
 
     def _differing(self, off: Finding, before: SceneFit, correction: Correction) -> Finding:
-        """Return a finding with a joint's largest difference from its log, and all in words."""
+        """Return finding `off` with a joint's largest difference from its log, and all in words.
+
+        Args:
+            before: the fit without the correction.
+            correction: of kind "sign" or "log".
+        """
         j = self.body.kinematics.names.index(correction.name)
         frames = [before.corrected(one) for one in self._sample]
         logged = np.array([one.values[j] for one in frames])
@@ -463,7 +502,7 @@ class SceneComparison:
         return replace(off, link=self._link(correction.name), text=text, angle=angle, shift=shift)
 
     def _link(self, joint: str) -> str:
-        """Return the first link that a joint moves."""
+        """Return the name of the first link that a joint moves; "" if it moves none."""
         tree, kinematics = self.body.tree, self.body.kinematics
         values = kinematics.flatten(tree.default_values())
         moved = values.copy()
@@ -489,7 +528,7 @@ class SceneComparison:
 
 
 def _add_remaining(one: Finding, rest: Finding | None) -> Finding:
-    """Return a searched finding plus the remaining error that fits found."""
+    """Return a correction's finding plus the error that fits found after it; None: no error."""
     if rest is None:
         return one
     shift = one.shift + rest.shift
@@ -505,8 +544,11 @@ def changed_after(found: Diagnosis, cameras: Collection[str], least: int) -> tup
 
     Args:
         found: the diagnosis.
-        cameras: only frames of these cameras are used.
+        cameras: names; only frames with masks of exactly these cameras are used.
         least: minimum number of frames before and after; with fewer there is no change.
+
+    Returns:
+        the outliers' indices in ``found.frames``, and a frame's name. ([], ""): no change.
     """
     own = [k for k, one in enumerate(found.frames) if {*one.given_ratios} == {*cameras}]
     wrong = [found.frames[k].finding is not None for k in own]
@@ -519,11 +561,11 @@ def changed_after(found: Diagnosis, cameras: Collection[str], least: int) -> tup
 def base_motion(
     given: Mapping[str, Camera], placed: Mapping[str, RegisteredCamera], sds: float = 4.0
 ) -> Finding | None:
-    """Return the motion of the base that several cameras agree on; None: they differ.
+    """Return the motion of the base that cameras agree on; None: they differ, or there is one.
 
     Args:
-        given: the cameras at their given poses.
-        placed: the registered cameras.
+        given: by name the cameras at their given poses.
+        placed: by name the registered cameras, some of these.
         sds: maximum difference of motions in standard deviations, plus 0.25 degrees and 3 mm.
     """
     motions = [given[name].X_WC @ one.camera.X_CW for name, one in placed.items()]

@@ -34,10 +34,10 @@ class KnownPositions:
     Args:
         path: the table, or the scene they were estimated from.
         kinematics: of the pose tree.
-        values: (m,) values of the pose tree by ``frame_key`` [rad or m].
+        values: (m,) values of the pose tree by ``frame_key``, a frame's number or name [rad or m].
         is_estimate: whether they were estimated from pictures.
         warnings: for the user.
-        radius_scales: (nodes,) estimated factors of the nodes' radii.
+        radius_scales: (nodes,) estimated factors of the nodes' radii; None: not estimated.
     """
 
     path: Path
@@ -52,7 +52,9 @@ class KnownPositions:
         return frame_key(frame) in self.values
 
     def of(self, frame: str, camera: str) -> Array:
-        """Return the values (m,) of the pose tree in a frame of a camera [rad or m].
+        """Return the values (m,) of the pose tree in a frame, by its name [rad or m].
+
+        camera: name of a camera with a mask of the frame, for the message.
 
         Raises SceneError: the table has no row of the frame.
         """
@@ -64,7 +66,7 @@ class KnownPositions:
         return self.values[frame_key(frame)]
 
     def are_one_pose(self, rows: Iterable[Array], times: float = 1.0) -> bool:
-        """Return whether positions in rows (m,) differ by less than `times` a degree or 5 mm."""
+        """Return whether all values (m,) in rows differ by less than `times` a degree or 5 mm."""
         same = times * np.where(self.kinematics.is_angle, math.radians(1.0), 0.005)
         return bool((np.ptp(np.array(list(rows)), axis=0) < same).all())
 
@@ -72,7 +74,11 @@ class KnownPositions:
 def put_on_base(
     model: ArticulatedModel, table: MeasuredPositions
 ) -> tuple[ArticulatedModel, MeasuredPositions]:
-    """Return a model on BASE_JOINTS, and a table with their positions from its base poses.
+    """Return a model whose base moves on BASE_JOINTS, and a table with positions of these joints.
+
+    They are 0 at the base pose of the table's first frame.
+
+    table: with base poses.
 
     Raises ModelError: the model is no URDF.
     """
@@ -95,13 +101,13 @@ def read_known_positions(
     unobserved: bool = False,
     table: MeasuredPositions | None = None,
 ) -> KnownPositions:
-    """Read a table with a column for the frame and one for each joint that is not held.
+    """Return the positions in a table with columns for the frame and each joint that is not held.
 
     Args:
         path: the table (CSV).
-        kinematics: of the pose tree.
+        kinematics: of the pose tree; its held values are added.
         unobserved: whether columns of joints that move no visible part are allowed.
-        table: the table's contents, if it has been read before.
+        table: the table's contents, if it has been read before; None: it is read.
 
     Raises:
         SceneError: the table cannot be read, lacks a joint, has an unusable column, or is not in
@@ -151,7 +157,15 @@ def estimate_positions(
     known: Sequence[Camera],
     settings: EstimateSettings,
 ) -> KnownPositions:
-    """Estimate the joint positions of the frames from cameras with known poses.
+    """Return joint positions estimated from the masks of cameras with known poses.
+
+    Frames without an estimate are left out.
+
+    Args:
+        scene_path: the scene of masks.
+        kinematics: of the pose tree of `model`.
+        known: the cameras with known poses.
+        settings: of the estimate, which select frames; its cameras are set here.
 
     Raises:
         SceneError: there are too few such cameras, or they see the body in no frame.

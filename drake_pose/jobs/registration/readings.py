@@ -36,12 +36,12 @@ def scene_corrections(
         2.0,
     ),
 ) -> Iterator[Correction]:
-    """Yield corrections of mistakes that users make.
+    """Yield corrections of mistakes that users make, each to be tried by itself.
 
     Args:
         cameras: the cameras at their given poses.
-        values: (m,) joint positions of each frame.
-        frames: names of the frames.
+        values: for each frame (m,) values of the pose tree [rad or m].
+        frames: names of the frames, in order.
         pairs: maximum number of camera pairs that are exchanged.
         factors: factors of focal lengths.
     """
@@ -79,7 +79,13 @@ def scene_corrections(
 def focal_correction(
     cameras: Sequence[Camera], group: Collection[str], text: str, factor: float
 ) -> Correction:
-    """Return focal lengths of a group's cameras, of all if it is empty, times a factor."""
+    """Return a correction that multiplies focal lengths by a factor.
+
+    Args:
+        cameras: all cameras.
+        group: names of the cameras that are corrected; empty: all. Parallel ones stay.
+        text: the correction's name.
+    """
     changed = [
         replace(one, focal_x=factor * one.focal_x, focal_y=factor * one.focal_y)
         if isinstance(one, PinholeCamera) and (not group or one.name in group)
@@ -90,13 +96,13 @@ def focal_correction(
 
 
 def _groups(cameras: Sequence[Camera]) -> list[tuple[str, ...]]:
-    """Return the names of all cameras together, and of each."""
+    """Return groups of cameras' names: all together first, then each if there are several."""
     names = tuple(one.name for one in cameras)
     return [names, *((name,) for name in names if len(names) > 1)]
 
 
 def _mirrored(group: Collection[str]) -> Callable[[MultiViewFrame], MultiViewFrame]:
-    """Return a function that mirrors the masks of a group's cameras left to right."""
+    """Return a function that mirrors a frame's masks of the named cameras left to right."""
 
     def change(frame: MultiViewFrame) -> MultiViewFrame:
         masks = {
@@ -109,12 +115,12 @@ def _mirrored(group: Collection[str]) -> Callable[[MultiViewFrame], MultiViewFra
 
 
 def _with_row(rows: Mapping[str, Array], frame: MultiViewFrame) -> MultiViewFrame:
-    """Return a frame with the joint positions of another row."""
+    """Return a frame with other values of the pose tree; rows: (m,) by the frame's name."""
     return replace(frame, values=rows[frame.name])
 
 
 def _conventions() -> Iterator[tuple[str, Callable[[Array], Array]]]:
-    """Yield other meanings of a camera's pose: words, and a function that returns X_WC (4, 4)."""
+    """Yield other meanings of a camera's given X_WC (4, 4): words, and a conversion to X_WC."""
     axes = {
         "": np.eye(3),
         "that of ROS' camera_link (x forward, y left, z up)":

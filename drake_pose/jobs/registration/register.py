@@ -168,9 +168,10 @@ class _Registration:
     Attributes:
         inputs, body: updated after each step.
         warnings: for the user.
-        registered, seconds, suggestions: results by camera.
+        registered, seconds, suggestions: by camera the result, the duration [s], and an entry on
+            joint positions that would distinguish alternative poses (None: none).
         parameters: the summary's part on joint offsets and link scales.
-        pictures: registrations from pictures, by camera.
+        pictures: registrations from pictures, by camera; empty for masks, and for a target.
         target_pictures: by camera and frame, pictures in which the target was found.
     """
 
@@ -287,7 +288,14 @@ class _Registration:
             self._on_camera(len(self.registered))
 
     def _find_target(self, target: CalibrationTarget, most: int = 24) -> None:
-        """Find the target in some pictures of each camera, and register the cameras from these."""
+        """Find the target in some pictures of each camera, and register the cameras from these.
+
+        most: maximum number of pictures of each camera.
+
+        Raises:
+            CameraError: a camera's focal length is unknown.
+            RegistrationError: the target is found in too few pictures, or no pose explains them.
+        """
         inputs, frames, start = self.inputs, list[MultiViewFrame](), time.perf_counter()
         body = target.body(np.eye(4))
         for camera in inputs.searched_cameras:
@@ -368,7 +376,7 @@ class _Registration:
         )
 
     def describe(self, more: float) -> dict[str, dict[str, Any]]:
-        """Return the cameras' parts of the summary; more: further seconds for each camera."""
+        """Return by camera its part of summary.json; more: duration added to each camera's [s]."""
         on, suggestions = self._settings.on, self.suggestions
         return {
             name: self.parameters
@@ -409,9 +417,11 @@ class _Registration:
     def fit_constants(self, folder: Path | None) -> bytes | None:
         """Fit joint offsets, link scales and focal lengths together with the cameras.
 
+        folder: the result folder, which the URDF's mesh paths will be relative to.
+
         Returns:
-            the corrected URDF for a result folder; None if no parameter is significant, or the
-            model is no URDF.
+            the text of a URDF with the significant parameters; None if there are none, no folder,
+            or the model is no URDF.
 
         Raises:
             RegistrationError: there are fewer frames than parameters.
@@ -471,7 +481,10 @@ class _Registration:
         return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
 
     def _offsets_in_pictures(self) -> dict[str, float]:
-        """Return the mean joint offsets from registrations in pictures, by name [rad or m]."""
+        """Return the mean joint offsets from registrations in pictures, by name [rad or m].
+
+        Without pictures the mapping is empty.
+        """
         if not self.pictures:
             return {}
         found = np.mean([one.joint_offsets for one in self.pictures.values()], axis=0)
@@ -484,7 +497,14 @@ class _Registration:
         covariance: Array,
         target_pose: TargetPose | None = None,
     ) -> None:
-        """Update a camera's pose, and its frames' misfits; inliers stay as they are."""
+        """Store a registered camera's new pose, and its frames' areas; inliers stay as they are.
+
+        Args:
+            kinematics: of the corrected pose tree.
+            camera: the camera at its new pose.
+            covariance: (6, 6) of this pose.
+            target_pose: the calibration target's new pose; None: there is no target.
+        """
         before = self.registered[camera.name]
         frames = PosedFrames(kinematics, self.body.full, camera, self.inputs.of(camera.name))
         found = overlap_areas(frames, camera.X_CW[None], np.inf)[0]
@@ -496,7 +516,10 @@ class _Registration:
 
 
 def joint_shifts(tree: PoseTree, scales: Sequence[KinematicParameter]) -> dict[str, list[float]]:
-    """Return the shifts (3,) of the joints that scaled links carry, by joint [m]."""
+    """Return by joint the shift (3,) of its origin in its parent link's frame [m].
+
+    scales: of links; only joints that links with another scale than 1 carry are shifted.
+    """
     longer = {one.name: one.value for one in scales if one.value}
     offsets = carried_joints(tree, longer)
     return {one.joint: (longer[one.link] * one.p_L).tolist() for one in offsets}

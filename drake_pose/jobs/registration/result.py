@@ -49,7 +49,7 @@ def describe_camera(
     Args:
         found: the camera.
         seconds: duration of the search [s].
-        suggestion: joint positions that would distinguish alternative poses.
+        suggestion: entry on joint positions that would distinguish alternative poses; None: none.
         link: the link that carries the camera, in whose frame its pose is; None: the world.
     """
     pose, target_pose, X = "X_WC" if link is None else "X_LC", found.target, found.camera.X_WC
@@ -86,7 +86,7 @@ def describe_camera(
 
 
 def describe_pose(name: str, X: Array, found: RegisteredCamera | TargetPose) -> dict[str, Any]:
-    """Return a pose X (4, 4) by its name, with its standard deviations."""
+    """Return a pose X (4, 4) under its name, with the standard deviations [mm, deg] of `found`."""
     return {
         name: X.tolist(),
         "translation_sd_mm": 1e3 * found.translation_sd,
@@ -95,9 +95,11 @@ def describe_pose(name: str, X: Array, found: RegisteredCamera | TargetPose) -> 
 
 
 def describe_pictures(one: PictureRegistration | None, found: bool = False) -> dict[str, Any]:
-    """Return a camera's part of summary.json on pictures; None: it was registered from masks.
+    """Return a camera's part of summary.json on its masks and clock.
 
-    found: whether the masks were segmented from pictures.
+    Args:
+        one: the registration from pictures; None: it was registered from masks.
+        found: whether, with None, the masks were segmented from pictures.
     """
     if one is None:
         masks = "found" if found else "given"
@@ -120,7 +122,10 @@ def describe_pictures(one: PictureRegistration | None, found: bool = False) -> d
 
 
 def picture_warnings(one: PictureRegistration, assumed: bool) -> list[str]:
-    """Warn of an assumed focal length, a drifting clock and an unknown time offset."""
+    """Return warnings of an unknown focal length, a drifting clock and an unknown time offset.
+
+    assumed: whether the focal length was not given.
+    """
     name, texts = one.found.camera.name, []
     if assumed:
         texts.append(
@@ -142,7 +147,13 @@ def picture_warnings(one: PictureRegistration, assumed: bool) -> list[str]:
 def describe_parameters(
     found: JointCalibration, kinematics: TreeKinematics
 ) -> dict[str, dict[str, Any]]:
-    """Return offsets [deg or mm] and scales [%] by name; None if they are not determined."""
+    """Return the summary's parts "zeros" on joint offsets and "lengths" on link scales.
+
+    Each has an entry by joint or link: whether it is determined and significant; value, standard
+    deviation and 95 % interval [deg, mm or %], None if not determined; and correlated unknowns.
+
+    kinematics: of the pose tree, which has the joints' kinds.
+    """
 
     def describe(one: KinematicParameter, unit: str, factor: float) -> dict[str, Any]:
         numbers = {"value": one.value, "sd": one.deviation, "low": one.low, "high": one.high}
@@ -164,7 +175,7 @@ def describe_parameters(
 def describe_run(
     inputs: RegistrationInputs, settings: AuditSettings, warnings: Sequence[str], seconds: float
 ) -> dict[str, Any]:
-    """Return the part of summary.json on a run's files, settings and versions."""
+    """Return the part of summary.json on a run's files, settings, versions and duration [s]."""
     joints = inputs.joints
     job = describe_job(inputs.scene.path, inputs.model.path, settings, inputs.cameras)
     job["sha256"]["joints"] = joints and file_digest(joints)
@@ -193,13 +204,14 @@ def write_result(
     Args:
         path: the folder.
         inputs: with the final positions of the frames.
-        cameras: cameras for the camera file.
-        registered: the registered cameras.
+        cameras: cameras for the camera file, by name.
+        registered: the registered cameras, by name; each has one misfit for each of its frames.
         summary: contents of summary.json.
         overlay: whether overlays are drawn.
-        urdf: the robot with estimated joint offsets and link scales.
+        urdf: text of the robot with estimated joint offsets and link scales; None: no such file.
         pictures: by camera and frame, of cameras registered from pictures. Their masks and joint
-            positions are written, so that the folder is a scene of masks.
+            positions are written, so that the folder is a scene of masks. Empty or None: masks were
+            given.
 
     Raises:
         OutputError: the folder cannot be written.
@@ -265,7 +277,13 @@ def write_overlays(
 ) -> None:
     """Draw the robot over each mask of a camera, or over its picture, below a title.
 
-    visible_nodes: names of the nodes that are drawn; None: all. pictures: by frame.
+    Args:
+        folder: the result folder.
+        tree: the robot's pose tree, with the frames' values.
+        camera: the camera at the pose from which the robot is drawn.
+        titled: frames of the camera with their titles.
+        visible_nodes: names of the nodes that are drawn; None: all.
+        pictures: (H, W, 3) by frame; for other frames the mask is shown.
     """
     draw = body_drawer(tree, visible_nodes)
     for frame, title in titled:
@@ -283,7 +301,17 @@ def write_comparisons(
     found: RegisteredCamera,
     pictures: Mapping[str, Picture],
 ) -> None:
-    """Draw the robot as seen by a camera at its given pose, and at its registered pose."""
+    """Draw the robot as seen by a camera at its given pose, and at its registered pose.
+
+    Only the frames of `compared_frames` are drawn, over their pictures, or else their masks.
+
+    Args:
+        folder: the result folder.
+        inputs: give the robot's pose tree.
+        frames: of this camera.
+        given, found: the camera at its given pose, and as registered.
+        pictures: (H, W, 3) by frame.
+    """
     draw = body_drawer(inputs.tree, inputs.visible_nodes)
     errors = {one.frame: one.E_total for one in found.frames}
     for frame in (one for one in frames if one.name in compared_frames(errors)):
@@ -297,9 +325,10 @@ def write_comparisons(
 def body_drawer(
     tree: PoseTree, visible_nodes: Collection[str] | None
 ) -> Callable[[Camera, PosedFrame], NDArray[np.intp]]:
-    """Return a function that draws a frame as the visible node's index (H, W) of each pixel or -1.
+    """Return a function that draws the body, from a camera and a frame with its values.
 
-    Indices count the drawn nodes: those in `visible_nodes`, or all.
+    The drawing (H, W) holds for each pixel the index of the node that it shows, or -1. Indices
+    count the drawn nodes: those named in `visible_nodes`; None: all.
     """
     kinematics, names = TreeKinematics(tree), visible_nodes
     shown = [k for k, node in enumerate(tree.nodes) if names is None or node.name in names]
@@ -329,9 +358,11 @@ _NORMAL = 1.96
 
 
 def parameter_rows(parameters: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    """Return rows of a table of joint offsets or link scales, from a camera's part of summary.json.
+    """Return rows of the report's table of joint offsets or link scales.
 
-    Each has the name, the value with its unit, the 95 % interval, and its significance in words.
+    parameters: entries by joint or link, see `describe_parameters`.
+
+    A row has the name, the value with its unit, the 95 % interval, and its significance in words.
     """
     rows: list[tuple[str, ...]] = []
     for name, one in parameters.items():
@@ -353,7 +384,10 @@ def parameter_rows(parameters: Mapping[str, Mapping[str, Any]]) -> list[tuple[st
 
 
 def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
-    """Return the page report.html, with the overlays in the result folder."""
+    """Return the text of report.html, with the overlays that lie in the result folder.
+
+    summary: content of summary.json.
+    """
     # The robot's parameters are the same in the parts of all cameras.
     first = next(iter(summary["cameras"].values()))
     pictures, pairs = [], []
@@ -394,7 +428,7 @@ def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
 
 
 def registration_answer(cameras: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the result in a few sentences, of the parts of summary.json by camera."""
+    """Return the result in a few sentences; cameras: the parts of summary.json by camera."""
     parts = list(cameras.values())
     shift, turn = (
         max(one[key] for one in parts) for key in ("translation_sd_mm", "rotation_sd_deg")
@@ -417,7 +451,10 @@ def registration_answer(cameras: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def compared_frames(errors: Mapping[str, float]) -> Sequence[str]:
-    """Return the frames whose pictures compare camera poses: the worst and the median one."""
+    """Return the frames that are drawn to compare camera poses: the worst, and the median one.
+
+    errors: E_total by frame; at least one.
+    """
     in_order = sorted(errors, key=lambda frame: -errors[frame])
     return tuple(dict.fromkeys([in_order[0], in_order[len(in_order) // 2]]))
 
@@ -426,6 +463,8 @@ def plot_offset(camera: Mapping[str, Any]) -> Figure | None:
     """Plot the scores of scanned time offsets; None: there are none.
 
     A vertical line marks the estimated offset, in its 95 % interval.
+
+    camera: its part of summary.json.
     """
     tried = np.array(camera.get("time_offset_scores") or ()).reshape(-1, 2)
     if len(tried) < 2:
@@ -442,6 +481,8 @@ def plot_offset(camera: Mapping[str, Any]) -> Figure | None:
 
 def check_exports(formats: Collection[str], cameras: Iterable[Camera]) -> None:
     """Refuse exports that could not be written, before any work.
+
+    formats: some of "ros", "mujoco", "drake" and "rerun".
 
     Raises:
         CameraError: a format does not support a camera.
@@ -467,7 +508,7 @@ def write_exports(
         formats: some of `ros`, `mujoco`, `drake` and `rerun`.
         inputs: the registration's inputs.
         cameras: cameras with poses in the world, or in the frames of links.
-        links: the link that carries a camera, by camera name.
+        links: by name of each camera on a link, the link; in its frame is the camera's pose.
         pictures: by camera and frame, for `rerun`.
 
     Raises:
@@ -491,7 +532,12 @@ def write_exports(
 def _texts(
     formats: Collection[str], cameras: list[Camera], world: str, links: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return file contents by file name; world: name of the frame of cameras on no link."""
+    """Return texts of exports by path in the result folder; those for rerun are no text.
+
+    Args:
+        world: name of the frame of cameras on no link.
+        links: the link of each other camera, by the camera's name.
+    """
     texts: dict[str, str] = {}
     if "ros" in formats:
         texts |= {f"ros/{camera.name}.yaml": ros_camera_info(camera) for camera in cameras}

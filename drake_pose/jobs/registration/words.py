@@ -10,7 +10,10 @@ from drake_pose.registration.findings import Finding, FrameDiagnosis
 
 
 def shift_unit(kind: str) -> tuple[str, float]:
-    """Return the unit of a finding's shift in reports, and its factor from m."""
+    """Return the unit of the shift of a finding of a kind in reports, and its factor.
+
+    The factor multiplies ``Finding.shift``, which is in m, s, pixels, or relative.
+    """
     units = {"focal": ("percent", 100.0), "center": ("px", 1.0), "clock": ("ms", 1e3)}
     return (units | {"rate": ("percent", 100.0)}).get(kind, ("mm", 1e3))
 
@@ -18,7 +21,9 @@ def shift_unit(kind: str) -> tuple[str, float]:
 def describe_error(one: Finding, verb: str = "off") -> str:
     """Return in words what is wrong, by how much, with standard deviations, and alternatives.
 
-    verb: `off` or `is off`; joints "read", focal lengths "are", too much.
+    one: of kind "joint", "camera", "base", "focal", "center", "clock" or "rate".
+    verb: "off" or "is off", before the amount of a camera, the base or a principal point; other
+        kinds have their own verbs.
     """
     if one.kind == "clock":
         word = "later" if one.shift > 0.0 else "earlier"
@@ -53,7 +58,7 @@ def describe_error(one: Finding, verb: str = "off") -> str:
 
 
 def describe_common_finding(one: Finding) -> str:
-    """Return an error common to all inlier frames in words."""
+    """Return a finding common to all inlier frames in words, without a full stop."""
     pixels = f", which moves outlines by {one.pixels:.1f} pixels" if one.pixels else ""
     link = f"link '{one.link}' is not where the log says"
     if one.kind == "sign":
@@ -75,7 +80,7 @@ def describe_common_finding(one: Finding) -> str:
 
 
 def describe_frame_finding(one: FrameDiagnosis, found: Finding) -> str:
-    """Return the error of an outlier frame in words."""
+    """Return the error of an outlier frame in words; found: the frame's finding."""
     pixels = f"which moves outlines by {found.pixels:.1f} pixels"
     if found.kind == "unexplained":
         worst = min(one.fitted_ratios, key=lambda name: one.fitted_ratios[name])
@@ -100,8 +105,8 @@ def describe_reading(value: float, deviation: float, unit: str) -> str:
     """Return in words that a joint's encoder reads too high or too low.
 
     Args:
-        value, deviation: what must be added to its readings, and its standard deviation.
-        unit: `deg` or `mm`.
+        value, deviation: what must be added to its readings, and its standard deviation [unit].
+        unit: "deg" or "mm".
     """
     word, digits = "low" if value > 0.0 else "high", 2 if unit == "deg" else 1
     size = f"{abs(value):.{digits}f} +- {deviation:.{digits}f}"
@@ -109,7 +114,12 @@ def describe_reading(value: float, deviation: float, unit: str) -> str:
 
 
 def describe_drift(camera: str, drift: float, deviation: float) -> str:
-    """Return in words how much faster the joint log's clock runs than a camera's [s/s]."""
+    """Return in words that the joint log's clock runs faster or slower than a camera's.
+
+    Args:
+        camera: its name.
+        drift, deviation: how much faster, and its standard deviation [s/s].
+    """
     word = "faster" if drift > 0.0 else "slower"
     return (
         f"camera '{camera}': the joint log's clock runs {100.0 * abs(drift):.2f} +- "

@@ -384,7 +384,7 @@ class _BeamRun:
     def _search_limbs_again(
         self, store: PoseStore, order: Sequence[int], poses: np.ndarray, J: float
     ) -> np.ndarray:
-        """Search single limbs and pairs of limbs again until J does not decrease any further.
+        """Search single limbs and pairs of limbs again until J does not decrease or time is up.
 
         Limbs are the largest subtrees without a fork that are not the whole tree; for a chain, its
         outer half.

@@ -86,7 +86,9 @@ def fill_cover(
     Args:
         cover: (levels, rows, columns, words) uint64 zeros, written in place.
         points: (n, 2) row and column of the points [pixel].
-        origin, cell, radii: as in ``CoarseView``.
+        origin: (2,) row and column of the corner of the first cell [pixel].
+        cell: side of the cells [pixel].
+        radii: (levels,) radii within which points are covered [pixel].
     """
     for level in range(cover.shape[0]):
         limit = radii[level] ** 2
@@ -419,8 +421,9 @@ class CoarseSearch:
         Args:
             poses: the poses, best first.
             count: greatest number of poses that are returned.
-            apart: poses differ if, in some view, the projection of some ball is farther than this
-                in u or v from that in the other pose [square root of the silhouettes' mean area].
+            apart: poses differ if, in some view, a node's first ball or the mean of its balls is
+                projected farther than this in u or v from its place in the other pose [square root
+                of the silhouettes' mean area].
         """
         marks = [
             np.vstack([p_NB.mean(axis=0), p_NB[0]]) @ np.swapaxes(X[:, :3, :3], 1, 2)

@@ -463,7 +463,7 @@ def without_specks(mask: np.ndarray, largest: int = 6, least: float = 0.02) -> n
     """Remove salt-and-pepper noise from a mask by a median filter.
 
     The median over 5 x 5 pixels also removes structures thinner than three pixels, so masks with
-    few specks are returned unchanged. A mask that the filter would empty is, too.
+    few specks are returned unchanged. So is a mask that the filter would empty.
 
     Args:
         mask: (H, W) bool; a filtered mask is a copy.

@@ -295,7 +295,11 @@ class PoseAndMask:
         return np.clip(drawn, self._kinematics.lower, self._kinematics.upper)
 
     def _probabilities(self, level: PictureLevel, frame: _Progress) -> list[Floats]:
-        """Return for each camera (H, W) a frame's foreground probability at a pyramid level."""
+        """Return for each camera (H, W) a frame's foreground probability at a pyramid level.
+
+        It is the fraction of random poses, spread by the frame's error, whose silhouettes cover a
+        pixel, blurred by the error of the surface and clipped to ``settings.probabilities``.
+        """
         spread, found, count = frame.error * self._spread, [], self._settings.samples
         poses = self._sample(frame.rng, frame.values, spread, count)
         for camera in level.cameras:

@@ -100,7 +100,8 @@ def choose_root_samples(
     """Choose the rotations of the root node whose projection fits best at each position.
 
     In one view the projection hardly depends on the position in the image, so the root is drawn
-    once for each rotation and shifted by whole pixels. In several views all rotations are chosen.
+    once for each rotation and shifted by whole pixels. In several views, or if there are no more
+    than ``count`` rotations, all are chosen.
 
     Args:
         body: the body, whose root has r samples, its rotations.
@@ -111,7 +112,7 @@ def choose_root_samples(
         farthest: the root is drawn only up to this distance from its origin [pixel].
 
     Returns:
-        (m,) samples as in ``place_body``, in increasing order.
+        (m,) chosen combinations, in increasing order: i is rotation i % r at position i // r.
     """
     rotations = len(body.sampled.X_PN[0])
     if len(views) > 1 or count >= rotations:
@@ -393,8 +394,9 @@ class RootPlacementSearch:
         return best
 
     def _settle(self, start: _PlacedPose, passes: Sequence[Pass], moves: bool) -> _PlacedPose:
-        """Refine a pose by passes, and convert the body's log scale to the camera's scale.
+        """Refine a pose by passes, with the camera's scale if that is unknown.
 
+        The refinement scales the body; the result has the scale in its parallel camera instead.
         ``moves``: whether the root's position is refined, too.
         """
         problem = RefinementProblem(self._refined, start.views)

@@ -212,7 +212,8 @@ class Scoring:
     ) -> None:
         """Remove the projections of k nodes, at samples (k,) and X_WN (k, 4, 4), from regions.
 
-        ``regions`` is changed in place.
+        ``regions``: the uncovered part of the silhouette in each view, changed in place; ``nodes``:
+        indices of the k nodes.
         """
         outlines = self.sampled.outlines_at(nodes, samples)
         for view, X_CW, (mask, prefixes) in zip(self.views, self.X_CW, regions, strict=True):

@@ -36,13 +36,14 @@ def counter_turns(
 ) -> list[np.ndarray]:
     """Return poses (m,) in which two joints with nearly parallel axes turn by opposite angles.
 
-    Poses outside the limits are left out.
+    The joints are of one chain, at most one movable angle apart. Poses outside the limits are left
+    out.
 
     Args:
         kinematics: kinematics of the pose tree, with m values.
         values: (m,) the pose [rad or m].
         interval: the angles are multiples of this, up to a full turn [rad].
-        parallel: least cosine of the angle between the axes.
+        parallel: least absolute cosine of the angle between the axes.
     """
     motions = kinematics.motions(values)
     turns, moves = motions.twists[:, :3], motions.moves

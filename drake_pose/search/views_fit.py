@@ -273,7 +273,7 @@ def describe_modes(
 def covariance_pose_set(
     tree: PoseTree, pose: PoseEstimate, covariance: np.ndarray, image_count: int
 ) -> PoseSet:
-    """Return the pose set of a single pose, with intervals from a covariance.
+    """Return the pose set of a single pose, with 95 % intervals from a covariance.
 
     Args:
         tree: the pose tree, with m values.

@@ -389,7 +389,7 @@ def prune_by_balls(
 ) -> np.ndarray:
     """Return (m,) bool, which pairs to keep: no ball proves that they exceed the limit.
 
-    No pair within the limit is pruned. The balls lie inside the node's surface.
+    No pair within the limit is pruned. The node's projection must contain each ball's.
 
     Args:
         view: one camera's silhouette.

@@ -358,7 +358,7 @@ def divide_outline(
     band: TriangleMesh | None = None,
     bands: np.ndarray | None = None,
 ) -> CelledOutline:
-    """Return a surface with its cells of directions.
+    """Return a surface with the possible contour edges for each cell of viewing directions.
 
     Args:
         outline: the rigid surface, in its node's frame N.

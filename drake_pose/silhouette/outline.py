@@ -548,7 +548,7 @@ class PackedSurfaces:
         return self._rest if self._bands is None else mutable_copy(self.bend_to(values))
 
     def bend_to(self, values: np.ndarray | None) -> PackedOutlines:
-        """As ``at``, in arrays that the thread's next call overwrites.
+        """Return all nodes' surfaces at the tree's values, overwritten by the thread's next call.
 
         ``values``: (m,) [rad or m]; None: leave the bands where this thread's last call put them.
         """

@@ -48,12 +48,14 @@ def score_bodies(
         surfaces: (nodes,) the body's surfaces, one per node, each in its node's frame N.
         X_CN: (n, nodes, 4, 4) poses of the nodes in the camera.
         camera: the camera; the areas are of its image.
-        prefixes: (k, H, W + 1) int32 ``prefix_sums`` of the pixel sets' masks; k may be 0.
-        bands: for each bending surface, (n, v, 3) vertices of its band in its frame N at each pose
-            [m].
+        prefixes: (k, H, W + 1) int32 ``prefix_sums`` of the pixel sets' masks, or of integer
+            weights of the pixels; k may be 0.
+        bands: for each BendingOutline, (n, v, 3) vertices of its band in its frame N at each pose
+            [m]; empty if there is none.
 
     Returns:
-        (n, 1 + k) int64 the body's area inside the image, then its area in each set [pixel].
+        (n, 1 + k) int64 the body's area inside the image, then its area (or the sum of weights) in
+        each set [pixel].
 
     Raises ValueError: poses, bands or sums have the wrong shape or are not finite.
     """

@@ -211,7 +211,7 @@ def foreground_log_ratios(
 
     Returns:
         (H, W) float32 log-likelihood ratio of each chosen picture: 0 where too few pictures show
-        the background, the lower bound at skipped pixels.
+        the background; at skipped pixels the lower bound, or 0 if there are too few pictures.
     """
     relevant = np.max([probabilities[k] for k in indices], axis=0) >= min_probability
     # Exposure gains (n, 3) of the channels, from pixels that are background in all pictures.
@@ -443,7 +443,7 @@ def _filled(region: Mask, max_fraction: float = 0.1) -> Mask:
 
 
 def _upscaled(region: Mask, above: Mask) -> Mask:
-    """Return a region (h, w) at full size (H, W), with its edge set by the threshold there.
+    """Return a region (h, w) at full size (H, W), its edge set by the threshold, holes filled.
 
     ``above``: (H, W) whether the picture's pixels are on the region's side of its threshold.
     """

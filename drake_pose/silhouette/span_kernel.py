@@ -249,10 +249,10 @@ def find_spans(
 
     Args:
         row: index of the row.
-        crossings: (height, capacity) crossings.
-        counts: (height,) number of crossings; the row's entry is set to 0.
+        crossings: (height, capacity) int32 crossings, 8 * pixel + weight + BIAS.
+        counts: (height,) number of crossings of each row; the row's entry is set to 0.
         changes: (width + 1,) zeros, used as scratch.
-        spans: (width + 1, 2) output.
+        spans: (width + 1, 2) output, first columns and columns after the last.
 
     Returns:
         The number of spans.

@@ -97,7 +97,11 @@ def check_upright(cameras: Iterable[Camera], min_component: float = 0.5) -> tupl
 
 
 def leave_out_unreadable(scene: Scene, frames: Iterable[str]) -> Scene:
-    """Return a scene without unreadable masks of frames that other cameras have, too.
+    """Return a scene without unreadable masks of frames of which other cameras' can be read.
+
+    A mask without an object counts as unreadable. The scene gets one warning for each camera.
+
+    ``frames``: names of the frames that are checked.
 
     Raises MaskError: a mask cannot be read, and no other camera has a readable one of that frame.
     """

@@ -158,7 +158,7 @@ class Scene:
 
         Raises:
             UnknownNameError: there is no such camera, or it has no such frame.
-            MaskError: the file is not a mask of the camera's size.
+            MaskError: the file is not a mask of the camera's size, or has no object.
         """
         path, size = self.mask_path(camera, frame), self.cameras[camera]
         key = path, size.width, size.height

@@ -172,7 +172,14 @@ def _check_urdf_visual(
 
 
 def _check_urdf_joint(joint: ElementTree.Element) -> None:
-    """Refuse a URDF joint's limits that make Drake abort; remove limits that have no effect."""
+    """Refuse a URDF joint's invalid numbers; remove limits that have no effect, in place.
+
+    Refused are an origin or axis that is not finite, limits that are not numbers or crossed, and
+    negative velocity limits. Removed are infinite limits, those of continuous joints, and limits of
+    effort and acceleration.
+
+    Raises ModelError: a number is refused.
+    """
     name = joint.get("name", "")
     _check_origin(joint, f"joint '{name}'")
     for axis in joint.iterfind("axis"):
@@ -374,7 +381,12 @@ def _check_sdf_visual(
 
 
 def _check_sdf_joint(joint: ElementTree.Element) -> Limits:
-    """Refuse limits that Drake refuses; return the limits that Drake's parser does not read."""
+    """Refuse an SDFormat joint's invalid poses, axes and limits (ModelError).
+
+    Returns:
+        Limits (lower, upper) [rad] of universal and screw joints by position name, which Drake's
+        parser does not read; empty for other joints.
+    """
     name, kind = joint.get("name", "(unnamed)"), joint.get("type", "")
     _check_poses(joint, f"joint '{name}'")
     suffixes = {"universal": {"axis": "_qx", "axis2": "_qy"}, "screw": {"axis": ""}}

@@ -142,7 +142,7 @@ class JointEdge:
     joint_map: JointMap | None
 
     def other(self, group: int) -> int:
-        """Return the index of the group at the other end."""
+        """Return the index of the group at the other end than the group of index ``group``."""
         return self.inner if group == self.outer else self.outer
 
 
@@ -253,6 +253,7 @@ def _make_group(
     """Return the group of welded bodies, their meshes joined in one frame.
 
     Args:
+        kinematics: forward kinematics of the model.
         bodies: indices of the bodies in the plant, the one nearest to the world first.
         preferred_frame: as for ``build_link_graph``.
     """
@@ -279,7 +280,8 @@ def _make_edge(
 ) -> JointEdge:
     """Return the edge of one joint, with its map fitted to the plant.
 
-    ``inner`` and ``outer`` are the indices in ``groups`` of the joint's two groups.
+    ``inner`` and ``outer`` are the indices in ``groups``, all groups of the graph, of the joint's
+    two groups. A floating joint has no map.
     """
     start, count = joint.position_start(), joint.num_positions()
     positions = tuple(range(start, start + count))

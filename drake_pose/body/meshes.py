@@ -94,7 +94,7 @@ def merge_duplicate_vertices(mesh: TriangleMesh) -> TriangleMesh:
 
 
 def join_meshes(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
-    """Return one mesh with the triangles of several meshes in a common frame."""
+    """Return one mesh with the triangles of several meshes, whose vertices are in one frame."""
     parts = [mesh for mesh in meshes if not mesh.is_empty]
     if not parts:
         return TriangleMesh.empty()
@@ -122,7 +122,8 @@ read_meshes: dict[Path, TriangleMesh] = {}
 def read_mesh_file(path: Path, scale: Array | None = None) -> TriangleMesh:
     """Return the triangles of an OBJ, glTF, GLB, STL or DAE file, with duplicate vertices merged.
 
-    ``scale``: (3,) factors along x, y and z; None: the file's own size.
+    The 64 files read last are not read again. ``scale``: (3,) factors along x, y and z; None: the
+    file's own size.
 
     Raises ModelError: the extension is unknown, the file cannot be read or holds no triangle, or a
     coordinate is not finite.
@@ -340,7 +341,7 @@ def was_written(path: Path) -> bool:
 
 
 def _write_with_normals(mesh: TriangleMesh, path: Path) -> None:
-    """Write an OBJ file whose vertex normals are area-weighted means of triangle normals."""
+    """Write a mesh to an OBJ file; vertex normals are area-weighted means of triangle normals."""
     triangles = mesh.triangles
     a, b, c = (mesh.vertices[triangles[:, corner]] for corner in range(3))
     area_normals = np.cross(b - a, c - a)

@@ -331,7 +331,7 @@ def read_model(
 
 @contextmanager
 def _model_errors(path: Path) -> Iterator[None]:
-    """Convert errors raised inside the context to a ModelError that names the file."""
+    """Convert errors of Drake and ModelErrors inside the context to a ModelError with the path."""
     try:
         yield
     # Drake aborts on some invalid values, which Python sees as SystemExit.

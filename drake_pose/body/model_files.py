@@ -175,6 +175,8 @@ def open_loops(
 ) -> None:
     """Remove the joints of a model that close a loop of links.
 
+    Joints that are the first to name their child link are kept in preference to later ones.
+
     Args:
         model: the element that contains the joints; changed in place.
         joints: the elements of the joints.
@@ -271,8 +273,9 @@ def package_folder() -> Path:
 
 
 def package_map(package_paths: Mapping[str, Path | str] | None = None) -> PackageMap:
-    """Return Drake's PackageMap with ``drake_pose`` and the given folders by package name.
+    """Return Drake's PackageMap with ``drake_pose`` and the given folders.
 
+    ``package_paths``: folders by package name, which precede the package's own; None: none.
     ``drake_models`` is removed, so that nothing is downloaded. Raises ModelError: a folder does not
     exist.
     """
@@ -294,6 +297,9 @@ class FileFinder:
 
     A package is searched for, in this order, among the given packages, the bundled one, the folders
     above the file that names it, and the folders of the search-path environment variables.
+
+    Args:
+        package_paths: folders by package name; None: none.
 
     Raises ModelError: a given package folder does not exist.
     """

@@ -169,7 +169,7 @@ class ModelSkin:
         return tuple(band.mesh for band in self.bands)
 
     def vertices(self, q: Array) -> list[Array]:
-        """Return each band's vertices (v, 3) [m] in the plant's world at positions q (nq,)."""
+        """Return each band's vertices (v, 3) [m] in the plant's world at q (nq,) [rad or m]."""
         placed = []
         for body, positions, skin in self._parts:
             X_BN = self._kinematics.pose_at(body, q)

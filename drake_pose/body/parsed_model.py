@@ -90,7 +90,7 @@ def load_skin(model_path: Path, link_names: Sequence[str]) -> tuple[SkinBand, ..
 
 @dataclass
 class BandEntry:
-    """A band as a skin file has it; ``load_skin`` describes the fields."""
+    """An entry of ``bands`` in a skin file; ``load_skin`` describes its fields."""
 
     parent: str = ""
     child: str = ""
@@ -279,8 +279,10 @@ def _intersect_limits(
 ) -> list[str]:
     """Intersect the limits of coupled positions in place; return warnings.
 
-    A follower whose limits leave its leader a single value loses these limits (PR2's have the wrong
-    sign).
+    A leader keeps the values at which it and its followers are within their limits. A follower
+    whose limits leave its leader a single value loses these limits (PR2's have the wrong sign).
+
+    Raises ModelError: the limits of a leader and a follower exclude each other.
 
     Args:
         couplings: couplings whose leaders follow no other position.
@@ -405,6 +407,7 @@ class ParsedModel:
         warnings: parts of the file that are not read or not enforced, limits that are ignored, and
             Drake's own warnings.
         labels: the render labels of the bodies of a model from ``from_plant``; else None.
+        _source: what is parsed to copy the model into other plants.
     """
 
     position_names: tuple[str, ...]

@@ -44,6 +44,10 @@ class ModelSource:
         warnings: parts of the file that are not read or not enforced, each once.
         limits: limits (lower, upper) [rad] by position name that Drake's parser does not read.
 
+    Args:
+        path: the model file.
+        package_paths: folders by package name.
+
     Raises ModelError: the file is missing, unreadable, of an unknown type, or cannot be sanitised;
     the message names the file and the link, joint or mesh.
     """
@@ -114,7 +118,10 @@ class ModelSource:
         return list(instances), [*self.warnings, *remarks]
 
     def _sanitise(self, path: Path) -> tuple[str, str]:
-        """Return the text that Drake parses in place of a file, and its file type."""
+        """Return the text that Drake parses in place of a file, and its file type (``kind``).
+
+        Raises ModelError: the file is of an unknown type, includes itself, or cannot be sanitised.
+        """
         # The file type of each extension, by the name that Drake's parser has for it.
         kinds = {".urdf": "urdf", ".sdf": "sdf", ".xml": "xml", ".mjcf": "xml"}
         kinds |= dict.fromkeys((".yaml", ".yml"), "dmd.yaml")
@@ -300,9 +307,11 @@ def check_in_child(
 
 @functools.lru_cache(maxsize=64)
 def _check_cached(read: Reader, path: str, packages: str, limits: str, _digest: str) -> None:
-    """As ``check_in_child``, with packages and limits as JSON; return if the model can be used.
+    """Raise ModelError as ``check_in_child``, unless the check passed before.
 
-    ``_digest`` keys the cache by file content.
+    Args:
+        packages, limits: mappings as for ``Reader``, as JSON.
+        _digest: keys the cache by file content.
     """
     try:
         try:
@@ -365,7 +374,7 @@ def why_unusable(read: Reader, path: str, packages: str, limits: str) -> str:
 def _check_in_fork(read: Reader, path: str, packages: str, limits: str) -> str:
     """Return ``why_unusable`` from a fork of this process, and keep the meshes that it read.
 
-    The arguments are those of ``why_unusable``.
+    The arguments are those of ``why_unusable``: packages and limits are JSON.
 
     Raises:
         TimeoutError: the fork did not answer in time.
@@ -415,7 +424,10 @@ def _run_check(
 
 
 def _check_in_subprocess(path: str, packages: str, limits: str) -> str:
-    """As ``_check_in_fork``, with ``read_model`` in a newly started process, which takes longer."""
+    """As ``_check_in_fork``, with ``read_model``, in a new process, which takes longer.
+
+    The meshes that the new process reads are not kept.
+    """
     # os._exit skips clean-up, which may crash after a broken file.
     program = (
         "import json, os, sys\n"

@@ -134,7 +134,14 @@ class PlantSource:
     ) -> tuple[list[ModelInstanceIndex], list[str]]:
         """Copy all bodies and joints, which keeps the meaning of q, and the drawn bodies' geometry.
 
-        Arguments and return values are those of ``ModelSource.parse``.
+        Args:
+            plant: a plant that is not finalized.
+            scene_graph: the SceneGraph to register the plant with; None: the plant is registered
+                already or gets no geometry.
+            prefix: put before the names of model instances.
+
+        Returns:
+            The model instances of the copy, and no warnings.
 
         Raises ModelError: a joint has a type that cannot be copied.
         """

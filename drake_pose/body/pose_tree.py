@@ -203,7 +203,7 @@ class PoseTree:
         return self._rebuild(root_position)
 
     def source(self, node: int) -> int:
-        """Return the node whose values place a node: itself, or the parent that it follows."""
+        """Return the index of the node whose values place a node: itself, or a followed parent."""
         return self.nodes[node].parent if self.placements[node].follows else node
 
     def node_index(self, name: str) -> int:
@@ -265,7 +265,7 @@ class PoseTree:
         return product_grid(axes, self.nodes[node].name)
 
     def value_bounds(self, node: int) -> tuple[Array, Array]:
-        """Return the search limits (k,), (k,) of a node's values [rad or m].
+        """Return the lower and upper search limits (k,), (k,) of a node's values [rad or m].
 
         An angle that can take every direction is searched over the turn about its default.
         """
@@ -274,7 +274,7 @@ class PoseTree:
         return np.where(around, low, placement.lower), np.where(around, high, placement.upper)
 
     def value_limits(self, node: int) -> tuple[Array, Array]:
-        """Return the limits (k,), (k,) of a node's values [rad or m].
+        """Return the lower and upper limits (k,), (k,) of a node's values [rad or m].
 
         They are equal for a held value and infinite for an angle without limits.
         """
@@ -288,9 +288,10 @@ class PoseTree:
         return covers_full_turn(placement.lower, placement.upper, placement.periodic)
 
     def relative_transforms(self, node: int, values: Array) -> Array:
-        """Return X_PN (n, 4, 4), the node's poses in its parent or in the world.
+        """Return X_PN (n, 4, 4), the poses of the node of index ``node`` in its parent.
 
-        ``values`` are (n, k) values of the node ``source(node)`` [rad or m].
+        A root's parent is the world. ``values``: (n, k) values of the node ``source(node)`` [rad or
+        m].
 
         Raises SettingsError: the number of columns is wrong.
         """
@@ -310,7 +311,7 @@ class PoseTree:
         return X
 
     def step_values(self, node: int, values: Array) -> Array:
-        """Return the values (n, j) of a node's joints, given values (n, k) of ``source(node)``."""
+        """Return a node's joint positions (n, j), given values (n, k) of ``source(node)``."""
         if not self.placements[node].follows:
             return values
         _, columns, multipliers, offsets = zip(*self.placements[node].follows, strict=True)

@@ -332,9 +332,12 @@ def base_of_chain(
 ) -> BasePose:
     """Return how the joints from the world outwards to a node take up that node's pose.
 
+    They do by a floating joint if there is one, else by base joints if these are at most twelve
+    positions that can move the node in six degrees of freedom; else the plant's world is placed.
+
     Args:
-        graph: the model's link graph, from which the chain is.
-        chain: the joints from the world outwards.
+        graph: the model's link graph.
+        chain: the joints from the world outwards to the node.
         node: index of the node in the tree.
         held: indices in q of positions that keep their values if the others can reach every pose.
     """

@@ -58,7 +58,14 @@ def build_pose_tree(
     root_rotation: RootRotation | None = None,
     held: Mapping[str, float] | None = None,
 ) -> PoseTree:
-    """Build a pose tree of a model; other arguments as for ``ArticulatedModel.pose_tree``."""
+    """Build a pose tree of a model; see ``ArticulatedModel.pose_tree`` for the errors.
+
+    Args:
+        root: name of the root link; None: the link with geometry nearest to the plant's world.
+        root_position: (3,) the root link's origin in the world [m]; None: as in the model file.
+        root_rotation: rotations of the root link; None: those of the base joint.
+        held: values [rad or m] of positions that are not searched, by name; None: none.
+    """
     held, rounding = held or {}, 1e-6
     if root is not None and root not in model.link_names:
         raise UnknownNameError("link", root, model.link_names, str(model.path))
@@ -154,7 +161,10 @@ def _choose_root(
 
 
 def _floating_tops(graph: LinkGraph) -> list[int]:
-    """Return the index of the first node's group behind each floating joint that moves geometry."""
+    """Return the index of the first node's group behind each floating joint that moves geometry.
+
+    Raises ModelError: a link floats relative to another one than the world.
+    """
     tops = []
     for edge in graph.edges:
         if edge.joint_map is None:
@@ -175,8 +185,9 @@ def _floating_tops(graph: LinkGraph) -> list[int]:
 def _branches(graph: LinkGraph, start: int) -> list[Branch]:
     """Return the branches reached from the group ``start`` without crossing a floating joint.
 
-    Groups without geometry are skipped unless several branches meet there. Branches are sorted by
-    depth, then by body.
+    Groups without geometry are skipped unless several branches meet there, and chains that end
+    without geometry are left out. Branches are sorted by depth, then by body; ``parent`` is an
+    index in the result.
     """
     # Prune chains that end in a group without geometry.
     edges_at = {
@@ -227,7 +238,8 @@ def _attach_followers(
     The pose of a node in its parent then depends on its own values only, or on its parent's values
     only. A branch stays where it is if other joints move it or a skin band is attached to it.
 
-    ``held``: indices in q of positions that are not searched; they follow nothing.
+    ``held``: indices in q of positions that are not searched; they follow nothing. Returns all
+    branches, sorted as by ``_branches``.
     """
     couplings = _couplings_by_position(model)
     skinned = {graph.group_of(link) for band in model.skin for link in (band.parent, band.child)}
@@ -272,7 +284,7 @@ def _attach_followers(
 
 
 def _couplings_by_position(model: ParsedModel) -> dict[int, Coupling]:
-    """Return the coupling of each follower and leader; a leader follows itself."""
+    """Return the coupling of each follower and leader, by index in q; a leader follows itself."""
     leaders = {leader: Coupling(leader, leader, 1.0, 0.0) for _, leader, *_ in model.couplings}
     return leaders | {coupling.follower: coupling for coupling in model.couplings}
 

@@ -125,7 +125,7 @@ class TreeKinematics:
         return tuple(np.asarray(values)[a:b] for a, b in pairwise(self._splits))
 
     def nearest_turns(self, values: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
-        """Return values (m,) of the same pose, with angles in the turn nearest to ``near``.
+        """Return values (m,) [rad or m] of the same pose, angles in the turn nearest to ``near``.
 
         Only angles that can take every direction are moved. ``near``: (m,) [rad or m]; None: the
         middle of the turn that is searched, which is the turn about the default positions.
@@ -133,7 +133,7 @@ class TreeKinematics:
         return nearest_turn(values, self._middle if near is None else near, self.covers_full_turn)
 
     def within_limits(self, values: np.ndarray) -> np.ndarray:
-        """Return values (m,) of the same pose, with angles moved by full turns into their limits.
+        """Return values (m,) [rad or m] of the same pose, angles moved by turns into their limits.
 
         Only angles that can take every direction are moved.
         """
@@ -145,7 +145,7 @@ class TreeKinematics:
         return np.where(self.covers_full_turn, values - full * (above - below), values)
 
     def local_limits(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return limits (m,), (m,) around a pose [rad or m].
+        """Return lower and upper limits (m,), (m,) [rad or m] around a pose's values (m,).
 
         An angle that can take every direction has half a turn either side of its value.
         """
@@ -157,7 +157,10 @@ class TreeKinematics:
         return self._compute(values)[0]
 
     def _compute(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return X_WN (nodes, 4, 4) and the twists (e, 6) of all motions at values (m,)."""
+        """Return X_WN (nodes, 4, 4) and twists (omega, v) (e, 6) of all motions at values (m,).
+
+        The motions are in the order of ``motion_values``.
+        """
         values = np.ascontiguousarray(values, dtype=np.float64)
         if values.shape != (len(self.names),):
             raise SettingsError(f"{len(self.names)} values expected, got shape {values.shape}")

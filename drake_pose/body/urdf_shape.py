@@ -30,13 +30,15 @@ def reshaped(
     Args:
         text: the URDF text.
         hidden: links that lose their visual geometry.
-        link_scales: (3,) scale factors of a link's visual geometry, and of the origins of the
+        link_scales: by link, (3,) scale factors of its visual geometry, and of the origins of the
             joints that it carries, along the axes of its frame. Shapes other than meshes are scaled
             as their type allows: spheres and capsule radii by the geometric mean.
-        link_shifts: (3,) shift [m] of a link's visual geometry and of the joints that it carries.
-        joint_shifts: (3,) shift [m] of a joint's origin in its parent link's frame.
-        joint_offsets: offset [rad or m] added to a joint's position: its origin is rotated about
-            its axis or shifted along it, and its limits are moved so that they stay in place.
+        link_shifts: by link, (3,) shift [m] of its visual geometry and of the joints that it
+            carries, in its frame.
+        joint_shifts: by joint, (3,) shift [m] of its origin in its parent link's frame.
+        joint_offsets: by joint, offset [rad or m] added to its position: its origin is rotated
+            about its axis or shifted along it, and its limits are moved so that they stay in place.
+            None: none.
     """
     root = ElementTree.fromstring(text)
     for link in root.iterfind("link"):
@@ -155,8 +157,10 @@ def _scale_shapes(visual: ElementTree.Element, scale: Array) -> None:
 
 
 def _numbers(text: str) -> list[float]:
+    """Return the numbers in an attribute's text."""
     return [float(number) for number in text.split()]
 
 
 def _text(numbers: Sequence[float] | Array) -> str:
+    """Return numbers as attribute text without loss of precision."""
     return " ".join(repr(float(number)) for number in numbers)

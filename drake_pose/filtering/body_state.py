@@ -126,15 +126,16 @@ class BodyState:
         )
 
     def is_angle(self, name: str) -> bool:
-        """Return whether an element is an angle [rad]; else it is a length [m] or LOG_SCALE."""
+        """Return whether the element ``name`` is an angle; else it is a length or LOG_SCALE."""
         if name in _ROOT:
             return False
         return bool(self._kinematics.is_angle[self._kinematics.names.index(name)])
 
     def inequalities(self) -> Inequalities:
-        """Return the limits of all values, and the inequalities of the model's couplings file.
+        """Return the limits of all free values, and inequalities of the model's couplings file.
 
-        Angles that turn around have no limits.
+        Angles that turn around have no limits. Inequalities that use other elements are left out.
+        Warn (UserWarning) if there are none.
 
         Raises:
             ModelError: the couplings file cannot be read.
@@ -157,7 +158,7 @@ class BodyState:
         return other
 
     def _root(self, values: Array) -> Array:
-        """Return the position (3,) of the root in the tree [m]."""
+        """Return the position (3,) of the root in the tree [m] at the tree's values (m,)."""
         return self._kinematics.poses(values)[0, :3, 3]
 
     def node_values(self, x: Array) -> tuple[Array, ...]:

@@ -303,7 +303,8 @@ class ContourObservation(BodyState):
     def covariance(self, measured: ContourMeasurement, area: float) -> Array:
         """Return the covariance (m, m) of the tree's values from one frame's measurement alone.
 
-        Errors of surfaces, masks and cameras are correlated, see ``fit.covariance``.
+        It is 0 for values that are not free. Errors of surfaces, masks and cameras are correlated,
+        see ``fit.covariance``.
 
         Args:
             measured: the measurement.
@@ -443,7 +444,10 @@ class ContourTracker:
         self._period = period
 
     def acceleration(self, name: str) -> float:
-        """Return the standard deviation of an element's acceleration [rad/s^2, m/s^2 or 1/s^2]."""
+        """Return the standard deviation of the acceleration of the moving element ``name``.
+
+        The unit is rad/s^2, m/s^2 or, for the log scale, 1/s^2.
+        """
         s = self.settings
         return self._of_kind(
             name, s.log_scale_acceleration, s.angle_acceleration, s.length_acceleration
@@ -551,7 +555,7 @@ class ContourTracker:
         return state, measurement
 
     def _lost_parts(self, measurement: ContourMeasurement) -> Mask:
-        """Return which parts (nodes,) are lost in pictures; all if the whole body is lost."""
+        """Return (nodes,) bool, whether each part is lost in pictures; all if the body is lost."""
         whole = measurement.distance > self.settings.lost_distance
         whole |= measurement.inlier_ratio < self.settings.lost_inlier_ratio
         return (measurement.part_distances > self.settings.lost_colour_distance) | whole

@@ -365,6 +365,8 @@ class HandSilhouette:
     ) -> HandMeasurement:
         """Measure lines and tips in a silhouette, near a prediction.
 
+        All measurements are NaN if the mask is empty or differs too much from the best rough pose.
+
         Args:
             mask: (H, W) the hand's silhouette.
             prediction: belief of the state before the measurement.
@@ -450,7 +452,9 @@ class HandSilhouette:
         gates: Sequence[float],
         scale: float | None,
     ) -> HandMeasurement:
-        """Measure near a rough state x (n,), which the measurements of each gate correct.
+        """Measure near a rough state x (n,).
+
+        The measurements of each gate but the last correct x; those of the last are returned.
 
         Args:
             mask: (H, W) the silhouette.
@@ -458,7 +462,7 @@ class HandSilhouette:
             prediction: belief of the state before the measurement.
             gates: largest distance between edge points and the rough body, by iteration [pixel at
                 ``reference_radius``].
-            scale: as for ``measure``.
+            scale: known image scale; None: unknown.
         """
         observation, names = self._observation, self._observation.names
         at, prior = names.index("scale"), self._hand.prior

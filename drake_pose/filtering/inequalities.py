@@ -324,7 +324,12 @@ class PriorRow:
 
 @dataclass
 class Couplings:
-    """The schema of a couplings file; ``load_couplings`` and ``load_joint_prior`` describe it."""
+    """The schema of a couplings file.
+
+    Attributes:
+        differences, rows: inequalities (``load_couplings``).
+        usual: the joints' prior (``load_joint_prior``).
+    """
 
     differences: list[Difference] = field(default_factory=list)
     rows: list[GeneralRow] = field(default_factory=list)
@@ -440,6 +445,8 @@ def couplings_file(model_file: Path) -> Path:
 
 def model_inequalities(model: ParsedModel) -> Inequalities:
     """Return a model's position limits, and the inequalities of its couplings file if there is one.
+
+    Warn (UserWarning) if there are none.
 
     Raises:
         ModelError: the couplings file cannot be read.

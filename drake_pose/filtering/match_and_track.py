@@ -55,6 +55,7 @@ def make_tracker(
     """Return a tracker of a pose tree's contour.
 
     Args:
+        tree: the body.
         cameras: the cameras whose masks or pictures are given in each frame.
         period: time between two frames [s].
 
@@ -319,7 +320,7 @@ class MatchAndTrack:
         return self.tracker.follow(track, frame.masks, first, frame.root_position, frame.pictures)
 
     def _unwrapped(self, matched: PoseEstimate, node_values: Sequence[Array]) -> PoseEstimate:
-        """Return a pose of a search with its angles in the turns of each node's values (k_i,)."""
+        """Return ``matched`` with its angles in the turns of ``node_values``, (k_i,) by node."""
         turns = [
             2.0 * np.pi * np.round((now - then) / (2.0 * np.pi))
             for now, then in zip(node_values, matched.node_values, strict=True)

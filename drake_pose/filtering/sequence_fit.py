@@ -135,6 +135,7 @@ def find_start(
     the following frames.
 
     Args:
+        tracker: tracker of the body, and its cameras.
         x: (n,) state in the first frame about which starts are tilted.
         masks: for each frame, for each camera the mask (H, W) or None.
     """
@@ -226,8 +227,8 @@ def fit_sequence(
 ) -> list[FittedSequence]:
     """Return the explanations of one camera's masks, sorted by cost, ascending.
 
-    All starts are fitted to some of the frames; the different ones among the best are then fitted
-    to all frames.
+    The first ``SEQUENCE.fitted_starts`` are fitted to frames about ``SEQUENCE.memory`` apart. Fits
+    that differ and cost at most ``SEQUENCE.worse_fit`` times the lowest are then fitted to all.
 
     Args:
         tracker: the body, its first camera, which took the masks, and settings of the motion.

@@ -141,9 +141,10 @@ def merge_duplicates(
 def prune(
     hypotheses: Sequence[Hypothesis], cap: int, smallest_weight: float, step: int
 ) -> tuple[list[Hypothesis], list[Rejection]]:
-    """Return the ``cap`` heaviest hypotheses of at least ``smallest_weight``, and the rejections.
+    """Return at most ``cap`` hypotheses, the heaviest, of at least ``smallest_weight``.
 
-    The heaviest is always kept. ``step``: number of the step, for the rejections.
+    The heaviest is always kept. Also return the rejections. Weights that are kept sum to 1.
+    ``step``: number of the step, for the rejections.
     """
     ordered = normalise(hypotheses)
     kept = [h for h in ordered[1:cap] if h.weight >= smallest_weight]
@@ -366,7 +367,7 @@ class TruncatedFilter:
         return FilterState(0, (self._finish(Hypothesis(checked, checked), checked, truncated),))
 
     def predict(self, state: FilterState) -> FilterState:
-        """Return the state after one step of the motion, for each hypothesis: (6)."""
+        """Return the state whose hypotheses have made one step of the motion: (6)."""
         stepped = []
         for h in state.hypotheses:
             # Linearised inside the limits, also for the belief without limits.
@@ -409,6 +410,9 @@ class TruncatedFilter:
         variances: Array | None = None,
     ) -> FilterState:
         """Return the state after a measurement: section 5, steps 2 to 6.
+
+        Each hypothesis is updated, in a new view also from its mirrored states, and truncated.
+        Hypotheses far beyond a limit are rejected, duplicates merged, and light ones removed.
 
         Args:
             state: the predicted state.

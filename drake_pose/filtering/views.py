@@ -21,7 +21,12 @@ from drake_pose.filtering.update import LinearObservation, Measurement, Observat
 
 @dataclass(frozen=True, eq=False)
 class StaticView:
-    """A static view: the first frame's measurement (m,) and the number of its frames so far."""
+    """A static view.
+
+    Attributes:
+        reference: (m,) measurement of its first frame, NaN where occluded.
+        count: number of its frames so far.
+    """
 
     reference: Array
     count: int
@@ -54,7 +59,7 @@ def next_view(view: StaticView | None, measurement: Measurement, significance: f
 
 @lru_cache(maxsize=1024)
 def _largest_change(significance: float, count: int) -> float:
-    """Return the chi-squared value of ``count`` degrees of freedom with this p-value."""
+    """Return the chi-squared value with ``count`` degrees of freedom and this p-value."""
     return float(chdtri(count, significance))
 
 

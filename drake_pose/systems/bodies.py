@@ -80,8 +80,9 @@ def add_avatar(
 
     Args:
         builder: the diagram to which the systems are added.
-        positions: port of the positions (nq,) in the plant's order; while they are NaN the body has
-            the model's default positions.
+        model: the body.
+        positions: port of the positions (nq,) in the plant's order [rad or m]; while they are NaN
+            the body has the model's default positions.
         prefix: Meshcat path under which it is drawn.
         period: time between two drawings [s].
     """
@@ -139,6 +140,7 @@ class MeshcatSkin(LeafSystem):
         positions (nq): in the model's order [rad or m].
 
     Args:
+        meshcat: where to draw.
         skin: the skin bands.
         position_count: nq.
         path: Meshcat path of the skin.
@@ -171,6 +173,7 @@ class MeshcatSkin(LeafSystem):
         self.DeclareForcedPublishEvent(self._draw)
 
     def _draw(self, context: Context) -> EventStatus:
+        """Draw the skin at the context's positions unless it is drawn there already."""
         positions = np.array(self._positions.Eval(context))
         if self._drawn is not None and np.array_equal(positions, self._drawn):
             return EventStatus.DidNothing()
@@ -305,6 +308,7 @@ class RobotStateMessage(PortedSystem):
         )
 
     def _calc(self, context: Context) -> lcmt_robot_state:
+        """Return the message of the context's positions and time."""
         message = lcmt_robot_state()
         message.utime = round(1e6 * context.get_time())
         message.num_joints = len(self._names)

@@ -55,7 +55,9 @@ class CameraRig:
     def picture(self, context: Context, camera: str) -> Picture:
         """Return the colour image (H, W, 3), red, green, blue, of the camera of this name.
 
-        ``context``: the diagram's. Raises:
+        ``context``: the diagram's.
+
+        Raises:
             UnknownNameError: the rig has no such camera.
         """
         return colour_image_to_picture(self._port("color_image", camera).Eval(context))
@@ -63,7 +65,9 @@ class CameraRig:
     def mask(self, context: Context, camera: str) -> Mask:
         """Return the body's silhouette (H, W) in the camera of this name.
 
-        ``context``: the diagram's. Raises:
+        ``context``: the diagram's.
+
+        Raises:
             UnknownNameError: the rig has no such camera.
         """
         return label_image_to_mask(self._port("label_image", camera).Eval(context))
@@ -300,6 +304,7 @@ class SilhouetteCamera(PortedSystem):
         self.add_output("image_time", 1, lambda context: [context.get_time()], time)
 
     def _calc_image(self, context: Context, output: AbstractValue) -> None:
+        """Write the label image at the context's body poses to an ImageLabel16I."""
         listed = self.GetInputPort("body_poses").Eval(context)
         if len(listed) != len(self._names):
             raise ModelError(

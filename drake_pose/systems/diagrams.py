@@ -343,7 +343,10 @@ def add_simulated_cameras(
 def _depth_range(
     camera: Camera, model: ParsedModel, true_positions: Trajectory
 ) -> tuple[float, float]:
-    """Return the nearest and farthest depth [m] of a moving body in a camera, with margins."""
+    """Return the nearest and farthest depth [m] of a moving body in a camera.
+
+    Both have a margin of 0.5 m and a tenth of the range, because the body is sampled at 100 times.
+    """
     start, end = true_positions.start_time(), true_positions.end_time()
     # A constant trajectory has infinite times.
     times = np.linspace(start, end, 100) if np.isfinite([start, end]).all() else np.zeros(1)
@@ -367,7 +370,10 @@ def _matcher(
     tracking: TrackingSettings | None,
     color_cameras: Sequence[str] = (),
 ) -> SilhouetteMatcher:
-    """Return a SilhouetteMatcher if ``tracking`` is None, else a SilhouetteTracker."""
+    """Return a SilhouetteMatcher if ``tracking`` is None, else a SilhouetteTracker.
+
+    ``color_cameras``: names of the cameras whose pictures the tracker uses.
+    """
     if tracking is None:
         return SilhouetteMatcher(search, cameras, period)
     # Recordings and simulations need no time limit; without one the result is repeatable.

@@ -252,7 +252,8 @@ class PersonTracker(MemorySystem):
     ) -> "tuple[TrackState | None, _SeparatedViews]":
         """Return the person's next state, and the views without other persons.
 
-        Others are looked for at first, while tracking is in trouble, and if ``is_watching``.
+        Others are cut out if there is no last state, while tracking is in trouble, and if
+        ``is_watching``; in other frames only if the person is not followed well with them.
 
         Args:
             last: the person's last state; None: no person was found yet.

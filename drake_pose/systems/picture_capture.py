@@ -222,11 +222,11 @@ class PictureCapture(PortedSystem):
         return begin
 
     def _feed(self, name: str, source: FrameSource, now: float, ahead: int = 8) -> None:
-        """Pass the pictures of a source that are due at ``now`` [s] to the synchroniser.
+        """Pass new pictures of a source to the synchroniser, or tell it that the source has ended.
 
-        The next picture of a recorded source is kept until it is due. Without ``live``, a source is
-        not read while ``ahead`` of its pictures wait in the synchroniser for other cameras.
-        ``name``: the camera.
+        A live source gives its newest picture, if it is new. A recorded one gives all pictures that
+        are due at ``now`` [s]; the next one is kept until it is due. In a capture that is not live,
+        reading stops while ``ahead`` pictures of the camera ``name`` wait for other cameras.
         """
         origin, synchroniser = self._origins[name], self._synchroniser
         if source.specification.live:

@@ -112,7 +112,7 @@ class StagedDiagram(Generic[T]):
     estimator: T
 
     def evaluate(self, context: Context, stage: str) -> None:
-        """Evaluate the ports of a stage; ``context`` is the diagram's."""
+        """Evaluate all ports of the stage of this name; ``context`` is the diagram's."""
         for port in self.stages[stage]:
             evaluate(port, context)
 
@@ -252,6 +252,7 @@ class BeliefSystem(PortedSystem, Generic[T]):
         raise NotImplementedError
 
     def _update(self, context: Context, state: State) -> EventStatus:
+        """Write ``next_belief`` to the state."""
         last = self.belief(context)
         known = self.next_belief(context, last)
         if known is last:
@@ -302,6 +303,7 @@ class MemorySystem(PortedSystem):
         raise NotImplementedError
 
     def _update(self, context: Context, state: DiscreteValues) -> EventStatus:
+        """Write ``next_vectors`` to the state."""
         changed = self.next_vectors(context, self.vectors(context))
         self.set_vectors(state, changed)
         return EventStatus.Succeeded() if changed else EventStatus.DidNothing()

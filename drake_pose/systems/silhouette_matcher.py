@@ -383,7 +383,7 @@ class SilhouetteTracker(SilhouetteMatcher):
         return deviations
 
     def _state(self, known: MatcherState) -> Array:
-        """Return the output ``estimated_state`` (nq + nv,)."""
+        """Return the output ``estimated_state`` (nq + nv,): q, then velocities."""
         plant = self._search.tree.model.plant
         qdot, track = np.full(len(known.q), np.nan), known.memory.tracker_state.track
         if track is not None:

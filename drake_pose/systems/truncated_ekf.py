@@ -152,7 +152,10 @@ class TruncatedEkf(BeliefSystem[_EkfState]):
         rows = belief_filter.inequalities.rows
 
         def filled(size: int, read: Callable[[Hypothesis], Any], empty: float) -> Any:
-            """Return a function of the belief: ``read`` of each hypothesis, else ``empty``."""
+            """Return a function of the belief that gives rows (cap * size,) of all hypotheses.
+
+            A row is ``read`` of a hypothesis, or ``empty`` where there are fewer hypotheses.
+            """
 
             def read_all(known: _EkfState) -> Array:
                 found = np.full((cap, size), empty)

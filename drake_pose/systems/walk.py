@@ -230,7 +230,8 @@ class WalkKeys(MemorySystem):
     def next_vectors(self, context: Context, known: dict[str, Array]) -> Mapping[str, Array]:
         """Return the state vectors ``pressed`` and ``left`` of the buttons, and ``frame``.
 
-        ``known``: the last state vectors by name. ``frame`` is the index of the stride's next row.
+        ``known``: the last state vectors by name. Row ``frame - 1`` of the stride is shown, the
+        last row if ``frame`` is 0.
         """
         pressed = np.array([float(self._meshcat.GetButtonClicks(name)) for name in KEYS])
         held = np.maximum(known["left"] - self._period, 0.0)
@@ -268,6 +269,7 @@ class WalkView(LeafSystem):
         self.DeclareForcedPublishEvent(self._show)
 
     def _show(self, context: Context) -> EventStatus:
+        """Move the avatar, once the rest stance is known, and the view."""
         pose, rest = self._pose.Eval(context), self._rest.Eval(context)
         if np.isfinite(rest).all():
             self._meshcat.SetTransform("walker", walker_transform(pose, rest))

@@ -212,6 +212,7 @@ class _Diagnoser:
         explained = explained_frames([one.inlier_ratios[1] for one in self._frames])
 
         def evaluate(kept: Mask) -> tuple[Array, Array]:
+            """Return p-values (frames,) and common errors (p,) of a set, see likeliest_inliers."""
             common = self._common(self._sum(kept))
             residuals = [self._residual(info, *common) for info in self._info]
             return np.array([one.p_value for one in residuals]), common[0]
@@ -265,11 +266,11 @@ class _Diagnoser:
         return ErrorSizes(*np.median(np.array(sizes), axis=0).tolist())
 
     def _distances(self, masks: Sequence[ComparedMask]) -> Distances:
-        """Return the distances in masks, by the p unknowns, then each mask's boundary bias."""
+        """Return distances in masks, linear in the p unknowns, then each mask's boundary bias."""
         return distances_in_masks(self._fit.outlines, masks, with_bias=True)
 
     def _info_of(self, fitted: FrameFit, sizes: ErrorSizes, bias_sd: float = 2.0) -> _Information:
-        """Return a frame's information; bias_sd: prior of its masks' boundary biases [pixel]."""
+        """Return a frame's information; bias_sd: prior deviation of its masks' biases [pixel]."""
         known = float(SHARED.prior_freedom)
         if not fitted.compared_masks:
             return self._empty._replace(lengths=fitted.outline_lengths, freedom=known)
@@ -520,10 +521,10 @@ def likeliest_inliers(
     of a set, and makes the frames without a significant residual the next set.
 
     Args:
-        explained: (frames,) candidates.
-        evaluate: returns, for a set, the p-values (frames,) of all frames' residuals, and its
-            common errors x (p,).
-        usual_deviation: prior standard deviation of x.
+        explained: (frames,) which frames may be inliers.
+        evaluate: returns, for a set (frames,), the p-values (frames,) of all frames' residuals, and
+            the common errors x (p,) of the set.
+        usual_deviation: prior standard deviation of each element of x.
         outlier_cost: negative log-likelihood of each outlier.
         max_iterations: maximum number of iterations from a start, and of single frames as starts.
     """
@@ -556,7 +557,7 @@ def explained_frames(
 
     Args:
         ratios: for each frame the fitted inlier ratios by camera.
-        of_best, least: minimum inlier ratio, as a fraction of the camera's best, and absolute.
+        of_best, least: each ratio must be at least `of_best` of its camera's best, and `least`.
     """
     limits = {}
     for name in {name for one in ratios for name in one}:

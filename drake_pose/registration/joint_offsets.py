@@ -79,7 +79,7 @@ class JointCalibration:
 
 
 def scalable_links(tree: PoseTree) -> tuple[str, ...]:
-    """Return the links that carry a joint away from their own joint, so that a scale matters."""
+    """Return names of links that carry a joint away from their own joint, so that scales matter."""
     return tuple(dict.fromkeys(one.link for one in carried_joints(tree)))
 
 
@@ -360,7 +360,8 @@ def describe_constants(
         names: of the constants.
         freedom: degrees of freedom of Student's t distribution.
         level: p-value below which a constant is significant.
-        determined: maximum standard deviation of a determined constant, over the prior's.
+        determined: maximum standard deviation of a determined constant, over the prior's. A
+            constant at the fit's bound is not determined, either.
         min_correlation: minimum correlation of the unknowns listed for an undetermined constant.
     """
     deviations = np.sqrt(np.diag(covariance))

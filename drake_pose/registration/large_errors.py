@@ -217,6 +217,7 @@ class LargeErrorSearch:
         near = np.radians(LARGE.reach_angle) if angle else LARGE.reach_shift
 
         def compare(k: int, places: Array) -> Array:
+            """Return the misfits (n,) of frame k with the joint at n places [rad or m]."""
             values = np.tile(frames[k].values, (len(places), 1))
             values[:, j] = places
             return self._compare(frames[k], values)
@@ -341,7 +342,7 @@ def mask_excess_and_lack(
 
 
 def _is_near(body: RegistrationBody, one: Correction) -> bool:
-    """Return whether an offset or focal length is off so little that fits of frames find it."""
+    """Return whether a correction is an offset or focal length so small that fits find it."""
     if one.kind == "offset":
         j = body.kinematics.names.index(one.name)
         near = np.radians(LARGE.reach_angle) if body.kinematics.is_angle[j] else LARGE.reach_shift
@@ -366,7 +367,10 @@ def joint_inlier_ratios(fits: Sequence[FrameFit], joints: Sequence[str]) -> dict
 
 
 def mismatched_links(fits: Sequence[FrameFit]) -> list[tuple[int, float]]:
-    """Return index and inlier ratio, over all frames together, of nodes that hardly fit."""
+    """Return index and inlier ratio of the nodes that hardly fit, over all frames together.
+
+    Limits are those of LARGE; nodes with a small fraction of all outlines are left out.
+    """
     lengths, fitting = np.sum([one.matched_lengths for one in fits], axis=0).T
     ratios = fitting / np.maximum(lengths, 1e-9)
     shown = lengths >= LARGE.min_outline_fraction * max(float(lengths.sum()), 1e-9)

@@ -198,7 +198,8 @@ class OnlineRegistration:
     ) -> OnlineState:
         """Return the state with one more outlier frame.
 
-        If the outlier frames agree with each other, the camera has the pose that fits them.
+        If the outlier frames agree with each other, the camera gets the pose that fits them, and
+        counts as moved if this differs significantly from the known pose.
 
         Args:
             registered: the state's known pose, which the frame contradicts.

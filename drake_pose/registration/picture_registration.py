@@ -77,7 +77,7 @@ class Recording:
         return replace(self, read=lambda k: np.ascontiguousarray(self.read(k)[:, ::-1]))
 
     def with_offsets(self, joint_offsets: Array) -> "Recording":
-        """Return the same recording with offsets (m,) added to all values."""
+        """Return the same recording with offsets (m,) [rad or m] added to all values."""
         return replace(self, values_at=lambda offset: self.values_at(offset) + joint_offsets)
 
     def with_drift(self, drift: float, since: float) -> "Recording":
@@ -187,7 +187,7 @@ def _register(
 ) -> PictureRegistration:
     """As register_pictures, without a test for mirrored pictures.
 
-    frames: as of choose_pictures. most: maximum number of pose hypotheses that are fitted.
+    frames: indices as of choose_pictures. most: maximum number of pose hypotheses that are fitted.
     """
     chosen, moving = frames
     search = PictureSearch(body, camera, posed_pictures(recording, chosen, 0.0))
@@ -420,6 +420,7 @@ def scan_time_offsets(
     rows = [recording.names.index(name) for name in names]
 
     def gains_at(clock: Recording, tried: Array) -> Array:
+        """Return log-likelihood gains (k,) at k time offsets [s]; NaN without logged joints."""
         found = np.full(len(tried), np.nan)
         for k, offset in enumerate(tried):
             values = clock.values_at(float(offset))[rows]

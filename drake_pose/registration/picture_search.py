@@ -138,6 +138,7 @@ def choose_frames(places: Array, count: int) -> list[int]:
     """
 
     def off(other: Array) -> Array:
+        """Return the mean distance (f,) of each frame's nodes from other places (n, 3) [m]."""
         return np.asarray(np.linalg.norm(places - other, axis=2).mean(axis=1))
 
     chosen = [int(np.argmax(off(places.mean(axis=0))))]
@@ -231,7 +232,8 @@ class PictureSearch:
 
         Args:
             camera: at the start's pose, with the pictures' original size.
-            constants: further unknowns shared by all frames, see ``SharedFit``.
+            constants: names of further unknowns shared by all frames, such as joints with an
+                offset, or TIME_OFFSET; see ``SharedFit``.
             focal: whether the focal length is fitted.
 
         Returns:

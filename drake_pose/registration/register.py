@@ -289,6 +289,7 @@ class CameraSearch:
         )
 
         def best_first(X_CW: Sequence[Array] | Array, side: float) -> list[Array]:
+            """Return poses (4, 4) in the order of mean E_total; side: as of `overlap_areas`."""
             # The error of a frame is clipped at 1.
             off = np.minimum(E_total(overlap_areas(posed, np.asarray(X_CW), side)), 1.0).mean(
                 axis=1

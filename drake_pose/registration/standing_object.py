@@ -185,6 +185,7 @@ class CalibrationTarget:
             return Rotation.from_rotvec(by).as_matrix()
 
         def alike(R: Array) -> bool:
+            """Return whether the rotation R (3, 3) leaves the surface unchanged."""
             turned = TriangleMesh(outline.vertices @ R.T, outline.triangles)
             off = surface_distance(outline, outline_from_mesh(turned))
             return off <= 0.005 * self.radius
@@ -538,7 +539,7 @@ def find_target_frames(
     Args:
         target: the target.
         camera: its pose is not used.
-        pictures: with values of the target's tree; the first ones are searched.
+        pictures: with values of the target's tree; the first PICTURES.search_frames are searched.
         most: maximum number of regions of a picture that may be the target.
         min_iou: minimum intersection over union of a mask by colours and the target as found.
 
@@ -575,7 +576,7 @@ def require_detections(
 
     camera: its name.
 
-    Raises RegistrationError: fewer than `least`, or than the fraction, are explained.
+    Raises RegistrationError: `count` is below `least`, or below this fraction of `of`.
     """
     if count < max(least, fraction * of):
         raise RegistrationError(

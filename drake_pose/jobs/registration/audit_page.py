@@ -187,7 +187,9 @@ def _joint_rows(
 def _errors_of(kinds: Sequence[str], name: str, summary: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the errors common to all frames that have one of the kinds, and the name.
 
-    The result is as of `correction_row`; name: of a joint or camera.
+    The result is as of `correction_row`.
+
+    kinds: some of those of ``Finding``. name: of a joint or camera. summary: of summary.json.
     """
     told = [one for one in summary["findings"] if one["what"] != "frame"]
     return [

@@ -298,6 +298,7 @@ def _recording(
     kept = kept_pictures(camera, settings)
 
     def values_at(offset: float | Array) -> Array:
+        """Return values (n, m) of the tree at time offsets [s], as of ``Recording``."""
         values = np.tile(default, (len(kept), 1))
         values[:, mapped.asked] = rows_of(mapped.log, camera, kept, np.asarray(offset))
         return values

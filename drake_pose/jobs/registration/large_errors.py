@@ -473,7 +473,7 @@ class SceneComparison:
         return replace(now, findings=(*findings, off), warnings=warnings)
 
     def _turns(self, joint: str) -> bool:
-        """Return whether a joint is revolute."""
+        """Return whether the positions of a joint, given by name, are angles."""
         kinematics = self.body.kinematics
         return bool(kinematics.is_angle[kinematics.names.index(joint)])
 
@@ -511,7 +511,10 @@ class SceneComparison:
         return next((tree.nodes[k].name for k in np.flatnonzero(off > 1e-9)), "")
 
     def _pixels(self, before: SceneFit, now: SceneFit) -> float:
-        """Return the root mean square motion of what moves between two fits [pixel]."""
+        """Return the root mean square motion between two fits [pixel]; 0: nothing moves.
+
+        Only points of the body that move by more than 0.1 pixels in a camera count.
+        """
         squares, kinematics = list[Array](), self.body.kinematics
         for frame in self._sample:
             X = [kinematics.poses(one.corrected(frame).values) for one in (before, now)]

@@ -120,7 +120,7 @@ def _with_row(rows: Mapping[str, Array], frame: MultiViewFrame) -> MultiViewFram
 
 
 def _conventions() -> Iterator[tuple[str, Callable[[Array], Array]]]:
-    """Yield other meanings of a camera's given X_WC (4, 4): words, and a conversion to X_WC."""
+    """Yield other meanings of a given X_WC: words, and a function from the given (4, 4) to X_WC."""
     axes = {
         "": np.eye(3),
         "that of ROS' camera_link (x forward, y left, z up)":
@@ -129,6 +129,7 @@ def _conventions() -> Iterator[tuple[str, Callable[[Array], Array]]]:
     }  # fmt: skip
 
     def convert(unit: float, inverse: bool, R: Array, X: Array) -> Array:
+        """Return X (4, 4) with lengths times `unit`, perhaps inverted, on axes rotated by R."""
         scaled = X * np.array([1.0, 1.0, 1.0, unit])
         scaled[3, 3] = 1.0
         found = np.array(np.linalg.inv(scaled) if inverse else scaled)
@@ -152,6 +153,7 @@ def _conventions() -> Iterator[tuple[str, Callable[[Array], Array]]]:
     yield "seems to hold the inverse of its rotation", partial(change_rotation, np.transpose)
 
     def reordered(given: str, meant_by: str, R: Array) -> Array:
+        """Return the rotation of R's (3, 3) Euler angles in order `given`, read as `meant_by`."""
         angles = Rotation.from_matrix(R).as_euler(given)
         return np.asarray(Rotation.from_euler(meant_by, angles).as_matrix())
 

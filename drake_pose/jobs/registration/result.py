@@ -156,6 +156,7 @@ def describe_parameters(
     """
 
     def describe(one: KinematicParameter, unit: str, factor: float) -> dict[str, Any]:
+        """Return a parameter's entry, with numbers times a factor to `unit` in their keys."""
         numbers = {"value": one.value, "sd": one.deviation, "low": one.low, "high": one.high}
         return {
             "determined": one.determined,

@@ -23,15 +23,23 @@ from drake_pose.search import MultiStartSearch, PoseSearch
 from drake_pose.version import VERSION
 
 Outcome = tuple[Figures, Sequence[RenderableType], Sequence[tuple[Any, ...]]]
-"""Figures by method, their tables, and rows that compare the paper's figures with ours.
+"""An experiment's figures, its tables, and rows that compare the paper's figures with ours.
 
 A row: label, format, then the entries of the paper, of its method here, and of ours. An entry is a
-text, or figures for the format.
+text, or figures by the names of the format.
 """
 
 
 class Experiment(NamedTuple):
-    """An experiment: folder, title, command that runs it alone, `run(short, folder, count)`."""
+    """An experiment of a paper.
+
+    Attributes:
+        name: of its folder.
+        title: its heading on the page.
+        command: the command line that runs it alone.
+        run: runs it: `run(short, folder, count)` with few images and runs if `short`, writes its
+            pictures to the folder, and reports progress to the count.
+    """
 
     name: str
     title: str
@@ -40,7 +48,7 @@ class Experiment(NamedTuple):
 
 
 def _kameda(short: bool, folder: Path, count: Count) -> Outcome:
-    """Run Kameda's experiment A by the paper's search and by the beam search."""
+    """Run Kameda's experiment A by the paper's search and the beam search; see `Experiment.run`."""
     searches: dict[str, PoseSearch] = {
         "paper": kameda.experiment_search(),
         "beam": kameda.beam_experiment_search(),
@@ -65,14 +73,14 @@ def _kameda(short: bool, folder: Path, count: Count) -> Outcome:
 
 
 def _kameda_continuous(short: bool, _folder: Path, count: Count) -> Outcome:
-    """Run Kameda's experiment A with continuous angles."""
+    """Run Kameda's experiment A with continuous angles, as `Experiment.run`; draws no pictures."""
     search = MultiStartSearch(kameda.experiment_tree(), exact_masks=True)
     result = kameda.run_experiment(search, 1 if short else 30, 77, count)
     return kameda.continuous_figures(result), [kameda.continuous_table(result)], ()
 
 
 def _kameda_pictures(experiment: str, short: bool, folder: Path, count: Count) -> Outcome:
-    """Run Kameda's experiment B or C."""
+    """Run Kameda's experiment "B" or "C"; the other arguments are those of `Experiment.run`."""
     figures = kameda.run_real_experiment(experiment, 1 if short else None, folder, count)
     paper, beam = figures["paper"], figures["beam"]
     said = "{paper_mean_e_total:.1%} ({paper_images} pictures)".format(**paper)
@@ -85,7 +93,7 @@ def _kameda_pictures(experiment: str, short: bool, folder: Path, count: Count) -
 
 
 def _filters() -> tuple[tuple[str, str, int], ...]:
-    """Return name, truncation and number of linearisations of the paper's filter and of ours."""
+    """Return name, truncation and most linearisations of the paper's filter and of ours."""
     return ("paper", "sequential", 1), (
         "ours",
         "joint",
@@ -94,7 +102,10 @@ def _filters() -> tuple[tuple[str, str, int], ...]:
 
 
 def _shimada(observed: str, runs: int, short: bool, folder: Path, count: Count) -> Outcome:
-    """Run Shimada's experiment with the paper's filter and with ours."""
+    """Run Shimada's experiment with the paper's filter and with ours; see `Experiment.run`.
+
+    `observed` and `runs` are those of `shimada.run_experiment`; one run if `short`.
+    """
     figures: dict[str, dict[str, Any]] = {}
     shown = []
     for name, truncation, iterations in _filters():
@@ -125,7 +136,7 @@ def _shimada(observed: str, runs: int, short: bool, folder: Path, count: Count) 
 
 
 def _shimada_hypotheses(short: bool, folder: Path, count: Count) -> Outcome:
-    """Run Shimada's experiment with several hypotheses, with both filters."""
+    """Run Shimada's experiment with several hypotheses by both filters; see `Experiment.run`."""
     figures, shown = {}, []
     for name, truncation, iterations in _filters():
         runs = 2 if short else 50
@@ -146,7 +157,7 @@ def _shimada_hypotheses(short: bool, folder: Path, count: Count) -> Outcome:
 
 
 def _date(short: bool, folder: Path, count: Count) -> Outcome:
-    """Run Date's experiment."""
+    """Run Date's experiment; see `Experiment.run`."""
     cameras, frames, size = (4, 40, (320, 240)) if short else (9, 240, (640, 480))
     result = date.run_experiment(cameras, frames, 0, "silhouette", count, size)
     date_walk.save_pictures(result, folder)
@@ -168,7 +179,7 @@ def _date(short: bool, folder: Path, count: Count) -> Outcome:
 
 
 def _date_walk(short: bool, folder: Path, count: Count) -> Outcome:
-    """Run Date's walk through a virtual place."""
+    """Run Date's walk through a virtual place; see `Experiment.run`."""
     cameras, size = (4, (320, 240)) if short else (9, (640, 480))
     walk = date_walk.run_walk_through(cameras, 0, count, size)
     walk.save(folder)
@@ -249,6 +260,7 @@ def reproduce_all(out: Path, short: bool, count: Count, say: Callable[[str], Non
     Args:
         out: folder of the results.
         short: whether to run few images, runs and frames, as a test.
+        count: reports the progress of each experiment.
         say: called with messages.
 
     Raises:
@@ -281,7 +293,10 @@ def reproduce_all(out: Path, short: bool, count: Count, say: Callable[[str], Non
 
 
 def _write_outcome(folder: Path, outcome: Outcome, cpu_seconds: float) -> None:
-    """Write figures.json, tables.txt, and paper.json with the rows that compare the figures."""
+    """Write figures.json, tables.txt, and paper.json with the rows that compare the figures.
+
+    `cpu_seconds` is the experiment's processor time [s], which paper.json has, too.
+    """
     figures, shown, rows = outcome
     beside = [
         {"what": what}
@@ -303,14 +318,17 @@ def _write_outcome(folder: Path, outcome: Outcome, cpu_seconds: float) -> None:
 
 
 def _write(path: Path, text: str) -> None:
-    """Write a file under another name and move it to its place."""
+    """Write a text file under another name and move it to its place."""
     beside = path.with_name(f"{path.name}.part")
     beside.write_text(text)
     os.replace(beside, path)
 
 
 def _page(out: Path, short: bool) -> str:
-    """Return the page of the finished experiments: compared figures first."""
+    """Return the HTML page of the finished experiments in a folder, compared figures first.
+
+    `short` as of `reproduce_all`; the page says so.
+    """
     finished = []
     for one in EXPERIMENTS:
         folder = out / one.name

@@ -44,7 +44,8 @@ class MotionSample(NamedTuple):
         picture: (H, W, 3) input of the shown camera.
         views: the person as each camera sees it, for the paper's method.
         found: features in space.
-        faces: (130, 80, 3) input face, nearest template and the model's face; () if not seen.
+        faces: (130, 80, 3) input face, nearest template and the model's face at the estimate; () if
+            no face was seen.
     """
 
     compared: Picture
@@ -56,6 +57,12 @@ class MotionSample(NamedTuple):
 
 class DateResult:
     """Measurements of the experiment, frame by frame; see run_experiment.
+
+    Args:
+        studio: simulated person and cameras.
+        motion: true positions and motion of each frame.
+        method: leading method, "paper" or "silhouette".
+        seed: of the perturbed tracks.
 
     Attributes:
         names: (n,) motion of each frame.
@@ -94,7 +101,7 @@ class DateResult:
         self.samples: dict[str, MotionSample] = {}
 
     def step(self, k: int) -> None:
-        """Process frame k."""
+        """Process frame k of the motion; frames must come in order."""
         studio, q = self.studio, self._motion.q[k]
         pictures = studio.pictures(q)
         images = {name: picture_to_colour_image(shot) for name, shot in pictures.items()}
@@ -130,7 +137,7 @@ class DateResult:
             )  # fmt: skip
 
     def _joint_errors(self, found: Array, q: Array) -> Array:
-        """Return the errors (k,) of the joint centres at found positions (nq,) [mm]."""
+        """Return the joint centres' errors (k,) [mm] at found positions (nq,); q: the true ones."""
         order = self.studio.skeleton.order
         places = [
             self._landmarks.positions(self._kinematics.poses(one[order])) for one in (found, q)
@@ -161,14 +168,17 @@ class DateResult:
         return max((lap["pose"] for track in own for lap in track.milliseconds), default=0.0)
 
     def milliseconds(self, method: str) -> dict[str, float]:
-        """Return median processor times of a frame's stages, all cameras together [ms]; "all"."""
+        """Return median processor times [ms] of a frame by stage, and their sum as "all".
+
+        Times of all cameras are added.
+        """
         laps = self._tracks[method].milliseconds
         names = dict.fromkeys(name for lap in laps for name in lap)
         stages = {name: float(np.median([lap.get(name, 0.0) for lap in laps])) for name in names}
         return {**stages, "all": sum(stages.values())}
 
     def as_json(self) -> dict[str, object]:
-        """Return the figures, without the frames of the registered pose."""
+        """Return the figures by key, over all frames but those of the registered pose."""
         leading = np.array(self.errors[self._method])[np.isin(self.names, self.motions)]
         all_motions = self._of_motions(self.motions)
         recoveries, spent = self.recoveries(self._method), self.milliseconds(self._method)
@@ -200,7 +210,10 @@ class DateResult:
         }
 
     def _as_found(self, motions: Sequence[str]) -> dict[str, float]:
-        """Return mean errors of elbows and knees as found, with and without the search [mm]."""
+        """Return mean errors [mm] of elbows and knees as found, in the frames of some motions.
+
+        Keys are elbow_mm and knee_mm with the search, elbow_ik_mm and knee_ik_mm without; or nan.
+        """
         chosen = np.isin(self.names, motions)
         figures = {}
         for method, ending in (("ik_only", "ik_mm"), ("paper", "mm")):
@@ -211,7 +224,7 @@ class DateResult:
         return figures
 
     def _of_motions(self, motions: Sequence[str]) -> dict[str, float]:
-        """Return mean errors [mm, deg] in the frames of some motions."""
+        """Return mean errors in some motions' frames: by method [mm], and the face's [deg]."""
         chosen = np.isin(self.names, motions)
         errors = {
             f"{method}_mm": _mean(np.array(one)[chosen]) for method, one in self.errors.items()
@@ -219,7 +232,7 @@ class DateResult:
         return {**errors, "face_error_deg": _mean(np.array(self.face_errors)[chosen])}
 
     def _of_joints(self, ends: tuple[str, ...]) -> dict[str, float]:
-        """Return mean errors [mm] of the joints with these endings in all motions, by method."""
+        """Return mean errors [mm] by method, in all motions, of joints with these endings."""
         moving = np.isin(self.names, self.motions)
         chosen = [i for i, name in enumerate(self._landmarks.names) if name.endswith(ends)]
         return {
@@ -280,9 +293,11 @@ def run_experiment(
 
     Args:
         cameras: number of cameras, including the face camera.
+        frames: number of frames, 40 or more.
         seed: of the motions and the noise.
         method: "paper": the paper's methods only; "silhouette": the fit to all silhouettes, too,
             whose figures lead.
+        count: reports progress.
         size: width and height of the pictures [pixel].
 
     Raises:
@@ -303,7 +318,13 @@ def run_experiment(
 def _table_of_motions(
     title: str, rows: Mapping[str, Mapping[str, float]], headings: Mapping[str, str], form: str
 ) -> Table:
-    """Tabulate figures: a row per motion, a column per figure."""
+    """Tabulate figures: a row per motion, a column per figure.
+
+    Args:
+        rows: figures by motion.
+        headings: heading of each figure's column, by the figure's key.
+        form: format of all figures.
+    """
     columns = {
         heading: {motion: figures[key] for motion, figures in rows.items()}
         for key, heading in headings.items()
@@ -312,7 +333,7 @@ def _table_of_motions(
 
 
 def perturbed_frames(motion: Motion) -> dict[int, str]:
-    """Return the frames in which tracks are perturbed, and their motions.
+    """Return the indices of the frames in which tracks are perturbed, with their motions.
 
     These are the middle of each motion, except in the last ten frames, and the first frame of the
     registered pose's return.
@@ -324,7 +345,7 @@ def perturbed_frames(motion: Motion) -> dict[int, str]:
 
 
 def _is_middle(motion: Motion, k: int) -> bool:
-    """Return whether frame k is the middle one of its motion."""
+    """Return whether frame k is the middle one of its motion; never in the registered pose."""
     same = [i for i, name in enumerate(motion.names) if name == motion.names[k]]
     return motion.names[k] != REGISTERED and k == same[len(same) // 2]
 

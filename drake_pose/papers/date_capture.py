@@ -62,7 +62,15 @@ def one_core() -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class Studio:
-    """Simulated person, cameras (face camera included), backgrounds, and generator of the noise."""
+    """Simulated person before cameras.
+
+    Args:
+        model, skeleton: of the person.
+        cameras: by name, the face camera included.
+        rig, context: diagram that renders the cameras' pictures, and its context.
+        backgrounds: learnt from noisy pictures without the person, by camera.
+        generator: of the pictures' noise.
+    """
 
     model: ArticulatedModel
     skeleton: Skeleton
@@ -79,6 +87,7 @@ class Studio:
         Args:
             cameras: number of cameras, including the face camera.
             size: width and height of the pictures [pixel].
+            generator: of the pictures' noise.
 
         Raises:
             SettingsError: there are fewer than three cameras.
@@ -101,32 +110,35 @@ class Studio:
         return Studio(model, skeleton, placed, rig, context, backgrounds, generator)
 
     def pictures(self, q: Array) -> dict[str, Picture]:
-        """Return the noisy pictures of all cameras of a person at q (nq,)."""
+        """Return the noisy pictures (H, W, 3) by camera of a person at q (nq,) [rad, m]."""
         self.rig.set_positions(self.context, q)
         pictures = {name: self.rig.picture(self.context, name) for name in self.cameras}
         return {name: noisy(shot, self.generator) for name, shot in pictures.items()}
 
     def prepare(self, q: Array) -> CaptureSetup:
-        """Prepare the paper's method with a person in the registered pose q (nq,)."""
+        """Prepare the paper's method: register a person in the registered pose q (nq,)."""
         pictures = self.pictures(q)
         return prepare_paper_capture(
             self.model, self.cameras, FACE_CAMERA, q, pictures, self.backgrounds
         )
 
     def shown_at(self, q: Array, camera: str) -> Picture:
-        """Return the picture (H, W, 3) of a person at q (nq,) in a camera, without noise."""
+        """Return the named camera's picture (H, W, 3) of a person at q (nq,), without noise."""
         self.rig.set_positions(self.context, q)
         return self.rig.picture(self.context, camera)
 
     def face_at(self, q: Array) -> Picture | None:
-        """Return the face (130, 80, 3) of a person at q (nq,) in the face camera; None: no skin."""
+        """Return the face (130, 80, 3) of a person at q (nq,) in the face camera, as `cut_face`."""
         picture = self.shown_at(q, FACE_CAMERA)
         mask = self.rig.mask(self.context, FACE_CAMERA)
         return cut_face(picture, see_person(picture, mask, SkinColour()).blobs)
 
 
 def noisy(picture: Picture, generator: np.random.Generator, deviation: float = 3.0) -> Picture:
-    """Add Gaussian noise to every channel of a picture [standard deviation in grey levels]."""
+    """Add Gaussian noise to every channel of a picture (H, W, 3).
+
+    `deviation` is its standard deviation [grey levels]; `generator` draws the seed of the noise.
+    """
     # OpenCV's 16-bit noise is precise enough, and four times as fast as doubles.
     noise = np.empty(picture.shape, dtype=np.int16)
     cv2.setRNGSeed(int(generator.integers(1 << 31)))
@@ -135,7 +147,11 @@ def noisy(picture: Picture, generator: np.random.Generator, deviation: float = 3
 
 
 class _StagedRun:
-    """A diagram run frame by frame, with the processor times of each frame's stages [ms]."""
+    """A diagram run frame by frame.
+
+    Attributes:
+        milliseconds: processor times of each frame by stage [ms].
+    """
 
     def __init__(self, staged: StagedDiagram[Any]) -> None:
         self.milliseconds: list[Mapping[str, float]] = []
@@ -155,12 +171,13 @@ class _StagedRun:
         self._frames += 1
 
     def _fix(self, images: Images) -> None:
+        """Fix the diagram's colour images, by camera."""
         for name, image in images.items():
             port = self._staged.diagram.GetInputPort(f"color_image_{name}")
             port.FixValue(self.context, AbstractValue.Make(image))
 
     def _finish_frame(self, stages: Iterable[str]) -> None:
-        """Evaluate stages and the pose, and store their processor times."""
+        """Evaluate the stages with these names and "pose", and store their processor times."""
         laps, last = {}, time.process_time()
         for stage in (*stages, "pose"):
             if stage == "pose":
@@ -181,11 +198,11 @@ class PaperTrack(_StagedRun):
 
     @staticmethod
     def build(setup: CaptureSetup) -> "PaperTrack":
-        """Return a track without a pose."""
+        """Return a track without a pose, of a prepared method."""
         return PaperTrack(build_paper_capture(setup, period=PERIOD))
 
     def step(self, images: Images) -> Array:
-        """Process a frame; return its positions (nq,).
+        """Process a frame's images, by camera; return its positions (nq,) [rad, m].
 
         Raises:
             SettingsError: the registered pose was not recognised in the first frame.
@@ -205,7 +222,10 @@ class PaperTrack(_StagedRun):
         return q
 
     def middle_joints(self) -> Array:
-        """Return elbows and knees of the last frame (4, 3), by LIMBS [m]; nan if recognised."""
+        """Return elbows and knees (4, 3) of the last frame, in the order of LIMBS [m].
+
+        nan where the registered pose was recognised.
+        """
         port = self._capture.diagram.GetOutputPort("limb_points")
         return np.array(port.Eval(self.context)).reshape(len(LIMBS), 3, 3)[:, 1]
 
@@ -236,7 +256,10 @@ class PaperTrack(_StagedRun):
         return views, found, (face, template)
 
     def perturbed(self, q: Array, generator: np.random.Generator) -> "PaperTrack":
-        """Return a track at q (nq,) turned around, with left and right features exchanged."""
+        """Return a track at q (nq,) turned around, with each feature in another one's place.
+
+        `generator` is not used.
+        """
         estimator = self._capture.estimator
         skeleton = estimator.setup.skeleton
         wrong = np.array(q)
@@ -252,7 +275,10 @@ class SilhouetteTrack(_StagedRun):
     """Track of all silhouettes at once, which can share another track's silhouettes.
 
     Args:
-        shared: a track of the same diagram that processes each frame before this one.
+        capture: diagram of the silhouettes and the tracker.
+        tracker: fits the person.
+        shared: a track of the same diagram that processes each frame before this one; None: the
+            silhouettes are found from the images.
     """
 
     def __init__(
@@ -272,7 +298,7 @@ class SilhouetteTrack(_StagedRun):
         return SilhouetteTrack(capture, tracker)
 
     def step(self, images: Images) -> Array:
-        """Process a frame; return its positions (nq,), even where the person is lost.
+        """Process a frame's images, by camera; return its positions (nq,), even if lost.
 
         Raises:
             SettingsError: fewer than two cameras saw the person in the first frame.
@@ -293,7 +319,11 @@ class SilhouetteTrack(_StagedRun):
         return self._tracker.positions(self._state().values)
 
     def perturbed(self, q: Array, generator: np.random.Generator) -> "SilhouetteTrack":
-        """Return a track with random angles, half a metre away."""
+        """Return a track that shares this one's silhouettes, from a perturbation of its state.
+
+        Angles are drawn between their limits by `generator`, and the person is moved by half a
+        metre. `q` is not used.
+        """
         fit, state = self._tracker.fit, self._state()
         values, angles = state.values.copy(), fit.kinematics.is_angle
         lower = np.where(np.isinf(fit.lower), -np.pi, fit.lower)
@@ -310,6 +340,7 @@ class SilhouetteTrack(_StagedRun):
         self._set_state(self._tracker.start(self._tracker.values(q)))
 
     def _state(self) -> TrackState:
+        """Return the tracker's state after the last frame."""
         person = self._capture.estimator
         state = person.known_person(person.GetMyContextFromRoot(self.context))
         if state is None:

@@ -40,7 +40,12 @@ from drake_pose.systems.walk import Walker, add_garden, view_from_behind, walker
 
 
 class WalkThrough(NamedTuple):
-    """Captured gestures compared with the true poses: figures, and figure 8 by command."""
+    """Commands and walk by captured gestures, compared with those by the true poses.
+
+    Attributes:
+        figures: results by key.
+        pictures: of each command's middle frame, the shown camera's input and the virtual place.
+    """
 
     figures: dict[str, Any]
     pictures: Mapping[str, tuple[Picture, Picture]]
@@ -117,10 +122,11 @@ def active_frames(commands: Array) -> dict[str, Mask]:
 
 
 def walk_by(model: ArticulatedModel, q: Array) -> tuple[Array, Array, Array]:
-    """Simulate a Walker on positions (n, nq), one frame per PERIOD, walking on the spot.
+    """Simulate a Walker on positions q (n, nq), one frame per PERIOD, walking on the spot.
 
     Returns:
-        (n, 2) commands, (n, 3) poses and (n, 5) rest stances.
+        (n, 2) commands, as of `recognise_command`; (n, 3) the walker's poses, x, y [m] and heading
+        [rad]; and (n, 5) rest stances, as of `stance_of`.
     """
     builder = DiagramBuilder()
     source = builder.AddSystem(TrajectorySource(held_positions(q, PERIOD)))
@@ -136,7 +142,13 @@ def walk_by(model: ArticulatedModel, q: Array) -> tuple[Array, Array, Array]:
 
 
 def draw_walk(model: ArticulatedModel, q: Array, pose: Array, rest: Array) -> Picture:
-    """Render the place (H, W, 3) from behind the avatar at q (nq,); pose, rest: of the Walker."""
+    """Render the virtual place from behind the avatar; return the picture (360, 480, 3).
+
+    Args:
+        model: of the avatar.
+        q: (nq,) its positions [rad, m].
+        pose, rest: (3,) pose of the walker and (5,) rest stance, as of `walk_by`.
+    """
     X_RP = walker_transform(pose, rest).inverse()
     builder = DiagramBuilder()
     scene_graph = add_garden(builder, X_RP)
@@ -181,7 +193,12 @@ def _draw_skin(sample: MotionSample) -> Picture:
 
 
 def _draw_points(result: DateResult, sample: MotionSample) -> Figure:
-    """Draw figure 3: 3-D points of skin by the feature they belong to, and the features."""
+    """Draw figure 3: 3-D points of skin by the feature they belong to, features, and blobs' rays.
+
+    Args:
+        result: experiment that the sample is from, for its cameras.
+        sample: middle frame of a motion.
+    """
     found = sample.found
     figure = Figure(figsize=(6.0, 6.0))
     axes = figure.add_subplot(projection="3d")

@@ -16,15 +16,17 @@ from rich.table import Table
 from drake_pose.errors import SettingsError
 
 Figures = Mapping[str, Any]
+"""Results of an experiment by key."""
+
 Advance = Callable[[int], None]
 """Called with the number that is done."""
 
 Count = Callable[[str, int], Advance]
-"""Starts a count: called with what is counted, and the total number."""
+"""Starts a progress count: called with what is counted, and the total number."""
 
 
 def uncounted(_what: str, _total: int) -> Advance:
-    """A ``Count`` that reports nothing."""
+    """Start a count that reports nothing; a ``Count``."""
     return lambda _done: None
 
 
@@ -36,7 +38,7 @@ def require_counts(**counts: int) -> None:
 
 
 def require_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    """Raise SettingsError, listing the choices, if a value is not among them."""
+    """Raise SettingsError, listing the choices, if argument `name` has none of them."""
     if value not in choices:
         raise SettingsError(f"{name} must be one of {', '.join(choices)}, not '{value}'")
 
@@ -44,7 +46,11 @@ def require_choice(name: str, value: str, choices: Sequence[str]) -> None:
 def spread_over_seeds(
     runs: Sequence[Figures], without: Sequence[str] = ()
 ) -> dict[str, dict[str, float]]:
-    """Return mean, minimum and maximum of each figure over runs that differ in the seed only."""
+    """Return "mean", "min" and "max" of each figure by key, over runs that differ in the seed only.
+
+    `runs` are the figures of each run. Figures that are no numbers, and the keys of `without`, are
+    left out.
+    """
     spread = {}
     for key, first in runs[0].items():
         if key not in without and isinstance(first, int | float):
@@ -66,8 +72,10 @@ def figure_table(
     """Tabulate figures side by side, one row per figure; figures that no column has are omitted.
 
     Args:
+        title: of the table.
         rows: label and format of each figure, by key.
-        columns: figures by heading. Figures of several seeds are shown as mean, minimum, maximum.
+        columns: figures of one run, or of several runs, by heading; of several runs mean, minimum
+            and maximum are shown. A figure that is missing, None or nan is shown as "-".
         heading: of the labels' column.
     """
     table = Table(title=title)
@@ -84,7 +92,10 @@ def figure_table(
 
 
 def _cell(values: Sequence[Any], form: str) -> str:
-    """Format a figure of one run, or mean, minimum and maximum of several runs."""
+    """Format a figure by `form`; of several different values, mean, minimum and maximum.
+
+    "-" if any of them is None or nan.
+    """
     if any(value is None or (isinstance(value, float) and math.isnan(value)) for value in values):
         return "-"
     if len(set(values)) == 1:
@@ -100,7 +111,15 @@ def draw_panels(
     below: Sequence[str] = (),
     title: str = "",
 ) -> Figure:
-    """Draw columns of pictures (H, W, 3), with titles above, texts below and labels of the rows."""
+    """Draw columns of pictures (H, W, 3).
+
+    Args:
+        columns: pictures of each column, from top to bottom; all have the same number.
+        titles: above each column.
+        labels: beside the rows, from the top.
+        below: below the columns, from the left.
+        title: above all.
+    """
     figure = Figure(figsize=(3.1 * len(columns), 3.1 * len(columns[0])))
     axes = figure.subplots(len(columns[0]), len(columns), squeeze=False)
     for line, pictures in zip(axes.T, columns, strict=True):

@@ -238,7 +238,8 @@ def _colour(material: ElementTree.Element) -> str | None:
 def _checked_shape(shape: ElementTree.Element, where: str, *, is_urdf: bool) -> str:
     """Return the type of a shape; raise ModelError for an unknown type or an invalid size.
 
-    Messages begin with ``where``. ``is_urdf``: the shape is from a URDF file, else SDFormat.
+    Sizes must be positive; the radius of a URDF sphere may be 0. Messages begin with ``where``.
+    ``is_urdf``: the shape is from a URDF file, else SDFormat.
     """
     # The sizes of each shape and how many numbers each has: URDF attributes, SDFormat elements.
     known: dict[str, dict[str, int]] = {

@@ -279,15 +279,17 @@ def _intersect_limits(
 ) -> list[str]:
     """Intersect the limits of coupled positions in place; return warnings.
 
-    A leader keeps the values at which it and its followers are within their limits. A follower
-    whose limits leave its leader a single value loses these limits (PR2's have the wrong sign).
-
-    Raises ModelError: the limits of a leader and a follower exclude each other.
+    A leader keeps the values at which it and its followers are within their limits; followers get
+    the limits that follow from it. A follower whose limits leave its leader a single value loses
+    these limits (PR2's have the wrong sign). A leader stays periodic if all its followers'
+    multipliers are whole numbers.
 
     Args:
         couplings: couplings whose leaders follow no other position.
         names: the position names, for messages.
         arrays: lower, upper, periodic and is_unlimited_angle of ``ParsedModel``, changed in place.
+
+    Raises ModelError: the limits of a leader and a follower exclude each other.
     """
     lower, upper, periodic, free = arrays
     warnings = []

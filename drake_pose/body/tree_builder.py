@@ -456,9 +456,14 @@ def _assemble(
     """Return the pose tree with one node for each branch, in their order.
 
     Args:
+        branches: branches of ``graph``, parents before children.
+        roots: pose and rotation of the branches without parents.
         base: how the plant takes up the pose of the tree's root.
         held: values of held positions [rad or m], by index in q.
         root: name of the root node, for ``PoseTree.root``.
+
+    Raises ModelError: a searched length has no limits, or the links of a skin band are no
+    neighbours.
     """
     placements: list[NodePlacement] = []
     nodes: list[PoseTreeNode] = []

@@ -206,6 +206,8 @@ class BodyState:
     def state(self, q: Array, X_WB: Array | None = None, scale: float = 1.0) -> Array:
         """Return the state (n,) at rest of a pose of the plant.
 
+        If the root does not move, its position in the pose is ignored.
+
         Args:
             q: (nq,) plant positions.
             X_WB: (4, 4) pose of the plant's world in the world; None: identity.

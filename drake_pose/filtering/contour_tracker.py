@@ -460,7 +460,7 @@ class ContourTracker:
         return angle if self.observation.is_angle(name) else length
 
     def start(self, x: Array) -> Track:
-        """Return the track that starts at a state x (n,), with the settings' uncertainty."""
+        """Return the track that starts at x (n,) with ``start_belief``, truncated by the limits."""
         return Track(self.filter.start(self.start_belief(x)), None, False)
 
     def start_belief(self, x: Array) -> Belief:

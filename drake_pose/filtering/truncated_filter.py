@@ -489,7 +489,10 @@ class TruncatedFilter:
         ]
 
     def _repeat(self, hypothesis: Hypothesis, measurement: Measurement) -> Branch:
-        """Update a predicted hypothesis by a measurement of another frame of its static view."""
+        """Update a predicted hypothesis by a measurement of another frame of its static view.
+
+        The measurement is linearised where the view's first frame was.
+        """
         repeated = hypothesis.repeated
         if repeated is None:
             repeated = begin_repeated_view(

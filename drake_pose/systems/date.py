@@ -66,8 +66,7 @@ class CaptureSetup:
         face_camera: camera that sees the face; None: there is none.
         faces: templates of the person's face; None: the face's direction is not measured.
         registered: pose that is recognised without earlier frames; None: there is none.
-        backgrounds: background models by name of the camera, including the face camera; a camera
-            without one needs masks.
+        backgrounds: background model of each camera that gives no masks, by name of the camera.
         skin: colour of the person's skin.
         search: whether elbows and knees are searched on their circles; see estimate_pose.
         recognition: smallest similarity at which the registered pose replaces the state.
@@ -116,7 +115,7 @@ def prepare_paper_capture(
         face_camera: name of the face camera; None: there is none.
         q: (nq,) the person's positions in the registered pose [rad or m].
         pictures: (H, W, 3), red, green, blue, by name of the camera, of the cameras on the circle.
-        backgrounds: background models by name of the camera.
+        backgrounds: background models by camera; that of the face camera may be missing.
         faces: templates of the person's face; None: rendered ones if there is a face camera.
 
     Raises:
@@ -145,7 +144,7 @@ def prepare_paper_capture(
 def render_registered_pose(
     skeleton: Skeleton, q: Array, cameras: Mapping[str, PinholeCamera]
 ) -> RegisteredPose:
-    """Return the registered pose at q (nq,), rendered in cameras by name (see register_pose)."""
+    """Return the pose q (nq,) with its silhouettes rendered in ``cameras``, for recognition."""
     rig = build_camera_rig(skeleton.model, cameras)
     context = rig.diagram.CreateDefaultContext()
 

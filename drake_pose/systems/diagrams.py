@@ -197,7 +197,7 @@ class MatchingDiagram:
     player: MaskPlayer | None = None
 
     def estimate(self, context: Context) -> PoseEstimate | None:
-        """Return the last update's estimate; None: no body was visible.
+        """Return the last update's estimate; None: no body was visible, or there was no update.
 
         ``context`` is the diagram's.
         """

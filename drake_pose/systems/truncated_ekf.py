@@ -431,7 +431,7 @@ def _add_hand_filter(
     builder: DiagramBuilder, image: OutputPort, silhouette: HandSilhouette, start: Belief,
     period: float,
 ) -> tuple[Diagram, TruncatedEkf, HandSensor]:  # fmt: skip
-    """Add filter and sensor for the label images at the port ``image``, and build the diagram."""
+    """Add filter and sensor for the label images at the port ``image``; build and return all."""
     ekf = TruncatedEkf(silhouette.belief_filter, start, period)
     builder.AddNamedSystem("truncated_ekf", ekf)
     sensor = builder.AddNamedSystem("hand_sensor", HandSensor(silhouette))

@@ -150,6 +150,8 @@ class Walker(MemorySystem):
     ) -> tuple[int, int]:
         """Return the command (turn, walk), each -1, 0 or 1, of a visible person; update ``known``.
 
+        It is (0, 0) until the rest stance is known.
+
         Args:
             q: (nq,) the person's positions [rad or m].
             known: state vectors by name; the person's stance and steps are overwritten.

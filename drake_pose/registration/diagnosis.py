@@ -69,7 +69,7 @@ class _Information(NamedTuple):
     freedom: float
 
     def plus(self, info: "_Information", sign: float = 1.0) -> "_Information":
-        """Return the sum with a frame's info over its variance factor; sign -1: without."""
+        """Return the sum with `info` divided by its variance factor; sign -1: the difference."""
         weight = sign / info.scale
         return self._replace(
             N=self.N + weight * info.N,

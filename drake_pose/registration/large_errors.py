@@ -326,7 +326,8 @@ def mask_excess_and_lack(
     Args:
         values: (m,) of the pose tree [rad or m].
         mask: (H, W) the silhouette in the camera's picture.
-        size: square root of the silhouettes' usual area [pixel], used for an empty mask.
+        size: square root of the silhouettes' usual area [pixel]; sets the scale of the compared
+            pictures, and stands for the size of an empty mask.
         band: pixels nearer to the other's outline do not count [pixel].
     """
     small = downscaled(camera, min(1.0, LARGE.side / size))

@@ -231,9 +231,10 @@ class OnlineRegistration:
     def _is_elsewhere(
         self, state: OnlineState, found: RegisteredCamera, registered: RegisteredCamera
     ) -> bool:
-        """Return whether pose `found` differs from `registered` by more than the usual differences.
+        """Return whether pose `found` differs significantly from `registered`.
 
-        These are the state's `distances`, without the last `newest` - 1.
+        Their squared Mahalanobis distance is tested at `false_alarm`, by an F distribution with a
+        scale of at least 1 from the state's `distances` without the last `newest` - 1.
         """
         newest, trust = self.settings.newest, self.settings.trust
         # The last distances may contain frames from after the motion.
@@ -257,7 +258,8 @@ class OnlineRegistration:
     def _is_found(self, found: RegisteredCamera, count: int, least: float) -> bool:
         """Return whether at least `count` frames, and over half, are inliers of a unique pose.
 
-        least: minimum median inlier ratio.
+        Their mean intersection over union must be at least `min_iou`, and their median inlier ratio
+        at least `least`.
         """
         inliers = [frame for frame in found.frames if frame.is_inlier]
         return (

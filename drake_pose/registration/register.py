@@ -586,12 +586,15 @@ def overlap_areas(frames: PosedFrames, X_CW: Array, side: float) -> Array:
 
 
 def E_total(found: Array) -> Array:
-    """Return the area (...) in body or mask alone over the mask's; found: ``overlap_areas``."""
+    """Return the area (...) in body or mask alone over the mask's.
+
+    found: (..., 3) areas of body, mask and their intersection, see `overlap_areas`.
+    """
     body, mask, both = np.moveaxis(found, -1, 0)
     return np.asarray((body + mask - 2.0 * both) / np.maximum(mask, 1.0))
 
 
 def intersection_over_union(found: Array) -> Array:
-    """Return the intersection over union (...) of body and mask; found: ``overlap_areas``."""
+    """Return the intersection over union (...) of body and mask; found: as of `E_total`."""
     body, mask, both = np.moveaxis(found, -1, 0)
     return np.asarray(both / np.maximum(body + mask - both, 1.0))

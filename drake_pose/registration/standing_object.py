@@ -459,7 +459,10 @@ class TargetSearch:
         poses: Array,
         side: float = SEARCH.refined_side,
     ) -> Array:
-        """Return E_total (n,) of ``HandEye`` poses (n, 2, 4, 4) in one frame, clipped at 1."""
+        """Return E_total (n,) of ``HandEye`` poses (n, 2, 4, 4) in one frame, clipped at 1.
+
+        side: see ``overlap_areas``.
+        """
         body = self._target.in_own_frame
         alone = PosedFrame(one.name, np.zeros(0), one.mask)
         posed = PosedFrames(body.kinematics, body.coarse, camera, [alone])

@@ -151,7 +151,7 @@ class SceneComparison:
         return self._finish(given if now.is_doubtful else now)
 
     def _correct(self, now: SceneFit, most: int) -> SceneFit:
-        """Return the fit `now` with large errors corrected, at most `most`, and recorded."""
+        """Return the fit with up to `most` further corrections, recorded in its findings."""
         for _ in range(most):
             correction = self._find_correction(now)
             if correction is None:
@@ -478,7 +478,7 @@ class SceneComparison:
         return bool(kinematics.is_angle[kinematics.names.index(joint)])
 
     def _differing(self, off: Finding, before: SceneFit, correction: Correction) -> Finding:
-        """Return finding `off` with a joint's largest difference from its log, and all in words.
+        """Return finding `off` with a joint's largest difference from its log, and in words.
 
         Args:
             before: the fit without the correction.
@@ -565,6 +565,8 @@ def base_motion(
     given: Mapping[str, Camera], placed: Mapping[str, RegisteredCamera], sds: float = 4.0
 ) -> Finding | None:
     """Return the motion of the base that cameras agree on; None: they differ, or there is one.
+
+    The motion is in the world, its shift that of the world's origin; pixels and p-value are 0.
 
     Args:
         given: by name the cameras at their given poses.

@@ -199,7 +199,10 @@ def _read_gltf(path: Path) -> TriangleMesh:
 
 
 def _read_stl(path: Path) -> TriangleMesh:
-    """Read a binary STL file, whatever its header says, or a text STL file of any encoding."""
+    """Read a binary STL file, whatever its header says, or a text STL file of any encoding.
+
+    Raises ModelError: the file is truncated or damaged.
+    """
     data = path.read_bytes()
     count = int.from_bytes(data[80:84], "little")
     if len(data) == 84 + 50 * count and count > 0:

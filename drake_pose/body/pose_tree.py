@@ -311,7 +311,10 @@ class PoseTree:
         return X
 
     def step_values(self, node: int, values: Array) -> Array:
-        """Return a node's joint positions (n, j), given values (n, k) of ``source(node)``."""
+        """Return the positions (n, j) [rad or m] of all joints of the node of index ``node``.
+
+        ``values``: (n, k) values of the node ``source(node)`` [rad or m].
+        """
         if not self.placements[node].follows:
             return values
         _, columns, multipliers, offsets = zip(*self.placements[node].follows, strict=True)

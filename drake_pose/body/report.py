@@ -184,7 +184,7 @@ def _size_warnings(
 
 
 def _symmetry_warnings(model: ArticulatedModel) -> list[str]:
-    """Return warnings about joints that rotate a last link about its axis of symmetry."""
+    """Return warnings about joints that rotate an outermost link about its axis of symmetry."""
     graph = build_link_graph(model, None)
     warnings = []
     for edge in graph.edges:

@@ -513,8 +513,12 @@ class HandSilhouette:
     def _search(self, mask: Mask, prediction: Belief, seed: int) -> Array:
         """Return states (k, n) near a prediction with the best silhouettes: cross-entropy search.
 
-        At most ``SEARCH.tracked`` states, best first, with the prediction's scale. ``mask``: (H,
-        W). ``seed``: seed of the random numbers.
+        At most ``SEARCH.tracked`` states, best first, with the prediction's scale.
+
+        Args:
+            mask: (H, W) the silhouette.
+            prediction: belief of the state, from which the first poses are drawn.
+            seed: seed of the random numbers.
         """
         size = (round(SEARCH.zoom * self.width), round(SEARCH.zoom * self.height))
         small = cv2.resize(mask.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)

@@ -365,7 +365,7 @@ class MatchAndTrack:
         return J, max(area, 1.0)
 
     def _result(self, track: Track, frame: _GivenFrame) -> PoseEstimate:
-        """Return the pose of a track, and how well it explains the evidence."""
+        """Return a track's pose as an estimate that is ``found``, with J and area in a frame."""
         observation, x = frame.observation, track.state.best.mean
         q, X_WB = observation.positions(x)
         J, area = self._difference(track, frame)

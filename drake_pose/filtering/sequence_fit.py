@@ -307,7 +307,10 @@ def pose_set(
 
 
 def _are_same(one: FittedSequence, other: FittedSequence) -> bool:
-    """Return whether two fits agree in all angles within SEQUENCE.same_fit."""
+    """Return whether two fits of the same frames are the same; see ``SequenceSettings.same_fit``.
+
+    Angles a full turn apart are equal; lengths are not compared.
+    """
     kinematics = one.body.kinematics
     count = len(kinematics.names)
     values, others = one.fitted.parameters[:, :count], other.fitted.parameters[:, :count]

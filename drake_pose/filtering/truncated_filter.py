@@ -568,7 +568,7 @@ class TruncatedFilter:
         return untruncated(belief) if self._limits is None else self._limits(belief, sites)
 
     def _truncate(self, belief: Belief, sites: Array) -> Truncated:
-        """Truncate a belief by the limits in the settings' way."""
+        """Truncate a belief by the limits in the settings' way; ``sites`` (S, 2) start "joint"."""
         if self.settings.truncation == "sequential":
             return truncate_sequential(belief, self.inequalities)
         if self.settings.truncation == "clip":

@@ -193,7 +193,11 @@ class TruncatedEkf(BeliefSystem[_EkfState]):
         return self.belief(context).state
 
     def next_belief(self, context: Context, last: _EkfState) -> _EkfState:
-        """Return the state after one step of the filter with the context's inputs."""
+        """Return the state after one step of the filter with the context's inputs.
+
+        Raises:
+            SettingsError: time runs backwards, or the context's parameters do not fit.
+        """
         require_time_forward(self, context, last.time)
         settings = self._settings(context)
         belief_filter = self.filter.with_settings(settings)
@@ -290,7 +294,7 @@ def plant_motion(
 
 
 def _require_loss(patience: float, probability: float) -> None:
-    """Raise SettingsError unless patience and loss probability are in range."""
+    """Raise SettingsError unless the patience is 1 or more and the probability in [0, 1)."""
     if not (patience >= 1 and 0.0 <= probability < 1.0):
         raise SettingsError(
             "patience must be 1 or more and loss_probability in [0, 1), not "

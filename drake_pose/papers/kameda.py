@@ -87,12 +87,14 @@ class RandomPose:
     """One pose of experiment A, and the result of the search.
 
     Args:
-        true_values: the drawn values of each node [rad or m].
+        true_values: the drawn values (k_i,) of each node [rad or m].
         inside: whether the whole body is inside the picture.
-        seconds: processor time of the search.
-        more_seconds: processor time of proof and modes, or of intervals.
+        result: the pose that the search found.
+        seconds: processor time of the search [s].
+        more_seconds: processor time of proof and modes, or of intervals [s].
         tolerance: silhouettes that differ by at most this are equal [pixel].
-        causes: why angles are wrong although the silhouette is matched; only on the grid.
+        causes: why angles are wrong although the silhouette is matched; None: they are right, the
+            silhouette is not matched, or angles are continuous.
     """
 
     true_values: tuple[np.ndarray, ...]
@@ -129,7 +131,7 @@ class RandomPoses:
     seed: int
 
     def view(self, trial: RandomPose) -> View:
-        """Return the first camera's silhouette of the true pose."""
+        """Return the first camera and its silhouette of a trial's true pose."""
         tree, camera = self.search.tree, self.cameras[0]
         pose = tree.positions_from(trial.true_values)
         return View(camera, LabelRenderer(tree.model, camera).mask(*pose))
@@ -154,7 +156,13 @@ def experiment_camera(angle: float = 0.0) -> ParallelCamera:
 def experiment_search(
     outside_limit: float = 200.0, candidate_limit: int = 5, interval_deg: float = 20.0
 ) -> PaperSearch:
-    """Return the paper's search of its female body: r [pixel], K, sampling interval [deg] (5)."""
+    """Return the paper's search of its female body (section 5).
+
+    Args:
+        outside_limit: r: a segment may leave the silhouette by this area [pixel].
+        candidate_limit: K: number of a segment's candidates that are kept.
+        interval_deg: sampling interval of the angles [deg].
+    """
     settings = PaperSearchSettings(
         interval=math.radians(interval_deg),
         outside_limit=outside_limit,
@@ -164,7 +172,10 @@ def experiment_search(
 
 
 def beam_experiment_search(interval_deg: float = 20.0) -> BeamSearch:
-    """Return the beam search of the same body, which needs no threshold r."""
+    """Return the beam search of the same body, which needs no threshold r.
+
+    `interval_deg` is the sampling interval of the angles [deg].
+    """
     settings = BeamSearchSettings(interval=math.radians(interval_deg))
     return BeamSearch(experiment_tree(), settings)
 
@@ -177,7 +188,14 @@ def experiment_tree() -> PoseTree:
 def draw_values(
     search: PoseSearch, angles: str, generator: np.random.Generator
 ) -> list[np.ndarray]:
-    """Draw each node's values [rad, m]: on the search's "grid", or "continuous" within limits."""
+    """Draw the values (k_i,) of each node of a search's tree [rad, m].
+
+    Args:
+        search: whose grid and limits are used.
+        angles: "grid": samples of the search's grid; "continuous": uniformly between the limits, where
+            the grid has several samples.
+        generator: draws them.
+    """
     values = []
     tree = search.tree
     lower, upper = tree.model.lower, tree.model.upper
@@ -210,6 +228,7 @@ def run_experiment(
             of ``experiment_tree``.
         images: number of poses; 219 in the paper.
         seed: of the random angles.
+        count: reports progress.
         views: number of cameras, 180 degrees / views apart: a silhouette from behind is the mirror
             image of that from the front.
 
@@ -279,9 +298,14 @@ def causes_of_wrong_angles(
     found_values: Sequence[np.ndarray],
     unseen: int = 20,
 ) -> Causes:
-    """Return why two poses have the same silhouette, given their nodes' values.
+    """Return why two different poses have the same silhouette.
 
-    Segments and differences of fewer than `unseen` pixels count as hidden.
+    Args:
+        sampled: the body.
+        camera: that sees the silhouette.
+        true_values, found_values: values (k_i,) of each node in both poses [rad, m].
+        unseen: segments that show fewer pixels in both poses are hidden, and inner edges are equal
+            if the segments of fewer pixels differ.
     """
     nodes = len(sampled.tree.nodes)
     images = [
@@ -303,8 +327,9 @@ def causes_of_wrong_angles(
 def grid_figures(*runs: RandomPoses) -> dict[str, Any]:
     """Return the figures of experiment A, by the keys of ``PAPER`` and others.
 
-    Several runs must differ in the seed only; the result then also has the spread of each figure.
-    E_total is over the silhouettes for which a pose was found; ``not_found`` counts the others.
+    Several runs must differ in the seed only; the result then has the first run's figures, and
+    under "spread" mean, minimum and maximum of each over all runs. E_total is over the silhouettes
+    for which a pose was found; ``not_found`` counts the others.
     """
     every = [_grid_figures(run) for run in runs]
     if len(runs) == 1:
@@ -314,7 +339,7 @@ def grid_figures(*runs: RandomPoses) -> dict[str, Any]:
 
 
 def _grid_figures(result: RandomPoses) -> dict[str, Any]:
-    """Return the figures of one run."""
+    """Return the figures of one run, as `grid_figures`."""
     trials = result.trials
     found = [trial.result for trial in trials]
     E_total = [one.E_total for one in found if one.found]
@@ -364,7 +389,10 @@ def _grid_figures(result: RandomPoses) -> dict[str, Any]:
 
 
 def grid_table(columns: Sequence[Sequence[RandomPoses]]) -> Table:
-    """Tabulate the paper's figures beside those of searches, each with one run per seed."""
+    """Tabulate the paper's printed figures beside those of searches.
+
+    `columns` has the runs of each search, one per seed.
+    """
     rows = {
         "images": ("silhouettes", "{}"),
         "tolerance": ("  equal within [pixel]", "{:.0f}"),
@@ -406,7 +434,10 @@ def grid_table(columns: Sequence[Sequence[RandomPoses]]) -> Table:
 
 
 def continuous_figures(result: RandomPoses) -> dict[str, Any]:
-    """Return the figures of a continuous search: ratios 0 to 1, errors [deg], times [s]."""
+    """Return the figures of a run with continuous angles: ratios 0 to 1, errors [deg], times [s].
+
+    Errors and coverage of determined joints are None if there are none.
+    """
     search = result.search
     assert isinstance(search, MultiStartSearch)
     # Positions that the experiment holds have a span of about 0.
@@ -441,7 +472,7 @@ def continuous_figures(result: RandomPoses) -> dict[str, Any]:
 
 
 def continuous_table(result: RandomPoses) -> Table:
-    """Tabulate the figures of ``continuous_figures``."""
+    """Tabulate the figures of a run, as of ``continuous_figures``."""
     rows = {
         "images": ("poses", "{}"),
         "views": ("cameras", "{}"),
@@ -460,7 +491,13 @@ def continuous_table(result: RandomPoses) -> Table:
 
 
 class RealPictures(NamedTuple):
-    """Experiment B or C: a stored scene, and the bundled model of another individual."""
+    """Experiment B or C: a stored scene, and the bundled model of another individual.
+
+    Attributes:
+        title: of its table.
+        scene, model: names of the stored scene and of the bundled model.
+        paper_images, paper_E_total: number of pictures and mean E_total that the paper prints.
+    """
 
     title: str
     scene: str
@@ -469,7 +506,10 @@ class RealPictures(NamedTuple):
     paper_E_total: float
 
     def settings(self, scene: Path) -> EstimateSettings:
-        """Return settings for a copy of the scene: the root's position and range of rotation."""
+        """Return settings with the root's position, and its rotation's range.
+
+        `scene` is the folder of the stored scene, or of a copy.
+        """
         if self.model == "man":
             return demo_settings(scene)
         # The forearm points up in the pictures, within 30 degrees; the hand may show either side.
@@ -497,6 +537,7 @@ def run_real_experiment(
         experiment: "B" or "C".
         images: number of pictures, from the first; None: all.
         out: folder for the poses and overlays of each method; None: write nothing.
+        count: reports progress.
 
     Returns:
         The figures by method. Mean E_total is over the pictures in which a pose was found.
@@ -538,7 +579,10 @@ def run_real_experiment(
 
 
 def real_table(figures: Mapping[str, Figures]) -> Table:
-    """Tabulate the paper's figures beside those of each method, with every picture's E_total."""
+    """Tabulate the paper's figures beside those of each method, with every picture's E_total.
+
+    `figures` are those of `run_real_experiment`.
+    """
     first = next(iter(figures.values()))
     rows = {
         "images": ("silhouettes", "{}"),

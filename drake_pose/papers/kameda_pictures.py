@@ -26,6 +26,8 @@ def save_pictures(
     """Draw examples of each outcome, a histogram of the effort, and sets of equally good poses.
 
     Args:
+        result: a run of experiment A.
+        folder: where the files are written.
         examples: largest number of poses per outcome.
         most_sets: largest number of pose sets.
 
@@ -82,7 +84,10 @@ def save_pictures(
 
 
 def _draw_examples(title: str, trials: list[RandomPose], result: RandomPoses) -> Figure:
-    """Draw true and estimated poses from the camera and from the side, and their silhouettes."""
+    """Draw true and estimated poses of trials from the camera and from the side.
+
+    Between them, the agreement of the silhouettes is drawn. `result` is the run of the trials.
+    """
     tree = result.search.tree
     front, side = (
         LabelRenderer(tree.model, camera)
@@ -107,13 +112,19 @@ def _draw_examples(title: str, trials: list[RandomPose], result: RandomPoses) ->
 
 
 def _coloured(segments: NDArray[Any], order: Sequence[int]) -> NDArray[np.float64]:
-    """Return segments (H, W), -1 for none, in colours (H, W, 3) by their place in `order`."""
+    """Return the picture (H, W, 3), 0 to 1, of segments (H, W), each in its own colour.
+
+    Segment i gets the colour with number order[i]; -1: no segment, white.
+    """
     colours = matplotlib.colormaps["tab20"](np.array(order) % 20)[:, :3]
     return np.where(segments[..., None] >= 0, colours[segments], 1.0)
 
 
 def _crop(pictures: list[np.ndarray], margin: int = 20) -> list[np.ndarray]:
-    """Cut pictures of segments (H, W) to the square around all that they show."""
+    """Cut pictures of segments (H, W), -1 for none, to one square around all that they show.
+
+    `margin` is added to the square's side [pixel].
+    """
     rows, columns = np.nonzero(np.logical_or.reduce([picture >= 0 for picture in pictures]))
     side = margin + max(np.ptp(rows), np.ptp(columns))
     square = []
@@ -126,7 +137,10 @@ def _crop(pictures: list[np.ndarray], margin: int = 20) -> list[np.ndarray]:
 
 
 def _draw_histogram(values: np.ndarray, end: int, label: str) -> Figure:
-    """Draw a histogram of values (n,); the last bin also counts all values beyond `end`."""
+    """Draw a histogram of values (n,), one per image, from 0 to `end`.
+
+    The last bin also counts all values beyond `end`. `label` says what the values are.
+    """
     figure = Figure(figsize=(6, 4))
     axis = figure.subplots()
     axis.hist(np.minimum(values, end), bins=np.linspace(0, end, 21).tolist(), color="0.4")
@@ -136,7 +150,10 @@ def _draw_histogram(values: np.ndarray, end: int, label: str) -> Figure:
 
 
 def _draw_chest_ranks(result: RandomPoses, limit: int) -> Figure:
-    """Draw the fraction of images whose true chest is among its first K candidates, over K."""
+    """Draw the fraction of images whose true chest is among its first K candidates, over K.
+
+    `limit` is the search's K, which is marked.
+    """
     ranks, lengths = chest_ranks(result)
     Ks = range(1, max(2, int(lengths.max())) + 1)
     figure = Figure(figsize=(6, 4))
@@ -157,10 +174,11 @@ def _draw_chest_ranks(result: RandomPoses, limit: int) -> Figure:
 
 
 def chest_ranks(result: RandomPoses) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the true chest's rank among its candidates in each image, and their numbers.
+    """Return the rank of the true chest among the chest's candidates, and the candidates' number.
 
-    The head is at its true pose, and K is unlimited (6.1, figure 12). Ranks count from 1; 0: the
-    true chest leaves the silhouette by more than r.
+    Both are (images,). The head is at its true pose, and K is unlimited (6.1, figure 12). Ranks
+    count from 1; 0: the true chest leaves the silhouette by more than r. `result` must be of the
+    paper's search.
     """
     search = result.search
     assert isinstance(search, PaperSearch)
@@ -190,7 +208,10 @@ def chest_ranks(result: RandomPoses) -> tuple[NDArray[np.int64], NDArray[np.int6
 
 
 def ratio_within(ranks: NDArray[np.int64], limit: int) -> float:
-    """Return the fraction of images whose true chest has a rank of at most `limit`."""
+    """Return the fraction of images whose true chest has a rank of 1 to `limit`.
+
+    `ranks` (images,) are those of `chest_ranks`.
+    """
     return float(((ranks > 0) & (ranks <= limit)).mean())
 
 
@@ -209,6 +230,10 @@ def save_modes(
     Below: the joints that are free in the mode.
 
     Args:
+        path: of the PNG file, which is returned.
+        model: body of the poses.
+        answer: pose set with one mode or more.
+        views: cameras and their silhouettes.
         most: largest number of modes.
         margin: around the body [pixel].
         most_names: largest number of joints named below a mode.

@@ -64,6 +64,8 @@ class FilteredHand(NamedTuple):
     """A filtered sequence.
 
     Attributes:
+        sequence: true states and measurements.
+        track: beliefs of the filter.
         bound: (n,) final mean of a filter that linearises at the truth and has no limits; nan with
             pictures.
     """
@@ -75,7 +77,7 @@ class FilteredHand(NamedTuple):
 
 @dataclass(frozen=True)
 class HandsResult:
-    """All runs of both cases, by the keys of ``CASES``, and the settings."""
+    """All runs of both cases, by the keys of ``CASES``, and the arguments of `run_experiment`."""
 
     trials: Mapping[str, tuple[FilteredHand, ...]]
     seed: int
@@ -99,7 +101,7 @@ class HandsResult:
 
 
 def result_table(*results: HandsResult) -> Table:
-    """Tabulate the figures of both cases, for one result or several truncations."""
+    """Tabulate the figures of both cases, for one result, or for results of several truncations."""
     rows = {
         "length_error_mean": ("length error, mean [pixel]", "{:.2f}"),
         "length_error_p95": ("  95th percentile", "{:.2f}"),
@@ -154,6 +156,7 @@ def run_experiment(
         truncation: "joint", "sequential" (the paper's), "clip" or "none".
         observed: "lines": axes, tips and the palm's outline, as in the paper; "lines_wrist": the
             wrist's position, too; "full": all; or PICTURES.
+        count: reports progress.
         iterations: largest number of linearisations per update; 1 in the paper; None: the default.
         noise: factor on the noise, known to the filter.
         acceleration: factor on the accelerations that the filter expects.
@@ -190,7 +193,9 @@ def run_experiment(
 def experiment_filter(
     settings: FilterSettings | None = None, noise: float = 1.0, acceleration: float = 1.0
 ) -> tuple[TruncatedFilter, HandObservation]:
-    """Return the experiment's filter, with table 1's rows from the bundled hand; its observation.
+    """Return the experiment's filter and its observation model.
+
+    The filter's inequalities are table 1's, read from the bundled hand.
 
     Args:
         settings: None: ``experiment_settings("joint")``.
@@ -222,13 +227,13 @@ def _hand() -> ArticulatedModel:
 
 
 def angle_error(means: Array, truths: Array) -> Array:
-    """Return the RMS error [deg] of the joint angles of states (..., n)."""
+    """Return the RMS errors (...) [deg] of the joint angles of states (..., n)."""
     errors = (means - truths)[..., HAND_STATE.indices((*SPREADS, *FLEXIONS))]
     return np.asarray(np.degrees(np.sqrt(np.mean(errors**2, axis=-1))))
 
 
 def _filter_sequence(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> FilteredHand:
-    """Filter a sequence; after a failure the last belief is kept."""
+    """Filter a sequence's measurements; after a failure the last belief is kept."""
     states, times, broken = [], [], False
     state = hand_filter.start(sequence.guess)
     for t, y in enumerate(sequence.measurements):
@@ -280,7 +285,7 @@ def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
 
 
 def _figures(trials: Sequence[FilteredHand]) -> dict[str, float | int]:
-    """Return the figures of a case.
+    """Return the figures of a case by key, from all its runs.
 
     The NEES of the six lengths is 6 on average if the filter's covariance is consistent.
     """
@@ -347,6 +352,7 @@ class HypothesisHistory:
     """A hypothesis of one run, from the frame in which it was made to its end.
 
     Attributes:
+        run: index of the run.
         frames: (k,) frames in which it lived, counted from 1; in the last one it ended.
         means: (k, n) mean states; the last one before truncation if it was rejected.
         weights: (k,) between 0 and 1; NaN in the last frame if it was rejected.
@@ -382,7 +388,14 @@ class HypothesisHistory:
 
 @dataclass(frozen=True, eq=False)
 class HypothesesResult:
-    """All hypotheses of all runs, and (runs,) final errors of the heaviest one's angles [deg]."""
+    """All hypotheses of all runs.
+
+    Attributes:
+        sequences: of each run.
+        final_errors: (runs,) RMS errors of the heaviest hypothesis's angles at the end [deg].
+        inequalities: of the filter.
+        settings: arguments of the experiment by name.
+    """
 
     histories: tuple[HypothesisHistory, ...]
     sequences: tuple[SyntheticSequence, ...]
@@ -476,7 +489,7 @@ def run_hypotheses_experiment(
     rejected in frame 20. The motion is that of ``run_experiment``, with the fingers pointing out of
     the image plane. Weights, which the paper does not have, reject nothing here.
 
-    Arguments and errors are those of ``run_experiment``.
+    Arguments and errors are those of ``run_experiment``; `observed` must not be PICTURES.
     """
     require_counts(runs=runs)
     require_choice("observed", observed, OBSERVED)
@@ -507,12 +520,19 @@ def run_hypotheses_experiment(
 
 
 def _histories(run: int, truths: Array, states: Sequence[FilterState]) -> list[HypothesisHistory]:
-    """Return all hypotheses of one run; those that outlived the sequence come last."""
+    """Return all hypotheses of one run; those that outlived the sequence come last.
+
+    Args:
+        run: index of the run.
+        truths: (frames, n) true states.
+        states: of the filter after each frame.
+    """
     histories: list[HypothesisHistory] = []
     believed: dict[tuple[int, int], list[tuple[int, Array, float]]] = {}
 
     def close(path: Sequence[tuple[int, Array, float]], kept: Array,
               reason: str = "", row: str = "", c: float = math.nan) -> None:  # fmt: skip
+        """Store a hypothesis by its (frame, mean, weight), and the mean kept in the last of them."""
         frames, means, weights = (np.array(one) for one in zip(*path, strict=True))
         own = truths[frames - 1]
         last = -2 if reason and len(frames) > 1 else -1

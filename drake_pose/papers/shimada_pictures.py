@@ -32,7 +32,7 @@ _DEGREES = 180 / np.pi
 
 
 def save_pictures(result: HandsResult, folder: Path) -> list[Path]:
-    """Draw the first run of each case; return the PNG files."""
+    """Draw the first run of each case into files of a folder; return the PNG files."""
     first = {key: trials[0] for key, trials in result.trials.items()}
     trial = first["r13_35"]
     curves = (
@@ -65,6 +65,8 @@ def save_pictures(result: HandsResult, folder: Path) -> list[Path]:
 
 def save_hypotheses(result: HypothesesResult, folder: Path) -> list[Path]:
     """Draw a hypothesis that an inequality rejected, and its survivor; return the PNG files.
+
+    [] if the result has none.
 
     Above: both with the truth. Below: the joint that differs most, the inequality, the weights.
     """
@@ -122,7 +124,10 @@ def save_hypotheses(result: HypothesesResult, folder: Path) -> list[Path]:
 def _draw_hand(
     axes: Axes, state: Array, colour: str, observation: HandObservation = _OBSERVATION
 ) -> None:
-    """Draw axes and joints of the fingers and the palm's outline for a state (n,)."""
+    """Draw axes and joints of the fingers and the palm's outline for a state (n,).
+
+    `observation` projects the state into the picture [pixel].
+    """
     points, shape = observation.drawing(state), observation.hand.radii.shape
     for finger in points[: shape[0] * shape[1]].reshape(*shape, 2):
         axes.plot(finger[:, 0], finger[:, 1], "-o", color=colour, markersize=3, linewidth=2)
@@ -147,7 +152,10 @@ def _draw_sequence(trial: FilteredHand) -> Figure:
 
 
 def _draw_matches(track: HandTrack, observation: HandObservation = _OBSERVATION) -> Figure:
-    """Draw figure 17: silhouettes, matched rough poses, measured axes and tips, and estimates."""
+    """Draw figure 17: silhouettes, matched rough poses, measured axes and tips, and estimates.
+
+    The frames are those kept by the track; `observation` projects states into the picture.
+    """
     kept = track.kept
     figure = Figure(figsize=(3.6 * len(kept), 11))
     grid = figure.subplots(4, len(kept))
@@ -180,14 +188,17 @@ def _draw_matches(track: HandTrack, observation: HandObservation = _OBSERVATION)
 
 
 def _rows_of(observation: HandObservation, first: str, second: str) -> NDArray[np.intp]:
-    """Return the indices (2, k) of two kinds of measurements among all, by parts of their names."""
+    """Return the indices (2, k) among all measurements of two kinds of them.
+
+    `first` and `second` are parts of the names of each kind.
+    """
     names = list(enumerate(observation.names))
     kinds = [[k for k, name in names if part in name] for part in (first, second)]
     return np.array(kinds, dtype=np.intp)
 
 
 def save_sequence(result: SequenceResult, folder: Path) -> list[Path]:
-    """Draw figures 17 and 18 of a recorded sequence; return the PNG files."""
+    """Draw figures 17 and 18 of a recorded sequence into a folder; return the PNG files."""
     observation = result.observation
     figures = {
         "figure_17": _draw_matches(result.track, observation),
@@ -205,7 +216,10 @@ def save_sequence(result: SequenceResult, folder: Path) -> list[Path]:
 
 
 def _draw_shapes(first: dict[str, FilteredHand]) -> Figure:
-    """Draw the hand laid flat: first guess, estimates and true shapes."""
+    """Draw the hand laid flat: first guess, estimates and true shapes.
+
+    `first` has the first run of each case, by the keys of CASES.
+    """
     figure = Figure(figsize=(12, 4))
     grid = figure.subplots(1, 3, sharex=True, sharey=True)
     sequence = first["r13_35"].sequence
@@ -222,7 +236,7 @@ def _draw_shapes(first: dict[str, FilteredHand]) -> Figure:
 
 
 def _flat(state: Array, hand: HandModel = TWO_FINGERS) -> Array:
-    """Return the state (n,) of a hand with the given sizes, laid flat."""
+    """Return the state (n,) of a hand with the sizes in `state` (n,), laid flat: all angles 0."""
     flat = np.zeros_like(state)
     shape = hand.layout.indices(hand.layout.constant)
     flat[shape] = state[shape]
@@ -232,7 +246,10 @@ def _flat(state: Array, hand: HandModel = TWO_FINGERS) -> Array:
 
 
 def _draw_curve(label: str, true: Array, estimate: Array, deviation: Array) -> Figure:
-    """Draw a true value and its estimate with 2 standard deviations over the frames."""
+    """Draw a true value and its estimate with 2 standard deviations over the frames.
+
+    `true`, `estimate` and `deviation` are (frames,), in the unit that `label` names.
+    """
     figure = Figure(figsize=(6, 4))
     axes = figure.subplots()
     frames = np.arange(1, len(true) + 1)

@@ -75,7 +75,13 @@ ACCELERATIONS = {
 
 @dataclass(frozen=True, eq=False)
 class SyntheticSequence:
-    """True states (55, n), noisy measurements (55, m), nan where hidden, and table 2's guess."""
+    """A synthetic sequence of 55 frames.
+
+    Args:
+        states: (55, n) true states, elements as of HAND_STATE.
+        measurements: (55, m) noisy measurements, elements as of MEASURED; nan: not measured.
+        guess: table 2's belief about the first state.
+    """
 
     states: Array
     measurements: Array
@@ -87,7 +93,8 @@ def true_states(r_13: float, phase: Array, yaw_middle: float = 0.0) -> Array:
 
     Args:
         r_13: length of finger 1's last segment [mm].
-        phase: (6,) phase shifts of the motions [rad].
+        phase: (6,) phase shifts of wrist x, wrist y, roll, yaw, pitch with the first flexions, and
+            spreads with the other flexions [rad].
         yaw_middle: mean yaw of the fingers away from the camera [rad]; negative: towards it.
     """
     frames = np.arange(FRAMES)
@@ -134,8 +141,10 @@ def make_sequence(
     """Draw a sequence: phases of the motion, noise, and table 2's first guess.
 
     Args:
-        observed: one of ``OBSERVED``.
         r_13, yaw_middle: as of ``true_states``.
+        observed: one of ``OBSERVED``.
+        observation: predicts the measurements of a state, and has their variances.
+        generator: draws the sequence.
     """
     states = true_states(r_13, generator.uniform(-0.6, 0.6, 6), yaw_middle)
     deviations = np.sqrt(observation.variances)
@@ -152,7 +161,7 @@ def make_sequence(
 
 
 def first_guess(x: Array, generator: np.random.Generator) -> Belief:
-    """Draw table 2's belief about a true state (n,): errors up to its values, its variances.
+    """Draw table 2's belief about a true state x (n,): errors up to its values, its variances.
 
     Table 2 does not list the palm's rotation, which gets the joint angles' error and variance. The
     scale is 1 with variance 0, so it is no part of the covariance.
@@ -185,7 +194,7 @@ def first_guess(x: Array, generator: np.random.Generator) -> Belief:
 
 
 def _about(axis: str, angles: Array) -> Array:
-    """Return the quaternions (n, 4) of rotations about an axis by angles (n,) [rad]."""
+    """Return the quaternions (n, 4), w first, of rotations about "x", "y" or "z" by angles (n,)."""
     quaternions = np.zeros((len(angles), 4))
     quaternions[:, 0] = np.cos(0.5 * angles)
     quaternions[:, 1 + "xyz".index(axis)] = np.sin(0.5 * angles)
@@ -193,7 +202,7 @@ def _about(axis: str, angles: Array) -> Array:
 
 
 def _product(a: Array, b: Array) -> Array:
-    """Quaternion products, row by row."""
+    """Return the products (n, 4) of quaternions a and b (n, 4), w first, row by row."""
     w, v, s, u = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
     vector = w * u + s * v + np.cross(v, u)
     return np.hstack([w * s - np.sum(v * u, axis=1, keepdims=True), vector])
@@ -229,7 +238,7 @@ class HandTrack(NamedTuple):
 
 
 def track_of(states: Sequence[FilterState], milliseconds: Sequence[float]) -> HandTrack:
-    """Return the track of a filter from its states after each frame."""
+    """Return the track of a filter from its states after each frame, and the times [ms] of each."""
     best = [state.best for state in states]
     ends = [end.reason for state in states for end in state.rejections]
     return HandTrack(
@@ -254,7 +263,8 @@ def follow_pictures(
     Args:
         parts: the diagram, with the filter and the sensor in it.
         period: between frames [s].
-        shown: indices of the frames whose pictures are kept.
+        frames: number of frames.
+        kept_frames: indices of the frames whose mask, measurement and rough pose are kept.
         advance: called with the number of frames done.
     """
     diagram, ekf, sensor = parts
@@ -286,8 +296,11 @@ class SequenceResult:
     """A filtered recorded sequence.
 
     Attributes:
+        name: of the sequence's folder.
+        observation: predicts measurements, and has the hand.
         guess: belief about the rough pose of the first frame.
-        truth: (frames,) true values by name of the angle [deg], where the sequence has them.
+        track: beliefs after each frame.
+        truth: (frames,) true values by name of the angle [deg]; {} if they are unknown.
     """
 
     name: str
@@ -308,6 +321,7 @@ class SequenceResult:
         )
 
     def _frames_beyond(self, difference: float) -> int:
+        """Return the number of frames in which silhouette and matched pose differ by more."""
         return int(np.count_nonzero(self.track.differences > difference))
 
     def as_json(self) -> dict[str, object]:
@@ -354,7 +368,15 @@ def sequence_table(results: Sequence[SequenceResult]) -> Table:
 
 
 def experiment_settings(truncation: str, iterations: int | None = None) -> FilterSettings:
-    """Return the hand's filter settings; iterated tangents. SettingsError: impossible values."""
+    """Return the settings of the hand's filter, which linearises by iterated tangents.
+
+    Args:
+        truncation: "joint", "sequential", "clip" or "none".
+        iterations: largest number of linearisations per update; None: 20.
+
+    Raises:
+        SettingsError: another value.
+    """
     return FilterSettings(
         truncation=cast(Truncation, truncation),
         linearisation="tangent",
@@ -378,6 +400,7 @@ def run_sequence(
             angles are in it: [rad], or [deg] if it has columns that the bundled hand lacks.
         settings: None: ``experiment_settings("joint")``.
         acceleration: factor on the accelerations that the filter expects.
+        count: reports progress.
 
     Raises:
         DrakePoseError: the scene has several cameras, or no hand in it can be matched.
@@ -407,7 +430,10 @@ def run_sequence(
     period = 1.0 / (scene.frame_rate_hz or 30.0)
 
     def of_kinds(wrist: float, turn: float, angle: float) -> Array:
-        """Return (moving,) deviations in the state's units: wrist [pixel], turn, angle [deg]."""
+        """Return standard deviations (moving,) of the state's moving elements, in their units.
+
+        `wrist` is that of the wrist [pixel], `turn` of the quaternion, `angle` of joints [deg].
+        """
         return np.repeat((wrist, turn, math.radians(angle)), (2, 4, len(hand.angles)))
 
     # Standard deviations of the rough pose, of its rates per frame, and of the relative sizes.
@@ -438,7 +464,10 @@ def run_sequence(
 
 
 def _truth(folder: Path, inputs: EstimateInputs, hand: HandModel) -> dict[str, Array]:
-    """Return the true angles (frames,) [deg] that the sequence's file contains."""
+    """Return the true angles (frames,) [deg] by name that the sequence's file contains.
+
+    {} if the folder has no ``joint_angles.csv``; angles that have no column are left out.
+    """
     file = folder / JOINT_TABLE
     if not file.is_file():
         return {}

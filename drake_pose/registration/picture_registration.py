@@ -557,8 +557,8 @@ def evaluate_pictures(
             fraction of the fit's median: dark and blurred contours fit badly even in correct poses.
 
     Returns:
-        the frames that show the body, with masks; the misfit of each; and the names of frames in
-        which nothing of the body is visible although the body covers enough of the picture.
+        the frames that show the body, with masks and logged values; the misfit of each; and the
+        names of frames in which the body is not visible although it covers enough of the picture.
     """
     count = len(one.recording.names)
     rows = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()

@@ -203,7 +203,7 @@ def _find_cameras(
 
     Returns:
         the inputs as a scene of masks: each picture is a frame of its camera only, compared with
-        `known_cameras`; `given_cameras` are those with a finding. And the registrations.
+        `known_cameras`; `given_cameras` are those whose poses are a finding. And the registrations.
 
     Raises:
         SceneError: no camera has a pose.

@@ -302,8 +302,9 @@ class SceneComparison:
 
         Args:
             more, more_in_one, less: minimum fractions of the mask's area, for excess in half of the
-                frames or more, for excess in fewer, and for lack. Real masks of arms have less than
-                0.02 excess, and 0.15 lack at most.
+                frames or more, for excess in fewer, and for lack. Either counts only if it exceeds
+                three times the other. Real masks of arms have less than 0.02 excess, and 0.15 lack
+                at most.
         """
         texts, names, wrong = list[str](), self._inputs.scene.frames, now.found.outliers
         for camera in (one.name for one in now.cameras):

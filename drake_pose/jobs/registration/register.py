@@ -117,9 +117,9 @@ def register_scene(
         scene: a folder with masks and cameras.yaml, in which X_WC may be missing; or an episode of
             pictures, see ``open_episode``.
         model: the robot's model file, with the robot placed in the world as in the file.
-        joints: joint positions by frame, or by time for an episode (CSV) [rad or m]. None: an
-            episode's own; in a scene they are estimated from the cameras with known X_WC, and
-            fitted together with the registered ones.
+        joints: joint positions by frame, or by time for an episode (CSV) [rad or m]. None: the
+            recording's own. If a scene has none, they are estimated from the cameras with known
+            X_WC, and fitted together with the registered ones.
         out: folder for the result, new or empty; None: nothing is written.
         settings: what is registered, and how.
         cameras: a camera file in place of the scene's or episode's own.
@@ -329,8 +329,9 @@ class _Registration:
 
         shown: maximum number of outlier pictures of each camera that are kept.
 
-        Raises RegistrationError: a focal length is wrong, and with it the camera's distance; or the
-            frames do not determine a camera's pose on its link.
+        Raises RegistrationError: a focal length is wrong, and with it the camera's distance; the
+            frames do not determine a camera's pose on its link; or half of a camera's masks or more
+            are outliers.
         """
         inputs, body, frames = self.inputs, self.body.with_tree(self.inputs.tree), []
         # All pictures of cameras that were registered from some of them.
@@ -424,7 +425,7 @@ class _Registration:
             or the model is no URDF.
 
         Raises:
-            RegistrationError: there are fewer frames than parameters.
+            RegistrationError: there are fewer frames than parameters, or the fit lost the robot.
         """
         inputs, names, cameras = self.inputs, self.body.kinematics.names, self.registered
         found = calibrate_joints(

@@ -113,7 +113,7 @@ def _describe_method(scene: Scene, estimate: SceneEstimate) -> str:
     if method == "person" and scene.images:
         method = "person_by_colour"
     text = {
-        "beam": "searched by beam search",
+        "beam": "searched by beam search and contour fits",
         "paper": "searched as published by Kameda et al.",
         "person": "one person, fitted to all silhouettes at once",
         "person_by_colour": "one person, tracked by colour",

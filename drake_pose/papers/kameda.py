@@ -192,8 +192,8 @@ def draw_values(
 
     Args:
         search: whose grid and limits are used.
-        angles: "grid": samples of the search's grid; "continuous": uniformly between the limits, where
-            the grid has several samples.
+        angles: "grid": samples of the search's grid; "continuous": uniformly between the limits,
+            where the grid has several samples.
         generator: draws them.
     """
     values = []

@@ -532,7 +532,11 @@ def _histories(run: int, truths: Array, states: Sequence[FilterState]) -> list[H
 
     def close(path: Sequence[tuple[int, Array, float]], kept: Array,
               reason: str = "", row: str = "", c: float = math.nan) -> None:  # fmt: skip
-        """Store a hypothesis by its (frame, mean, weight), and the mean kept in the last of them."""
+        """Store the history of a path of (frame, mean, weight).
+
+        `kept` (n,) is the mean of the heaviest hypothesis in the last frame; `reason`, `row` and
+        `c` are those of its rejection, if it was rejected.
+        """
         frames, means, weights = (np.array(one) for one in zip(*path, strict=True))
         own = truths[frames - 1]
         last = -2 if reason and len(frames) > 1 else -1

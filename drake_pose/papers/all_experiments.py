@@ -48,7 +48,10 @@ class Experiment(NamedTuple):
 
 
 def _kameda(short: bool, folder: Path, count: Count) -> Outcome:
-    """Run Kameda's experiment A by the paper's search and the beam search; see `Experiment.run`."""
+    """Run Kameda's experiment A by the paper's and by the beam search; 3 poses if `short`, or 219.
+
+    Pictures are written to `folder`, progress is reported to `count`.
+    """
     searches: dict[str, PoseSearch] = {
         "paper": kameda.experiment_search(),
         "beam": kameda.beam_experiment_search(),
@@ -73,14 +76,20 @@ def _kameda(short: bool, folder: Path, count: Count) -> Outcome:
 
 
 def _kameda_continuous(short: bool, _folder: Path, count: Count) -> Outcome:
-    """Run Kameda's experiment A with continuous angles, as `Experiment.run`; draws no pictures."""
+    """Run Kameda's experiment A with continuous angles, one pose if `short`, otherwise 30.
+
+    Progress is reported to `count`.
+    """
     search = MultiStartSearch(kameda.experiment_tree(), exact_masks=True)
     result = kameda.run_experiment(search, 1 if short else 30, 77, count)
     return kameda.continuous_figures(result), [kameda.continuous_table(result)], ()
 
 
 def _kameda_pictures(experiment: str, short: bool, folder: Path, count: Count) -> Outcome:
-    """Run Kameda's experiment "B" or "C"; the other arguments are those of `Experiment.run`."""
+    """Run Kameda's experiment "B" or "C", only its first picture if `short`.
+
+    Pictures are written to `folder`, progress is reported to `count`.
+    """
     figures = kameda.run_real_experiment(experiment, 1 if short else None, folder, count)
     paper, beam = figures["paper"], figures["beam"]
     said = "{paper_mean_e_total:.1%} ({paper_images} pictures)".format(**paper)
@@ -102,9 +111,13 @@ def _filters() -> tuple[tuple[str, str, int], ...]:
 
 
 def _shimada(observed: str, runs: int, short: bool, folder: Path, count: Count) -> Outcome:
-    """Run Shimada's experiment with the paper's filter and with ours; see `Experiment.run`.
+    """Run Shimada's experiment with the paper's filter and with ours.
 
-    `observed` and `runs` are those of `shimada.run_experiment`; one run if `short`.
+    Pictures are written to `folder`, progress is reported to `count`.
+
+    Args:
+        observed: what is measured, as of `shimada.run_experiment`.
+        runs: number of runs of each case; one if `short`.
     """
     figures: dict[str, dict[str, Any]] = {}
     shown = []
@@ -136,7 +149,10 @@ def _shimada(observed: str, runs: int, short: bool, folder: Path, count: Count) 
 
 
 def _shimada_hypotheses(short: bool, folder: Path, count: Count) -> Outcome:
-    """Run Shimada's experiment with several hypotheses by both filters; see `Experiment.run`."""
+    """Run Shimada's experiment with several hypotheses by both filters, 2 runs if `short`, or 50.
+
+    Pictures are written to `folder`, progress is reported to `count`.
+    """
     figures, shown = {}, []
     for name, truncation, iterations in _filters():
         runs = 2 if short else 50
@@ -157,7 +173,10 @@ def _shimada_hypotheses(short: bool, folder: Path, count: Count) -> Outcome:
 
 
 def _date(short: bool, folder: Path, count: Count) -> Outcome:
-    """Run Date's experiment; see `Experiment.run`."""
+    """Run Date's experiment, with few cameras, frames and pixels if `short`.
+
+    Pictures are written to `folder`, progress is reported to `count`.
+    """
     cameras, frames, size = (4, 40, (320, 240)) if short else (9, 240, (640, 480))
     result = date.run_experiment(cameras, frames, 0, "silhouette", count, size)
     date_walk.save_pictures(result, folder)
@@ -179,7 +198,10 @@ def _date(short: bool, folder: Path, count: Count) -> Outcome:
 
 
 def _date_walk(short: bool, folder: Path, count: Count) -> Outcome:
-    """Run Date's walk through a virtual place; see `Experiment.run`."""
+    """Run Date's walk through a virtual place, with few cameras and pixels if `short`.
+
+    Pictures are written to `folder`, progress is reported to `count`.
+    """
     cameras, size = (4, (320, 240)) if short else (9, (640, 480))
     walk = date_walk.run_walk_through(cameras, 0, count, size)
     walk.save(folder)

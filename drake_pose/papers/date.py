@@ -137,7 +137,7 @@ class DateResult:
             )  # fmt: skip
 
     def _joint_errors(self, found: Array, q: Array) -> Array:
-        """Return the joint centres' errors (k,) [mm] at found positions (nq,); q: the true ones."""
+        """Return the errors (k,) [mm] of k joint centres, at found and true positions q (nq,)."""
         order = self.studio.skeleton.order
         places = [
             self._landmarks.positions(self._kinematics.poses(one[order])) for one in (found, q)
@@ -152,7 +152,8 @@ class DateResult:
     def recoveries(self, method: str) -> dict[str, int | None]:
         """Return the number of frames until a perturbed track recovered, by motion.
 
-        A track has recovered within twice its mean error, or 25 mm. None: not while observed.
+        A track has recovered when its mean error is at most 25 mm, or twice that of the unperturbed
+        track in all frames. None: not in the 30 frames observed.
         """
         right = max(25.0, 2.0 * _mean(self.errors[method]))
         return {

@@ -75,7 +75,11 @@ def run_walk_through(
 ) -> WalkThrough:
     """Capture table 1's gestures by the paper's method, and walk by them.
 
-    Arguments are those of papers.date.run_experiment.
+    Args:
+        cameras: number of cameras, including the face camera.
+        seed: of the pictures' noise.
+        count: reports progress.
+        size: width and height of the pictures [pixel].
     """
     with one_core():
         studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]))
@@ -116,7 +120,10 @@ def run_walk_through(
 
 
 def active_frames(commands: Array) -> dict[str, Mask]:
-    """Return in which frames (n,) each of COMMANDS is active, given commands (n, 2)."""
+    """Return by name of COMMANDS in which of n frames it is active.
+
+    `commands` (n, 2) are turning and walking, as of `recognise_command`.
+    """
     turn, walk = commands.T
     return dict(zip(COMMANDS, (turn > 0, turn < 0, walk > 0, walk < 0), strict=True))
 
@@ -164,7 +171,10 @@ def draw_walk(model: ArticulatedModel, q: Array, pose: Array, rest: Array) -> Pi
 
 
 def save_pictures(result: DateResult, folder: Path) -> list[Path]:
-    """Draw a frame of each motion (figures 2, 3, 4, 7), and errors over time; return PNG files."""
+    """Draw a frame of each motion (figures 2, 3, 4, 7), and errors over time.
+
+    PNG files are written to the folder; their paths are returned.
+    """
     files = []
     for motion, sample in result.samples.items():
         files.append(save_picture(sample.compared, folder / f"figure_07_{motion}.png"))

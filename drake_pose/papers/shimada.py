@@ -101,7 +101,7 @@ class HandsResult:
 
 
 def result_table(*results: HandsResult) -> Table:
-    """Tabulate the figures of both cases, for one result, or for results of several truncations."""
+    """Tabulate the figures of both cases, for one result or for one of each truncation."""
     rows = {
         "length_error_mean": ("length error, mean [pixel]", "{:.2f}"),
         "length_error_p95": ("  95th percentile", "{:.2f}"),
@@ -227,13 +227,16 @@ def _hand() -> ArticulatedModel:
 
 
 def angle_error(means: Array, truths: Array) -> Array:
-    """Return the RMS errors (...) [deg] of the joint angles of states (..., n)."""
+    """Return the RMS errors (...) [deg] of joint angles, in estimated and true states (..., n)."""
     errors = (means - truths)[..., HAND_STATE.indices((*SPREADS, *FLEXIONS))]
     return np.asarray(np.degrees(np.sqrt(np.mean(errors**2, axis=-1))))
 
 
 def _filter_sequence(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> FilteredHand:
-    """Filter a sequence's measurements; after a failure the last belief is kept."""
+    """Filter a sequence's measurements, also without limits and linearised at the truth.
+
+    After a failure the last belief of `hand_filter` is kept.
+    """
     states, times, broken = [], [], False
     state = hand_filter.start(sequence.guess)
     for t, y in enumerate(sequence.measurements):

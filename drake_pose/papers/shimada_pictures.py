@@ -66,9 +66,8 @@ def save_pictures(result: HandsResult, folder: Path) -> list[Path]:
 def save_hypotheses(result: HypothesesResult, folder: Path) -> list[Path]:
     """Draw a hypothesis that an inequality rejected, and its survivor; return the PNG files.
 
-    [] if the result has none.
-
-    Above: both with the truth. Below: the joint that differs most, the inequality, the weights.
+    There are none if no hypothesis was rejected so. Above: both with the truth. Below: the joint
+    that differs most, the inequality, the weights.
     """
     shown = result.example()
     if shown is None:
@@ -188,9 +187,9 @@ def _draw_matches(track: HandTrack, observation: HandObservation = _OBSERVATION)
 
 
 def _rows_of(observation: HandObservation, first: str, second: str) -> NDArray[np.intp]:
-    """Return the indices (2, k) among all measurements of two kinds of them.
+    """Return the indices (2, k) of two kinds of measurements in the vector of all.
 
-    `first` and `second` are parts of the names of each kind.
+    The names of each kind contain the text `first` or `second`.
     """
     names = list(enumerate(observation.names))
     kinds = [[k for k, name in names if part in name] for part in (first, second)]

@@ -238,7 +238,7 @@ class HandTrack(NamedTuple):
 
 
 def track_of(states: Sequence[FilterState], milliseconds: Sequence[float]) -> HandTrack:
-    """Return the track of a filter from its states after each frame, and the times [ms] of each."""
+    """Return the track of a filter from its state after each frame, and each frame's time [ms]."""
     best = [state.best for state in states]
     ends = [end.reason for state in states for end in state.rejections]
     return HandTrack(
@@ -464,7 +464,7 @@ def run_sequence(
 
 
 def _truth(folder: Path, inputs: EstimateInputs, hand: HandModel) -> dict[str, Array]:
-    """Return the true angles (frames,) [deg] by name that the sequence's file contains.
+    """Return the true angles (frames,) [deg] by name of `hand.angles`, from the sequence's file.
 
     {} if the folder has no ``joint_angles.csv``; angles that have no column are left out.
     """

@@ -138,7 +138,7 @@ class CameraComparison:
     def inlier_ratio(self, camera: Camera, edge: EdgePoints, values: Array) -> float:
         """Return the inlier ratio of a camera's edge points at values (m,), 0 to 1.
 
-        Inliers are nearer than about 5 cm, the fit's last scale.
+        It is the fraction of silhouette and body contour with a residual below 5 cm.
         """
         return self._fit.compare(
             pack_views([camera], [edge]), values, AnnealingStage(0.05, 0.05)
@@ -234,6 +234,7 @@ class CameraComparison:
         names = [name for name in self._cameras if any(name in frame.edges for frame in frames)]
 
         def is_off(name: str) -> bool:
+            """Return whether a camera fits or lies badly by the pose found with all cameras."""
             # The pose follows a moved camera by 0.3 of the way with nine cameras, by half with
             # four. So at least a fifth of the motion shows beside the pose found with all cameras.
             own = [frame for frame in frames if name in frame.edges]
@@ -295,7 +296,8 @@ def _shift_to_regions(camera: Camera, edges: Sequence[EdgePoints], places: Array
     """Return the mean shift (3,) [m] from the body's middle to the ray of its region's middle.
 
     Args:
-        edges: edge points of the camera's region in each frame; frames without any are skipped.
+        edges: edge points of the camera's region in each frame; frames without any are skipped; if
+            all are, the shift is 0.
         places: (frames, nodes, 3) origins of the body's nodes [m]; their mean is the middle.
     """
     shifts = [np.zeros(3)]

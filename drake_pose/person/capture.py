@@ -70,7 +70,7 @@ class PersonCapture:
 
     @staticmethod
     def empty(count: int, shape: PersonShape | None, fit: ContourFit) -> "PersonCapture":
-        """Return a capture of `count` frames without poses, of the body and tree of `fit`."""
+        """Return a capture of `count` frames without poses: nan, or 0 for the inlier ratio."""
         q = np.full((count, len(fit.tree.model.position_names)), np.nan)
         return PersonCapture(q, np.zeros(count), shape, fit.outlines, fit.tree, q.copy())
 
@@ -207,7 +207,7 @@ class _Capture:
     def _fit_shape(
         self, frames: Sequence[int], poses: Sequence[Array]
     ) -> tuple[PersonShape, PersonPoseTracker]:
-        """Fit the shape to frames, from initial poses (m,); return it and a tracker that has it."""
+        """Fit the shape to frames (indices) from initial poses (m,); return it, and its tracker."""
         fit, observed = self._bare, [self._see(k) for k in frames]
         views = [(one.cameras, [view.edge for view in one.views]) for one in observed]
         shape = fit_shape(fit, views, np.array(poses))
@@ -276,6 +276,7 @@ class _Capture:
         found: dict[int, TrackState | None] = {}
 
         def follow(state: TrackState | None, frame: int, last: int) -> TrackState | None:
+            """Find and keep the state of a frame, from the state of the frame `last` before it."""
             seen = self._see(frame)
             if state is None and not self._is_sequence:
                 found[frame] = self._search_frame(frame, known.get(frame))
@@ -308,7 +309,7 @@ class _Capture:
         return found
 
     def _search_frame(self, frame: int, known: TrackState | None) -> TrackState | None:
-        """Return the state in a frame by itself, with the tracker's shape; None: no person.
+        """Return the state of one frame by itself, with the tracker's shape; None: no person.
 
         `known` is the state from which the pose is refined; None: the person is searched.
         """

@@ -289,6 +289,7 @@ def sort_figures(
     """
 
     def covers(camera: Camera, figure: Figure, one: Person) -> bool:
+        """Return whether a person's middle appears in the box of a figure."""
         uv, depth = camera.project(one.position[None])
         left, top, right, bottom = figure.box
         return bool(depth[0] > 0.0 and left <= uv[0, 0] <= right and top <= uv[0, 1] <= bottom)
@@ -362,6 +363,8 @@ def keep_views(
     frame: FrameViews, position: Array | None = None
 ) -> tuple[FrameViews, tuple[str, ...], tuple[str, ...]]:
     """Keep one person in a frame's views, as `keep_person` does in masks.
+
+    `position` is where the person was in the last frame (3,) [m]; None: the largest is kept.
 
     Returns:
         The views; the names of the cameras whose regions others were cut out of; and of those in
@@ -442,7 +445,7 @@ def find_tracks(
 
 
 def _prominence(person: Person, middle: Array) -> tuple[float, float]:
-    """Return the sort key of the most prominent person: area first, then nearness to the middle."""
+    """Return a sort key, greatest for the largest person, of equal ones nearest to `middle`."""
     return person.area, -float(np.linalg.norm(person.position - middle))
 
 

@@ -108,7 +108,7 @@ class PersonSettings:
     def headings_of(self, frame: int) -> list[int]:
         """Return the indices of the headings tried in a troubled frame, spread all around.
 
-        `frame` counts troubled frames from 0; after `cycle` frames the headings repeat.
+        `frame` is the number of a troubled frame, any integer; it is taken modulo `cycle`.
         """
         # The bit-reversed order puts neighbouring headings late.
         order = sorted(range(self.cycle), key=lambda k: f"{k:032b}"[::-1])
@@ -401,7 +401,7 @@ class PersonSearch:
     def distinct(self, fits: Iterable[PoseFit]) -> list[PoseFit]:
         """Return the fits that differ from all better ones, best first.
 
-        Some landmark must be more than `distinct_distance` away.
+        From each better one some landmark must be more than `distinct_distance` away.
         """
         found: list[PoseFit] = []
         kept: list[Array] = []
@@ -575,16 +575,17 @@ class PersonSearch:
         return found
 
     def _distances(self, values: Array, limb: PlannedLimb, samples_W: Array) -> Array:
-        """Return the largest distances (n,) [m] of a limb's points in its n poses from others.
+        """Return the largest distance (n,) [m] of points in each pose of a limb from given points.
 
-        `values` place the trunk; the others are `samples_W` (m, 3), along any limb from its root.
+        `values` is the pose that places the trunk; `samples_W` (m, 3) are the given points in the
+        world, from the root to the end of any limb [m].
         """
         X_WT = self._fit.kinematics.poses(values)[self._plan.trunk]
         samples_T = (samples_W - X_WT[:3, 3]) @ X_WT[:3, :3]
         return np.asarray(np.linalg.norm(limb.samples_T - samples_T, axis=2).max(axis=1))
 
     def _move_trunk(self, values: Array, middle: Array) -> Array:
-        """Shift values (m,), in place, so that the trunk's middle is at a place (3,) [m]."""
+        """Shift and return values (m,), so that the trunk's middle is at `middle` (3,) [m]."""
         kinematics = self._fit.kinematics
         off = middle - self._plan.trunk_middle(kinematics.poses(values))
         motions = kinematics.motions(values)

@@ -168,7 +168,7 @@ def see_silhouette(region: Mask, spacing: float) -> SilhouetteView:
 
 
 def edge_spacing(camera: Camera, edge_points: float = EDGE_POINTS) -> float:
-    """Return the distance between edge points for a camera [pixel]; `edge_points` a height."""
+    """Return the spacing of edge points for a camera [pixel]: height / `edge_points`, 2 or more."""
     return max(2.0, camera.height / edge_points)
 
 

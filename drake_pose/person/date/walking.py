@@ -61,7 +61,7 @@ def stance_of(left_W: Array, head_W: Array, feet_W: Array) -> Array:
 def offsets_from_rest(stance: Array, rest: Array) -> tuple[float, float]:
     """Return the turn to the left [rad] and the way ahead [m] of a stance (5,) from that at rest.
 
-    The way ahead is the smaller of the head's and the feet's; 0 if their signs differ, as when a
+    The way ahead is the head's or the feet's, the shorter one; 0 if their signs differ, as when a
     person leans.
     """
     turned = stance[0] - rest[0]
@@ -171,7 +171,7 @@ def _sides(left: float = 1.0, right: float = 1.0, **degrees: float) -> dict[str,
 
 
 def _key_poses(motion: str) -> list[dict[str, float]]:
-    """Return the key poses of a motion of MOTIONS: angles [deg] that differ from the relaxed pose.
+    """Return the key poses of a motion of MOTIONS: angles [deg] by joint; others are relaxed.
 
     The motion goes from one key pose to the next.
     """
@@ -203,7 +203,7 @@ def _key_poses(motion: str) -> list[dict[str, float]]:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Positions q (n, nq) [rad, m], and the motion of each frame: one of MOTIONS, or REGISTERED."""
+    """Positions q (n, nq) [rad, m] of n frames, and each one's motion or gesture, or REGISTERED."""
 
     q: Array
     names: tuple[str, ...]

@@ -242,7 +242,7 @@ class DateResult:
         }
 
     def tables(self) -> tuple[Table, Table]:
-        """Tabulate the errors in each motion, and those of elbows and knees as found."""
+        """Tabulate each motion's mean errors by method, and those of elbows and knees as found."""
         rows = {motion: self._of_motions((motion,)) for motion in self.motions}
         found = {motion: self._as_found((motion,)) for motion in self.motions}
         headings = {f"{method}_mm": f"{TITLES[method]} [mm]" for method in self.errors}
@@ -267,7 +267,7 @@ class DateResult:
         )
 
     def costs(self) -> str:
-        """Describe the times of a frame, and the recovery of perturbed tracks."""
+        """Describe in words the times of a frame [ms], and the recovery of perturbed tracks."""
         *stages, (_, whole) = self.milliseconds(self._method).items()
         parts = ", ".join(f"{name} {spent:.1f}" for name, spent in stages)
         soon = ", ".join(

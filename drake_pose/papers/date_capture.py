@@ -319,10 +319,11 @@ class SilhouetteTrack(_StagedRun):
         return self._tracker.positions(self._state().values)
 
     def perturbed(self, q: Array, generator: np.random.Generator) -> "SilhouetteTrack":
-        """Return a track that shares this one's silhouettes, from a perturbation of its state.
+        """Return a track from a perturbation of this one's state, whose silhouettes it shares.
 
-        Angles are drawn between their limits by `generator`, and the person is moved by half a
-        metre. `q` is not used.
+        Each frame must be processed by this track first. `generator` draws angles between their
+        limits, and a horizontal direction in which the person is half a metre away. `q` is not
+        used.
         """
         fit, state = self._tracker.fit, self._state()
         values, angles = state.values.copy(), fit.kinematics.is_angle

@@ -454,7 +454,7 @@ class HypothesesResult:
         }
 
     def table(self) -> Table:
-        """Tabulate the counts."""
+        """Tabulate the counts of `as_json`."""
         rows = {
             "mirrored": ("made by mirroring", "{}"),
             "became_another": ("dropped as equal to another", "{}"),

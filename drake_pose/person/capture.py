@@ -462,6 +462,9 @@ def capture_checked(
 ) -> CheckedCapture:
     """Capture a recording as `capture_person` does, and find its faults.
 
+    A camera at fault is left out from its first faulty frame on, unless another may be at fault
+    instead, and the recording is captured again. Identified faults of the rig are undone.
+
     Args:
         tree, cameras, read, is_sequence: as of `capture_person`.
         count: number of frames, all of which are read.

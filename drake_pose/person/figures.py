@@ -275,13 +275,16 @@ def sort_figures(
 ) -> dict[str, tuple[tuple[Figure, ...], bool]]:
     """Find the figures of other persons, and where they merge with the followed person.
 
+    A figure is another's if it belongs to another person, if its ray passes nearer to another
+    person's middle, or if it is a stranger's.
+
     Args:
         cameras: by name.
         figures: of each mask by camera, in the order of the persons' camera indices.
         persons: all persons found in the frame.
         person: the followed one, without figures where hidden; None: absent.
-        far, large: a figure of no known person is a stranger's if it is farther away [m] and
-            larger than this fraction of the followed person's figure.
+        far, large: a figure is a stranger's if the ray is farther from the followed person [m] and
+            it is larger than this fraction of the followed person's figure.
 
     Returns:
         By camera: the figures of others, all figures where the person is absent; and whether the

@@ -89,6 +89,9 @@ def find_rig_fault(
 ) -> RigFault | None:
     """Find what is wrong with a rig as a whole, from one person's masks in some frames.
 
+    The visual hull of a sound rig fills all silhouettes. If it does not, pictures are mirrored (all
+    or one) or exchanged (two of equal size), and the change that leaves least unfilled is taken.
+
     Args:
         cameras: by name.
         frames: masks (H, W) of each frame by camera; frames with fewer than two are ignored.

@@ -315,8 +315,7 @@ class PersonSearch:
         """Refine a fit and search its doubtful limbs again; keep what is better.
 
         Args:
-            fitted: fit of the frame to begin with.
-            frame: silhouettes.
+            fitted, frame: fit to begin with, and the silhouettes.
             enough: the search ends at this inlier ratio.
             first: index of the doubtful limb to begin with, modulo their number; 0 is the worst.
             limbs: number of limbs searched; None: all doubtful ones.
@@ -364,9 +363,10 @@ class PersonSearch:
 
         Args:
             frame: silhouettes.
-            headings: indices of headings; if not all, only the best start's limbs are searched.
+            headings: indices of headings, out of the settings' number evenly spread. If not all,
+                only the best start's limbs are searched, and no similar poses.
             known: (m,) values from which held ones are taken; None: the person's at rest.
-            enough: inlier ratio at which no more limbs are searched, unless all headings are tried.
+            enough: inlier ratio at which no more limbs are searched, if not all headings are.
         """
         if len(headings) == self._settings.headings:
             return next(iter(self.find_explanations(frame, known)), None)

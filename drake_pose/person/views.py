@@ -300,7 +300,7 @@ def meeting_points(
 ) -> Array:
     """Return the points (m, 3) [m] half-way between rays of two views that nearly meet.
 
-    All pairs of pixels of all pairs of views are tried.
+    All pairs of pixels of all pairs of views are tried. Points lie in front of both cameras.
 
     Args:
         cameras: of the views.

@@ -265,13 +265,13 @@ class _Capture:
         """Track the person; return the state of each frame, None where no person is found.
 
         A sequence is tracked from its first known frame, or the best-fitting one of a few, forwards
-        to the end, then from there backwards. Otherwise each frame is searched by itself.
+        to the end, then from there backwards. Otherwise each frame is refined from its known state,
+        or searched by itself.
 
         Args:
             frames: indices in order; after a gap the person is also searched anew.
             known: states by frame that are known before; {}: none.
-            finish: called with each frame's index, state and views when the frame is done; None:
-                nothing is called.
+            finish: called with index, state and views of each frame that is done, if not None.
         """
         found: dict[int, TrackState | None] = {}
 

@@ -76,8 +76,8 @@ class ColourViews:
         Args:
             fit: weighs contours by its noise.
             placement: the body at a pose.
-            step: its scale counts; the spacing is that of the search lines.
-            offset: distance between candidate edges on a search line, over the fit's scale.
+            step: its scale is the reach of search lines [m]; its spacing is not used, but theirs.
+            offset: distance between candidate edges on a search line, as a fraction of the scale.
 
         Returns:
             The comparison; 0 for cameras without known colours.

@@ -305,10 +305,11 @@ def recognise(
         skeleton: of the person.
         registered: templates; cameras without any are ignored.
         contours: of each camera; None where the person is not whole. Two are needed.
-        threshold: least mean similarity.
+        threshold: least similarity of a template, in the mean of the cameras.
 
     Returns:
-        (nq,) positions and the mean similarity, 0 to 1; None if the pose is not recognised.
+        (nq,) positions, at the place and heading that the cameras see, and the mean similarity, 0
+        to 1; None if the pose is not recognised.
     """
     scores, used, middles = [], [], []
     for camera, contour in zip(cameras, contours, strict=True):

@@ -106,7 +106,7 @@ def batch(
 
 
 def _print_batch(result: Batch, most: int = 4) -> None:
-    """Print a row for each scene, with the first few errors of audited ones, and the folder."""
+    """Print a row for each scene, with up to ``most`` errors of audited ones, and the folder."""
     estimates = Table("scene", "state", "found", "E_total", "chunks", "seconds", title="Batch")
     audits = Table("scene", "state", "consistent", "errors", "seconds", title="Audits")
     for name, state in result.scenes.items():

@@ -76,7 +76,13 @@ def print_json(value: Mapping[str, Any]) -> None:
 
 
 def print_result(result: Any, json: bool, print_text: Callable[[Any], None]) -> None:
-    """Print a result's warnings to stderr, and its summary (JSON) or its text to stdout."""
+    """Print a result's warnings to stderr, and its summary or text to stdout.
+
+    Args:
+        result: a job's result, with the attributes ``warnings`` and ``summary``.
+        json: whether the summary is printed as JSON.
+        print_text: prints the result as text, if ``json`` is False.
+    """
     for text in result.warnings:
         warn(text)
     if json:
@@ -99,7 +105,9 @@ def print_files(*files: tuple[str, Path]) -> None:
 
 
 def worst_frames(errors: Sequence[float | None], most: int = 30) -> tuple[list[int], str]:
-    """Return the indices of the worst frames, ascending, and a text for the table's title.
+    """Return the indices of the worst frames, ascending, and a text to append to a table's title.
+
+    The text is "" if these are all frames.
 
     Args:
         errors: error of each frame; nan or None if no pose was found, which counts as worst.
@@ -126,7 +134,10 @@ def progress_bar() -> Progress:
 
 @contextmanager
 def count_progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar; yields a function to be called with the number of finished items."""
+    """Show a progress bar; yields a function to be called with the number of finished items.
+
+    ``what`` labels the bar; ``total`` is the number of all items, None if unknown.
+    """
     with progress_bar() as progress:
         task = progress.add_task(what, total=total)
         yield lambda done: progress.update(task, completed=done)
@@ -150,7 +161,10 @@ class FrameProgress:
         self._progress.stop()
 
     def show_stage(self, stage: str, done: int, total: int | None) -> None:
-        """Show the progress of a stage of the work, each stage with its own bar."""
+        """Show the progress of a stage of the work, each stage with its own bar.
+
+        ``done`` of ``total`` items of the stage are finished; None: their number is unknown.
+        """
         if stage != self._stage:
             self._progress.remove_task(self._task)
             self._task = self._progress.add_task(stage, total=total)
@@ -158,7 +172,7 @@ class FrameProgress:
         self._progress.update(self._task, completed=done, total=total)
 
     def __call__(self, finished: int, total: int, frame: str, record: FrameRecord | None) -> None:
-        """Count a finished frame."""
+        """Count a finished frame; the arguments are those of `files.writer.OnFrame`."""
         self.show_stage("frames", finished, total)
         if record is not None and not record.found:
             self._lost += 1

@@ -44,7 +44,13 @@ class _Formatter(DefaultFormatter):
 
 
 def _program(name: str, help: str, *commands: Callable[..., None]) -> App:
-    """Return a program whose commands are functions; their docstrings are the help texts."""
+    """Return a program whose commands are functions; their docstrings are the help texts.
+
+    Args:
+        name: the program's name.
+        help: its help text, before the list of commands.
+        commands: functions, whose names without ``reproduce_`` are the commands' names.
+    """
 
     def show_default(value: object) -> str | None:
         return None if value in (None, (), {}) or isinstance(value, bool) else str(value)
@@ -114,7 +120,10 @@ def main(words: Sequence[str] | None = None) -> None:
 
 
 def _run(words: Sequence[str] | None) -> None:
-    """Parse the arguments and run the command; errors become one line and an exit status."""
+    """Parse the arguments (as in `main`) and run the command.
+
+    An error becomes one line on stderr and a SystemExit.
+    """
     try:
         command, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
     except (CycloptsError, SettingsError) as error:
@@ -147,6 +156,7 @@ def _run(words: Sequence[str] | None) -> None:
 
 
 def _stop(message: str, status: int = 1) -> NoReturn:
+    """Print an error message to stderr, and exit with a status."""
     say(f"drake-pose: error: {message}")
     sys.exit(status)
 

@@ -57,7 +57,12 @@ class KamedaOptions:
     out: Pictures = None
 
     def refuse(self, needed: str, *but: str) -> None:
-        """Raise a UsageError if an option other than ``but`` was given: it needs ``needed``."""
+        """Raise a UsageError if an option was given, because it needs another one.
+
+        Args:
+            needed: the other option, for the message.
+            but: names of the fields that may be given.
+        """
         for field in fields(self):
             if field.name not in but and getattr(self, field.name) is not None:
                 raise UsageError(f"--{field.name.replace('_', '-')} needs {needed}")
@@ -287,7 +292,11 @@ def reproduce_all(*, out: Out, short: bool = False, resume: Resume = False) -> N
 
 @contextmanager
 def _experiment(out: Path | None, resume: bool = False) -> Iterator[Count]:
-    """Lock the folder for results; yields a function that starts the next progress bar."""
+    """Lock the folder for results, unless it is None; yields a function that starts a progress bar.
+
+    That function gets a label and the number of all items, removes the bar before, and returns a
+    function to be called with the number of finished items. ``resume``: as in `claimed`.
+    """
     from drake_pose.files.folder import claimed
 
     with ExitStack() as bars, nullcontext() if out is None else claimed(out, resume):
@@ -305,7 +314,14 @@ def _show(
     json: bool,
     warnings: Sequence[str] = (),
 ) -> None:
-    """Print warnings, then results as JSON or as tables."""
+    """Print warnings to stderr, and results to stdout.
+
+    Args:
+        figures: all results, printed if ``json`` is True.
+        shown: tables of the main results, printed otherwise.
+        json: whether JSON is printed.
+        warnings: messages for the user.
+    """
     for text in warnings:
         warn(text)
     if json:

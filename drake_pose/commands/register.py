@@ -209,7 +209,10 @@ def _print_registration(result: SceneRegistration) -> None:
 
 
 def _say_clock(one: Mapping[str, Any]) -> str:
-    """Return a text of a camera's time offset and focal length, as far as they were estimated."""
+    """Return a text of a camera's time offset and focal length, as far as they were estimated.
+
+    ``one`` is the camera's entry of summary.json.
+    """
     texts = []
     if one["time_offset_s"] is not None:
         value, deviation = 1e3 * one["time_offset_s"], 1e3 * one["time_offset_sd_s"]
@@ -224,7 +227,7 @@ def _say_clock(one: Mapping[str, Any]) -> str:
 
 
 def _say_target(target: Mapping[str, Any]) -> str:
-    """Return a text of the target's estimated position."""
+    """Return a text of the position of the calibration target, from its entry of summary.json."""
     place = ", ".join(f"{row[3]:.4f}" for row in target["X_WT"][:3])
     return (
         f"target at {place} m in the robot's world, sd {target['translation_sd_mm']:.2f} mm, "

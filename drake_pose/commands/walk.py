@@ -133,7 +133,10 @@ def walk(
 
 
 def _open_page(options: WalkOptions, waits: bool) -> Meshcat:
-    """Open the page in a browser; if ``waits``, wait until one shows it, else warn if none does."""
+    """Serve the page, open it in a browser if ``options.browser``, and return it.
+
+    ``waits``: wait until a browser shows it; otherwise only warn if none does within 10 s.
+    """
     from drake_pose.jobs.live.walk import open_page, wait_for_browser
 
     page = open_page(options.port)

@@ -33,7 +33,12 @@ RESULT_FILES = (
 
 
 def write_file(folder: Path, name: str, content: bytes | str) -> None:
-    """Write the file ``name``, a path relative to ``folder``, atomically; folders are created.
+    """Write bytes or text (UTF-8) atomically to a file; missing folders are created.
+
+    Args:
+        folder: the result folder.
+        name: path of the file relative to ``folder``.
+        content: content of the whole file.
 
     Raises:
         OutputError: the file cannot be written.
@@ -51,20 +56,20 @@ def write_file(folder: Path, name: str, content: bytes | str) -> None:
 
 
 def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
-    """Write summary.json; numbers that are not finite become null."""
+    """Write a mapping to summary.json in a result folder, as `without_nan` converts it to JSON."""
     text = json.dumps(without_nan(summary), indent=2, allow_nan=False, ensure_ascii=False)
     write_file(folder, SUMMARY, text + "\n")
 
 
 @contextmanager
 def claimed(path: Path, resume: bool = False) -> Iterator[None]:
-    """Create and lock a result folder; a folder that stays empty is removed at the end.
+    """Create and lock a result folder; folders created here that stay empty are removed at the end.
 
     The lock is flock's on the folder itself, so that it ends with the process.
 
     Args:
         path: the folder.
-        resume: whether the folder may already hold files.
+        resume: whether the folder may already hold files; False: it must be new or empty.
 
     Raises:
         OutputError: another run is writing there, the folder is not empty, or it cannot be created.
@@ -101,9 +106,11 @@ def claimed(path: Path, resume: bool = False) -> Iterator[None]:
 
 
 def writes_folder(job: _Job) -> _Job:
-    """Decorate a job so that the folder of its argument ``out``, if any, is locked while it runs.
+    """Decorate a function so that the folder of its argument ``out`` is locked while it runs.
 
-    Error messages name Python arguments instead of options when the job is called from Python.
+    See `claimed`; ``resume`` is an argument of the function, too (False if it has none). Nothing is
+    locked if ``out`` is None. Error messages name Python arguments instead of options when the
+    function is called from Python.
     """
 
     @wraps(job)
@@ -130,7 +137,7 @@ def require_no_file(path: Path) -> None:
 
 
 def read_summary(path: Path) -> dict[str, Any]:
-    """Return the content of a result folder's summary.json.
+    """Return the content of summary.json in the result folder ``path``.
 
     Raises:
         OutputError: the file is missing or damaged.
@@ -151,7 +158,10 @@ def read_summary(path: Path) -> dict[str, Any]:
 
 
 def without_nan(value: Any) -> Any:
-    """Return plain JSON values: arrays become lists, numbers that are not finite become None."""
+    """Return nested values as plain JSON values: arrays and tuples become lists.
+
+    Numbers that are not finite become None, keys of mappings strings; other values stay.
+    """
     # The most frequent types come first.
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
@@ -167,5 +177,5 @@ def without_nan(value: Any) -> Any:
 
 
 def cannot_write(path: Path, error: OSError) -> OutputError:
-    """Return the exception for a file that cannot be written."""
+    """Return the exception to raise for a file that cannot be written because of ``error``."""
     return OutputError(f"{path}: cannot be written: {error.strerror}")

@@ -43,15 +43,18 @@ def write_motion(
 ) -> list[str]:
     """Write joint_centres.csv, and for a sequence TRC, MOT and BVH files; return warnings.
 
-    Joint centres need a landmarks.yaml beside the model; BVH needs that or a skin, since no
-    tool for robots reads it. Files of a sequence hold all frames from the first to the last record.
+    Joint centres (also in TRC) need a landmarks.yaml beside the model; BVH needs that or a skin,
+    since no tool for robots reads it. Files of a sequence hold all frames from the first to the
+    last record; frames without a record count as frames without a pose. If no record has a pose, no
+    file is written.
 
     Args:
         folder: the result folder.
         model: the model of the positions.
         frames: names of the scene's frames, in order.
-        records: estimates, in order.
-        rate_hz: frame rate [Hz]; None if the frames are not a sequence.
+        records: estimates of some or all of the frames, in order.
+        rate_hz: frame rate [Hz]; None if the frames are not a sequence: only joint_centres.csv is
+            written.
 
     Raises:
         ModelError: the landmarks cannot be read.
@@ -107,7 +110,13 @@ def joint_centres(
 
 
 def centres_as_csv(frames: Sequence[str], names: Sequence[str], places: Array) -> str:
-    """Return joint_centres.csv of positions (frames, joints, 3) [m], without frames of nan."""
+    """Return the text of joint_centres.csv: a row for each frame and joint, in the order given.
+
+    Args:
+        frames: names of the frames.
+        names: (joints,) names of the joints.
+        places: (frames, joints, 3) positions [m]; frames with a nan are left out.
+    """
     cells = [
         [frame, name, *(f"{number:.4f}" for number in place)]
         for frame, row in zip(frames, places, strict=True)
@@ -178,8 +187,8 @@ def positions_as_mot(
 
 
 Skeleton = tuple[tuple[str, int], ...]
-"""Joints of a BVH skeleton: link ("world" if several parts stand on it), and index of the parent,
--1 for the root."""
+"""Joints of a BVH skeleton: name of the link ("world" if several parts stand on it), and index of
+the parent joint in the skeleton, -1 for the root."""
 
 
 def skeleton_of(model: ArticulatedModel, q: Array, stays: float = 1e-5) -> Skeleton:
@@ -207,6 +216,11 @@ def skeleton_of(model: ArticulatedModel, q: Array, stays: float = 1e-5) -> Skele
         return sum(names[k] in seen or branches(k) > 0 for k, *_ in children[body])
 
     def walk(body: int, parent: int, length: bool, motion: bool) -> None:
+        """Append the joints of a body and of all bodies below it to ``found``.
+
+        ``parent`` is the index in ``found`` of the last joint above the body. ``length`` and
+        ``motion``: whether a constant length and a moving joint lie between both.
+        """
         is_half = parent >= 0 and length and not motion and branches(body) > 0
         if (names[body] in seen or branches(body) > 1) and not is_half:
             found.append((names[body], parent))
@@ -221,7 +235,7 @@ def skeleton_of(model: ArticulatedModel, q: Array, stays: float = 1e-5) -> Skele
 def motion_as_bvh(
     model: ArticulatedModel, q: Array, X_WB: Array | None, rate_hz: float, stays: float = 1e-5
 ) -> tuple[str, int]:
-    """Return the text of a BVH file, and the number of frames in it without a pose of their own.
+    """Return the text of a BVH file, and the number of its frames that repeat another frame's pose.
 
     Args:
         model: the model of the positions.
@@ -283,7 +297,10 @@ def motion_as_bvh(
 
 
 def _smooth_angles(R: Array) -> Array:
-    """Return the continuous Euler angles (n, 3) about Z, X, Y [deg] of rotations (n, 3, 3)."""
+    """Return Euler angles (n, 3) about Z, X, Y [deg] of rotations (n, 3, 3) of successive frames.
+
+    Of the equivalent angles those nearest to the frame before are chosen.
+    """
     with warnings.catch_warnings():
         # At 90 degrees about X only the sum of the other angles is determined.
         warnings.filterwarnings("ignore", message="Gimbal lock", category=UserWarning)
@@ -297,13 +314,13 @@ def _smooth_angles(R: Array) -> Array:
 
 
 def _hierarchy(skeleton: Skeleton, offsets: Array, slides: Mask, tips: Array) -> list[str]:
-    """Return the lines of HIERARCHY.
+    """Return the lines of a BVH file's HIERARCHY after its first, in centimetres.
 
     Args:
         skeleton: (n,) joints.
         offsets: (n, 3) positions in their parents [m].
-        slides: (n,) whether the position in the parent changes.
-        tips: (n, 3) end sites of the leaves [m].
+        slides: (n,) whether the position in the parent changes: the joint has position channels.
+        tips: (n, 3) end sites, used for joints without children [m].
     """
     lines: list[str] = []
 
@@ -311,6 +328,7 @@ def _hierarchy(skeleton: Skeleton, offsets: Array, slides: Mask, tips: Array) ->
         return " ".join(["OFFSET", *(f"{100.0 * number:.6f}" for number in place)])
 
     def write(k: int, depth: int) -> None:
+        """Append the lines of joint k and all joints below it, indented by ``depth`` tabs."""
         link, tab = skeleton[k][0], "\t" * depth
         name = "".join("_" if c.isspace() or c in "{}" else c for c in link)
         positions = ("Xposition", "Yposition", "Zposition") if slides[k] else ()

@@ -34,9 +34,15 @@ _OUTLINE = 0
 def paint_agreement(
     mask: np.ndarray, body: np.ndarray, segments: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return an RGB picture (H, W, 3) of where mask (H, W) and body (H, W) agree.
+    """Return an RGB picture (H, W, 3) uint8 of where a mask and a body agree.
 
-    Mask only is MISSING_RGB, body only EXCESS_RGB. Borders between segments (H, W) are drawn.
+    Both is AGREEMENT_RGB, mask only MISSING_RGB, body only EXCESS_RGB, neither BACKGROUND_RGB.
+
+    Args:
+        mask: (H, W) bool silhouette.
+        body: (H, W) bool, the estimated body.
+        segments: (H, W) int, index of the body's segment at each pixel, whose borders are drawn in
+            OUTLINE_RGB; None: no borders.
     """
     return PALETTE[_number_agreement(mask, body, segments)]
 
@@ -44,7 +50,10 @@ def paint_agreement(
 def _number_agreement(
     mask: np.ndarray, body: np.ndarray, segments: np.ndarray | None
 ) -> np.ndarray:
-    """Return the picture of `paint_agreement` as indices (H, W) uint8 into PALETTE."""
+    """Return the picture of `paint_agreement`, of the same arguments, as indices (H, W) uint8.
+
+    The indices are those of PALETTE.
+    """
     picture = _FIRST + mask.view(np.uint8) + 2 * body.view(np.uint8)
     _draw_borders(picture, body, segments, _OUTLINE)
     return picture
@@ -59,7 +68,8 @@ def draw_overlay(
         observed: (H, W) bool silhouette to compare the body with, or (H, W, 3) picture over which
             the body's contour is drawn.
         body: (H, W) bool, the estimated body; all False if no pose was found.
-        segments: (H, W) int, index of the segment at each pixel, or None.
+        segments: (H, W) int, index of the body's segment at each pixel, whose borders are drawn;
+            None: no borders.
         title: text above the picture.
 
     Returns:
@@ -94,7 +104,8 @@ def draw_shapes(
     """Draw the contours of one or two bodies over a silhouette or picture.
 
     Args:
-        observed: (H, W) bool silhouette, or (H, W, 3) picture, which is not cropped.
+        observed: (H, W) bool silhouette, which is cropped to bodies and silhouette; or (H, W, 3)
+            uint8 RGB picture, which is not cropped.
         shapes: one or two bodies (H, W) bool.
         names: their names in the legend.
         title: text above the picture.
@@ -128,6 +139,7 @@ def encode_png(picture: np.ndarray) -> bytes:
 
 
 def _draw_contour(picture: np.ndarray, body: np.ndarray, colour: Colour, width: int) -> None:
+    """Draw the contours of a body (H, W) bool, ``width`` pixels wide, into a picture (H, W, 3)."""
     shape = body.astype(np.uint8)
     contours, _ = cv2.findContours(shape, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(picture, contours, -1, colour, width)
@@ -136,7 +148,14 @@ def _draw_contour(picture: np.ndarray, body: np.ndarray, colour: Colour, width: 
 def _draw_borders(
     picture: np.ndarray, body: np.ndarray, segments: np.ndarray | None, colour: Colour | int
 ) -> None:
-    """Colour the body's pixels whose right or lower neighbour is another segment of the body."""
+    """Colour the body's pixels whose right or lower neighbour is another segment of the body.
+
+    Args:
+        picture: (H, W, 3) RGB, or (H, W) indices into PALETTE; changed in place.
+        body: (H, W) bool.
+        segments: (H, W) int, index of the segment at each pixel; None: nothing is drawn.
+        colour: RGB, or index into PALETTE.
+    """
     if segments is None:
         return
     borders = np.zeros(body.shape, dtype=np.bool_)
@@ -146,9 +165,10 @@ def _draw_borders(
 
 
 def _surroundings(shown: np.ndarray, margin_fraction: float = 0.12) -> tuple[slice, slice]:
-    """Return rows and columns around the True pixels (H, W); the whole picture if there are none.
+    """Return slices of rows and columns around the True pixels of ``shown`` (H, W).
 
-    ``margin_fraction``: margin as a fraction of their extent.
+    They are those of the whole picture if no pixel is True. The margin is 8 pixels and the fraction
+    ``margin_fraction`` of the larger of the pixels' width and height.
     """
     left, top, width, height = cv2.boundingRect(shown.view(np.uint8))
     if not width:
@@ -159,7 +179,10 @@ def _surroundings(shown: np.ndarray, margin_fraction: float = 0.12) -> tuple[sli
 
 
 def _enlarged(picture: np.ndarray, width_to: int = 1120, height_to: int = 480) -> np.ndarray:
-    """Enlarge a picture by the largest integer, at most 8, that keeps it within a size [pixel]."""
+    """Return a picture (H, W) or (H, W, 3) enlarged by the largest integer, at most 8, that fits.
+
+    It fits a width ``width_to`` and height ``height_to`` [pixel]; a larger picture keeps its size.
+    """
     height, width = picture.shape[:2]
     scale = max(1, min(height_to // height, width_to // width, 8))
     size = width * scale, height * scale
@@ -173,7 +196,15 @@ def _framed(
     least_width: int = 560,
     band: int = 36,
 ) -> np.ndarray:
-    """Add bands of height ``band`` [pixel] with title and legend, and pad to ``least_width``."""
+    """Return a picture with a band for the title above it, and one for the legend below it.
+
+    Args:
+        picture: (H, W, 3) uint8 RGB, or (H, W) uint8 indices into PALETTE; so is the result.
+        title: text above the picture.
+        legend: colour (RGB or index, as in the picture) and text of each entry; empty: no band.
+        least_width: width to which a narrower picture is padded on both sides [pixel].
+        band: height of a band [pixel].
+    """
     numbered = picture.ndim == 2
     ground, text_colour = (_BACKGROUND, _TEXT) if numbered else (BACKGROUND_RGB, _TEXT_RGB)
     pad = max(0, least_width - picture.shape[1])
@@ -197,4 +228,5 @@ def _framed(
 def _put_text(
     picture: np.ndarray, text: str, position: tuple[int, int], colour: Colour | int
 ) -> None:
+    """Draw a text into a picture, with its lower left corner at ``position`` (x, y) [pixel]."""
     cv2.putText(picture, text, position, cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)

@@ -49,6 +49,8 @@ JointEstimate [deg or m], and ``value``, which is None where several modes are c
 class FrameRecord:
     """Estimate of one frame: its row of poses.csv and its part of summary.json.
 
+    Fields that the method does not estimate are None or empty.
+
     Args:
         q: (nq,) positions [rad or m]; NaN if no pose was found.
         base: (7,) BASE_COLUMNS; None if the model's own joints place it in the world.
@@ -59,7 +61,7 @@ class FrameRecord:
         runs: number of runs of the search's step 3.
         stopped_by: why the search ended: "end", "exact", "run_limit" or "time_limit"; "tracked" if
             the pose was tracked, "followed" if a person was.
-        outside_limit: the paper's r in each view [pixel].
+        outside_limit: Kameda's r in each view: allowed area of a segment outside the mask [pixel].
         joint_errors: estimate minus ground truth by position [deg or m], as far as that is known.
         camera_scale: estimated scale of a parallel camera [pixel/m].
         explained: whether the pose fits the silhouettes at least roughly.
@@ -99,7 +101,10 @@ class FrameRecord:
     def from_json(
         frame: str, values: Mapping[str, Any], q: Array, base: Array | None = None
     ) -> "FrameRecord":
-        """Return the record from the values of `as_json` and the row of poses.csv (q, base)."""
+        """Return a frame's record from the content of `as_json` and its row of poses.csv.
+
+        The row: q (nq,) [rad or m], and BASE_COLUMNS (7,), None if it has none.
+        """
         known = {name: value for name, value in values.items() if name != "found"}
         return FrameRecord(frame, q, base, **known)
 
@@ -116,7 +121,7 @@ class SceneEstimate:
     Args:
         position_names: (nq,) in the plant's order.
         position_kinds: (nq,) "angle" [rad], "length" [m] or "quaternion".
-        records: estimates by frame.
+        records: estimates by frame, in the scene's order.
         summary: content of summary.json.
         folder: the result folder; None if nothing was written.
         warnings: messages for the user.
@@ -151,7 +156,7 @@ def base_pose(base: Array | None) -> Array:
 
 
 class PoseTable:
-    """Reads and writes the poses.csv of a result folder, with or without BASE_COLUMNS."""
+    """Reads and writes poses.csv in a result folder; ``with_base``: it has BASE_COLUMNS."""
 
     def __init__(self, folder: Path, position_names: Sequence[str], with_base: bool) -> None:
         self._folder, self._count, self._with_base = folder, len(position_names), with_base
@@ -173,10 +178,11 @@ class PoseTable:
             raise cannot_write(path, error) from error
 
     def read(self, known: Mapping[str, Mapping[str, Any]] | None = None) -> list[FrameRecord]:
-        """Return the records of an interrupted job; empty if there is no poses.csv.
+        """Return the records of an interrupted job, in the file's order; [] without poses.csv.
 
         Args:
-            known: ``frames`` of its summary.json.
+            known: ``frames`` of its summary.json, content of `FrameRecord.as_json` by frame. Other
+                frames' records have the values of poses.csv only.
 
         Raises:
             OutputError: the table cannot be read, or belongs to another model.
@@ -204,6 +210,7 @@ class PoseTable:
         return records
 
     def _cells(self, record: FrameRecord) -> list[str]:
+        """Return the cells of a record's row; unknown numbers are empty."""
         base = np.full(len(BASE_COLUMNS), np.nan) if record.base is None else record.base
         error = math.nan if record.E_total is None else record.E_total
         numbers = [*record.q, *(base if self._with_base else ()), error]
@@ -217,7 +224,7 @@ def user_units(model: ArticulatedModel) -> Array:
 
 
 def measured_positions(model: ArticulatedModel, records: Sequence[FrameRecord]) -> Array:
-    """Return the measured positions (frames, nq) [rad or m]; nan without measurement or pose."""
+    """Return each record's q minus its joint_errors (frames, nq) [rad or m]; nan if unknown."""
     names, q = model.position_names, np.array([record.q for record in records])
     errors = [[record.joint_errors.get(name, np.nan) for name in names] for record in records]
     measured = q - np.array(errors).reshape(q.shape) / user_units(model)
@@ -228,13 +235,17 @@ def measured_positions(model: ArticulatedModel, records: Sequence[FrameRecord]) 
 
 
 def record_pose_set(pose_set: PoseSet | None, tree: PoseTree) -> dict[str, Any]:
-    """Return FrameRecord's fields ``joints``, ``modes`` and ``mode_count``; empty for None."""
+    """Return FrameRecord's fields ``joints``, ``modes`` and ``mode_count`` by name; {} for None.
+
+    ``pose_set``: all poses of a frame, found by a search with the pose tree ``tree``.
+    """
     if pose_set is None:
         return {}
     kinds = dict(zip(tree.model.position_names, tree.model.position_kinds, strict=True))
     followers = [one.follower for one in tree.followers]
 
     def record(joints: Sequence[JointEstimate], values: Sequence[float | None]) -> Joints:
+        """Return the estimates of joints and their followers; values [rad or m] in this order."""
         estimates = {}
         for joint, value in zip((*joints, *mimic_joints(tree, joints)), values, strict=True):
             unit = 1.0 if kinds.get(joint.name) == "length" else math.degrees(1.0)
@@ -259,11 +270,13 @@ def record_pose_set(pose_set: PoseSet | None, tree: PoseTree) -> dict[str, Any]:
 
 
 def record_deviations(model: ArticulatedModel, q: Array, deviations: Array) -> Joints:
-    """Return the 95 % interval of each position, clipped to its limits.
+    """Return the 95 % interval of each position by name, clipped to its limits; no ``value``.
 
-    A position is determined if its interval is less than half of its range.
+    A position is determined if its interval, before clipping, is less than half of its range.
+    Positions with an infinite interval are left out; the result is {} if q is not finite.
 
     Args:
+        model: the model of the positions.
         q: (nq,) positions [rad or m].
         deviations: (nq,) standard deviations [rad or m]; nan where unknown.
     """
@@ -291,8 +304,11 @@ def record_deviations(model: ArticulatedModel, q: Array, deviations: Array) -> J
 def record_modes(model: ArticulatedModel, answers: Sequence[tuple[Array, Array]]) -> dict[str, Any]:
     """Return FrameRecord's fields of one pose, or of several that fit a frame equally well.
 
+    They are ``joints`` (the union of the intervals); for several also ``modes`` and ``mode_count``.
+
     Args:
-        answers: positions (nq,) and deviations (nq,), as in `record_deviations`, best first.
+        model: the model of the positions.
+        answers: positions and deviations of each pose, as in `record_deviations`, best first.
     """
     of_modes = [record_deviations(model, *one) for one in answers]
     if len(of_modes) < 2:
@@ -329,7 +345,7 @@ def joint_table(records: Iterable[FrameRecord]) -> str:
 
 
 def mode_table(records: Iterable[FrameRecord]) -> str:
-    """Return the text of modes.csv: a row for each frame, mode and joint; mode 1 is the best."""
+    """Return the text of modes.csv: a row for each frame, mode (1: best) and joint [deg or m]."""
     rows = [
         (record.frame, number, name, f"{one['value']:.6g}", *_ends(one))
         for record in records
@@ -340,6 +356,7 @@ def mode_table(records: Iterable[FrameRecord]) -> str:
 
 
 def _ends(joint: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Return the cells determined, low and high of a joint's entry of `Joints`."""
     return "yes" if joint["determined"] else "no", f"{joint['low']:.6g}", f"{joint['high']:.6g}"
 
 
@@ -362,8 +379,8 @@ def describe_job(
 ) -> dict[str, Any]:
     """Return scene, model, settings and the files' SHA-256 digests as plain JSON values.
 
-    Args:
-        cameras: camera file used instead of the scene's own.
+    The digest of an unreadable file is None. ``scene`` is the scene's folder, ``cameras`` a camera
+    file used instead of its cameras.yaml, or None.
     """
     return {
         "scene": str(scene),
@@ -377,7 +394,7 @@ def describe_job(
 
 
 def mask_digests(scene: Scene, cameras: Iterable[str], frame: str) -> dict[str, str]:
-    """Return digests of a frame's mask files by camera, without files that cannot be read."""
+    """Return digests (16 hex digits) of a frame's masks by camera; unreadable ones are left out."""
     found = {}
     for camera in cameras:
         path = scene.masks.get((camera, frame))
@@ -388,11 +405,18 @@ def mask_digests(scene: Scene, cameras: Iterable[str], frame: str) -> dict[str, 
 
 
 def open_job(folder: Path | None, job: Mapping[str, Any], resume: bool) -> Mapping[str, Any] | None:
-    """Return the summary of the job to be resumed; None for a new job.
+    """Return the summary.json in a result folder, checked to be of the same job, if ``resume``.
+
+    Without ``resume`` nothing is read, and the result is None.
+
+    Args:
+        folder: the result folder; None if there is none.
+        job: the present job, from `describe_job`.
 
     Raises:
         SettingsError: no folder is given.
-        OutputError: the earlier job had other files, or other settings than its frames.
+        OutputError: the summary cannot be read, or model file, camera file or settings (other than
+            ``frames``) differ.
     """
     if not resume:
         return None
@@ -427,7 +451,7 @@ def summarize(
         job: from `describe_job`.
         records: finished frames by name.
         complete: whether all frames are finished.
-        more: entries of the method.
+        more: further entries, of the method; None: none.
     """
     ious = [iou for record in records.values() for iou in record.ious.values()]
     errors = [record.E_total for record in records.values() if record.E_total is not None]
@@ -474,6 +498,7 @@ def camera_warnings(
     """Return a warning for each of three or more cameras whose IoU is much lower than the others'.
 
     Args:
+        records: estimates by frame.
         known: earlier warnings; cameras that these name get no other one.
         suspicious: minimum difference of the mean IoU to the cameras' median.
     """
@@ -490,7 +515,7 @@ def camera_warnings(
 
 
 def frame_warnings(records: Mapping[str, FrameRecord]) -> tuple[str, ...]:
-    """Return a warning of the frames without a pose, and one of those whose search was stopped."""
+    """Return warnings of the frames (keys) without a pose, and with a search ended by a limit."""
     found: dict[str, list[str]] = {}
     limits = {"run_limit": "run limit", "time_limit": "time limit; raise it (time_limit)"}
     for frame, record in records.items():
@@ -513,9 +538,11 @@ def poor_fit_warnings(
     held: Iterable[str],
     at_limit: float = 1e-3,
 ) -> tuple[str, ...]:
-    """Return a warning if poses fit their pictures badly.
+    """Return one warning of all frames with an E_total of BADLY_EXPLAINED or more; () if none has.
 
     Args:
+        records: estimates by frame; those of the method person are not evaluated.
+        model: the model of the positions; joints at their limits are named.
         held: names of positions that were held.
         at_limit: distance below which a joint is at a limit, as a fraction of its range.
     """

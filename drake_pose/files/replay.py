@@ -100,7 +100,10 @@ def make_replay(
 
 
 def _lighten(scene_graph: SceneGraph, source: SourceId, most: int) -> None:
-    """Simplify a source's illustration meshes to at most ``most`` triangles in all."""
+    """Simplify illustration meshes of a scene graph to at most ``most`` triangles in all.
+
+    ``source`` is the geometry source of the meshes, such as a plant's; others stay unchanged.
+    """
     inspector = scene_graph.model_inspector()
     shown = {
         one: shape
@@ -124,7 +127,16 @@ def _record(
     model: ArticulatedModel,
     measured: np.ndarray | None,
 ) -> None:
-    """Record every frame at its time, and stills once more just before the next frame."""
+    """Record the animation of all frames, and publish it to Meshcat.
+
+    Frame k is at k times ``period``; from a period of 1 s on it is repeated just before the next
+    frame. positions, X_WB, period, model and measured are as in `make_replay`.
+
+    Args:
+        meshcat: the page.
+        diagram: diagram that publishes the body to the page.
+        source: the diagram's source of positions (nq,).
+    """
     context = diagram.CreateDefaultContext()
     value = source.get_mutable_source_value(source.GetMyMutableContextFromRoot(context))
     still = period >= 1.0
@@ -152,7 +164,10 @@ def _record(
 def _extent(
     model: ArticulatedModel, positions: np.ndarray, X_WB: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return centre (3,) and radius [m] of the body's bounding box, over all frames."""
+    """Return centre (3,) in the world and radius [m] of the body's bounding box, over all frames.
+
+    positions (frames, nq) and X_WB (frames, 4, 4) are as in `make_replay`.
+    """
     boxes = {
         model.link_index(link): np.array(
             [*product(*np.c_[mesh.vertices.min(0), mesh.vertices.max(0)])]
@@ -173,7 +188,9 @@ def _draw_camera(
     """Draw a camera's frustum; that of a parallel camera begins outside the object.
 
     Args:
-        p_WO: (3,) centre of the object [m].
+        meshcat: the page.
+        camera: the camera.
+        p_WO: (3,) centre of the object in the world [m].
         radius: radius of the object [m].
         length: length of the frustum, in radii.
     """
@@ -221,8 +238,9 @@ def make_recording(
     Args:
         tree: the body, in the frame of the cameras' X_WC.
         cameras: cameras; only pinhole cameras are shown.
-        frames: frames in the order of the timeline `frame`.
-        pictures: pictures by camera and frame.
+        frames: values of the pose tree and masks of each frame, in the order of the timeline
+            `frame`.
+        pictures: pictures by camera and frame; pictures may be missing.
 
     Raises:
         OutputError: rerun-sdk is not installed.
@@ -253,7 +271,10 @@ def make_recording(
 
 
 def _log_rerun_camera(rr: Any, recording: Any, camera: Camera) -> bool:
-    """Log a pinhole camera's pose and intrinsics; return False for another camera."""
+    """Log a pinhole camera's pose and intrinsics; log nothing and return False for another camera.
+
+    ``rr`` is the module rerun, ``recording`` its RecordingStream.
+    """
     if not isinstance(camera, PinholeCamera):
         return False
     place = ["world", camera.name]
@@ -272,9 +293,11 @@ def _log_rerun_camera(rr: Any, recording: Any, camera: Camera) -> bool:
 
 
 def _rerun_mesh(rr: Any, mesh: TriangleMesh) -> Any:
+    """Return a mesh as a Mesh3D of the module rerun, ``rr``."""
     surface = mesh.vertices, mesh.triangles
     return rr.Mesh3D(vertex_positions=surface[0], triangle_indices=surface[1])
 
 
 def _rerun_pose(rr: Any, X_AB: NDArray[np.float64]) -> Any:
+    """Return a pose (4, 4) as a Transform3D of the module rerun, ``rr``."""
     return rr.Transform3D(translation=X_AB[:3, 3], mat3x3=X_AB[:3, :3])

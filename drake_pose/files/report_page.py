@@ -27,7 +27,14 @@ from drake_pose.silhouette.pictures.scenes import Scene
 def make_report(
     folder: Path, model: ArticulatedModel, scene: Scene, estimate: SceneEstimate
 ) -> str:
-    """Return the HTML page of an estimate, with links to the files and overlays in its folder."""
+    """Return the HTML page of an estimate, with links to the files and overlays in its folder.
+
+    Args:
+        folder: the result folder, with its other files already written.
+        model: the model of the positions.
+        scene: the scene, with the cameras that were used.
+        estimate: the estimate.
+    """
     frames, records, joined = list(estimate.records), estimate.records.values(), scene.sequence
     found = ["found" if record.found else "not-found" for record in records]
     use = {name: _picture_use(scene, estimate, name) for name in scene.cameras}
@@ -79,7 +86,10 @@ def make_report(
 
 
 def estimate_answer(model: ArticulatedModel, estimate: SceneEstimate) -> str:
-    """Return the result in one or two sentences: poses found, error, and determined joints."""
+    """Return the result in one or two sentences: poses found, error, and determined joints.
+
+    A joint of ``model`` counts as determined if it is so in all frames of ``estimate`` with a pose.
+    """
     found = [record for record in estimate.records.values() if record.found]
     count = len(estimate.records)
     of_frames = "" if count == 1 else f" in {len(found)} of {count} frames"
@@ -108,7 +118,10 @@ def estimate_answer(model: ArticulatedModel, estimate: SceneEstimate) -> str:
 
 
 def _describe_method(scene: Scene, estimate: SceneEstimate) -> str:
-    """Return how the poses were found, such as ``tracked in 58 frames, 2 searched``."""
+    """Return how the poses of an estimate were found: ``tracked in 58 frames, 2 searched by ...``.
+
+    Tracking is by colour if the scene has pictures (``scene.images``).
+    """
     method, states = str(estimate.summary["method"]), estimate.records.values()
     if method == "person" and scene.images:
         method = "person_by_colour"
@@ -128,7 +141,10 @@ def _describe_method(scene: Scene, estimate: SceneEstimate) -> str:
 
 
 def page_template(package: str, name: str = "report_template.html.j2") -> Template:
-    """Return the template ``name`` of a package; it may extend report_base.html.j2."""
+    """Return the template in the file ``name`` of a package (dotted name).
+
+    It may extend report_base.html.j2, and has the style sheet as the variable ``style``.
+    """
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
         loader=PackageLoader("drake_pose.files", ""),
@@ -145,7 +161,15 @@ def _joint_rows(
     """Return the rows of the table of joints, with a bar and a plot of each joint.
 
     Positions are in degrees or mm. Joints without an estimate, and those of a fixed base, have no
-    row.
+    row; without records there is none.
+
+    Args:
+        model: the model of the positions.
+        estimate: the estimate.
+        joined: whether frames are a sequence, whose plots join neighbouring frames by a line.
+
+    Returns:
+        The variables of each row for report_template.html.j2.
     """
     records, frames = list(estimate.records.values()), list(estimate.records)
     if not records:
@@ -192,13 +216,16 @@ def _joint_rows(
 
 
 def _range(ends: tuple[float, float], digits: int) -> str:
-    """Return ``low to high``, one number if both are equal, or a dash where they are unknown."""
+    """Return ``low to high`` with this number of digits after the point; a dash for nan.
+
+    ``ends`` is low and high: an infinite one becomes ``none``, equal ones a single number.
+    """
     low, high = ("none" if math.isinf(one) else f"{one:z.{digits}f}" for one in ends)
     return "–" if math.isnan(ends[0]) else low if low == high else f"{low} to {high}"
 
 
 def _limits_text(limits: tuple[float, float]) -> str:
-    """Return ``lower to upper``, to a tenth at most."""
+    """Return ``lower to upper``, rounded to a tenth; an infinite limit becomes ``none``."""
     return " to ".join("none" if math.isinf(one) else f"{round(one, 1):g}" for one in limits)
 
 
@@ -210,12 +237,16 @@ def _bar(
     is_open: bool,
     least_width: float = 1.0,
 ) -> list[dict[str, Any]]:
-    """Return the rectangles of a bar between a joint's limits; none where a limit is infinite.
+    """Return the rectangles of a bar between a joint's limits, [] if a limit is infinite.
 
     Args:
         limits, estimate, interval: smallest and largest value in one unit; nan where unknown.
         is_open: whether the joint is not determined in some frame.
         least_width: width of a single value [percent of the bar].
+
+    Returns:
+        For the template, by name: ``kind`` ("open" or "interval", and "estimate"), ``left`` and
+        ``width`` [percent of the bar] of each rectangle.
     """
     span = limits[1] - limits[0]
     if not (math.isfinite(span) and span > 0.0):
@@ -232,20 +263,26 @@ def _bar(
 
 
 def _warnings_of(estimate: SceneEstimate, name: str) -> list[int]:
-    """Return the numbers, from 1, of the warnings that name a camera or joint."""
+    """Return the numbers, from 1, of an estimate's warnings that name the camera or joint."""
     texts = dict.fromkeys(estimate.summary["warnings"])
     return [number for number, text in enumerate(texts, 1) if f"'{name}'" in text]
 
 
 def _ends(*values: Array) -> tuple[float, float]:
-    """Return the smallest and the largest finite value; nan if there is none."""
+    """Return the smallest and the largest finite value of all arrays (n,); nan if there is none."""
     known = np.concatenate(values)
     known = known[np.isfinite(known)]
     return (float(known.min()), float(known.max())) if len(known) else (np.nan, np.nan)
 
 
 def _camera_row(estimate: SceneEstimate, camera: str, states: Sequence[str]) -> dict[str, Any]:
-    """Return a row of the table of cameras: number of pictures, of those used, IoU, warnings."""
+    """Return a row of the table of cameras: number of pictures, of those used, IoU, warnings.
+
+    Args:
+        estimate: the estimate.
+        camera: the camera's name.
+        states: (frames,) result of `_picture_use`.
+    """
     records = estimate.records
     ious = {f: one.ious[camera] for f, one in records.items() if camera in one.ious}
     worst = min(ious, key=lambda frame: ious[frame], default=None)
@@ -261,7 +298,7 @@ def _camera_row(estimate: SceneEstimate, camera: str, states: Sequence[str]) -> 
 
 
 def _picture_use(scene: Scene, estimate: SceneEstimate, camera: str) -> list[str]:
-    """Return for each frame whether a camera's picture was used, left out, or missing."""
+    """Return "used", "left-out" or "no-picture" for a camera's picture in each frame's record."""
     states = []
     for frame, record in estimate.records.items():
         has_mask, has_image = (camera, frame) in scene.masks, (camera, frame) in scene.images
@@ -275,7 +312,13 @@ def _pick_pictures(
 ) -> list[dict[str, Any]]:
     """Return existing overlays of the frames with the largest, median and smallest error.
 
+    The result is in this order, as `overlay_picture` returns it; of each frame the overlays with
+    the lowest IoU are taken.
+
     Args:
+        folder: the result folder.
+        scene: the scene, with the cameras that were used.
+        estimate: the estimate.
         most: approximate maximum number of overlays.
     """
     records = estimate.records.values()
@@ -299,16 +342,19 @@ def overlay_picture(
     overlay: str = OVERLAY,
     height: int = 300,
 ) -> dict[str, Any] | None:
-    """Return an overlay for a page: camera, frame, E_total, link to the file, data URI.
+    """Return an overlay for a page, embedded as a smaller picture.
 
     Args:
         folder: the result folder.
-        E_total: the frame's error, as a fraction.
+        camera: the camera's name.
+        frame: the frame's name.
+        E_total: the frame's error, as a fraction; None if it has no pose.
         overlay: the overlays' folder in the result folder.
         height: maximum height of the embedded picture [pixel].
 
     Returns:
-        The entries for a template; None if the file does not exist or is not a picture.
+        Entries for a template: ``camera``, ``frame``, ``E_total``, ``uri`` (data URI) and ``link``
+        (to the file); None if the file does not exist or is not a picture.
     """
     place = f"{overlay}/{camera}/{frame}.png"
     if not (folder / place).is_file():
@@ -363,8 +409,9 @@ def plot_curves(
         frames: names of the frames.
         values: label and (frames,) values of each curve; the curve "measured" is wide.
         joined: whether neighbouring frames are joined by a line.
-        limits: lower and upper limit, each drawn only if it is near.
-        intervals: low and high (frames,), and whether the joint is determined (frames,).
+        limits: lower and upper limit, each drawn only if it is near; None: no limits.
+        intervals: low and high (frames,), and whether the joint is determined (frames,), drawn as
+            bars behind the curves; None: no bars, and a legend if there are several curves.
         least: lower end of the axis, such as 0; None: chosen from the curves.
         limits_within: a limit is near if its distance to curves and intervals is at most this
             fraction of their span.
@@ -413,7 +460,13 @@ def _mark_frames(axes: Axes, frames: Sequence[str], count: int = 6) -> None:
 
 
 def draw_grid(frames: Sequence[str], rows: Sequence[tuple[str, Sequence[str]]]) -> Figure:
-    """Draw a row of bars for each name and (frames,) states; equal neighbours are one bar."""
+    """Plot states over frames: a row of bars for each name; equal neighbours are one bar.
+
+    Args:
+        frames: names of the frames.
+        rows: name and (frames,) states of each row. "used" and "found" are blue, "no-picture" is
+            grey, other states are orange.
+    """
     colours = {"used": "#0072b2", "found": "#0072b2", "no-picture": "#d8dee4"}
     figure, axes = new_plot(0.4 + 0.2 * len(rows), 0.2)
     for number, (_, states) in enumerate(rows):

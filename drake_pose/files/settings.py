@@ -29,7 +29,12 @@ Corner = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class FromText:
-    """Converter of an option: parses its text, or the list of texts of a repeated option."""
+    """Converter of an option for cyclopts.
+
+    Args:
+        parse: returns the value of the option's text; raises a SettingsError.
+        repeated: whether the option may be repeated: ``parse`` gets the list of its texts.
+    """
 
     parse: Callable[[Any], Any]
     repeated: bool = False
@@ -46,7 +51,13 @@ class FromText:
 def from_text(
     parse: Callable[[Any], Any], metavar: str, *, name: str | None = None, repeated: bool = False
 ) -> Parameter:
-    """Return the cyclopts parameter of an option whose text ``parse`` converts."""
+    """Return the cyclopts parameter of an option whose text ``parse`` converts.
+
+    Args:
+        parse, repeated: as in `FromText`.
+        metavar: form of the text, for the help.
+        name: the option's name; None: that of the settings field.
+    """
     return Parameter(
         name,
         converter=FromText(parse, repeated),
@@ -58,7 +69,7 @@ def from_text(
 
 
 def within(low: float, high: float = math.inf) -> Parameter:
-    """Return the cyclopts validator of an option: a finite number in [low, high]."""
+    """Return the cyclopts parameter of an option that is None or a finite number in [low, high]."""
 
     def check(hint: object, value: float | None) -> None:
         if value is not None and not (math.isfinite(value) and low <= value <= high):
@@ -144,9 +155,9 @@ def parse_root_position(text: str) -> Corner | tuple[Path, str] | Literal["unkno
 
 
 def parse_root_rotation(text: str) -> RootTurns:
-    """Return ``fixed``, ``free``, or the (lower, upper) limits [deg] by axis, in rotation order.
+    """Return "fixed", "free", or (lower, upper) limits [deg] by axis, in the order of rotation.
 
-    Limits are written as ``y=-180:180,z=-10:10``.
+    The text is ``fixed``, ``free``, or limits like ``y=-180:180,z=-10:10``.
     """
     if text == "fixed":
         return "fixed"
@@ -176,7 +187,10 @@ def percent(fraction: float | None) -> str:
 
 
 class _Documentation:
-    """Descriptor of a settings class's docstring: its own text and, as Args, its fields' texts."""
+    """Descriptor of a settings class's docstring: its own text and, as Args, its fields' texts.
+
+    ``own``: the docstring as written in the class. A field's text is its docstring or its help.
+    """
 
     def __init__(self, own: str) -> None:
         self._own = own

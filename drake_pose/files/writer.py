@@ -60,7 +60,7 @@ class ResultWriter:
 
     Attributes:
         records: finished frames by name, including those of an earlier job.
-        more: entries of the method for summary.json.
+        more: entries of the method for summary.json, by name.
         warnings: messages for the user.
 
     Args:
@@ -137,8 +137,8 @@ class ResultWriter:
 
         Args:
             frames: records and overlay contents, in order.
-            asked: names of all frames to be estimated.
-            on_frame: called after each frame.
+            asked: names of all frames to be estimated, those that are finished included.
+            on_frame: called before the first and after each frame; None: not called.
         """
         finished = sum(frame in self.records for frame in asked)
         if on_frame is not None:
@@ -165,12 +165,15 @@ class ResultWriter:
             self.write_summary()
 
     def write(self, name: str, content: bytes | str) -> None:
-        """Write another file of the result, by its path in the folder."""
+        """Write another file, ``name`` relative to the result folder; nothing without a folder."""
         if self.folder is not None:
             write_file(self.folder, name, content)
 
     def finish(self, replay: bool) -> None:
-        """Write the files about all frames and mark the result as complete."""
+        """Write the files about all frames; `write_summary` then marks the result as complete.
+
+        ``replay``: whether replay.html is written, too. Without a folder no file is written.
+        """
         records = self.result().records
         self.warnings += frame_warnings(records)
         self.warnings += camera_warnings(records, self.warnings)

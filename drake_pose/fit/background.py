@@ -100,7 +100,14 @@ def estimate_gain(picture: Picture | Floats, reference: Floats, rounds: int = 4)
 
 
 def apply_gain(picture: Picture | Floats, gain: Floats) -> Floats:
-    """Return an image (H, W, 3) with a photometric gain (3, 4) applied."""
+    """Return an image (H, W, 3) as float32 with a photometric gain (3, 4) applied.
+
+    Values may leave the range 0 to 255.
+
+    Args:
+        picture: (H, W, 3) image.
+        gain: (3, 4) slopes and offsets, see ``estimate_gain``.
+    """
     return np.asarray(cv2.transform(picture.astype(np.float32), gain))
 
 
@@ -138,7 +145,7 @@ class Backgrounds:
 
     @staticmethod
     def estimate(pictures: Picture) -> "Backgrounds":
-        """Estimate the backgrounds of images (f, H, W, 3) red, green, blue."""
+        """Estimate the backgrounds of a static camera's images (f, H, W, 3) red, green, blue."""
         floats = pictures.astype(np.float32)
         reference = np.median(floats, axis=0)
         gains = tuple(estimate_gain(one, reference) for one in floats)
@@ -180,7 +187,10 @@ class Backgrounds:
         return float(np.maximum(best - sums.uncovered, 0.0).sum())
 
     def changed_frames(self) -> Floats:
-        """Return (H, W) the number of frames that differ from the most frequent background."""
+        """Return (H, W) the number of frames that differ from the most frequent background.
+
+        A frame counts as a number between 0.5 and 1, by how much it differs, or not at all.
+        """
         counts = np.zeros(self.pictures.shape[1:3], np.float32)
         for picture in self.pictures:
             likeness = _likeness(picture, self.colours[0], self.deviations)
@@ -210,7 +220,7 @@ class KnownBackground:
     Args:
         colours: (H, W, 3) colours of the background.
         deviations: (H, W) their standard deviations.
-        unseen: (H, W) whether no frame shows the background.
+        unseen: (H, W) whether no frame shows the background at a pixel.
         on, beside: (COLOURS,) logarithms of the relative frequencies of colours on the body, and
             beside it (0: as frequent as if all colours were equally frequent).
     """
@@ -297,7 +307,7 @@ def foreground_of_colours(nodes: int) -> Floats:
 def mask_of_foreground(
     foreground: Floats, covered: Mask, smooth: float = 0.7, reach: float = 0.1
 ) -> Mask:
-    """Return a mask (H, W) of the pixels that more likely show the body.
+    """Return a mask (H, W) of the pixels that more likely show the body than the background.
 
     Args:
         foreground: (H, W) log-odds.
@@ -319,15 +329,16 @@ def _largest(channels: Floats) -> Floats:
 
 
 def _slopes(picture: Floats) -> tuple[Floats, Floats]:
-    """Return (H, W, 3) colour gradients along u and v [per pixel]."""
+    """Return the gradients of an image along u and along v, each (H, W, 3) [per pixel]."""
     u, v = (cv2.Sobel(picture, cv2.CV_32F, *by, scale=0.125) for by in ((1, 0), (0, 1)))
     return np.asarray(u), np.asarray(v)
 
 
 def _deviations(picture: Floats, noise: float) -> Floats:
-    """Return (H, W) standard deviations of a background's colours (H, W, 3).
+    """Return (H, W) standard deviations of a background's colours.
 
     Args:
+        picture: (H, W, 3) the background.
         noise: standard deviation of the noise [of 255].
     """
     gradient = _largest(np.hypot(*_slopes(picture)))
@@ -336,7 +347,7 @@ def _deviations(picture: Floats, noise: float) -> Floats:
 
 
 def _grown(masks: Mask, by: int) -> Mask:
-    """Return masks (f, H, W) dilated by a number of pixels."""
+    """Return masks (f, H, W) dilated by a disc whose radius is ``by`` pixels."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * by + 1,) * 2)
     return np.array([cv2.dilate(one.astype(np.uint8), disc) for one in masks]).astype(np.bool_)
 
@@ -434,13 +445,15 @@ def explain(
         is_static: (nodes,) whether a node is static in all frames. Static nodes belong to the
             background; only their outline is scored.
         camera: (8,) kernel parameters.
-        side, tiles_per_side: the gain is also summed in (squares, squares) tiles of this side
-            [pixel], modulo ``tiles_per_side``; 0: it is not.
+        sums: log-likelihoods and edges of the f frames' images.
+        side: side of a tile in which the gain is also summed [pixel].
+        tiles_per_side: t, number of tiles per row and column, to which their indices are taken
+            modulo; 0: there are no tiles.
         always_covered: factor of the gain of pixels that the body covers in all frames, whose
             background is unknown.
 
     Returns:
-        (4,) sums by ``Explained``, and (squares, squares) the gain of each tile.
+        (4,) sums by ``Explained``, and (t, t) the gain of each tile (row, column).
     """
     height, width = sums.uncovered.shape
     frames, one = X_CN.shape[0], np.uint64(1)

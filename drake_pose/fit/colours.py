@@ -97,7 +97,7 @@ LINES = LineSettings()
 
 
 def colour_numbers(pixels: Picture) -> NDArray[np.intp]:
-    """Return (...) histogram indices of the colours of pixels (..., 3 or 4)."""
+    """Return (...) histogram indices, below COLOURS, of pixels (..., 3 or 4) without alpha."""
     red, green, blue = np.moveaxis(pixels[..., :3].astype(np.intp) >> 4, -1, 0)
     return (red * 16 + green) * 16 + blue
 
@@ -125,10 +125,10 @@ class PartColours:
         """Learn the colours of parts.
 
         Args:
-            histograms: (nodes, 3, COLOURS) histograms of each camera.
+            histograms: (nodes, 3, COLOURS) histograms of each camera, in rows by ``Colour``.
             outlines: surface of each node.
-            X_WN: (nodes, 4, 4) poses of the nodes.
-            views: cameras and their images (H, W, 3).
+            X_WN: (nodes, 4, 4) known poses of the nodes.
+            views: cameras, and an image (H, W, 3) of each at this pose.
         """
         # A characteristic colour covers at least this fraction of the part's pixels.
         is_own = np.any([one[:, Colour.ON] > 4e-4 for one in histograms], axis=0)
@@ -140,8 +140,13 @@ class PartColours:
     ) -> Array:
         """Return (nodes,) fraction of pixels with own colours, over the usual fraction.
 
-        The values are divided by their median, because illumination changes affect all parts.
-        Arguments as for ``learn``.
+        The values are divided by their median, because illumination changes affect all parts. They
+        are nan for parts that are occluded here or were when learnt.
+
+        Args:
+            outlines: surface of each node.
+            X_WN: (nodes, 4, 4) estimated poses of the nodes.
+            views: cameras, and an image (H, W, 3) of each.
         """
         fractions = self._fractions(outlines, X_WN, views) / self.usual_fractions
         return np.asarray(fractions / max(float(np.nanmedian([*fractions, 1.0])), 1e-9))
@@ -149,7 +154,11 @@ class PartColours:
     def _fractions(
         self, outlines: Sequence[Outline], X_WN: Array, views: Iterable[tuple[Camera, Picture]]
     ) -> Array:
-        """Return (nodes,) fraction of each part's pixels with own colours; nan if occluded."""
+        """Return (nodes,) fraction of each part's pixels with own colours in all views.
+
+        It is nan for parts with fewer than 100 visible pixels. The arguments are those of
+        ``relative_fractions``.
+        """
         counts = np.zeros((2, len(outlines)))
         for camera, picture in views:
             labels = draw_labels(outlines, range(1, 1 + len(outlines)), camera.X_CW @ X_WN, camera)
@@ -157,7 +166,6 @@ class PartColours:
             parts = labels[covered] - 1
             np.add.at(counts[0], parts, self.is_own[parts, colour_numbers(picture[covered])])
             np.add.at(counts[1], parts, 1.0)
-        # A hundred visible pixels are needed to evaluate a part.
         return np.where(counts[1] < 100, np.nan, counts[0] / np.maximum(counts[1], 1.0))
 
 
@@ -167,7 +175,10 @@ def search_line_step(number: int) -> int:
 
 
 def uninformed_histograms(cameras: int, nodes: int) -> Floats:
-    """Return uninformative histograms (cameras, nodes, 3, COLOURS): all colour ratios are one."""
+    """Return histograms (cameras, nodes, 3, COLOURS) in which all colour ratios are one.
+
+    Rows ``Colour.ON`` and ``Colour.BESIDE`` are 0, so that the first colours replace them.
+    """
     histograms = np.zeros((cameras, nodes, len(Colour), COLOURS), dtype=np.float32)
     histograms[:, :, Colour.FOREGROUND] = 1.0
     return histograms
@@ -175,6 +186,10 @@ def uninformed_histograms(cameras: int, nodes: int) -> Floats:
 
 def check_picture(camera: Camera, picture: Picture) -> Picture:
     """Return an image as kernels take it; a copy unless it is contiguous and writeable.
+
+    Args:
+        camera: the camera that took the image.
+        picture: the image.
 
     Raises:
         SettingsError: it is not (H, W, 3) or (H, W, 4) bytes of the camera's size.
@@ -205,9 +220,10 @@ def add_pictures(
     """Add the residuals of colour images to those of silhouettes, in place.
 
     Args:
-        compared: comparison with the silhouettes of all cameras.
-        pictures: image of each camera; None: none.
-        histograms: (cameras, nodes, 3, COLOURS) colour histograms.
+        compared: comparison with the silhouettes of all cameras; its arrays are added to.
+        cameras: the cameras, in the same order.
+        pictures: image (H, W, 3 or 4) of each camera; None: this camera has none.
+        histograms: (cameras, nodes, 3, COLOURS) colour histograms, in rows by ``Colour``.
         stage: scale of the residuals and spacing of the lines [pixel].
         noise: noise of search lines [pixel].
         pixels: distance between offsets along a line [pixel].
@@ -236,7 +252,7 @@ def weigh_parts(
     parts is used.
 
     Args:
-        compared: comparison of all cameras.
+        compared: comparison of all cameras; its A and b are changed.
         deviation: minimum standard deviation of a line [pixel].
         pictures: image of each camera; None: its silhouettes keep their weight.
         noisiest: maximum standard deviation of a part's lines [pixel], so that the lines of a
@@ -252,7 +268,9 @@ def weigh_parts(
 
 
 def part_distances(sums: Array, closest: float = 0.7, shortest: float = 20.0) -> Array:
-    """Return (nodes,) distance of each part from its contour in colour images [pixel]; 0: unknown.
+    """Return (nodes,) root mean square distance of each part from its contour in images [pixel].
+
+    It is 0 for parts that are not evaluated.
 
     The harmonic mean of the squared distances over the cameras is used, so that an occluder in one
     camera does not count against a part that another camera sees.
@@ -280,9 +298,11 @@ def update_histograms(
 
     Args:
         placement: the body at its estimated pose.
-        pictures: image of each camera; None: its histograms stay.
-        histograms: histograms before the frame.
-        pose_is_known: the pose is known: all lines are used, and the old histograms are discarded.
+        cameras: the cameras.
+        pictures: image (H, W, 3 or 4) of each camera; None: its histograms stay.
+        histograms: histograms before the frame, of the same shape.
+        pose_is_known: use all lines, and discard the old histograms; else lines whose edge is far
+            from the contour are ignored, and new colours have the weight LINES.learning_rate.
     """
     updated = histograms.copy()
     packed = pack_cameras(cameras)
@@ -321,8 +341,8 @@ def compare_lines(
         X_WN: (nodes, 4, 4) poses of the nodes.
         camera: X_CW (4, 4) and kernel parameters (8,).
         picture: (H, W, 3 or 4) image.
-        histograms: (nodes, 3, COLOURS) colour histograms.
-        weights: (4,) as of `compare_contours`.
+        histograms: (nodes, 3, COLOURS) colour histograms, in rows by ``Colour``.
+        weights: (4,) one camera's weights as of `compare_contours`; the spacing is that of lines.
         step: distance between offsets [pixel].
         A, b, sums, bias_terms: (nodes, 12, 12), (nodes, 12), (nodes + 1, 6) and (nodes, 13), added
             to, as of `compare_contours`. A line's length is weighted by its information.
@@ -351,7 +371,11 @@ def compare_lines(
 
 @compiled
 def _colour(picture: Picture, u: float, v: float) -> int:
-    """Return the colour index of the pixel at (u, v) [pixel]; -1 outside the image."""
+    """Return the histogram index of an image's colour at (u, v) [pixel]; -1 outside the image.
+
+    Args:
+        picture: (H, W, 3 or 4) image.
+    """
     column, row = math.floor(u + 0.5), math.floor(v + 0.5)
     if column < 0 or row < 0 or column >= picture.shape[1] or row >= picture.shape[0]:
         return -1
@@ -379,10 +403,11 @@ def _find_edge(
         uv, normal: (2,) point of the contour and its outward normal [pixel].
         clearance: (2,) distance inwards and outwards [pixel] over which the line crosses no other
             contour.
-        step: distance between offsets [pixel].
+        step: distance between offsets [pixel]; it is reduced on thin parts.
+        scratch: (3, 2 LINES.blocks + 2) working memory, overwritten.
 
     Returns:
-        The edge's offset outwards [pixel], and its variance [pixel^2]; -1: no information.
+        The edge's offset outwards [pixel], and its variance [pixel^2]; (0, -1) without information.
     """
     blocks, on, beside = scratch[0], scratch[1], scratch[2]
     # The variance of an edge that lies anywhere in the window [steps^2].
@@ -455,8 +480,11 @@ def learn_colours(
     """Update a camera's colour histograms from both sides of a body's contour, in place.
 
     Args:
-        packed, X_WN, camera, picture: as of `compare_lines`.
-        histograms: (nodes, 3, COLOURS) histograms, changed.
+        packed: surfaces of the nodes.
+        X_WN: (nodes, 4, 4) poses of the nodes.
+        camera: X_CW (4, 4) and kernel parameters (8,).
+        picture: (H, W, 3 or 4) image.
+        histograms: (nodes, 3, COLOURS) histograms, in rows by ``Colour``, changed.
         spacing: distance between search lines along the contour [pixel].
         strip_widths: (2,) widths of the strips inside and outside the contour that are counted
             [pixel].

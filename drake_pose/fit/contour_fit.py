@@ -46,21 +46,30 @@ class Noise:
     def per_pixel(cls, pixels: float | Array) -> "Noise":
         """Return noise that gives each pixel of contour the weight one.
 
-        pixels: unit of length [pixel], scalar or (cameras,).
+        Args:
+            pixels: unit of length of the fit [pixel], scalar or (cameras,), as of ``ContourFit``.
         """
         return cls(deviation=1.0, correlation=0.5 / pixels**3)
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Independent normal priors of the tree values: mean (m,) [rad or m] and information (m,)."""
+    """Independent normal priors of the tree values: mean (m,) [rad or m] and information (m,).
+
+    The information is the inverse variance; 0: no prior.
+    """
 
     mean: Array
     information: Array
 
 
 class Views(NamedTuple):
-    """Cameras, X_CW (c, 4, 4) and kernel parameters (c, 8), and the edges of their silhouettes."""
+    """Cameras and the edges of their silhouettes in one frame.
+
+    Attributes:
+        cameras: X_CW (c, 4, 4) and kernel parameters (c, 8), see ``pack_cameras``.
+        evidence: edges of the c silhouettes, in the same order.
+    """
 
     cameras: tuple[Array, Array]
     evidence: Evidence
@@ -72,9 +81,11 @@ class Comparison(NamedTuple):
     Attributes:
         A: (cameras, nodes, 12, 12) lower triangles.
         b: (cameras, nodes, 12).
-        sums: (cameras, nodes + 1, 6) as of `compare_contours`.
-        bias_terms: (cameras, nodes, 13) derivatives by the boundary bias, as of `compare_contours`.
-        placement: the body's placement.
+        sums: (cameras, nodes + 1, 6) by ``Sum`` of each node's contour, and of the silhouette's
+            edge in the last row.
+        bias_terms: (cameras, nodes, 13) derivatives by the boundary bias, as of
+            `compare_contours`; 0 if they were not requested.
+        placement: the body at the pose that was compared.
     """
 
     A: Array
@@ -99,8 +110,9 @@ class PoseFit:
 
     Args:
         values: (m,) tree values [rad or m].
-        sums: (nodes + 1, 6) over all cameras, before the last step, as of `compare_contours`.
-        cost: cost at the last comparison, including the prior.
+        sums: (nodes + 1, 6) as of ``Comparison``, over all cameras, at the last comparison, which
+            may be that of a rejected step or precede a single step.
+        cost: cost at the last accepted comparison, including the prior.
         evaluations: number of comparisons.
     """
 
@@ -125,14 +137,14 @@ def inlier_ratio_of(sums: Array) -> float:
     """Return the fraction of both contours' length whose residual is below the scale.
 
     Args:
-        sums: (..., 6) as of `compare_contours`.
+        sums: (..., 6) by ``Sum``; the leading axes are summed.
     """
     total = sums.reshape(-1, sums.shape[-1]).sum(axis=0)
     return float(total[Sum.FITTING] / max(total[Sum.COMPARED], 1e-9))
 
 
 def pack_views(cameras: Sequence[Camera], edges: Sequence[EdgePoints]) -> Views:
-    """Return cameras and the edges of their silhouettes; an edge may be empty."""
+    """Return cameras and the edge of each one's silhouette, which may be empty."""
     return Views(pack_cameras(cameras), pack_evidence(edges))
 
 
@@ -154,7 +166,8 @@ class ContourFit:
         tree: the body's pose tree, or its kinematics.
         outlines: surface of each node, preferably with few triangles; None: simplified surfaces of
             the tree.
-        steps: settings of the optimiser's steps.
+        noise: errors of the silhouettes; None: ``Noise()``.
+        steps: settings of the optimiser's steps; None: ``StepSettings()``.
         pixels: unit of length of the stages and the noise [pixel], scalar or (c,); None: the size
             of a metre at the body's root.
         body: parameters of the body; None: the tree's values and ROOT_NAMES.
@@ -192,8 +205,10 @@ class ContourFit:
         Args:
             evidence: the cameras and their silhouettes' edges, or a function that compares the
                 contours.
-            values: (m,) initial guess [rad or m].
-            held: (m,) which values are fixed.
+            values: (m,) initial guess [rad or m]; those not fixed are moved into their limits.
+            stages: annealing stages in order, coarse to fine [``pixels`` or m].
+            prior: prior of the m values; None: none.
+            held: (m,) which values are fixed; None: none.
         """
         index = np.flatnonzero(np.ones(len(values), bool) if held is None else ~held)
         current = np.array(values, dtype=np.float64)
@@ -225,22 +240,30 @@ class ContourFit:
         return PoseFit(current, sums, cost, evaluations)
 
     def compare(self, views: Views, theta: Array, stage: AnnealingStage) -> Comparison:
-        """Compare the contours with all cameras' edges at values (m,) or all parameters (n,)."""
+        """Compare the contours with all cameras' edges at theta and the scale of a stage.
+
+        Args:
+            theta: (m,) tree values, or (n,) all parameters of the body, as of
+                ``BodyParameters.place``.
+        """
         placement = self.body.place(theta)
         return compare_views(views, placement, self.weights(views.cameras, placement, stage))
 
     def tile_costs(self, views: Views, theta: Array, stage: AnnealingStage, side: float) -> Array:
-        """Return the cost at values (m,) in image tiles (cameras, k, k) of a side [pixel]."""
+        """Return the cost (cameras, 64, 64) in image tiles at theta (m,) or (n,), without prior.
+
+        Tile (row, column) has its upper left corner at (row side, column side) and indices modulo
+        64. The arguments are those of ``compare``, and the side of a tile [pixel].
+        """
         placement = self.body.place(theta)
         weights = self.weights(views.cameras, placement, stage)
         placed = placement.packed, placement.X_WN
-        # Tile indices are taken modulo 64.
         return np.asarray(compare_contours(*placed, *views, weights, 64, side, False)[3])
 
     def weights(
         self, cameras: tuple[Array, Array], placement: Placement, stage: AnnealingStage
     ) -> Array:
-        """Return (c, 4) weights of cameras, as `compare_contours` takes them."""
+        """Return (c, 4) weights of packed cameras, see ``camera_weights``."""
         return camera_weights(cameras, placement, stage, self.noise, self._pixels)
 
 
@@ -250,8 +273,8 @@ def compare_views(
     """Compare a placed body's contours with all cameras' edges.
 
     Args:
-        weights: (c, 4) as of `compare_contours`.
-        with_bias: compute derivatives by the silhouettes' boundary bias.
+        weights: (c, 4) as of `compare_contours`, see ``camera_weights``.
+        with_bias: compute derivatives by the silhouettes' boundary bias; else they are 0.
     """
     placed = placement.packed, placement.X_WN
     A, b, sums, _, bias_terms = compare_contours(*placed, *views, weights, 0, 1.0, with_bias)
@@ -267,8 +290,14 @@ def camera_weights(
 ) -> Array:
     """Return (c, 4) weights of cameras, as `compare_contours` takes them.
 
+    Columns: units of length per pixel; scale of the cost and spacing of the body's contour points
+    [pixel], at least FINEST_SCALE and 1; half the weight per pixel of contour length.
+
     Args:
         cameras: X_CW (c, 4, 4) and kernel parameters (c, 8).
+        placement: the body, whose root gives the default unit of length.
+        stage: scale and spacing [unit of length].
+        noise: errors of the silhouettes [unit of length].
         pixels: unit of length [pixel], scalar or (c,); None: the size of a metre at the root.
     """
     size = pixels_per_metre(cameras, placement.X_WN[0, :3, 3]) if pixels is None else pixels
@@ -282,10 +311,11 @@ def camera_weights(
 
 
 def normal_equations(compared: Comparison, size: int) -> tuple[Array, Array]:
-    """Return H (size, size) and g (size,) of H dx = -g, summed over cameras.
+    """Return H (size, size) and g (size,) of H dx = -g for a step dx of the body's parameters.
 
     Args:
-        size: number of body parameters.
+        compared: comparison; its cameras are summed.
+        size: number of parameters, at least those of its placement.
     """
     A, b = compared.A.sum(axis=0), compared.b.sum(axis=0)
     return assemble_normal_equations(A, b, *compared.placement[2:], size)
@@ -297,7 +327,12 @@ def symmetric(A: Array) -> Array:
 
 
 def pixels_per_metre(cameras: tuple[Array, Array], place: Array) -> Array:
-    """Return (c,) the size of a metre in each image [pixel/m], at a point (3,) in the world [m]."""
+    """Return (c,) the size of a metre in each image [pixel/m], at a point in the world.
+
+    Args:
+        cameras: X_CW (c, 4, 4) and kernel parameters (c, 8).
+        place: (3,) the point [m]; depths below a camera's near plane count as the near plane.
+    """
     X_CW, parameters = cameras
     kind, focal, near = parameters[:, 0], parameters[:, 1], parameters[:, 5]
     depth = np.maximum(X_CW[:, 2, :3] @ place + X_CW[:, 2, 3], near)

@@ -34,10 +34,11 @@ class ErrorSizes(NamedTuple):
 
     Attributes:
         noise: independent noise of a contour point, relative to the fit's weights.
-        repeated: noise repeated in all images of a part that is static relative to a camera; 0 if
-            there is none.
-        surface, mask, camera: displacement of contours [the unit of the distances].
-        nuisances: each group of nuisance parameters [its own unit].
+        repeated: noise repeated in all images of a part that is static relative to a camera,
+            likewise; 0 if there is none.
+        surface, mask, camera: displacement of contours by an error of a part's surface, of its edge
+            in one mask, and of a camera's extrinsics [unit of the ``ComparedMask``].
+        nuisances: each group of nuisance parameters [unit of the group].
     """
 
     noise: float
@@ -51,14 +52,17 @@ class ErrorSizes(NamedTuple):
 class Distances(NamedTuple):
     """Residuals of the contours' distances, in independent linear combinations.
 
+    The m values are the parameters that were fitted, such as joint positions.
+
     Attributes:
-        y: (n,) the residuals.
-        X: (n, m) derivatives by the values.
-        effects: (5, n, n) covariances of y for each error of ``ErrorSizes`` with unit size.
+        y: (n,) residuals; their standard deviation is one if the fit's weights are correct.
+        X: (n, m) derivatives of y by the values.
+        effects: (5, n, n) covariances of y for the first five errors of ``ErrorSizes``, each of
+            size one.
         information: (m, m) information about the values if all errors were independent.
-        surface_derivatives: (n, 12 nodes) derivatives by deformations of the parts' surfaces,
-            common to all images.
-        pictures: (n,) index of the image.
+        surface_derivatives: (n, 12 nodes) derivatives of y by deformations of the parts' surfaces,
+            common to all images [per unit of errors].
+        pictures: (n,) index of each residual's mask.
         nuisances: per group (n, k) derivatives by nuisance parameters that are common to all images
             and not among the values, such as joint offsets; each by a unit of its group.
     """
@@ -76,12 +80,13 @@ class ComparedMask(NamedTuple):
     """A body's contours compared with one silhouette.
 
     Attributes:
-        A: (nodes, 12, 12), lower triangles, as of ``Comparison``.
-        b: (nodes, 12), as of ``Comparison``.
+        A: (nodes, 12, 12), lower triangles, one camera's part of ``Comparison.A``.
+        b: (nodes, 12), likewise.
         X_WN: (nodes, 4, 4) poses of the nodes.
         X_CW: (4, 4) pose of the world in the camera.
         moves: (nodes, m, 12) affine motions of the nodes caused by the m values.
-        size: unit of errors at the body's distance [m].
+        size: unit of errors, some pixels of the image, at the body's distance [m].
+        camera: index of the camera.
     """
 
     A: Array
@@ -109,14 +114,14 @@ def distances(
     moves: Array,
     unit: float,
 ) -> Distances:
-    """Return the residuals at a fitted pose.
+    """Return the residuals of one frame, seen by all cameras, at a fitted pose.
 
     Args:
         outlines: surface of each node.
-        cameras: packed, see ``pack_cameras``.
+        cameras: X_CW (c, 4, 4) and kernel parameters (c, 8), see ``pack_cameras``.
         compared: comparison at the pose.
         moves: (nodes, m, 12) affine motions of the nodes caused by the m values.
-        unit: unit of errors [pixel].
+        unit: unit of errors [pixel], see ``error_unit``.
     """
     X_WN = compared.placement.X_WN
     size = unit / pixels_per_metre(cameras, X_WN[:, :3, 3].mean(axis=0))
@@ -139,7 +144,8 @@ def distances_in_masks(
         outlines: surface of each node.
         pictures: comparisons with the masks, all with the same values.
         max_count: maximum number of residuals; those with the largest information are kept.
-        with_bias: add each silhouette's boundary bias to the values, as a further one [unit].
+        with_bias: append each mask's boundary bias [unit of errors] to the m values, so that X and
+            the information have m + masks of them.
     """
     if with_bias:
         has_surface, wider = [[len(outline.vertices) > 0] for outline in outlines], []
@@ -188,11 +194,17 @@ def distances_in_masks(
 def _known_directions(
     outlines: Sequence[Outline], pictures: Sequence[ComparedMask], max_count: int
 ) -> tuple[Indices, Array, Array]:
-    """Return affine motions of parts that one image determines, by information, descending.
+    """Return affine motions of parts that one mask determines, by information, descending.
+
+    Args:
+        outlines: surface of each node.
+        pictures: comparisons with the masks.
+        max_count: maximum number of motions; there are fewer if fewer are determined.
 
     Returns:
-        (n, 2) image and node of each; (n, 12) the motion whose cost has unit curvature; and (n, 12)
-        its derivative by deformations of the part's surface.
+        (n, 2) index of the mask and of the node of each; (n, 12) the affine motion, scaled to unit
+        curvature of the cost; and (n, 12) derivatives of its residual by the part's
+        ``surface_deformations`` of one unit of errors.
     """
     mean_size = float(np.mean([picture.size for picture in pictures]))
     found: list[tuple[Array, Indices, Indices, Array, Array]] = []
@@ -217,9 +229,14 @@ def _known_directions(
 
 
 def _views(outlines: Sequence[Outline], pictures: Sequence[ComparedMask]) -> Indices:
-    """Return (pictures, nodes) the first image that shows a part in the same pose.
+    """Return (masks, nodes) index of the first mask in which a part has the same pose.
 
-    A part has the same pose if it moves by less than half the unit.
+    That is the mask's own index if none before it has. Poses relative to the camera are the same if
+    the root mean square distance of the part's vertices is less than half the unit of errors.
+
+    Args:
+        outlines: surface of each node.
+        pictures: comparisons with the masks.
     """
     X_CN = np.array([one.X_CW @ one.X_WN for one in pictures])[:, :, :3]
     found = np.tile(np.arange(len(pictures))[:, None], len(outlines))
@@ -235,6 +252,9 @@ def _views(outlines: Sequence[Outline], pictures: Sequence[ComparedMask]) -> Ind
 
 def surface_deformations(outlines: Sequence[Outline], X_WN: Array) -> Array:
     """Return (n, 12, 12) affine motions, in columns, that move each surface by about a metre.
+
+    The first three columns are shifts along the part's axes; the other nine stretch, shear and
+    rotate the part about the mean of its vertices.
 
     Args:
         outlines: surface of each part.
@@ -253,7 +273,15 @@ def surface_deformations(outlines: Sequence[Outline], X_WN: Array) -> Array:
 
 
 def _camera_motions(outlines: Sequence[Outline], one: ComparedMask) -> Array:
-    """Return (12, 6) translations along and rotations about a camera's axes, by about the unit."""
+    """Return (12, 6) affine motions of the body that are equivalent to motions of a camera.
+
+    They are three translations along and three rotations about the camera's axes, which move the
+    body by about the unit of errors.
+
+    Args:
+        outlines: surface of each node.
+        one: comparison with a mask of the camera.
+    """
     placed = zip(outlines, one.X_WN, strict=True)
     moments = sum(len(own.vertices) * (X @ own.moments @ X.T) for own, X in placed)
     moments = np.asarray(moments) / sum(len(own.vertices) for own in outlines)
@@ -278,10 +306,13 @@ def estimate_sizes(
     """Return the most likely sizes of the errors, given the residuals and the prior.
 
     Args:
-        is_angle: (m,) which values are angles.
-        min_camera: minimum error of a camera [of the unit].
-        prior_deviation: standard deviation of the sizes' logarithms about the unit.
-        tolerance: iterations end when no log size changes by more than this.
+        residuals: the residuals; each group of their nuisances gets a size, too.
+        is_angle: (m,) which values are angles; the others are lengths.
+        min_camera: minimum returned error of a camera [unit of errors].
+        prior_deviation: standard deviation of the prior of the sizes' logarithms, whose mean is 0.
+        tolerance: iterations end when no log size changes by more than this, after 20, or when
+            the log-likelihood gains less than 0.05. Repeated noise is estimated only if an element
+            of its covariance differs from that of independent noise by more than this.
     """
     n = len(residuals.y)
     stands_still = np.abs(residuals.effects[1] - residuals.effects[0]).max(initial=0.0) > tolerance
@@ -293,7 +324,10 @@ def estimate_sizes(
     prior_information = _prior_information(is_angle)
 
     def likelihood(t: Array) -> tuple[float, Array, Array]:
-        """Restricted log-likelihood and prior of sizes' logarithms t (k,); P (n, n); P y (n,)."""
+        """Return the restricted log-likelihood plus log prior of log sizes t (k,), P and P y.
+
+        P (n, n) projects the values out: P = V^-1 - V^-1 X H^-1 X^T V^-1, with V the covariance.
+        """
         L = np.linalg.cholesky((np.exp(2.0 * t) @ stacked).reshape(n, n))
         inverse = symmetric(dpotri(L.T)[0].T)
         VX = inverse @ residuals.X
@@ -345,8 +379,10 @@ def values_covariance(
     It is H^-1 J^T V J H^-1 (the sandwich of Huber 1967), with V the covariance of the residuals.
 
     Args:
+        residuals: the residuals at the fitted values.
+        sizes: sizes of their errors, see ``estimate_sizes``; nuisances are ignored.
         free: (f,) indices of the free values.
-        is_angle: (m,) which values are angles.
+        is_angle: (m,) which values are angles; the others are lengths.
     """
     white = sizes.noise**2 + sizes.repeated**2
     own = residuals.X[:, free]
@@ -359,7 +395,7 @@ def values_covariance(
 
 
 def distances_covariance(residuals: Distances, sizes: ErrorSizes) -> Array:
-    """Return the covariance (n, n) of the residuals, without nuisance parameters."""
+    """Return the covariance (n, n) of the residuals y, given the sizes of the first five errors."""
     parts = zip(sizes[:5], residuals.effects, strict=True)
     return sum((size**2 * W for size, W in parts), np.zeros((len(residuals.y), len(residuals.y))))
 
@@ -372,7 +408,13 @@ def nuisance_covariance(
 
     Nuisance parameters were not fitted, so they bias the values. The result is their variance plus
     the square of their most likely values, given the residuals (best linear unbiased
-    prediction, Henderson 1975).
+    prediction, Henderson 1975). The second result has these values' effect subtracted from y, and
+    no nuisances.
+
+    Args:
+        residuals: the residuals, with at least one group of nuisances.
+        sizes: sizes of the errors and nuisances, see ``estimate_sizes``.
+        is_angle: (m,) which values are angles; the others are lengths.
     """
     white = sizes.noise**2 + sizes.repeated**2
     A = np.concatenate(residuals.nuisances, axis=1)
@@ -393,9 +435,14 @@ def nuisance_covariance(
 
 @_on_one_thread
 def score_nuisances(residuals: Distances, sizes: ErrorSizes) -> tuple[Array, Array]:
-    """Return estimates and standard deviations (k,) of nuisance parameters [the group's unit].
+    """Return estimates (k,) and standard deviations (k,) of all groups' nuisance parameters.
 
-    Each is estimated alone beside the values (score test, Rao 1948).
+    Each is estimated beside the values as if all others were 0 (score test, Rao 1948) [unit of its
+    group]. Without nuisances, k is 0.
+
+    Args:
+        residuals: the residuals, whose groups of nuisances are taken one after the other.
+        sizes: sizes of the errors; those of nuisances are ignored.
     """
     if not residuals.nuisances:
         return np.zeros(0), np.zeros(0)
@@ -408,18 +455,22 @@ def score_nuisances(residuals: Distances, sizes: ErrorSizes) -> tuple[Array, Arr
 
 
 def _prior_information(is_angle: Mask) -> Array:
-    """Return the information (m, m) of uniform distributions over a full turn or ten metres."""
+    """Return the information (m, m) of uniform distributions of the values.
+
+    Angles, where ``is_angle`` (m,), cover a full turn, and lengths ten metres.
+    """
     return np.diag(12.0 / np.where(is_angle, 2.0 * np.pi, 10.0) ** 2)
 
 
 def vuong_statistic(tiles: Array, others: Array) -> float:
-    """Return by how many standard deviations a cost exceeds another one (Vuong's test, 1989).
+    """Return the difference of two costs in its standard deviations (Vuong's test, 1989).
 
     The scatter of the differences between tiles gives the standard deviation of their sum. Evidence
     that no pose explains contributes equally to both costs and cancels.
 
     Args:
-        tiles, others: costs of both in the same image tiles, any shape.
+        tiles, others: first and second cost in the same image tiles, of equal shape. The result is
+            positive if the first one is larger.
     """
     more = tiles - others
     return float(more.sum() / max(np.sqrt(float((more**2).sum())), 1e-9))

@@ -54,9 +54,10 @@ class Observation(NamedTuple):
         edges: edges of the silhouettes.
         values: (k,) known values of the first k parameters of a ``Problem``, such as encoder
             readings [rad or m]; the remaining parameters are 0.
-        foreground: per camera an image (H, W, 3) that encodes log-odds (``fit.background``), or
-            None; empty for none.
-        rates: (m,) velocities of the pose tree's values [rad/s or m/s]; None: unknown.
+        foreground: per camera an image (H, W, 3) that encodes the log-odds that a pixel shows the
+            body (``foreground_picture``), or None; empty: no camera has one.
+        rates: (m,) velocities of the pose tree's values [rad/s or m/s]; None: unknown, so that a
+            time offset has no effect.
     """
 
     edges: Evidence
@@ -66,7 +67,7 @@ class Observation(NamedTuple):
 
 
 def pack_evidence(edges: Sequence[EdgePoints]) -> Evidence:
-    """Return the edges of all cameras' silhouettes in one tuple of arrays."""
+    """Return the edges of all cameras' silhouettes, one per camera, in one tuple of arrays."""
     return Evidence(
         np.concatenate([np.zeros((0, 2)), *(edge.uv for edge in edges)]),
         np.concatenate([np.zeros((0, 2)), *(edge.normals for edge in edges)]),
@@ -76,7 +77,12 @@ def pack_evidence(edges: Sequence[EdgePoints]) -> Evidence:
 
 
 def offset_edges(evidence: Evidence, widths: Array) -> Evidence:
-    """Return edges moved outwards by widths (c,) [pixel] along their normals; negative: inwards."""
+    """Return edges moved outwards along their normals, sorted by v again.
+
+    Args:
+        evidence: edges of c silhouettes.
+        widths: (c,) distance for each camera [pixel]; negative: inwards.
+    """
     counts = np.diff(evidence.starts)
     uv = evidence.uv + np.repeat(widths, counts)[:, None] * evidence.normals
     order = np.concatenate(
@@ -90,6 +96,8 @@ def offset_edges(evidence: Evidence, widths: Array) -> Evidence:
 
 def find_edge_points(region: Mask, spacing: float, chord: int = 3) -> EdgePoints:
     """Return points of a silhouette's edge, including holes; the image border is not an edge.
+
+    The result is NO_EDGE if no contour has more than 2 chord + 1 pixels.
 
     Args:
         region: (H, W) the silhouette.
@@ -126,14 +134,14 @@ def _sample(
     height: int,
     chord: int,
 ) -> tuple[Array, Array, Array]:
-    """Return points, normals and lengths along closed chains of pixels.
+    """Return points (n, 2), outward normals (n, 2) and lengths (n,) along closed chains of pixels.
 
     Args:
         pixels: (n, 2) pixels of all chains.
         starts: (chains + 1,) index of each chain's first pixel.
         spacing: distance between points [pixel].
         width, height: size of the image [pixel].
-        chord: as of find_edge_points.
+        chord: number of pixels on both sides that give the direction of the edge.
     """
     capacity = int(2 * len(pixels) / spacing) + 2 * len(starts)
     uv, normals, lengths = np.empty((capacity, 2)), np.empty((capacity, 2)), np.empty(capacity)

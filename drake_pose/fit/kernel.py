@@ -49,8 +49,8 @@ def match_points(
     The other points are sorted into a grid of square cells, which is searched in growing rings.
 
     Args:
-        uv, normals: (n, 2) points and unit normals of a contour or an edge.
-        other_uv, others: (k, 2) points and unit normals of the other one.
+        uv, normals: (n, 2) points [pixel] and unit normals of a contour or an edge.
+        other_uv, others: (k, 2) points [pixel] and unit normals of the other one.
         reach: maximum distance of a match [pixel].
         min_cosine: minimum cosine of the angle between matched normals.
         max_cells: maximum number of cells along a side of the grid.
@@ -128,7 +128,7 @@ def compare_contours(
         packed: surfaces of the nodes.
         X_WN: (nodes, 4, 4) poses of the nodes.
         cameras: X_CW (c, 4, 4) and kernel parameters (c, 8).
-        edges: edges of the silhouettes.
+        edges: edges of the c silhouettes; a camera without edge points contributes 0.
         weights: (c, 4) per camera: units of length per pixel, scale of the cost [pixel], spacing of
             the body's contour points [pixel], and weight per pixel of contour length.
         tiles_per_side: k, number of tiles per row and column in which the cost is summed; 0: none.
@@ -138,8 +138,9 @@ def compare_contours(
     Returns:
         A (c, nodes, 12, 12), lower triangles.
         b (c, nodes, 12).
-        Sums (c, nodes + 1, 6) by ``Sum`` of each node's contour, and of all edges in the last row.
-        Cost (c, k, k) of each tile.
+        Sums (c, nodes + 1, 6) by ``Sum`` of each node's contour, and of the camera's edge in the
+        last row.
+        Cost (c, k, k) in tiles (row, column) of the image.
         Derivatives (c, nodes, 13) of b (12,) and of half the cost by the boundary bias [pixel].
     """
     count, nodes = len(weights), len(X_WN)
@@ -196,7 +197,7 @@ def compare_contours(
 
 @compiled
 def poses_in_camera(X_CW: Array, X_WN: Array) -> Array:
-    """Return X_CN (nodes, 4, 4), the poses of nodes in a camera."""
+    """Return X_CN (nodes, 4, 4), the poses of nodes in a camera, of X_CW (4, 4) and X_WN."""
     X_CN = np.zeros_like(X_WN)
     for node in range(len(X_WN)):
         multiply(X_CW, X_WN[node], X_CN[node])
@@ -236,7 +237,15 @@ def robust_weight(
 
 @compiled
 def add_residual(point_sums: Array, i: int, n0: float, n1: float, r: float, weight: float) -> None:
-    """Add a weighted residual r [pixel] along (n0, n1) to row i of (n, 7) point sums."""
+    """Add a weighted squared residual to the first five columns of a row of point sums, in place.
+
+    Args:
+        point_sums: (n, 7) as of `accumulate_residuals`, changed.
+        i: the row.
+        n0, n1: unit vector along u and v in which the point should move.
+        r: the residual [pixel], the distance to move.
+        weight: weight of the squared residual.
+    """
     point_sums[i, 0] += weight * n0 * n0
     point_sums[i, 1] += weight * n0 * n1
     point_sums[i, 2] += weight * n1 * n1
@@ -318,11 +327,12 @@ def assemble_normal_equations(
     """Return the normal equations H dx = -g of all parameters.
 
     Args:
-        A, b: (nodes, 12, 12) and (nodes, 12) as of compare_contours.
+        A, b: (nodes, 12, 12) lower triangles and (nodes, 12), one camera's of `compare_contours`
+            or summed over cameras.
         motions: (k, 12) affine motions.
         starts: (nodes + 1,) index of each node's first entry in owners.
-        owners: (s,) indices of motions, ordered by node.
-        parameters: (s,) the parameter that causes each motion.
+        owners: (s,) indices of the motions that move each node, ordered by node.
+        parameters: (s,) index of the parameter that causes each of these motions.
         size: number of parameters.
 
     Returns:

@@ -32,7 +32,7 @@ class AnnealingStage:
 
     Args:
         scale: distance at which a point's weight drops to a quarter.
-        spacing: distance between points of the body's contour.
+        spacing: distance between sampled points of the body's contour.
         iterations: maximum number of steps; a single step is taken without checking the cost.
     """
 
@@ -76,9 +76,10 @@ class Equations:
     """The normal equations H dx = -g of frames at given unknowns.
 
     Attributes:
-        H: (frames, u, u), each frame's own unknowns first, then the shared ones.
-        g: (frames, u).
-        cost: the cost.
+        H: (frames, u, u) contribution of each frame; u = p own unknowns of the frame, then q
+            shared ones. The shared parts of all frames add up.
+        g: (frames, u) likewise.
+        cost: cost of all frames.
     """
 
     H: Array
@@ -130,9 +131,11 @@ def minimise(
     Args:
         evaluate: returns the equations at own (frames, p) and shared (q,) unknowns and a stage,
             without the coupling.
-        own, shared: (frames, p) and (q,) initial guess.
+        own, shared: (frames, p) and (q,) initial guess; it is moved into the limits.
         limits: lower and upper (p + q,), own unknowns first.
-        coupling: prior that couples the own unknowns of several frames.
+        stages: the stages in order, coarse to fine.
+        settings: settings of the steps; None: ``StepSettings()``.
+        coupling: prior that couples the own unknowns of several frames; None: none.
 
     Returns:
         Own and shared unknowns; the cost at the last evaluation, which precedes the last step if
@@ -189,7 +192,9 @@ def damped_step(
         own, shared: (frames, p) and (q,) current unknowns.
         limits: lower and upper (p + q,).
         damping: fraction of the diagonal that is added to it.
-        curvature: (frames p, frames p) of a coupling.
+        settings: maximum step and uniform damping; its other damping settings are not used.
+        curvature: (frames p, frames p) information matrix of a coupling; None: the own unknowns of
+            different frames are independent.
     """
     lower, upper = limits
     p = own.shape[1]
@@ -221,7 +226,15 @@ def _solve_coupled(
     fractions: tuple[float, float],
     curvature: csc_array,
 ) -> tuple[Array, Array]:
-    """As _solve_frames, for frames whose own unknowns are coupled by a curvature."""
+    """Return damped steps (frames, p) and (q,) as _solve_frames, with coupled own unknowns.
+
+    Args:
+        equations: equations without the coupling's H, but with its g.
+        own, shared: (frames, p) and (q,) current unknowns.
+        limits: lower and upper (p + q,).
+        fractions: fractions of each diagonal element and of the diagonal's mean that are added.
+        curvature: (frames p, frames p) information matrix of the coupling.
+    """
     lower, upper = limits
     frames, p = own.shape
     H, g = equations.H, equations.g
@@ -245,7 +258,12 @@ def _solve_coupled(
 
 
 def _is_free(x: Array, g: Array, lower: Array, upper: Array) -> NDArray[np.bool_]:
-    """Return whether each unknown can move: it is not at a limit that it would leave."""
+    """Return whether each unknown can move: it is not at a limit that it would leave.
+
+    Args:
+        x, g: (..., k) unknowns, and gradient of the cost, against which they move.
+        lower, upper: (k,) limits.
+    """
     return np.asarray(~((x <= lower) & (g > 0.0) | (x >= upper) & (g < 0.0)))
 
 
@@ -333,7 +351,7 @@ def _damp(
 
 @compiled
 def eliminate(M: Array) -> None:
-    """Replace [A B] (n, n + k) by [I A^-1 B] in place, by Gauss-Jordan elimination.
+    """Replace M = [A B] (n, n + k) by [I A^-1 B] in place, by Gauss-Jordan elimination.
 
     A must be positive definite. LAPACK is not faster on such small matrices, and slow to compile
     in.

@@ -42,13 +42,16 @@ pixels per metre), and the shift of its principal point [pixel]."""
 class Placement(NamedTuple):
     """A body at given parameters, in the form that kernels take.
 
+    A node's motion caused by a parameter is the sum of the affine motions that ``owners`` and
+    ``parameters`` list for both.
+
     Attributes:
         packed: surfaces of the nodes.
         X_WN: (nodes, 4, 4) poses of the nodes.
-        motions: (k, 12) affine motions.
-        starts: (nodes + 1,) index of each node's first entry in owners.
-        owners: (s,) indices of motions, ordered by node.
-        parameters: (s,) parameter that causes each motion.
+        motions: (k, 12) affine motions per unit of their parameters.
+        starts: (nodes + 1,) index of each node's first entry in owners; the last one is s.
+        owners: (s,) indices of motions that move a node, ordered by node.
+        parameters: (s,) index of the parameter that causes each of these motions.
     """
 
     packed: PackedOutlines
@@ -59,7 +62,10 @@ class Placement(NamedTuple):
     parameters: Indices
 
     def dense(self, size: int) -> Array:
-        """Return (nodes, size, 12) affine motions of each node caused by each parameter."""
+        """Return (nodes, size, 12) affine motion of each node caused by each of size parameters.
+
+        It is 0 for a node that a parameter does not move.
+        """
         motions = np.zeros((len(self.X_WN), size, 12))
         nodes = np.repeat(np.arange(len(self.X_WN)), np.diff(self.starts))
         # np.add.at is slow; only mimic joints and scales have several motions per parameter.
@@ -95,8 +101,8 @@ class BodyParameters:
             -1; None: there are no radius scales.
         radius_scale_names: names of the radius scales.
         surfaces: surfaces of the pose tree, if skin is to bend with the values. The outlines are
-            then these at rest, and there are no radius scales.
-        offsets: joints whose origins move with link scales.
+            then these at rest, and there are no radius scales. None: all parts are rigid.
+        offsets: vectors that link scales stretch, see ``carried_joints``; empty: no link scales.
     """
 
     def __init__(
@@ -159,7 +165,10 @@ class BodyParameters:
         )  # fmt: skip
 
     def place(self, theta: Array) -> Placement:
-        """Place the body at its tree's values (m,), or at all parameters (n,)."""
+        """Return the body at parameters theta: the tree's values (m,), or all parameters (n,).
+
+        With the m values only, the placement has no motions by the other parameters, which are 0.
+        """
         count = len(self.kinematics.names)
         at = self.kinematics.motions(theta[:count])
         if len(theta) == count:
@@ -209,7 +218,12 @@ class BodyParameters:
         return self._packed if self._bending is None else self._bending.at(values)
 
     def _offsets_in_world(self, values: Array, X_WN: Array) -> Array:
-        """Return the unscaled offsets (offsets, 3) in the world at the tree's values (m,) [m]."""
+        """Return the unscaled offsets (offsets, 3) in the world [m].
+
+        Args:
+            values: (m,) the tree's values.
+            X_WN: (nodes, 4, 4) poses of the nodes at these values.
+        """
         tree, split = self.kinematics.tree, self.kinematics.split(values)
         found = np.zeros((len(self._offsets), 3))
         for k, one in enumerate(self._offsets):
@@ -231,7 +245,10 @@ def link_scale_name(link: str) -> str:
 def carried_joints(tree: PoseTree, links: Collection[str] | None = None) -> list[LinkVector]:
     """Return the vectors from links' joints to the robot's joints that they carry at a distance.
 
+    The joints that position a target (TARGET_POSITIONS) are left out.
+
     Args:
+        tree: the pose tree.
         links: names of the carrying links; None: all.
     """
     return [
@@ -261,7 +278,10 @@ class CameraParameters:
         self._pivots = turned + self._X_CW[:, :3, 3]
 
     def place(self, theta: Array) -> tuple[Array, Array, Array]:
-        """Return the cameras at all parameters (9 c,).
+        """Return the cameras at their parameters.
+
+        Args:
+            theta: (9 c,) CAMERA_NAMES of each camera in turn.
 
         Returns:
             X_CW (c, 4, 4), kernel parameters (c, 8), and the affine motions (c, 9, 12) of all nodes
@@ -294,7 +314,12 @@ class CameraParameters:
 
 @compiled
 def affine_motions(twists: Array) -> Array:
-    """Return twists (m, 7), rotation, translation and scale rates, as affine motions (m, 12)."""
+    """Return affine motions (m, 12), the rows of (M v), of twists.
+
+    Args:
+        twists: (m, 7) angular velocity w, velocity v of the world's origin, and scale rate s of
+            each: dp = w x p + s p + v.
+    """
     affine = np.zeros((len(twists), 12))
     for k in range(len(twists)):
         own, twist = affine[k], twists[k]
@@ -306,23 +331,27 @@ def affine_motions(twists: Array) -> Array:
 
 
 def affine_of(M: Array, v: Array) -> Array:
-    """Return affine motions (m, 12) of M (m, 3, 3) and v (m, 3)."""
+    """Return the affine motions dp = M p + v, (m, 12), of M (m, 3, 3) and v (m, 3)."""
     return np.concatenate([M, v[:, :, None]], axis=2).reshape(-1, 12)
 
 
 def owners_of(moves: NDArray[np.bool_], parameters: Indices) -> tuple[Indices, Indices, Indices]:
-    """Return starts, owners and parameters of a Placement.
+    """Return ``starts``, ``owners`` and ``parameters`` of a Placement.
 
     Args:
         moves: (nodes, k) whether each motion moves a node.
-        parameters: (k,) parameter that causes each motion.
+        parameters: (k,) index of the parameter that causes each motion.
     """
     owners = np.nonzero(moves)[1].astype(np.int64)
     return np.cumsum([0, *moves.sum(axis=1)]), owners, parameters[owners]
 
 
 def scale_surfaces(packed: PackedOutlines, scale: Array) -> PackedOutlines:
-    """Return surfaces scaled by (nodes, 3) along the axes of each node's frame."""
+    """Return packed surfaces scaled about the origins of their nodes' frames.
+
+    Args:
+        scale: (nodes, 3) factors along the axes of each node's frame.
+    """
     points, planes = packed.points.copy(), packed.planes.copy()
     for node, (s, volume) in enumerate(zip(scale, scale.prod(axis=1), strict=True)):
         points[:, slice(*packed.starts[node : node + 2, 0])] *= s[:, None]
@@ -333,7 +362,7 @@ def scale_surfaces(packed: PackedOutlines, scale: Array) -> PackedOutlines:
 
 
 def _rotation(r: Array) -> tuple[Array, Array]:
-    """Return the rotation (3, 3) of a rotation vector (3,), and the left Jacobian of SO(3)."""
+    """Return the rotation (3, 3) of a rotation vector (3,) [rad], and the left Jacobian (3, 3)."""
     angle = float(np.linalg.norm(r))
     if angle > 1e-4:
         a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle**2

@@ -53,9 +53,10 @@ class Unknowns:
 
     Args:
         names: (u,) names of the parameters, see ``parameter_names``.
-        shared: whether all frames share them.
-        lower, upper: limits, scalar or (u,) [rad, m, pixel or a logarithm].
-        deviation: standard deviation of the prior, scalar or (u,); infinite: no prior.
+        shared: whether all frames share one value of each; else each frame has its own.
+        lower, upper: limits, scalar or (u,) [rad, m, s, pixel or a logarithm].
+        deviation: standard deviation of the prior [same unit], scalar or (u,); infinite: no
+            prior. Its mean is given to ``Problem.solve``.
     """
 
     names: Sequence[str]
@@ -70,12 +71,12 @@ class Solution:
     """The best fit of a problem.
 
     Attributes:
-        own: (frames, p) each frame's own unknowns.
-        shared: (q,) shared unknowns.
-        parameters: (frames, n) all parameters of the frames.
+        own: (frames, p) each frame's own unknowns, in the order of ``Problem.names``.
+        shared: (q,) shared unknowns, likewise.
+        parameters: (frames, n) all parameters of the frames, in the order of ``parameter_names``.
         cost: cost of all frames, including priors.
-        ending: evaluates the final normal equations and inlier ratios on first use.
-        coupling: prior that couples the frames' own unknowns.
+        ending: returns ``equations`` and ``inlier_ratios``, evaluated on the first call.
+        coupling: prior that couples the frames' own unknowns; None: none.
     """
 
     own: Array
@@ -87,7 +88,7 @@ class Solution:
 
     @property
     def equations(self) -> Equations:
-        """The final normal equations, including priors but not the coupling."""
+        """Normal equations at the solution and the last stage, with priors but not the coupling."""
         return self.ending()[0]
 
     @property
@@ -98,7 +99,8 @@ class Solution:
     def own_deviations(self) -> Array:
         """Return (frames, p) standard deviations of own unknowns, marginalised over shared ones.
 
-        They are at most 100 [in the unknown's unit], reached if nothing is observed.
+        The coupling is included. They are at most 100 [in the unknown's unit], reached if nothing
+        is observed.
         """
         frames, p = self.own.shape
         H = self.equations.H
@@ -114,7 +116,7 @@ class Solution:
 
 
 def parameter_names(body: BodyParameters, cameras: Sequence[Camera]) -> tuple[str, ...]:
-    """Return the names of all parameters of a frame, in order.
+    """Return the names of the n parameters of a frame, in order.
 
     They are the body's parameters, TIME_OFFSET, CAMERA_NAMES of each camera, and BOUNDARY_BIAS of
     each camera.
@@ -129,17 +131,20 @@ class Problem:
 
     Attributes:
         names: names of the u unknowns: the p own ones of each frame, then the q shared ones.
-        entries: (u,) index of the frame parameter to which each unknown is added.
+        entries: (u,) index, in ``parameter_names``, of the parameter to which each unknown is
+            added.
         own_count: p.
-        information: (u,) inverse variances of the unknowns' priors.
+        information: (u,) inverse variances of the unknowns' priors; 0: no prior.
 
     Args:
-        unknowns: the unknown parameters.
+        body: parameters of the body.
+        cameras: the cameras when their parameters are 0.
+        unknowns: groups of unknowns; all other parameters are known.
         pivot: (3,) or (cameras, 3) point in the world about which cameras rotate [m]; None: the
             root's position.
         noise: noise of contours; None: a weight of one per pixel, or ``Noise()`` if lengths are in
             metres.
-        steps: settings of the optimiser's steps.
+        steps: settings of the optimiser's steps; None: ``StepSettings()``.
         pixels: unit of length of stages and noise [pixel], scalar or (cameras,); None: the size of
             a metre at the root.
 
@@ -214,10 +219,14 @@ class Problem:
         """Return the best fit near an initial guess.
 
         Args:
+            observations: evidence and known values of each frame.
+            stages: annealing stages in order, coarse to fine [``pixels`` or m].
             start: initial guess of own (frames, p) and shared (q,) unknowns; None: 0.
-            expected: mean of the unknowns' prior; None: the initial guess.
-            shared_information: (q, q) further information matrix of the shared unknowns.
-            coupling: prior that couples all frames' own unknowns.
+            expected: mean of the prior of own (frames, p) and shared (q,) unknowns; None: the
+                initial guess.
+            shared_information: (q, q) information matrix of a further prior of the shared
+                unknowns, with the same mean; None: none.
+            coupling: prior that couples all frames' own unknowns; None: none.
 
         Raises:
             SettingsError: shapes do not match.
@@ -255,11 +264,23 @@ class Problem:
         stage: AnnealingStage,
         expected: tuple[Array, Array] | None = None,
     ) -> Equations:
-        """Return the normal equations at own and shared unknowns; arguments as of ``solve``."""
+        """Return the normal equations at given unknowns.
+
+        Args:
+            observations: evidence and known values of each frame.
+            at: own (frames, p) and shared (q,) unknowns.
+            stage: scale of the residuals.
+            expected: mean of the prior, of the same shapes; None: ``at``.
+        """
         return self._equations(observations, at, expected or at, stage, None)[0]
 
     def parameters(self, observations: Sequence[Observation], own: Array, shared: Array) -> Array:
-        """Return (frames, n) all parameters at own (frames, p) and shared (q,) unknowns."""
+        """Return (frames, n) all parameters: the known values plus the unknowns.
+
+        Args:
+            observations: the frames; only their known values are used.
+            own, shared: (frames, p) and (q,) unknowns.
+        """
         theta = np.zeros((len(observations), self._count))
         for row, one in zip(theta, observations, strict=True):
             row[: len(one.values)] = one.values
@@ -275,7 +296,13 @@ class Problem:
         stage: AnnealingStage,
         shared_information: Array | None,
     ) -> tuple[Equations, Array]:
-        """Return the equations, and the inlier ratios (frames, cameras)."""
+        """Return the equations with priors, and the inlier ratios (frames, cameras).
+
+        Args:
+            at: own (frames, p) and shared (q,) unknowns.
+            about: mean of their prior, of the same shapes.
+            shared_information: as of ``solve``.
+        """
         p, u, frames = self.own_count, len(self.names), len(observations)
         H, g, cost = np.zeros((frames, u, u)), np.zeros((frames, u)), 0.0
         ratios = []
@@ -304,7 +331,11 @@ class Problem:
     def _frame(
         self, frame: Observation, theta: Array, stage: AnnealingStage
     ) -> tuple[Array, Array, Array]:
-        """Return H (u, u), g (u,) and the sums (cameras, nodes + 1, 6) of a frame."""
+        """Return H (u, u) and g (u,) of a frame without priors, and its ``Comparison.sums``.
+
+        Args:
+            theta: (n,) all parameters of the frame.
+        """
         compared, (_, _, motions) = self.compare(frame, theta, stage)
         if self._cameras_fixed:
             moves = self._moves(compared, motions, 0, frame.rates)
@@ -339,7 +370,11 @@ class Problem:
     def compare(
         self, frame: Observation, theta: Array, stage: AnnealingStage
     ) -> tuple[Comparison, tuple[Array, Array, Array]]:
-        """Compare a frame's contours with its silhouettes at all parameters (n,).
+        """Compare the body's contours with a frame's silhouettes and foreground images.
+
+        Args:
+            theta: (n,) all parameters of the frame.
+            stage: scale of the residuals.
 
         Returns:
             The comparison, and the cameras as of ``CameraParameters.place``.
@@ -370,14 +405,31 @@ class Problem:
     def tile_costs(
         self, frame: Observation, theta: Array, stage: AnnealingStage, side: float
     ) -> Array:
-        """Return the costs at all parameters (n,) in tiles of a side [pixel], (cameras, k, k)."""
+        """Return the cost of a frame's silhouettes in tiles, as ``ContourFit.tile_costs`` does.
+
+        Args:
+            theta: (n,) all parameters of the frame.
+            side: side of a tile [pixel].
+
+        Returns:
+            (cameras, 64, 64) costs without priors and foreground images.
+        """
         views = self._views(frame, theta)
         return self._contours.tile_costs(
             views, self._body_parameters(theta, frame.rates), stage, side
         )
 
     def _body_parameters(self, theta: Array, rates: Array | None) -> Array:
-        """Return the body's parameters; only the tree's values (m,) if all others are 0."""
+        """Return the body's parameters, with the tree's values moved on by the time offset.
+
+        Args:
+            theta: (n,) all parameters of a frame.
+            rates: (m,) velocities of the tree's values; None: no motion.
+
+        Returns:
+            (k,) the body's parameters, or only the tree's values (m,) if all others are known and
+            0.
+        """
         own = theta[: len(self.body.names)]
         if rates is not None:
             own = own.copy()
@@ -385,13 +437,13 @@ class Problem:
         return own[: self._values] if self._values_only and not own[self._values :].any() else own
 
     def _views(self, frame: Observation, theta: Array) -> Views:
-        """Return the cameras, and the edges corrected for the boundary bias."""
+        """Return the cameras at theta (n,), and a frame's edges moved in by the boundary biases."""
         biases = theta[self._first_bias :]
         edges = offset_edges(frame.edges, -biases) if biases.any() else frame.edges
         return Views(self.place_cameras(theta)[:2], edges)
 
     def place_cameras(self, theta: Array) -> tuple[Array, Array, Array]:
-        """Return the cameras at all parameters (n,), as of ``CameraParameters.place``."""
+        """Return the cameras at a frame's parameters (n,), as ``CameraParameters.place`` does."""
         camera_part = theta[self._first_camera : self._first_bias]
         # Successive frames mostly have the same camera parameters.
         if camera_part.tobytes() != self._last_cameras[0]:
@@ -401,9 +453,15 @@ class Problem:
     def compared_masks(
         self, observations: Sequence[Observation], parameters: Array, stage: AnnealingStage
     ) -> list[ComparedMask]:
-        """Return the comparison with each silhouette at all parameters (frames, n).
+        """Return the comparison with each silhouette that has a contour to compare.
 
-        Its values are the unknowns except boundary biases, each frame's own ones first.
+        The values of a ``ComparedMask`` are here the unknowns except boundary biases: the own ones
+        of all frames, frame by frame, then the shared ones. The unit of errors is a pixel.
+
+        Args:
+            observations: the frames.
+            parameters: (frames, n) all parameters of each.
+            stage: scale of the residuals.
         """
         chosen, frames = self.entries < self._first_bias, len(observations)
         p = int(np.count_nonzero(chosen[: self.own_count]))
@@ -430,6 +488,13 @@ class Problem:
         """Return (nodes, u, 12) motions of the nodes, as seen by a camera, caused by the unknowns.
 
         Boundary biases move no node.
+
+        Args:
+            compared: comparison, whose placement is used.
+            motions: (cameras, 9, 12) motions caused by camera parameters, as of
+                ``CameraParameters.place``.
+            camera: index of the camera.
+            rates: (m,) velocities of the tree's values; None: the time offset moves no node.
         """
         entries, placement = self.entries, compared.placement
         moves = np.zeros((len(placement.X_WN), len(entries), 12))

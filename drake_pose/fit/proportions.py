@@ -33,18 +33,20 @@ from drake_pose.silhouette.outline import TreeSurfaces
 
 
 class ProportionedBody(BodyParameters):
-    """Parameters of a body: tree values, ROOT_NAMES, log lengths, log widths, and joint positions.
+    """Parameters of a body: tree values, ROOT_NAMES, log lengths, log widths, and joint shifts.
 
-    A limb is a chain of nodes that each carry only the next one. There is one length per node, one
-    width per limb, and one position per joint at which a limb begins.
+    A limb is a chain of nodes that each carry only the next one. There is one length factor per
+    node, one width factor per limb, and one shift [part's length] per joint at which a limb begins.
 
     Attributes:
         axes: (nodes,) axis 0, 1 or 2 of each node's frame along which its length is scaled.
         limbs: (nodes,) index of each node's limb.
-        movable: nodes at which limbs begin and whose joints may move.
+        movable: (k,) indices of nodes at which limbs begin and whose joints may move.
+        length_names, width_names, joint_shift_names: names of the last three groups of parameters.
 
     Args:
         kinematics: kinematics of the pose tree.
+        surfaces: surfaces of the pose tree.
 
     Raises:
         ModelError: the model has mimic joints.
@@ -123,7 +125,11 @@ class ProportionedBody(BodyParameters):
         self._owners = owners_of(np.hstack(moves), np.concatenate(caused_by))
 
     def factors(self, theta: Array) -> Array:
-        """Return (nodes, 3) the scale of each node along the axes of its frame."""
+        """Return (nodes, 3) the scale of each node along the axes of its frame.
+
+        Args:
+            theta: (n,) all parameters.
+        """
         count = len(self.kinematics.names) + len(ROOT_NAMES)
         nodes = len(self.limbs)
         lengths = theta[count : count + nodes]
@@ -133,10 +139,11 @@ class ProportionedBody(BodyParameters):
         return np.asarray(np.exp(logs))
 
     def applied_to(self, model: ArticulatedModel, theta: Array) -> ArticulatedModel:
-        """Return a model with the proportions of all parameters (n,).
+        """Return a model with the proportions of all parameters.
 
         Args:
-            model: the tree's model, or one like it.
+            model: the tree's model, or another one with the same links and joints.
+            theta: (n,) all parameters; only the proportions are used.
 
         Raises:
             ModelError: the model's file is not a URDF.
@@ -156,13 +163,19 @@ class ProportionedBody(BodyParameters):
         )
 
     def relative_joint_shifts(self, theta: Array) -> Array:
-        """Return (nodes,) shift of each part's joint along the part [part's length]."""
+        """Return (nodes,) shift of each part's joint along the part [part's length].
+
+        It is 0 for joints that do not move.
+
+        Args:
+            theta: (n,) all parameters.
+        """
         joint_shifts = np.zeros(len(self.limbs))
         joint_shifts[self.movable] = theta[len(self.names) - len(self.movable) : len(self.names)]
         return joint_shifts
 
     def place(self, theta: Array) -> Placement:
-        """Place the body at all parameters (n,)."""
+        """Return the body at all parameters theta (n,)."""
         kinematics = self.kinematics
         count = len(kinematics.names)
         at_rest = kinematics.motions(theta[:count])
@@ -234,8 +247,8 @@ def sequence_prior(
 
     Args:
         frames: number of frames, at least three.
-        usual: phi (k, p), mean (k,) and information (k,), the inverse variance, of phi x in each
-            frame.
+        usual: phi (k, p), mean (k,) and information (k,), the inverse variance, of the k linear
+            combinations phi x of each frame's unknowns x (p,).
         acceleration: (p,) standard deviation of an unknown about its linear extrapolation from the
             two preceding frames.
     """
@@ -263,16 +276,20 @@ def fit_proportions(
     """Fit a body's proportions, and its pose in each frame, to several frames of one camera.
 
     Args:
+        body: parameters of the body.
+        camera: the camera.
         frames: edges of the silhouettes of three or more frames.
         starts: (frames, k) initial guess of the tree's values and ROOT_NAMES, or (frames, n) of all
-            parameters, with the proportions taken from the first frame.
-        stages: the annealing stages [pixel].
+            parameters, with the proportions taken from the first frame; else they are the model's.
+        stages: annealing stages in order, coarse to fine [pixel].
+        noise: errors of the silhouettes [pixel].
         limits: lower and upper (p,) limits of the free tree values, then of ROOT_NAMES.
-        prior: prior of these unknowns in all frames.
+        prior: prior of these p unknowns in all frames, see ``sequence_prior``.
 
     Returns:
-        The solution, and the standard deviations (frames, k) of the tree's values and ROOT_NAMES, 0
-        for fixed values.
+        The solution, whose own unknowns are the free tree values and ROOT_NAMES, and whose shared
+        ones are the proportions; and the standard deviations (frames, k) of the tree's values and
+        ROOT_NAMES, 0 for fixed values.
     """
     kinematics = body.kinematics
     moving = np.array(kinematics.names)[kinematics.lower < kinematics.upper].tolist()

@@ -51,7 +51,13 @@ class Border(NamedTuple):
         return (len(self.rows[1]) + len(self.columns[1])) * math.pi / 4.0
 
     def covered(self, step: int, shape: tuple[int, ...]) -> Mask:
-        """Return the mask (h, w) inside the border, on every step-th row and column."""
+        """Return the mask inside the border, on every step-th row and column.
+
+        Args:
+            step: distance between the rows and between the columns that are kept [pixel]; the first
+                ones are 0.
+            shape: shape (h, w) of the mask: the image's, divided by the step and rounded up.
+        """
         starts, places = self.rows
         rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
         chosen = rows % step == 0
@@ -95,11 +101,12 @@ def compare_raster(
         X_WN: (nodes, 4, 4) poses of the nodes.
         is_moving: (nodes,) whether a node moves.
         camera: X_CW (4, 4) and kernel parameters (8,).
-        static_border: border of the union of all other nodes.
+        static_border: border of the union of all other nodes, see `find_body_border`.
         border: border of the silhouette.
-        lines: step between the rows and columns used, and index of the first one.
-        scale: residuals beyond it lose weight [pixel].
-        slack: only the excess of a distance over this counts [pixel]; 0: the whole distance counts.
+        lines: step between the rows and columns used, and index of the first one [pixel].
+        scale: residual at which the weight drops to a half [pixel].
+        slack: only the excess of a distance along the line over this counts [pixel], and with 0.03
+            of the weight the whole distance; 0: the whole distance counts.
         A, b: (nodes, 12, 12), lower triangles, and (nodes, 12), added to, as of `compare_contours`.
 
     Returns:
@@ -196,7 +203,14 @@ def compare_raster(
 def find_body_border(
     packed: PackedOutlines, X_WN: Array, is_moving: Mask, camera: tuple[Array, Array]
 ) -> Border:
-    """Return the border of the union of the moving nodes; arguments as of compare_raster."""
+    """Return the border of the union of some nodes in a camera's image.
+
+    Args:
+        packed: surfaces of all nodes.
+        X_WN: (nodes, 4, 4) poses of the nodes.
+        is_moving: (nodes,) whether a node belongs to the union.
+        camera: X_CW (4, 4) and kernel parameters (8,).
+    """
     segments = find_segments(packed, poses_in_camera(camera[0], X_WN), camera[1], is_moving)
     spans = np.empty((segments.ends.shape[0] + 1, 2), dtype=np.int64)
     borders = []
@@ -223,13 +237,17 @@ def _unite_line(
     """Write where a line enters and leaves the union of moving and static surfaces.
 
     Args:
-        spans, found, moving: the line's spans of moving surfaces, as from ``find_line_spans``.
-        static_border: crossings of the static surfaces; those of this line are ``first`` to
-            ``end``.
-        places, chosen: output: positions [pixel], and index of the moving crossing or -1.
+        spans: (k, 2) spans of moving surfaces, as indices of crossings, from ``find_line_spans``;
+            the first ``found`` rows are used.
+        found: number of spans.
+        moving: positions of the moving surfaces' crossings along their lines [pixel].
+        static_border: positions of the static surfaces' crossings, likewise.
+        first, end: range of this line's static crossings.
+        places, chosen: output (count,): positions along the line, ascending and alternately
+            entering and leaving [pixel], and index of the moving crossing, or -1 if it is static.
 
     Returns:
-        Number of positions.
+        Number of positions; the rest of the output is unchanged.
     """
     count, depth, i, j = 0, 0, 0, first
     while i < 2 * found or j < end:
@@ -253,7 +271,12 @@ def _pixels_apart(
 ) -> float:
     """Return the number of a line's pixel centres covered by exactly one of body and silhouette.
 
-    Arguments as of _compare_line; width: the line's length [pixel].
+    Args:
+        places: positions of the contour's crossings, ascending [pixel]; the first ``count`` are
+            used.
+        border: positions of the silhouette's crossings; those of this line are ``first`` to
+            ``end``.
+        width: the line's length [pixel].
     """
     length, open_at, inside = 0.0, -0.5, False
     i, j = 0, first
@@ -277,14 +300,19 @@ def _compare_line(
 ) -> None:  # fmt: skip
     """Write the weight and the weighted residual of each contour crossing.
 
+    Each crossing of either border is matched to the nearest one of the other border that has the
+    same sense. Contour crossings beyond the image are ignored.
+
     Args:
-        places: (count,) positions of the contour's crossings, alternately entering and leaving.
+        places: (count,) positions of the contour's crossings, alternately entering and leaving
+            [pixel].
         slopes: (count,) cosines between the line and the contour's normal.
         border: positions of the silhouette's crossings; those of this line are ``first`` to
             ``end``.
         extent: end of the image along the line [pixel].
         scale, slack: as of compare_raster.
-        weights, residuals: output.
+        weights, residuals: (count,) output: sum over the matches of the weights, and of the
+            weights times the residuals (contour minus silhouette) [pixel].
     """
     for k in range(count):
         weights[k] = residuals[k] = 0.0

@@ -68,7 +68,11 @@ def _read(path: Path) -> Outline | None:
 
 
 def _write(path: Path, outline: Outline) -> None:
-    """Store a surface atomically, so that processes storing the same one do not interfere."""
+    """Store a surface atomically, so that processes storing the same one do not interfere.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
     buffer = io.BytesIO()
     np.savez(buffer, vertices=outline.vertices, triangles=outline.triangles)
     payload = buffer.getvalue()
@@ -84,7 +88,10 @@ def _write(path: Path, outline: Outline) -> None:
 
 
 def _remove_oldest(folder: Path, most: int) -> None:
-    """Remove the least recently used files, including leftovers of killed processes."""
+    """Remove a folder's least recently used files until at most ``most`` are left.
+
+    Leftovers of killed processes are removed likewise.
+    """
     ages = sorted((one.stat().st_mtime, one) for one in folder.iterdir() if one.is_file())
     for _, one in ages[: max(0, len(ages) - most)]:
         with suppress(OSError):

@@ -31,7 +31,10 @@ def simplify_rigid_parts(surfaces: TreeSurfaces, count: int) -> TreeSurfaces:
 
 
 def simplify_surfaces(surfaces: TreeSurfaces, count: int = FEW) -> tuple[Outline, ...]:
-    """Return each node's surface, skin at rest, with about ``count`` triangles."""
+    """Return each node's surface, with skin at rest, simplified to about ``count`` triangles.
+
+    A surface with fewer triangles stays.
+    """
     outlines = []
     for node, rigid in enumerate(surfaces.rigid):
         bending = surfaces.bending[node]
@@ -40,7 +43,10 @@ def simplify_surfaces(surfaces: TreeSurfaces, count: int = FEW) -> tuple[Outline
 
 
 def simplify_outlines(outlines: Sequence[Outline], count: int = 160) -> tuple[Outline, ...]:
-    """Return simplified surfaces simplified further, much faster than from the originals."""
+    """Return simplified surfaces simplified further, to about ``count`` triangles each.
+
+    This is much faster than simplifying the originals.
+    """
     return tuple(_simplify(outline, count) for outline in outlines)
 
 
@@ -51,7 +57,7 @@ def reduce_meshes(
 
     Args:
         meshes: the meshes; each keeps its fraction of the triangles.
-        total: number of triangles.
+        total: number of triangles; meshes with up to 1.2 times as many in all stay.
         rounds: maximum number of simplifications; meshes with holes and slivers keep several times
             as many triangles in a single one.
     """
@@ -87,7 +93,7 @@ def simplify_or_hull(
 
 
 def with_radius_scales(outlines: Sequence[Outline], radius_scales: Array) -> tuple[Outline, ...]:
-    """Return surfaces scaled across their y axes by radius scales (nodes,)."""
+    """Return the nodes' surfaces, with x and z multiplied by radius scales (nodes,)."""
     scaled = []
     for outline, radius_scale in zip(outlines, radius_scales, strict=True):
         vertices = outline.vertices * [radius_scale, 1.0, radius_scale]
@@ -96,7 +102,7 @@ def with_radius_scales(outlines: Sequence[Outline], radius_scales: Array) -> tup
 
 
 def _simplify(outline: Outline, count: int) -> Outline:
-    """Return a surface with at most about ``count`` triangles.
+    """Return a surface with at most about ``count`` triangles; one with fewer stays.
 
     In each pass the simplifier allows larger errors, in absolute units, until there are few enough
     triangles. It never merges slivers: with many of them it folds the rest of the surface or leaves
@@ -134,7 +140,12 @@ def _simplify_cached(vertices: bytes, triangles: bytes, count: int) -> Outline:
 
 
 def _simplify_uncached(outline: Outline, count: int) -> Outline:
-    """Return the closer of two simplifications of a surface to about ``count`` triangles."""
+    """Return a surface with about ``count`` triangles, in one of two ways.
+
+    If edge collapses leave too many triangles or a distant surface, the surface is also simplified
+    with merged vertices, and that result is returned if it is clearly closer, or close and the
+    first one has too many triangles.
+    """
     simplified = collapse_edges(outline, count)
     size = float(np.linalg.norm(np.ptp(outline.vertices, axis=0)))
     # The distance of a simplified smooth surface is 0.4 to 1.4 times size / count, on all parts of
@@ -164,7 +175,8 @@ def collapse_edges(outline: Outline, count: int, unit: float = 1.0) -> Outline:
     """Return a surface simplified by edge collapses (quadric error metric, Garland and Heckbert).
 
     Args:
-        count: number of triangles.
+        outline: the surface; it stays if it has no more than ``count`` triangles.
+        count: number of triangles to reach; slivers and holes may leave more.
         unit: unit of length in which the simplifier works [m].
     """
     if len(outline.triangles) <= count:
@@ -189,7 +201,7 @@ def surface_distance(one: Outline, other: Outline) -> float:
 
 
 def _squared_distances(one: Outline, other: Outline) -> Array:
-    """Return (n,) squared distances of points spread over a surface to another surface [m^2]."""
+    """Return (300,) squared distances of points spread over a surface to another one [m^2]."""
     points, corners = _sample_surface(one), other.vertices[other.triangles]
     centers = corners.mean(axis=1)
     radii = np.linalg.norm(corners - centers[:, None], axis=2).max(axis=1)
@@ -219,7 +231,7 @@ def _squared_distances(one: Outline, other: Outline) -> Array:
 
 
 def _sample_surface(outline: Outline, count: int = 300) -> Array:
-    """Return points (count, 3) spread evenly over a surface's area."""
+    """Return points (count, 3) spread evenly over a surface's area [m], the same in every call."""
     generator = np.random.default_rng(0)
     areas = np.cumsum(np.linalg.norm(outline.planes[:, :3], axis=1))
     where = np.searchsorted(areas, areas[-1] * (np.arange(count) + 0.5) / count)

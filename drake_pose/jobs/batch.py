@@ -72,8 +72,8 @@ class Task:
         job: the scene's job.
         out: folder of the batch.
         index: index of the chunk; None: the whole scene, joined from its chunks if it has any.
-        frames: frames of the chunk or of the whole scene.
-        chunks: result folders of the chunks to be joined.
+        frames: names of the frames of the chunk or of the whole scene.
+        chunks: result folders of the chunks to be joined; () if there are none.
     """
 
     job: SceneJob
@@ -108,7 +108,7 @@ class Outcome(NamedTuple):
     Args:
         error: message of the error; None if the task succeeded.
         seconds: wall time [s]; 0 if the result existed already.
-        totals: entries of the summary of a whole scene.
+        totals: of a whole scene that succeeded, the result of `_totals`; else None.
     """
 
     error: str | None
@@ -122,9 +122,9 @@ class SceneState:
 
     Args:
         job: the scene's job.
-        described: the job and its files as they were at the start.
-        tasks: its chunks, or the single task of a scene that is not cut.
-        done: indices of the finished tasks.
+        described: ``SceneJob.describe()`` at the start.
+        tasks: its chunks, or the single task of a scene that is not cut; () before planning.
+        done: indices (``Task.index``) of the finished tasks.
         errors: by message, the ranges of frames that failed ("": the whole scene).
         totals: as in Outcome; empty until the scene is finished.
         seconds: time spent on the scene in this run, summed over all workers [s].
@@ -182,6 +182,10 @@ class SceneState:
 def plan_scene(job: SceneJob, out: Path) -> tuple[Task, ...]:
     """Return the tasks of a scene: its chunks in order; one task for a person or an audit.
 
+    Args:
+        job: the scene's job.
+        out: folder of the batch.
+
     Raises:
         DrakePoseError: the scene cannot be read.
     """
@@ -207,7 +211,7 @@ def plan_scene(job: SceneJob, out: Path) -> tuple[Task, ...]:
 
 
 def perform(task: Task) -> Outcome:
-    """Run a task; errors become part of the outcome."""
+    """Run a task, unless its result folder exists; an error becomes part of the outcome."""
     begin = time.perf_counter()
     seconds = 0.0
     try:
@@ -231,7 +235,7 @@ def _describe_failure(error: BaseException) -> str:
 
 
 def _load(job: SceneJob) -> Scene:
-    """Return the scene of a job."""
+    """Return the scene of a job, with all cameras and frames."""
     cameras = None if job.camera_file is None else load_cameras(job.camera_file)
     settings = job.settings
     is_person = isinstance(settings, EstimateSettings) and settings.method == "person"
@@ -244,7 +248,10 @@ def _joints(job: SceneJob) -> Path | None:
 
 
 def _require_same_masks(task: Task) -> None:
-    """Raise an OutputError if masks of a finished scene have changed; joining checks chunks."""
+    """Raise an OutputError if masks of a finished whole scene have changed since.
+
+    Chunks are checked when they are joined, and episodes have no masks.
+    """
     settings = task.job.settings
     is_episode = isinstance(settings, AuditSettings) and uses_pictures(task.job.scene, settings)
     if task.index is not None or is_episode:
@@ -294,7 +301,10 @@ def _make(task: Task) -> None:
 
 
 def _join_chunks(task: Task, settings: EstimateSettings, part: Path) -> None:
-    """Join chunks to an unfinished result with all frames; resuming it writes the other files."""
+    """Join a task's chunks to an unfinished result with all frames in the new folder ``part``.
+
+    Resuming the estimate with these ``settings`` in ``part`` writes the other files.
+    """
 
     def link(source: str, target: str) -> None:
         try:
@@ -318,7 +328,12 @@ def _join_chunks(task: Task, settings: EstimateSettings, part: Path) -> None:
 
 
 def _totals(task: Task) -> Mapping[str, Any] | None:
-    """Return the totals of a whole scene from its summary; None for a chunk."""
+    """Return entries of a finished whole scene's summary.json; None for a chunk.
+
+    Estimate: ``frame_count``, ``found_count``, ``mean_E_total``. Audit: ``frame_count``,
+    ``agreeing_count``, ``findings``, and ``cameras``: entries of the cameras found, by name, with
+    ``off_mm`` and ``off_deg``, the distance from the given pose (None if that is no error).
+    """
     if task.index is not None:
         return None
     summary = read_summary(task.place)
@@ -356,13 +371,16 @@ def run_batch(
     ``out``.
 
     Args:
-        jobs: the scenes.
-        out: folder of the batch; it must be new or empty.
+        jobs: the scenes, whose names differ.
+        out: folder of the batch; it must be new or empty, unless ``resume``.
         client: Dask client of the workers; None: this process does the work.
         resume: continue the batch in ``out``, and try failed scenes again.
         on_progress: called when a task is finished or has failed.
-        work: runs a task.
-        tries: number of attempts for a task that kills its process.
+        work: runs a task and returns its outcome; picklable if there is a client.
+        tries: number of attempts for a task that kills its process; used with a client only.
+
+    Returns:
+        The batch, in which scenes may have failed.
 
     Raises:
         OutputError: the folder cannot be used, or holds another batch.
@@ -389,10 +407,13 @@ class Batch:
     """State and result of a batch.
 
     Attributes:
-        scenes: progress by scene.
-        seconds: wall time of this run [s].
+        scenes: progress by name of the scene.
+        seconds: wall time of this run until the last `write` [s].
         out: folder of the batch.
-        waiting: tasks still to be run.
+        waiting: tasks still to be run, first ones first.
+
+    Args:
+        jobs, out, on_progress: as in `run_batch`.
     """
 
     def __init__(self, jobs: Sequence[SceneJob], out: Path, on_progress: OnProgress) -> None:
@@ -417,7 +438,7 @@ class Batch:
         }
 
     def write(self) -> None:
-        """Write batch.json and the tables of audits.
+        """Write batch.json; for audits also findings.csv, episodes.csv and camera files.
 
         Raises:
             OutputError: a file cannot be written.
@@ -460,9 +481,13 @@ class Batch:
         self._report()
 
     def run_on(self, client: Client, work: Callable[[Task], Outcome], tries: int) -> None:
-        """Run the tasks on workers, one at a time on each thread.
+        """Run all waiting tasks on a client's workers, one at a time on each thread.
 
-        No task waits at a worker, where it would be blamed for the worker's death.
+        No task waits at a worker, where it would be blamed for the worker's death. ``work`` and
+        ``tries`` are as in `run_batch`.
+
+        Raises:
+            ClusterError: the connection to the scheduler is lost.
         """
         from distributed import KilledWorker, as_completed
 
@@ -495,7 +520,11 @@ class Batch:
                 )
 
     def note(self, task: Task, outcome: Outcome) -> None:
-        """Record the outcome of a task; queue the joining of a scene after its last chunk."""
+        """Record the outcome of a task.
+
+        After a scene's last chunk the task that joins them is queued; a whole scene with another
+        number of frames than planned fails.
+        """
         state = self.scenes[task.job.name]
         state.seconds += outcome.seconds
         if outcome.error is not None:
@@ -526,7 +555,11 @@ class Batch:
             self._next_summary = next_summary(begin)
 
     def _fail(self, state: SceneState, extent: str, error: str, most: int = 3) -> None:
-        """Record an error; after ``most`` failed chunks the scene's other tasks are dropped."""
+        """Record an error of a task of a scene.
+
+        The scene's other tasks are dropped if the whole scene or ``most`` of its chunks failed.
+        ``extent`` is the task's `Task.extent`.
+        """
         state.errors.setdefault(error, []).append(extent)
         if not extent or sum(map(len, state.errors.values())) >= most:
             self.waiting = deque(one for one in self.waiting if one.job is not state.job)
@@ -534,13 +567,17 @@ class Batch:
         self._report(f"scene '{state.job.name}'{where}: {error}")
 
     def _report(self, message: str = "") -> None:
+        """Call ``on_progress`` with the present numbers of frames, and an error message or ""."""
         states = self.scenes.values()
         done = sum(one.frames_done for one in states)
         self._on_progress(done, sum(one.frame_count for one in states), message)
 
 
 def _require_same_batch(jobs: Sequence[SceneJob], out: Path) -> None:
-    """Raise an OutputError if a scene of the batch has changed; new scenes are allowed."""
+    """Raise an OutputError if a job differs from that of the same name in batch.json in ``out``.
+
+    Jobs of new names are allowed. There must be a readable batch.json.
+    """
     path = out / "batch.json"
     try:
         recorded = json.loads(path.read_text(encoding="utf-8"))["scenes"]

@@ -22,15 +22,15 @@ class SceneJob:
 
     Args:
         name: name of the scene and its result folder.
-        scene: the scene's folder.
+        scene: the scene's folder; of an audit also an episode, a folder or file.
         model: the model file.
         settings: settings of the estimate or audit.
-        truth: measured joint positions to compare an estimate with.
+        truth: measured joint positions to compare an estimate with; None: the scene's own, if any.
         overlay, replay: whether overlays and replay.html are written.
         chunk: number of frames in a chunk; recordings of a person and audits are not cut.
         audit: table of joint positions to be audited; True: the episode's own joint log; None: the
             scene is estimated.
-        camera_file: camera file of an audit, used instead of the scene's cameras.yaml.
+        camera_file: camera file of an audit, used instead of the scene's cameras.yaml; None: that.
     """
 
     name: str
@@ -62,8 +62,9 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
 
     Args:
         path: YAML file with ``scenes`` (settings by name) and optionally ``defaults`` (settings of
-            all scenes) and ``chunk``.
-        chunk: number of frames in a chunk, instead of the file's.
+            all scenes) and ``chunk``. A scene with ``episodes: "0:99"`` becomes one scene for each
+            episode, NAME_000000 and so on.
+        chunk: number of frames in a chunk; None: the file's, else 100.
 
     Raises:
         SettingsError: the message names the file, scene and setting at fault.
@@ -109,10 +110,10 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
 
 
 def _known(value: Any, where: str, known: tuple[str, ...]) -> dict[str, Any]:
-    """Return a mapping whose keys are in ``known``.
+    """Return a value of a YAML file, checked to be a mapping with no other keys than ``known``.
 
     Raises:
-        SettingsError: it is not a mapping, or has other keys.
+        SettingsError: it is not a mapping, or has other keys; the message begins with ``where``.
     """
     if not isinstance(value, dict):
         raise SettingsError(f"{where}: expected NAME: VALUE lines")
@@ -130,7 +131,8 @@ def _scene_job(
     """Return the job of a scene from its entry, the defaults included.
 
     Args:
-        values: the entry; None means that the key is not given.
+        name: name of the scene.
+        values: the entry, whose keys are known; None means that the key is not given.
         own: keys that are fields of SceneJob.
         chunk: number of frames in a chunk.
         where: file and scene, for messages.
@@ -168,7 +170,17 @@ def _scene_job(
 
 
 def _convert(value: Any, hint: Any, where: str, base: Path) -> Any:
-    """Convert a YAML value to the type of a settings field; paths are relative to ``base``."""
+    """Return a YAML value converted to the type of a settings field.
+
+    Args:
+        value: the value as read.
+        hint: the field's type hint, with its cyclopts parameters.
+        where: file, scene and field, for messages.
+        base: folder of relative paths.
+
+    Raises:
+        SettingsError: the value cannot be converted.
+    """
     reader = None
     while get_origin(hint) is Annotated:
         hint, *more = get_args(hint)

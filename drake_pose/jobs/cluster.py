@@ -39,13 +39,13 @@ def open_cluster(
     tries: int = 3,
     timeout: float = 5.0,
 ) -> Iterator[Client]:
-    """Open a Dask client and, without ``scheduler``, workers on this machine.
+    """Open a Dask client and, without ``scheduler``, workers on this machine; yields the client.
 
     Args:
         workers: number of worker processes with one thread each, which listen on the loopback
             address only; None: one for each core.
-        scheduler: address of a Dask scheduler whose workers are used instead.
-        tries: number of workers that a task may kill before it fails.
+        scheduler: address of a Dask scheduler whose workers are used instead; None: no scheduler.
+        tries: number of workers that a task may kill before it fails; not used with ``scheduler``.
         timeout: timeout of the connection to a scheduler [s].
 
     Raises:
@@ -105,7 +105,15 @@ def open_cluster(
 
 
 def _connect(address: str, timeout: float) -> Client:
-    """Return a client of a running scheduler."""
+    """Return a client of a running scheduler.
+
+    Args:
+        address: address of the scheduler, such as tcp://10.0.0.7:8786.
+        timeout: timeout of the connection [s].
+
+    Raises:
+        ClusterError: the address is malformed, or no scheduler answers.
+    """
     from distributed import Client
     from distributed.comm import connect, get_address_host_port
 
@@ -139,7 +147,10 @@ def address_of(client: Client) -> str:
 
 
 def worker_facts(file: Path | None = None) -> tuple[str, str, bool]:
-    """Return this process's version, the SHA-256 of its source code, and whether a file exists."""
+    """Return this process's version, the SHA-256 of its source code, and whether a file exists.
+
+    The last is True for None.
+    """
     digest = hashlib.sha256()
     package = Path(version.__file__).parent
     for path in sorted(package.rglob("*.py")):
@@ -149,10 +160,15 @@ def worker_facts(file: Path | None = None) -> tuple[str, str, bool]:
 
 
 def require_fit_workers(client: Client, out: Path, timeout: float = 5.0) -> None:
-    """Check that all workers have this version of drake_pose and see the result folder.
+    """Check that all workers have this version of drake_pose and see a folder.
+
+    Args:
+        client: client of the workers.
+        out: the folder, which is created if it does not exist.
+        timeout: time for which a first worker is waited for [s].
 
     Raises:
-        ClusterError: there is no worker within the timeout [s], or a worker fails a check.
+        ClusterError: there is no worker, the folder cannot be written, or a worker fails a check.
     """
     with suppress(asyncio.TimeoutError):
         client.wait_for_workers(1, timeout=timeout)
@@ -236,7 +252,12 @@ def call_in_child(payload: bytes) -> bytes:
 
 
 def _answer(requests: Connection, memory_limit: int | None) -> None:
-    """Serve the parent's calls until the parent ends."""
+    """Serve the parent's calls until the parent ends.
+
+    Args:
+        requests: gets each ``payload`` of `call_in_child`, and sends the pickled result.
+        memory_limit: limit of this process's data [bytes]; None or 0: unlimited.
+    """
     # The parent handles Ctrl-C.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if memory_limit:

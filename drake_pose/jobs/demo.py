@@ -34,8 +34,9 @@ def demo_scene() -> Path:
 def demo_settings(scene: Path) -> EstimateSettings:
     """Return the settings of Kameda, Minoh and Ikeda's experiment B for a standing person.
 
-    The root is a foot with a known position, any heading, and a tilt of up to 20 degrees. The
-    search is the multi-start search at continuous angles.
+    ``scene`` is the scene's folder, with root_position.csv. The root is a foot with a known
+    position, any heading, and a tilt of up to 20 degrees. The search is the multi-start search at
+    continuous angles.
     """
     return EstimateSettings(
         root="right_foot",
@@ -49,7 +50,7 @@ def run_demo(out: Path, on_frame: OnFrame | None = None) -> SceneEstimate:
 
     Args:
         out: folder for the result; the result of an earlier demonstration is replaced.
-        on_frame: called with the finished frame.
+        on_frame: called before and after the only frame; None: not called.
 
     Raises:
         OutputError: the folder holds other files.

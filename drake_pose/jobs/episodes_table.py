@@ -14,6 +14,9 @@ from drake_pose.registration.diagnosis import DIAGNOSIS
 from drake_pose.registration.online_registration import pose_difference, squared_distance
 
 Found = Mapping[str, Any]
+"""A camera found by an audit, as in ``found_cameras`` of its summary.json; keys used here: X_WC (4,
+4), covariance (6, 6; rotation first, rad and m), translation_sd_mm, focal_sd_px (None if not
+estimated) and camera (its entry of a camera file)."""
 
 COLUMNS = (
     "scene", "camera", "frames", "agreeing", "x", "y", "z", "sd_mm", "sd_deg", "off_mm", "off_deg",
@@ -30,10 +33,11 @@ def episodes_table(episodes: Mapping[str, Mapping[str, Any]]) -> tuple[str, dict
 
     A camera has moved if its pose differs significantly from the combined pose of the episodes
     since its last move. A new camera file begins at each episode in which a camera has moved. There
-    are no camera files without audited episodes.
+    are no camera files ({}) without audited episodes.
 
     Args:
-        episodes: totals by scene, in the order of the job; scenes without cameras are skipped.
+        episodes: totals of audits (`batch.Outcome`) by scene, in the order of the job; scenes
+            without ``cameras`` are skipped.
     """
     rows = list[list[Any]]()
     files: list[dict[str, _Standing]] = [{}]
@@ -73,6 +77,9 @@ class _Standing:
     Covariance intersection with equal weights (Julier and Uhlmann, 1997) gives a covariance that is
     consistent for any correlation: with n equal episodes it is that of one. Only sums are stored,
     since a batch may have thousands of episodes.
+
+    ``one``: the camera in its first episode, about whose pose the others are averaged; it is not
+    yet added.
     """
 
     def __init__(self, one: Found) -> None:
@@ -98,7 +105,10 @@ class _Standing:
         return X_WC, np.asarray(self._count * inverse)
 
     def moved(self, one: Found) -> tuple[float, float, str]:
-        """Return the distance [mm], angle [deg] and "yes" or "no": whether the camera has moved."""
+        """Return distance [mm] and angle [deg] of a pose from the combined one, and "yes" or "no".
+
+        "yes": the camera has moved, since the difference is significant.
+        """
         X_WC, covariance = self.pose()
         off = pose_difference(np.array(one["X_WC"]), X_WC)
         distance = squared_distance(off, covariance + np.array(one["covariance"]))

@@ -38,9 +38,10 @@ class Source:
         path: folder or file of the source.
         camera_file: the camera file; None if there is none.
         cameras: content of the camera file; None if there is none.
-        pictures: picture files by camera and frame; empty if there are videos.
-        videos: video files by camera.
-        annotated: COCO files, each with the name of the folder that it lies in.
+        pictures: picture files by camera and frame.
+        videos: video files by camera, of cameras without picture files.
+        annotated: COCO files, each after the name of the folder that it lies in ("": the source's);
+            then pictures and videos are empty.
         episode: recorded episode whose pictures are read; None if there is none.
     """
 
@@ -59,14 +60,14 @@ class Source:
         return (*self.pictures, *self.videos, *(self.episode.cameras if self.episode else ()))
 
     def rate(self) -> tuple[float | None, tuple[str, ...]]:
-        """Return the frame rate [Hz] of videos or an episode, and warnings about their times."""
+        """Return the frame rate [Hz] of videos or an episode, None if unknown, and warnings."""
         if self.episode is None:
             return common_rate(self.videos)
         steps = np.diff(next(iter(self.episode.cameras.values())).times)
         return (1.0 / float(np.median(steps)) if len(steps) else None), self.episode.warnings
 
     def read(self, camera: str) -> Iterator[tuple[str, str, Picture]]:
-        """Yield each frame of a camera: name, origin for messages, and picture (H, W, 3).
+        """Yield each frame of a camera: name, origin for messages, and picture (H, W, 3) uint8 RGB.
 
         Raises:
             SceneError: a picture cannot be read, or differs in size from its camera.
@@ -149,7 +150,7 @@ class Source:
 
 
 def open_source(path: Path, camera_file: Path | None = None, episode: int | None = None) -> Source:
-    """Open a source of masks.
+    """Return a source of masks; pictures and videos are not read yet.
 
     Args:
         path: one of: a folder with ``images/<camera>/<frame>.png`` or ``.jpg`` (cameras without
@@ -157,7 +158,7 @@ def open_source(path: Path, camera_file: Path | None = None, episode: int | None
             without both, in ``masks``; the pictures of a single camera need no folder of their own;
             a picture, video or COCO file; an episode of a LeRobot data set, of DROID, or a bag.
         camera_file: camera file; None: the folder's cameras.yaml, if it exists.
-        episode: number of the episode in a LeRobot data set.
+        episode: number of the episode in a LeRobot data set; None: the only one.
 
     Raises:
         SceneError: the message names what is missing or ambiguous.
@@ -203,6 +204,7 @@ def open_source(path: Path, camera_file: Path | None = None, episode: int | None
 
 
 def _open_file(path: Path) -> Source:
+    """Return the source of a COCO file, video or picture; its camera is ""."""
     kind = path.suffix.lower()
     if kind == ".json":
         return Source(path, annotated=[("", read_coco(path))])
@@ -214,7 +216,12 @@ def _open_file(path: Path) -> Source:
 
 
 def _open_folder(path: Path) -> Source:
-    """Return the pictures, videos or COCO files of a folder by camera; "" without a name."""
+    """Return the source of a folder: its pictures, videos or COCO files by camera, "" without one.
+
+    Raises:
+        SceneError: the folder's pictures and videos are ambiguous.
+        MaskError: a COCO file cannot be used.
+    """
     places = [path / name for name in ("images", "videos") if (path / name).is_dir()]
     # Without pictures to segment, masks of another tool are read.
     roots = places or [path / "masks" if (path / "masks").is_dir() else path]

@@ -190,7 +190,7 @@ def make_masks(
 
 
 def _doubt_camera(name: str, frames: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
-    """Yield a warning if masks of a camera depend on the settings of the segmentation."""
+    """Yield a warning if a camera's masks are doubtful; ``frames``: its entries of the summary."""
     known = {frame: one["agreement"] for frame, one in frames.items() if "agreement" in one}
     bad = [frame for frame, agreement in known.items() if agreement < MIN_AGREEMENT]
     if bad:
@@ -203,7 +203,7 @@ def _doubt_camera(name: str, frames: Mapping[str, Mapping[str, Any]]) -> Iterato
 
 
 def _write_scene(source: Source, folder: Path, summary: Mapping[str, Any]) -> None:
-    """Write the scene's other files, then rename the folder of masks."""
+    """Write scene.yaml and cameras.yaml (if known) and summary.json; rename masks.part to masks."""
     own = source.path / SCENE_FILE
     try:
         if source.path.is_dir() and own.is_file():
@@ -279,7 +279,7 @@ def largest_patch(mask: Mask) -> Mask:
 
 
 def find_masks(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
-    """Yield the masks of a source, read or segmented as the settings say.
+    """Yield the masks of a source by camera and frame, read or segmented as the settings say.
 
     Raises:
         DrakePoseError: the message names the file, camera or frame at fault.
@@ -355,8 +355,9 @@ def _by_box(
     """Segment a picture by GrabCut in a box.
 
     Args:
-        box: x, y, width and height [pixel].
-        picture: (H, W, 3).
+        box: left, top, width and height [pixel].
+        _: the camera's name; not used.
+        picture: (H, W, 3) uint8 RGB.
         usual: minimum and maximum fraction of its box that an object fills.
         margins: enlargements of the box for comparison, as fractions of its sides.
 
@@ -397,7 +398,8 @@ def _by_empty_room(
         source: the source.
         background: as in ``MaskSettings.background``.
         thresholds: factors of the background's noise for masks to compare with.
-        changed: fraction of a picture from which a changed light or camera is suspected.
+        changed: fraction of a picture in the mask above which a changed light or camera is
+            suspected.
     """
     doubts: dict[str, tuple[str, ...]] = {}
     rooms: dict[str, list[Background]] = {}
@@ -428,7 +430,7 @@ def _by_empty_room(
 def _background(
     source: Source, camera: str, given: Path | str, max_count: int = 60
 ) -> tuple[Background, tuple[str, ...]]:
-    """Return a camera's background model, and warnings.
+    """Return a camera's background model, and warnings; raise a SceneError if there is no picture.
 
     Args:
         source: the source.
@@ -481,10 +483,11 @@ def _doubt_median(
 
     Args:
         room: the background from the median.
-        recording: the pictures.
+        recording: pictures (H, W, 3) spread over the recording.
         support: a pixel may belong to the body if a smaller fraction of pictures shows the median.
-        doubtful: fraction of the masks' area of such pixels from which the median is doubtful.
-        radius: radius around a point within which the body stays, as a fraction of its size.
+        doubtful: fraction of such pixels in a mask (median of all masks) above which there is a
+            warning.
+        radius: radius within which the body stays, as a fraction of the square root of its area.
         stays: fraction of the pictures from which the body stays near one point (simulated arms:
             0.8 and more; a person walking by: 0.3).
     """
@@ -514,7 +517,7 @@ def _doubt_median(
 
 
 def _find_by_model(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
-    """Yield the masks of a body whose approximate pose is given (``settings.start``)."""
+    """Yield the masks of the body ``settings.model``, from the initial poses ``settings.start``."""
     file = source.cameras
     if file is None:
         raise CameraError(

@@ -44,7 +44,10 @@ Shimada et al.), or None."""
 
 
 class _Fitted(NamedTuple):
-    """A model, its search and observation, first state x, and known estimates by frame index."""
+    """A model, its search and observation, state x (n,) in the first frame, and estimates by index.
+
+    ``known``: estimates by index of the frame, of the first frame or of all that were fitted.
+    """
 
     model: ArticulatedModel
     search: RootPlacementSearch
@@ -59,7 +62,7 @@ class _StartedSearch(RootPlacementSearch):
     first: PoseEstimate | None = None
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
-        """Return the given estimate once, then search as RootPlacementSearch does."""
+        """Return the given estimate in the first call, then that of RootPlacementSearch.match."""
         known, self.first = self.first, None
         return super().match(views, root_position) if known is None else known
 
@@ -67,7 +70,15 @@ class _StartedSearch(RootPlacementSearch):
 def fit_body(
     inputs: EstimateInputs, settings: EstimateSettings, on_stage: OnStage | None
 ) -> FittedBody:
-    """Fit the body to a tracked sequence of one uncalibrated camera; other inputs stay unchanged.
+    """Fit the body to a tracked sequence of one uncalibrated camera.
+
+    Other inputs are returned unchanged, with {} and None: those of a calibrated camera, of a single
+    frame, without tracking, or of a body that cannot change its shape or turn freely.
+
+    Args:
+        inputs: the inputs.
+        settings: settings of the estimate.
+        on_stage: called when the fit begins; None: not called.
 
     Raises:
         DrakePoseError: as for an estimate.
@@ -87,7 +98,7 @@ def fit_body(
 
 
 class _BodyFit:
-    """Fit of a body's shape to the first masks of a sequence."""
+    """Fit of a body's shape to the first masks of a sequence; ``tracking``: of the tracker used."""
 
     def __init__(
         self, inputs: EstimateInputs, settings: EstimateSettings, tracking: TrackingSettings
@@ -101,6 +112,8 @@ class _BodyFit:
 
     def run(self, search: RootPlacementSearch, min_frames: int = 3) -> FittedBody:
         """Search the first frame, leave out hidden links, and fit the sequence.
+
+        If no pose is found in the first frame, the inputs are returned with {} and None.
 
         Args:
             search: search for the pose in the first frame.
@@ -149,7 +162,12 @@ class _BodyFit:
         return inputs, self._more, shapes
 
     def _fit(self, tracker: ContourTracker, starts: Sequence[TrackedStart]) -> _Fitted | None:
-        """Fit shape and poses to the sequence; return None if that does not reduce E_total."""
+        """Fit shape and poses to the sequence; return None if the mean E_total is not reduced.
+
+        Args:
+            tracker: tracker of the body with the file's shape.
+            starts: alternative tracks through all masks, best first.
+        """
         explanations = fit_sequence(
             tracker, self._masks, [start.states for start in starts], self._period
         )
@@ -197,12 +215,14 @@ class _BodyFit:
     ) -> tuple[RootPlacementSearch, PoseEstimate]:
         """Return search and estimate without links that are missing in the first frame.
 
+        They are the given ones if no link is missing. Inputs, settings and summary are updated.
+
         Args:
             search: search for all links.
             first: its estimate in the first frame.
             shown: a leaf at the root may be missing if a smaller fraction of its area is in the
                 mask and outside of all other links.
-            better_by: it is left out if that reduces E_total below this multiple.
+            better_by: links are left out if that reduces E_total below this multiple.
         """
         if self._settings.unseen:
             return search, first
@@ -246,7 +266,7 @@ class _BodyFit:
         return make_tracker(search.tree, [self._camera], self._period, self._tracking)
 
     def _answer(self, observation: ContourObservation, x: np.ndarray, frame: int) -> PoseEstimate:
-        """Return the state x in the frame of this index as a PoseEstimate."""
+        """Return the state x (n,) of an observation, in the frame of this index, as an estimate."""
         q, X_WB = observation.positions(x)
         wrong, area = observation.difference(x, [(self._camera, self._masks[frame])])
         return PoseEstimate(

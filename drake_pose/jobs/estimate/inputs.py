@@ -70,7 +70,7 @@ def make_search(
 
     Args:
         model: the body's model.
-        settings: method, root, held positions and time limit.
+        settings: method, root, root rotation, held positions and time limit.
         position: (3,) position of the root in the world [m]; None: as the model has it.
         interval_deg: sampling interval of the published search [deg].
     """
@@ -90,11 +90,12 @@ def make_placement_search(
 ) -> RootPlacementSearch:
     """Return the search for a body with an unknown root position.
 
-    If joints turn the model's root freely, the pose tree starts at the node with most neighbours.
+    If joints turn the model's root freely, and the settings have no root and root rotation, the
+    pose tree starts at the node with most neighbours.
 
     Args:
         model: the body's model.
-        settings: root, held positions and time limit.
+        settings: method, root, root rotation, held positions and time limit.
         position: (3,) start of the root position in the world [m]; None: the origin.
         scale_unknown: whether the scale of a parallel camera is searched as well.
         interval_deg: sampling interval of joint angles [deg].
@@ -123,7 +124,9 @@ def make_placement_search(
 def make_tree(
     model: ArticulatedModel, settings: EstimateSettings, position: np.ndarray | None = None
 ) -> PoseTree:
-    """Return the pose tree with the root position (3,) [m] and the root rotation of the settings.
+    """Return a model's pose tree with root, root rotation and held positions of the settings.
+
+    ``position``: (3,) position of the root in the world [m]; None: as the model has it.
 
     Raises:
         SettingsError: the root cannot be rotated.
@@ -182,7 +185,7 @@ def leave_out_links(
 
 
 def _in_plant_units(model: ArticulatedModel, values: Mapping[str, float]) -> dict[str, float]:
-    """Return values [deg or m] in [rad or m]; unknown names count as angles."""
+    """Return values by position name [deg or m] in [rad or m]; unknown names count as angles."""
     kinds = dict(zip(model.position_names, model.position_kinds, strict=True))
     is_angle = {name: kinds.get(name, "angle") == "angle" for name in values}
     return {name: math.radians(one) if is_angle[name] else one for name, one in values.items()}
@@ -195,14 +198,14 @@ class EstimateInputs:
     Args:
         scene: the scene with the cameras that are used.
         model: the body's model.
-        frames: frames to be estimated.
+        frames: names of the frames to be estimated.
         tracked: whether the body is tracked from frame to frame.
         search: search for the body's pose; None for the method person.
         truth: measured joint positions to compare with; None if there are none.
         warnings: messages for the user.
         root_positions: position (3,) of the root by frame [m]; None if it is the same in all.
-        starts: known positions (nq,) by frame at which a track starts [rad or m].
-        known: estimates by frame that were made before, of the first frames.
+        starts: known positions (nq,) by frame, at which a track starts [rad or m]; may be empty.
+        known: estimates by frame that were made before, of the first frames; may be empty.
     """
 
     scene: Scene
@@ -247,10 +250,10 @@ class EstimateInputs:
             frame: the frame's name.
             pose: the estimate; if its J is not finite, E_total is computed from the masks.
             masks: masks by camera, of the cameras used.
-            parts: index (H, W) of the visible part of the body by camera, -1 outside the body;
-                empty if no pose was found.
+            parts: result of `draw_parts` for the cameras of ``masks`` and ``shown``; empty if no
+                pose was found.
             shown: masks or pictures by camera over which the body is drawn.
-            more: other fields of FrameRecord.
+            more: other fields of FrameRecord by name.
         """
         q, base, E_total = np.full(len(pose.q), np.nan), None, None
         if pose.found:
@@ -306,8 +309,9 @@ def read_inputs(
         scene_path: the scene's folder, or an episode.
         model_path: the model file.
         settings: the settings.
-        truth_path: measured joint positions; None: the scene's joint_angles.csv, if it exists.
-        camera_path: camera file used instead of the scene's own.
+        truth_path: measured joint positions; None: the scene's joint_angles.csv, if it exists, or
+            the episode's joint log.
+        camera_path: camera file used instead of the scene's own; None: that.
 
     Raises:
         DrakePoseError: the message names the file, camera, frame, link or joint at fault.
@@ -370,7 +374,13 @@ def read_inputs(
 def draw_parts(
     outlines: Sequence[Outline], X_WN: np.ndarray, cameras: Iterable[Camera]
 ) -> dict[str, np.ndarray]:
-    """Return the index (H, W) of the visible part by camera, -1 outside; X_WN is (parts, 4, 4)."""
+    """Return the index (H, W) of the visible part at each pixel by camera, -1 outside the body.
+
+    Args:
+        outlines: surface of each part of the body.
+        X_WN: (parts, 4, 4) poses of the parts in the world.
+        cameras: the cameras.
+    """
     labels = range(1, 1 + len(outlines))
     return {one.name: draw_labels(outlines, labels, one.X_CW @ X_WN, one) - 1 for one in cameras}
 
@@ -378,7 +388,14 @@ def draw_parts(
 def _read_truth(
     scene: Path, given: Path | None, model: ArticulatedModel, frames: Sequence[str]
 ) -> tuple[MeasuredPositions | None, tuple[str, ...]]:
-    """Return the measured positions, None if there are none, and warnings."""
+    """Return the measured positions of a scene's folder, None if there are none, and warnings.
+
+    Args:
+        scene: the scene's folder.
+        given: the table; None: joint_angles.csv, ignored if it belongs to another model.
+        model: the model with the positions.
+        frames: names of the frames to be estimated; there is a warning if none has a row.
+    """
     path = given or scene / JOINT_TABLE
     if given is None and not os.path.lexists(path):
         return None, ()
@@ -398,7 +415,13 @@ def _read_truth(
 def _read_starts(
     file: Path | None, frames: Sequence[str], model: ArticulatedModel
 ) -> dict[str, np.ndarray]:
-    """Return the positions (nq,) by frame of ``settings.start`` [rad or m]; empty for None."""
+    """Return the positions (nq,) by frame of the table ``settings.start`` [rad or m]; {} for None.
+
+    Of ``frames`` those without a row are left out; columns that are missing get the defaults.
+
+    Raises:
+        SceneError: the table cannot be read, or has no row of the first frame.
+    """
     if file is None:
         return {}
     known = read_measured_positions(file, model.position_names)
@@ -421,6 +444,8 @@ def _check_start(
     scene: Scene, frames: Sequence[str], starts: Mapping[str, np.ndarray], track: bool
 ) -> None:
     """Check that a track has a start, that a start is tracked, and that pictures can be read.
+
+    ``starts`` are the known positions by frame, ``track`` is that of the settings.
 
     Raises:
         SettingsError, SceneError: a check fails.

@@ -32,7 +32,7 @@ class MeasuredPositions:
         path: the table.
         names: names of the positions.
         values: (len(names),) positions [rad or m] by frame, see `frame_key`.
-        bases: (7,) BASE_COLUMNS by frame, from an estimate whose base moved.
+        bases: (7,) BASE_COLUMNS by frame, from an estimate whose base moved; otherwise empty.
         is_estimate: whether the table is the poses.csv of an estimate.
     """
 
@@ -48,9 +48,10 @@ class MeasuredPositions:
 
 
 def read_joint_centres(path: Path, joint: str, frames: Sequence[str]) -> dict[str, np.ndarray]:
-    """Return a joint's position (3,) [m] in each frame, from a table ``frame,joint,x,y,z``.
+    """Return a joint's position (3,) [m] by frame, from a table ``frame,joint,x,y,z``.
 
-    Frames are compared as numbers: frame 3 is ``0003.png``.
+    Each name in ``frames`` must have a row. Frames are compared as numbers: frame 3 is
+    ``0003.png``.
 
     Raises:
         SceneError: the table cannot be read, or a frame has no row.
@@ -80,8 +81,9 @@ def read_joint_centres(path: Path, joint: str, frames: Sequence[str]) -> dict[st
 def read_measured_positions(path: Path, position_names: Sequence[str]) -> MeasuredPositions:
     """Read joint positions [rad or m] from a table with the column ``frame`` and one a position.
 
-    Frames are compared as numbers if they are numbers: frame 3 is ``0003.png``. Rows of poses.csv
-    without a pose are skipped.
+    ``position_names`` are those of the model, of which some may have no column. Frames are compared
+    as numbers if they are numbers: frame 3 is ``0003.png``. Rows of poses.csv without a pose are
+    skipped.
 
     Raises:
         SceneError: the table cannot be read, or has a column or frame twice.
@@ -192,6 +194,11 @@ def check_units(
 
 
 def _numbers(cells: Sequence[str], path: Path, line: int) -> np.ndarray:
+    """Return the finite numbers (n,) in cells of a table's line.
+
+    Raises:
+        SceneError: a cell is no finite number; the message names ``path`` and ``line``.
+    """
     try:
         numbers = np.array([read_number(cell) for cell in cells])
     except ValueError:
@@ -202,7 +209,12 @@ def _numbers(cells: Sequence[str], path: Path, line: int) -> np.ndarray:
 
 
 class PlacedCameras(NamedTuple):
-    """Cameras of an episode that are used, and the names of those with a known pose."""
+    """Cameras of an episode that are used.
+
+    Args:
+        cameras: the cameras, in the episode's order.
+        placed: names of all cameras of the camera file with a known, static pose X_WC.
+    """
 
     cameras: list[EpisodeCamera]
     placed: frozenset[str]
@@ -212,8 +224,9 @@ class TreeLog(NamedTuple):
     """A joint log in the values of a pose tree.
 
     Args:
-        log: positions of the tree's values ``asked``.
-        asked: indices of the tree's values that are not held.
+        log: positions (rows, asked) of the tree's values ``asked`` [rad or m]; nan for readings that
+            are not used, the model's defaults for values that are not logged.
+        asked: (asked,) indices of the tree's values that are not held.
         names: names of the logged values.
         posed: nodes that only logged or held joints move.
         unposed: all other nodes.
@@ -229,7 +242,11 @@ class TreeLog(NamedTuple):
 
 
 def is_episode(path: Path, settings: EpisodeSettings) -> bool:
-    """Return whether a path is an episode (pictures and joint log), not a scene of masks."""
+    """Return whether a path is an episode (pictures and joint log), not a scene of masks.
+
+    It is one if it is a file, the settings have the number of an episode, or it has no folder masks
+    and the format of a recording.
+    """
     if path.is_file() or settings.episode is not None:
         return True
     return not (path / "masks").is_dir() and recording_format(path) != ""
@@ -242,7 +259,8 @@ def cameras_of(
 
     Args:
         episode: the episode.
-        camera_path: camera file used instead of the episode's own.
+        camera_path: camera file used instead of the episode's own; None: cameras.yaml in the
+            episode; without that file no camera has a pose.
         settings: names of the cameras; all if none are given.
 
     Raises:
@@ -263,7 +281,7 @@ def cameras_of(
 
 
 def left_out_warnings(names: Iterable[str], placed: Collection[str]) -> list[str]:
-    """Return a warning for each camera that is not used because its pose is unknown."""
+    """Return a warning for each camera of ``names`` without a pose: those that ``placed`` lacks."""
     return [
         f"camera '{name}' has no X_WC and is left out; drake-pose register finds its pose"
         for name in names
@@ -277,8 +295,8 @@ def map_log(path: Path, joints: JointLog, tree: PoseTree, settings: EpisodeSetti
     Args:
         path: the episode, for messages.
         joints: the joint log.
-        tree: the pose tree.
-        settings: joint map and units.
+        tree: the pose tree, whose held values are left out.
+        settings: joint map and units; None: inferred.
 
     Raises:
         DrakePoseError: the message names columns, joints or units at fault.
@@ -335,6 +353,9 @@ def rows_of(log: JointLog, camera: EpisodeCamera, kept: Indices, later: Array) -
         camera: the camera.
         kept: (k,) indices of pictures.
         later: () or (k,) time offset added to the pictures' times [s]; unused without times.
+
+    Returns:
+        [rad or m]; nan where the log has no value.
     """
     if is_timed(log, camera):
         return log.at(camera.times[kept] + later)
@@ -348,9 +369,10 @@ def is_timed(log: JointLog, camera: EpisodeCamera) -> bool:
 
 
 def kept_pictures(camera: EpisodeCamera, settings: EpisodeSettings) -> Indices:
-    """Return the indices of the chosen pictures of a camera.
+    """Return the indices of a camera's pictures that are chosen by ``frames`` and ``every``.
 
     Raises:
+        SettingsError: ``every`` is below 1.
         UnknownNameError: a frame does not exist.
     """
     if settings.every < 1:
@@ -370,8 +392,8 @@ def read_episode_scene(
     Args:
         path: the episode.
         settings: cameras, frames and joint log.
-        joints: table of joint positions used instead of the episode's own.
-        cameras: camera file used instead of the episode's own.
+        joints: table of joint positions used instead of the episode's own; None: that.
+        cameras: camera file used instead of the episode's own; None: that.
 
     Raises:
         DrakePoseError: the message names the file, camera or frame at fault; or no camera's pose is
@@ -413,7 +435,8 @@ def _synchronised_pictures(
 ) -> dict[int, int]:
     """Return the index of another camera's synchronised picture by index into ``kept``.
 
-    Without times pictures of the same name are synchronised.
+    Pictures without a synchronised one have no entry. Without times pictures of the same name are
+    synchronised.
 
     Args:
         first: the first camera.
@@ -436,7 +459,14 @@ def logged_positions(
 ) -> tuple[MeasuredPositions | None, dict[str, Array], tuple[str, ...]]:
     """Return a scene's logged positions, the plant's positions (nq,) by frame, and warnings.
 
-    Without a log the first is None and the others are empty.
+    The plant's positions [rad or m] have the model's defaults for joints that are not logged.
+    Frames at which the log has no value are left out. Without a log (``scene.joints``) the result
+    is (None, {}, ()).
+
+    Args:
+        scene: scene of `read_episode_scene`.
+        tree: the pose tree, with its held values.
+        settings: joint map and units.
 
     Raises:
         DrakePoseError: the message names columns, joints or units at fault.

@@ -97,6 +97,10 @@ def _follow_colours(
 ) -> tuple[PersonCapture, ReadFrame, tuple[str, ...], Array]:
     """Track a person by colour through pictures with few masks.
 
+    Args:
+        inputs: the inputs, of a scene with pictures.
+        reader: reads the masks of each frame.
+
     Returns:
         The capture, a reader of masks, warnings, and the mean distance (frames,) of the contours
         [pixel].
@@ -133,7 +137,12 @@ def _follow_colours(
 
 
 class _Reader:
-    """Reads the masks of frames; masks that cannot be read are left out and recorded."""
+    """Reads the masks of frames; masks that cannot be read are left out and recorded.
+
+    Attributes:
+        on_stage: called with the progress of each stage; None: not called.
+        refused: why a mask cannot be read, by camera and frame.
+    """
 
     def __init__(self, inputs: EstimateInputs, on_stage: OnStage | None) -> None:
         self._scene, self._frames = inputs.scene, inputs.frames
@@ -163,7 +172,7 @@ class _Reader:
         return masks
 
     def count_followed(self, _: int) -> None:
-        """Count a frame in which the person was tracked."""
+        """Count a frame in which the person was tracked; its index is not used."""
         self._followed += 1
         self._tell("tracking", self._followed, len(self._frames))
 
@@ -221,7 +230,7 @@ def _record_frame(
 
 
 def describe_faults(checked: CheckedCapture, frames: Sequence[str]) -> tuple[str, ...]:
-    """Return all warnings of a checked capture with these names of frames."""
+    """Return all warnings of a checked capture; ``frames`` are the names of its frames."""
     return (
         *describe_views(checked.views, frames),
         *describe_fit(checked.captured.inlier_ratios.tolist()),
@@ -231,7 +240,10 @@ def describe_faults(checked: CheckedCapture, frames: Sequence[str]) -> tuple[str
 
 
 def describe_views(views: ViewFaults, frames: Sequence[str]) -> tuple[str, ...]:
-    """Return warnings of frames without the person or with other people in view."""
+    """Return warnings of frames without the person or with other people in view.
+
+    ``views`` has indices of frames, ``frames`` their names.
+    """
 
     def listed(*several: Sequence[int]) -> str:
         return frame_ranges({frames[k] for own in several for k in own}, frames)
@@ -279,7 +291,10 @@ def describe_fit(inlier_ratios: Sequence[float], usual_from: float = 0.6) -> tup
 
 
 def describe_alternatives(captured: PersonCapture, frames: Sequence[str]) -> tuple[str, ...]:
-    """Return warnings of frames that another pose fits equally well, with the parts that differ."""
+    """Return warnings of frames that another pose fits equally well.
+
+    They name the landmarks that differ; ``frames`` are the names of the capture's frames.
+    """
     model, found = captured.tree.model, []
     marks = load_landmarks(model.path)
     for k, alternatives in sorted(captured.alternatives.items()):
@@ -298,7 +313,7 @@ def describe_alternatives(captured: PersonCapture, frames: Sequence[str]) -> tup
 
 
 def describe_rig(rig: RigFault | None) -> tuple[str, ...]:
-    """Return a warning of a calibration with which no body fits all silhouettes; empty for None."""
+    """Return a warning of a calibration with which no body fits all silhouettes; () for None."""
     if rig is None:
         return ()
     worst = min(rig.filled, key=lambda name: rig.filled[name])
@@ -319,7 +334,10 @@ def describe_rig(rig: RigFault | None) -> tuple[str, ...]:
 
 
 def describe_camera(fault: CameraFault, frames: Sequence[str]) -> str:
-    """Return the warning of a camera that is inconsistent with the others."""
+    """Return the warning of a camera that has moved or is inconsistent with the others.
+
+    ``frames`` are the names of the recording's frames.
+    """
     motion = fault.motion
     since = "" if fault.first == 0 else f" since frame {frames[fault.first]}"
     action = f"left out{since}" if fault.is_left_out else "still used"
@@ -342,7 +360,7 @@ def describe_camera(fault: CameraFault, frames: Sequence[str]) -> str:
 
 
 def _cameras(names: Sequence[str], word: str = "and") -> str:
-    """Return a text such as ``cameras 'a', 'b' and 'c'``."""
+    """Return a text such as ``cameras 'a', 'b' and 'c'``, or ``camera 'a' or 'b'`` (``word``)."""
     *most, last = [f"'{name}'" for name in names]
     if not most:
         return f"camera {last}"

@@ -1,4 +1,4 @@
-"""A scene in, a pose a frame out: one call, one loop over frames."""
+"""Estimate of a scene: the pose in each frame, and checks of cameras and track at the end."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -70,11 +70,11 @@ def estimate_scene(
         out: folder for the result; None writes nothing.
         settings: cameras, frames, root and method; None: defaults.
         truth: measured joint positions to compare with; None: joint_angles.csv or joint log.
-        cameras: camera file used instead of the scene's own.
+        cameras: camera file used instead of the scene's own; None: that.
         resume: continue the interrupted result in ``out``.
         replay, overlay: whether replay.html and overlays are written.
-        on_frame: called after each frame.
-        on_stage: called with the progress of stages before the first frame.
+        on_frame: called before the first and after each frame; None: not called.
+        on_stage: called with the progress of stages before and after the frames; None: not called.
 
     Raises:
         DrakePoseError: the message names the file, camera, frame, link or joint at fault.
@@ -115,6 +115,13 @@ def estimate_frames(
     inputs: EstimateInputs, search: PoseSearch, missing: Sequence[str]
 ) -> Iterator[tuple[str, PoseEstimate]]:
     """Yield name and pose of each missing frame: known estimates, then those of a Drake diagram.
+
+    Poses of a MultiStartSearch have intervals of their joints.
+
+    Args:
+        inputs: the inputs.
+        search: the search, with which the diagram matches or tracks the body.
+        missing: names of the frames to be estimated, in the order of ``inputs.frames``.
 
     Raises:
         SettingsError: a frame has no picture.
@@ -166,7 +173,10 @@ def _views(scene: Scene, frame: str) -> list[View]:
 def match_frames(
     inputs: EstimateInputs, search: PoseSearch, overlay: bool, missing: Sequence[str]
 ) -> Iterator[tuple[FrameRecord, Drawn]]:
-    """Yield record and overlays of each missing frame."""
+    """Yield record and overlays of each missing frame; the arguments are as in `estimate_frames`.
+
+    ``overlay``: whether there are overlays; otherwise their mapping is empty.
+    """
     scene, model = inputs.scene, inputs.model
     tree = model.pose_tree()
     surfaces = TreeSurfaces(tree)
@@ -207,13 +217,14 @@ def compare_cameras(
 ) -> list[str]:
     """Return a warning of cameras that are exchanged or inconsistent, if the poses fit badly.
 
-    A few frames are searched again with single cameras, and with exchanged masks.
+    The result is [] if there is no such camera. A few frames are searched again with single
+    cameras, and with exchanged masks.
 
     Args:
         inputs: the inputs.
         search: the search.
         records: estimates by frame.
-        on_stage: called before the comparison.
+        on_stage: called before the comparison; None: not called.
         doubtful: median E_total from which two cameras are compared. Three or more are compared
             only from BADLY_EXPLAINED on: a real person before four cameras has an E_total of 15 to
             18 %, and a single inconsistent camera is detected by its IoU.
@@ -288,7 +299,7 @@ def compare_cameras(
 def _match_again(
     inputs: EstimateInputs, search: PoseSearch, frame: str, views: Sequence[View]
 ) -> PoseEstimate:
-    """Search a frame's pose again, without alternative poses."""
+    """Return the pose searched from these views of a frame, without alternative poses."""
     if isinstance(search, (BeamSearch, MultiStartSearch)):
         search = search.without_alternatives()
     return search.match(views, (inputs.root_positions or {}).get(frame))
@@ -300,9 +311,10 @@ def check_track(
     records: Mapping[str, FrameRecord],
     elsewhere: float = 0.2,
 ) -> list[str]:
-    """Return a warning if the track follows a wrong pose.
+    """Return a warning if the track follows a wrong pose, otherwise [].
 
-    If the worst tracked frame fits clearly worse than the searched frames, it is searched as well.
+    If the worst tracked frame fits clearly worse than the best searched frame, it is searched as
+    well; there is a warning if the search fits clearly better than the track.
 
     Args:
         inputs: the inputs.
@@ -338,5 +350,5 @@ def check_track(
 
 
 def _is_worse(error: float, other: float) -> bool:
-    """Return whether an E_total is clearly larger than another."""
+    """Return whether an E_total is clearly larger than another: by a fifth, and by 0.01."""
     return error > max(1.2 * other, other + 0.01)

@@ -175,9 +175,20 @@ def _fit_first_frames(
     on_report: Callable[[str], None],
     count: int = 40,
 ) -> KnownShape | None:
-    """Fit link lengths and radius scales to the first ``count`` frames that two cameras see.
+    """Fit link lengths and radius scales to the first frames in which two cameras see somebody.
 
-    Returns None for a model without shape joints.
+    Args:
+        scene: cameras, sources and backgrounds.
+        settings: tolerance of synchronised pictures.
+        tree: the person's pose tree.
+        on_report: called with messages about live cameras.
+        count: number of frames; fewer if the recordings end or no more come within a minute.
+
+    Returns:
+        Link lengths and radius scales; None for a model without shape joints.
+
+    Raises:
+        SettingsError: two cameras never saw a person at the same time.
     """
     if not shape_values(tree).any():
         return None
@@ -224,6 +235,10 @@ def find_registered_pose(
         settings: settings without shape; without a face camera and faces, the head's direction is
             found by inverse kinematics only.
         on_report: called when a camera stops, returns, or is left out.
+
+    Returns:
+        The cameras used, the registered pose with its silhouettes, and all else that
+        `build_paper_capture` needs.
 
     Raises:
         SceneError, CameraError, ModelError, SettingsError, UnknownNameError: the inputs do not
@@ -277,7 +292,7 @@ def _best_registered_frame(
     on_report: Callable[[str], None],
     more_frames: int = 10,
 ) -> tuple[tuple[Array, float] | None, dict[str, Picture]]:
-    """Return positions (nq,) and similarity of the frame most like the registered pose.
+    """Find the frame most like the registered pose.
 
     Args:
         setup: setup without registered pose.
@@ -287,8 +302,8 @@ def _best_registered_frame(
         more_frames: number of frames after a good one that may still be better.
 
     Returns:
-        Positions and similarity, None if no frame had two whole silhouettes; and the frame's
-        pictures by camera.
+        Positions (nq,) [rad or m] and similarity (1: equal), None if no frame had two whole
+        silhouettes; and the frame's pictures (H, W, 3) by camera, {} for None.
     """
     diagram = build_paper_capture(setup, sensors, sensors.period).diagram
     registered: RegisteredPose | None = None
@@ -360,7 +375,10 @@ class _FrameWriter:
         self._index, self._time, self._begin = -1, float("nan"), time.perf_counter()
 
     def watch(self, context: Context) -> None:
-        """Write a frame if the pictures are new; its name counts periods since the first one."""
+        """Write a frame if the pictures at the time of the diagram's context are new.
+
+        The frame's name counts periods since the first frame, with six digits, and always grows.
+        """
         now = float(self._value(context, "time")[0])
         if np.isnan(now) or now == self._time:
             return
@@ -445,7 +463,10 @@ class _FrameWriter:
             self._doubts.setdefault(text, []).append(frame)
 
     def finish(self, sensors: PictureCapture, replay: bool) -> None:
-        """Write warnings, the use of pictures, and the files about all frames."""
+        """Write warnings, the use of pictures, and the files about all frames.
+
+        ``sensors`` is the sensor system of the capture; ``replay``: whether replay.html is written.
+        """
         writer = self._writer
         writer.warnings += [
             f"frame {frame_ranges(frames, list(self._times))}: {text}"
@@ -471,7 +492,7 @@ class _FrameWriter:
             writer.write(TIME_STAMPS, csv_text([("frame", "time"), *times]))
 
     def _value(self, context: Context, name: str, size: int = 1) -> Array:
-        """Return the value of an output of the diagram; nan if there is no such output."""
+        """Return the value (n,) of an output of the diagram; nan (size,) without such an output."""
         if not self._diagram.HasOutputPort(name):
             return np.full(size, np.nan)
         return np.array(self._diagram.GetOutputPort(name).Eval(context))

@@ -53,7 +53,8 @@ class LiveScene:
 
         Args:
             live: whether frames follow the computer's clock; None: if any source is live.
-            tolerance: maximum difference of the times of synchronised pictures [s].
+            tolerance: maximum difference of the times of synchronised pictures [s]; None: the
+                default of ``LiveSettings.tolerance``.
 
         Raises:
             SceneError: a source cannot be opened; sources opened before are closed.
@@ -69,7 +70,7 @@ class LiveScene:
 def _open_sources(
     given: Mapping[str, SourceSpecification], opened: ExitStack
 ) -> dict[str, FrameSource]:
-    """Open sources, which ``opened`` closes.
+    """Return the opened sources by camera; ``opened`` closes them.
 
     Raises:
         SceneError: a source cannot be opened.
@@ -85,7 +86,7 @@ def hush_opencv() -> None:
 
 
 def load_live_scene(path: Path) -> LiveScene:
-    """Read cameras.yaml, sources.yaml and background pictures.
+    """Return the live scene of a folder with cameras.yaml, sources.yaml and background pictures.
 
     Raises:
         SceneError, CameraError: the message names a missing or damaged file.
@@ -167,9 +168,10 @@ def run_live(
     Args:
         diagram: the diagram.
         sensors: its sensor system; None: it has none.
-        seconds: duration [s]; None: unlimited.
+        seconds: duration [s], of the clock if a source is live, else simulated; None: unlimited.
         on_report: called with messages about cameras and pictures.
-        monitor: called with the diagram's context after every step; may end the run.
+        monitor: called with the diagram's context after every step; ends the run by returning
+            ReachedTermination; None: no monitor.
         speed: simulated time per real time without live cameras; 0: as fast as possible.
         largest_lag: delay to the clock beyond which a simulation skips ahead [s].
 

@@ -44,10 +44,11 @@ class Player:
 
     Args:
         model: model of the avatar; default: the bundled person.
-        q: (n, nq) recorded positions [rad or m], nan where the person was not found.
+        q: (n, nq) recorded positions [rad or m], nan where the person was not found; None: no
+            recording.
         period: time between two positions, or sampling period of keys or cameras [s].
-        sensors: sensor system of the cameras.
-        add: adds the sensors and a tracker of the person to a diagram builder.
+        sensors: sensor system of the cameras; None: no cameras.
+        add: adds the sensors and a tracker of the person to a diagram builder; None: no cameras.
     """
 
     model: ArticulatedModel = field(
@@ -133,7 +134,7 @@ def live_player(
 
 
 def stride_positions(model: ArticulatedModel) -> Array:
-    """Return positions (n, nq) of one stride on the spot that ends standing.
+    """Return positions (n, nq) [rad or m] of one stride on the spot, at RATE_HZ, ending standing.
 
     Joints that the bundled person does not have keep their default positions.
     """
@@ -168,7 +169,8 @@ def walk(
         speed: simulated time per real time; 0: as fast as possible; always 1 with cameras.
         on_command: called with the words of the command whenever it changes, "" for none.
         again: called at the end of a walk without cameras; True starts it again.
-        on_spot: as in Walker.
+        on_spot: whether standing ahead or behind is a command only while the person also walks on
+            the spot, as in the paper.
         on_report: called with messages about cameras, pictures, and a person found or lost.
         settle: time for which a person must stand still before commands count [s].
 
@@ -210,7 +212,10 @@ def walk(
 
 
 class _WalkLog:
-    """Logs the duration of each command and the final pose of a diagram of build_walk."""
+    """Logs the duration of each command and the final pose of a diagram of build_walk.
+
+    ``on_command`` and ``on_report`` are as in `walk`.
+    """
 
     def __init__(
         self,

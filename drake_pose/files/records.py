@@ -404,7 +404,9 @@ def mask_digests(scene: Scene, cameras: Iterable[str], frame: str) -> dict[str, 
     return found
 
 
-def open_job(folder: Path | None, job: Mapping[str, Any], resume: bool) -> Mapping[str, Any] | None:
+def read_earlier_summary(
+    folder: Path | None, job: Mapping[str, Any], resume: bool
+) -> Mapping[str, Any] | None:
     """Return the summary.json in a result folder, checked to be of the same job, if ``resume``.
 
     Without ``resume`` nothing is read, and the result is None.

@@ -69,7 +69,9 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
     Raises:
         SettingsError: the message names the file, scene and setting at fault.
     """
-    content = _known(read_yaml(path, SettingsError), str(path), ("chunk", "defaults", "scenes"))
+    content = _checked_mapping(
+        read_yaml(path, SettingsError), str(path), ("chunk", "defaults", "scenes")
+    )
     scenes = content.get("scenes")
     if not isinstance(scenes, dict) or not scenes:
         raise SettingsError(f"{path}: has no scenes; expected 'scenes:' with NAME: settings")
@@ -85,7 +87,7 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
     ]
     of_audits = [one.name for one in fields(AuditSettings)]
     keys = tuple(dict.fromkeys((*own, *of_estimates, *of_audits, "episodes")))
-    defaults = _known(content.get("defaults") or {}, f"{path}: defaults", keys)
+    defaults = _checked_mapping(content.get("defaults") or {}, f"{path}: defaults", keys)
     jobs = []
     for name, entry in scenes.items():
         where = f"{path}: scene '{str(name)[:60]}'"
@@ -94,7 +96,7 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
                 f"{where}: its name becomes a folder's: a text without slashes that does not "
                 "begin with a dot; put numbers in quotes"
             )
-        values = {**defaults, **_known(entry or {}, where, keys)}
+        values = {**defaults, **_checked_mapping(entry or {}, where, keys)}
         named = [(name, values)]
         if (numbers := values.pop("episodes", None)) is not None:
             first, _, last = str(numbers).partition(":")
@@ -109,7 +111,7 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
     return tuple(jobs)
 
 
-def _known(value: Any, where: str, known: tuple[str, ...]) -> dict[str, Any]:
+def _checked_mapping(value: Any, where: str, known: tuple[str, ...]) -> dict[str, Any]:
     """Return a value of a YAML file, checked to be a mapping with no other keys than ``known``.
 
     Raises:
@@ -207,7 +209,7 @@ def _convert(value: Any, hint: Any, where: str, base: Path) -> Any:
         texts = value if isinstance(value, list) else [value]
         return tuple(_convert(one, arguments[0], where, base) for one in texts)
     if isinstance(origin, type) and issubclass(origin, Mapping):
-        pairs = _known(value, where, tuple(value) if isinstance(value, dict) else ())
+        pairs = _checked_mapping(value, where, tuple(value) if isinstance(value, dict) else ())
         return {
             str(name): _convert(one, arguments[1], f"{where}: {name}", base)
             for name, one in pairs.items()

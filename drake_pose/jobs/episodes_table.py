@@ -13,7 +13,7 @@ from drake_pose.csv_files import csv_text
 from drake_pose.registration.diagnosis import DIAGNOSIS
 from drake_pose.registration.online_registration import pose_difference, squared_distance
 
-Found = Mapping[str, Any]
+FoundCamera = Mapping[str, Any]
 """A camera found by an audit, as in ``found_cameras`` of its summary.json; keys used here: X_WC (4,
 4), covariance (6, 6; rotation first, rad and m), translation_sd_mm, focal_sd_px (None if not
 estimated) and camera (its entry of a camera file)."""
@@ -40,7 +40,7 @@ def episodes_table(episodes: Mapping[str, Mapping[str, Any]]) -> tuple[str, dict
             without ``cameras`` are skipped.
     """
     rows = list[list[Any]]()
-    files: list[dict[str, _Standing]] = [{}]
+    files: list[dict[str, _CombinedPose]] = [{}]
     for scene, totals in episodes.items():
         named = totals.get("findings", ())
         joints = " ".join(one["name"] for one in named if one["what"] == "joint")
@@ -53,7 +53,7 @@ def episodes_table(episodes: Mapping[str, Mapping[str, Any]]) -> tuple[str, dict
         for name, move in moves.items():
             one = totals["cameras"][name]
             if name not in files[-1]:
-                files[-1][name] = _Standing(one)
+                files[-1][name] = _CombinedPose(one)
             files[-1][name].add(one)
             place = [row[3] for row in one["X_WC"][:3]]
             rows.append(
@@ -70,7 +70,7 @@ def episodes_table(episodes: Mapping[str, Mapping[str, Any]]) -> tuple[str, dict
     return csv_text([COLUMNS, *rows]), texts
 
 
-class _Standing:
+class _CombinedPose:
     """Combined pose of a static camera from several episodes: the information-weighted mean.
 
     Errors of episodes are correlated by an unknown amount, for instance by joint offsets.
@@ -82,12 +82,12 @@ class _Standing:
     yet added.
     """
 
-    def __init__(self, one: Found) -> None:
+    def __init__(self, one: FoundCamera) -> None:
         self._first, self._surest = np.array(one["X_WC"]), one
         self._count, self._is_focal = 0, False
         self._information, self._weighted = np.zeros((6, 6)), np.zeros(6)
 
-    def add(self, one: Found) -> None:
+    def add(self, one: FoundCamera) -> None:
         """Add the camera's pose in another episode."""
         information = np.linalg.inv(np.array(one["covariance"]))
         self._information += information
@@ -104,7 +104,7 @@ class _Standing:
         X_WC[:3, 3] += mean[3:]
         return X_WC, np.asarray(self._count * inverse)
 
-    def moved(self, one: Found) -> tuple[float, float, str]:
+    def moved(self, one: FoundCamera) -> tuple[float, float, str]:
         """Return distance [mm] and angle [deg] of a pose from the combined one, and "yes" or "no".
 
         "yes": the camera has moved, since the difference is significant.

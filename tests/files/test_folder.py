@@ -18,7 +18,7 @@ from drake_pose.files.folder import (
     write_summary,
     writes_folder,
 )
-from drake_pose.files.records import FrameRecord, PoseTable, open_job
+from drake_pose.files.records import FrameRecord, PoseTable, read_earlier_summary
 from drake_pose.files.writer import ResultWriter
 from drake_pose.jobs.batch import run_batch
 from drake_pose.jobs.live.capture import capture_live
@@ -157,18 +157,20 @@ def test_summary_has_no_nan(tmp_path):
 def test_only_the_same_job_is_resumed(tmp_path):
     settings = {"interval": 20.0, "frames": ["0000"]}
     job = {"sha256": {"model": "m", "cameras": "c"}, "settings": settings}
-    assert open_job(tmp_path, job, resume=False) is None
+    assert read_earlier_summary(tmp_path, job, resume=False) is None
     with pytest.raises(SettingsError, match="needs the folder"):
-        open_job(None, job, resume=True)
+        read_earlier_summary(None, job, resume=True)
     write_summary(tmp_path, job)
-    assert open_job(tmp_path, job | {"settings": settings | {"frames": []}}, True) == job
+    assert (
+        read_earlier_summary(tmp_path, job | {"settings": settings | {"frames": []}}, True) == job
+    )
     for other, message in (
         ({"sha256": {"model": "m", "cameras": "d"}}, "with another cameras file"),
         ({"sha256": {"model": "n", "cameras": "c"}}, "with another model file"),
         ({"settings": settings | {"interval": 9.0}}, r"with interval = 20\.0, not 9\.0"),
     ):
         with pytest.raises(OutputError, match=message):
-            open_job(tmp_path, job | other, resume=True)
+            read_earlier_summary(tmp_path, job | other, resume=True)
 
 
 def test_finished_frames_with_changed_masks_are_estimated_again(own_scene, tmp_path):

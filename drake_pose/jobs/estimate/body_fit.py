@@ -129,7 +129,7 @@ class _BodyFit:
         starts = find_start(
             tracker, own.state(first.q, first.X_WB, first.scale), [[one] for one in self._masks]
         )
-        known = {0: self._answer(own, starts[0].x, 0)}
+        known = {0: self._estimate_of(own, starts[0].x, 0)}
         body = _Fitted(self._inputs.model, search, own, starts[0].x, known)
         fitted = self._fit(tracker, starts) if len(self._masks) >= min_frames else None
         shapes = None
@@ -182,7 +182,7 @@ class _BodyFit:
             search = make_placement_search(changed, settings, None, True)
             own = self._tracker(search).observation
             path = [own.state_of(theta[:count]) for theta in one.fitted.parameters]
-            known = {k: self._answer(own, x, k) for k, x in enumerate(path)}
+            known = {k: self._estimate_of(own, x, k) for k, x in enumerate(path)}
             found.append(_Fitted(changed, search, own, path[0], known))
         best = found[0]
         errors = [one.E_total for one in best.known.values()]
@@ -265,7 +265,9 @@ class _BodyFit:
     def _tracker(self, search: RootPlacementSearch) -> ContourTracker:
         return make_tracker(search.tree, [self._camera], self._period, self._tracking)
 
-    def _answer(self, observation: ContourObservation, x: np.ndarray, frame: int) -> PoseEstimate:
+    def _estimate_of(
+        self, observation: ContourObservation, x: np.ndarray, frame: int
+    ) -> PoseEstimate:
         """Return the state x (n,) of an observation, in the frame of this index, as an estimate."""
         q, X_WB = observation.positions(x)
         wrong, area = observation.difference(x, [(self._camera, self._masks[frame])])

@@ -224,8 +224,8 @@ class TreeLog(NamedTuple):
     """A joint log in the values of a pose tree.
 
     Args:
-        log: positions (rows, asked) of the tree's values ``asked`` [rad or m]; nan for readings that
-            are not used, the model's defaults for values that are not logged.
+        log: positions (rows, asked) of the tree's values ``asked`` [rad or m]; nan for readings
+            that are not used, the model's defaults for values that are not logged.
         asked: (asked,) indices of the tree's values that are not held.
         names: names of the logged values.
         posed: nodes that only logged or held joints move.

@@ -20,7 +20,7 @@ from drake_pose.files.records import (
     FrameRecord,
     SceneEstimate,
     describe_job,
-    open_job,
+    read_earlier_summary,
     record_deviations,
     record_pose_set,
 )
@@ -82,7 +82,7 @@ def estimate_scene(
     settings, folder = settings or EstimateSettings(), None if out is None else Path(out)
     known, own = (None if one is None else Path(one) for one in (truth, cameras))
     job = describe_job(Path(scene), Path(model), settings, own)
-    earlier = open_job(folder, job, resume)
+    earlier = read_earlier_summary(folder, job, resume)
     inputs = read_inputs(Path(scene), Path(model), settings, known, own)
     inputs, of_body, shapes = fit_body(inputs, settings, on_stage)
     result = ResultWriter(

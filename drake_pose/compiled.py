@@ -46,8 +46,11 @@ def compiled(function: Any = None, **options: Any) -> Any:
     """Decorate a kernel with ``numba.njit``, without the GIL, with numpy's division, and cached.
 
     Args:
-        function: the kernel, if the decorator is used without parentheses.
+        function: the kernel, if the decorator is used without parentheses; None: with them.
         options: options of ``numba.njit``; they override the defaults.
+
+    Returns:
+        The compiled kernel, or, with parentheses, a decorator.
     """
     if function is None:
         return functools.partial(compiled, **options)
@@ -63,7 +66,10 @@ def compiled(function: Any = None, **options: Any) -> Any:
 
 
 def _without_literals(find_template: Callable[..., Any]) -> Callable[..., Any]:
-    """Drop literal types from call signatures; numba would compile a kernel once per literal."""
+    """Return a kernel's ``get_call_template`` that drops literal types from call signatures.
+
+    numba would compile a kernel once per literal.
+    """
 
     def find(args: Any, kws: Any) -> Any:
         plain = {name: types.unliteral(kind) for name, kind in kws.items()}
@@ -80,7 +86,14 @@ class _SharedCache(FunctionCache):
         self._held: int | None = None
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the stored kernel, or None; the caller then compiles it and saves it."""
+        """Return the stored kernel of a signature, or None; numba then compiles and saves it.
+
+        None is returned while holding the lock, which ``save_overload`` releases.
+
+        Args:
+            sig: types of the arguments.
+            target_context: numba's target, which rebuilds the kernel.
+        """
         found = self._load(sig, target_context)
         if found is not None or self._held is not None:
             return found
@@ -94,7 +107,7 @@ class _SharedCache(FunctionCache):
         return found
 
     def _load(self, sig: Any, target_context: Any) -> Any:
-        """Return the stored kernel, or None; an unreadable cache is deleted."""
+        """Return the stored kernel of a signature, or None; an unreadable cache is deleted."""
         try:
             return super().load_overload(sig, target_context)
         # A stored kernel refers to the modules of its argument types, which may have moved.
@@ -103,7 +116,7 @@ class _SharedCache(FunctionCache):
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Store a compiled kernel and release the lock."""
+        """Store the kernel compiled for a signature, numba's result ``data``; release the lock."""
         try:
             super().save_overload(sig, data)
         finally:
@@ -119,7 +132,9 @@ class _SharedCache(FunctionCache):
 
 
 def _lock_file(path: Path, longest_wait: float = 300.0) -> int | None:
-    """Return a file descriptor that holds a lock until closed; None if locks are unavailable.
+    """Return a file descriptor that holds a lock until closed; None if there is no lock.
+
+    That is after the timeout, without fcntl, or if the file cannot be opened or locked.
 
     Args:
         path: the lock file.
@@ -154,7 +169,12 @@ class _NoCache(NullCache):
 
 @functools.cache
 def _announce(folder: Path | None, beside: Path | None) -> None:
-    """Log once per process where compiled kernels are stored."""
+    """Log, once per process and folder, that kernels are compiled, and where they are stored.
+
+    Args:
+        folder: folder of the stored kernels; None: they cannot be stored.
+        beside: folder beside the source, where they are stored by default.
+    """
     if folder is None:
         _LOGGER.warning(
             "compiling kernels takes up to two minutes in every run, because they cannot be "
@@ -177,7 +197,15 @@ def _dependency_digest(function: Callable[..., Any]) -> str:
 
 
 def _dependencies(function: Callable[..., Any], seen: set[int]) -> Iterator[tuple[str, str]]:
-    """Yield dependencies: ("file", path) of each kernel called, (name, value) of each constant."""
+    """Yield a function's dependencies, and those of the kernels that it calls.
+
+    They are ("file", path) of each function's source, and (name, text of the value, or digest of an
+    array) of each constant.
+
+    Args:
+        function: the kernel in Python.
+        seen: ids of functions that are done; changed.
+    """
     if id(function) in seen:
         return
     seen.add(id(function))
@@ -211,7 +239,7 @@ def copy_into(target: np.ndarray, source: np.ndarray) -> None:
 
 @compiled
 def grow_rows(array: np.ndarray, used: int, rows: int) -> np.ndarray:
-    """Return an array of ``rows`` rows whose first ``used`` rows are copied from ``array``."""
+    """Return a new array of ``rows`` rows: the first ``used`` ones of ``array``, then garbage."""
     grown = np.empty((rows, *array.shape[1:]), dtype=array.dtype)
     copy_into(grown, array[:used])
     return grown
@@ -219,7 +247,7 @@ def grow_rows(array: np.ndarray, used: int, rows: int) -> np.ndarray:
 
 @compiled
 def multiply(X_AB: np.ndarray, X_BC: np.ndarray, X_AC: np.ndarray) -> None:
-    """Write the upper three rows of X_AB X_BC, each (3 or 4, 4), into X_AC."""
+    """Write the upper three rows of X_AB X_BC into X_AC; all three are (3, 4) or (4, 4)."""
     for i in range(3):
         for j in range(4):
             total = X_AB[i, 0] * X_BC[0, j] + X_AB[i, 1] * X_BC[1, j] + X_AB[i, 2] * X_BC[2, j]

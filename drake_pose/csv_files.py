@@ -36,6 +36,7 @@ def read_csv(
     Cells are stripped of surrounding spaces.
 
     Args:
+        error_type: class of the exceptions.
         whole_lines: ignore text after the last line break, which an interrupted writer left.
 
     Raises:

@@ -50,6 +50,7 @@ class UnknownNameError(DrakePoseError):
 
     Args:
         kind: kind of the name, for example ``"link"``.
+        name: the name that does not exist.
         known: the existing names.
         where: where the name was looked up, for example a file's path.
     """
@@ -63,7 +64,7 @@ class UnknownNameError(DrakePoseError):
 
 
 def listed(names: Sequence[str], most: int = 5) -> str:
-    """Return names joined by commas; beyond ``most`` names only the number of further ones."""
+    """Return the first ``most`` names joined by commas, and the number of further ones, if any."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
 

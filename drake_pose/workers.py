@@ -38,6 +38,8 @@ def map_ordered(
     """Return the function's result for each item, in the order of the items.
 
     Args:
+        function: the function, which several threads call at the same time.
+        items: its arguments.
         workers: number of threads; None: as set by ``use_workers``. Nested calls, and calls in
             child processes of ``multiprocessing``, use a single thread.
     """

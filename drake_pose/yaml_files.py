@@ -38,7 +38,10 @@ class _TaggedLoader(_UniqueKeyLoader):
 
 
 def _construct_tagged(loader: _TaggedLoader, suffix: str, node: yaml.Node) -> Any:
-    """Return the value of a node with a local tag, such as Drake's ``!Rpy``."""
+    """Return the value of a node with a local tag ``!suffix``, such as Drake's ``!Rpy``.
+
+    A mapping gets the tag under the key ``_tag``; sequences and scalars lose it.
+    """
     if isinstance(node, yaml.MappingNode):
         return {"_tag": f"!{suffix}", **loader.construct_mapping(node, deep=True)}
     if isinstance(node, yaml.SequenceNode):
@@ -58,7 +61,9 @@ def read_yaml(
     unless the caller walks through every copy.
 
     Args:
-        tags: store local tags of mappings, as Drake's files have them, under the key ``_tag``.
+        error_type: class of the exceptions.
+        tags: store local tags of mappings, as Drake's files have them, under the key ``_tag``;
+            else such a file is refused.
         largest: maximum size of the file [byte].
 
     Raises:
@@ -85,8 +90,10 @@ def typed_entry(
     """Return an entry of a YAML file as an instance of a dataclass, by ``yaml_load_typed``.
 
     Args:
-        entry: plain values as from ``read_yaml``.
+        entry: plain values as from ``read_yaml``, with the dataclass's fields as keys.
         schema: the dataclass.
+        where: start of the error message.
+        error_type: class of the exception.
 
     Raises:
         error_type: a field is unknown or has the wrong type.

@@ -34,7 +34,8 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2RGB),
 }
 
-# A message: its time in the header and in the bag [ns], and its content.
+# A message: its times in the header (0: none) and in the bag [ns], and its content, which is the
+# frame's name for an image and the positions (m,) for joints.
 _Row = tuple[int, int, Any]
 
 
@@ -47,7 +48,7 @@ def open_bag(path: Path, joints: JointLog | None) -> Episode:
     frame is attached to others by `/tf_static` is mounted on the last of these.
 
     Args:
-        joints: joint log to use instead of the bag's.
+        joints: joint log to use instead of the bag's; None: the bag's, if it has any.
 
     Raises:
         SceneError: the bag is unreadable, truncated, or has no images.
@@ -85,9 +86,12 @@ def _scan(path: Path) -> tuple[Any, Any, Any, Any, Any]:
     """Read a bag once, without decoding images.
 
     Returns:
-        Images by topic (their content is the frame's name), joint positions by topic and names,
-        CameraInfos by topic, parent and pose of each static frame by name, and the reasons why
-        topics are ignored, by topic.
+        Rows of images by topic; rows of joint positions by (topic, names of the joints); the last
+        CameraInfo message by topic; (parent frame's name, pose (4, 4) in it [m]) of each static
+        frame by name; and the reason why a topic of images is ignored, by topic.
+
+    Raises:
+        SceneError: the bag is damaged, or has no images.
     """
     pictures, states = defaultdict[str, list[_Row]](list), defaultdict[Any, list[_Row]](list)
     infos, parents, ignored = {}, {}, {}
@@ -153,7 +157,18 @@ def _translate_errors(path: Path) -> Iterator[None]:
 
 
 def _ordered_times(rows: Sequence[_Row], what: str, warnings: list[str]) -> tuple[Array, Indices]:
-    """Return times [s] and indices of the rows in order; the bag's times if headers have none."""
+    """Return ascending times (k,) [s], and indices (k,) of their rows; other rows are left out.
+
+    The times are those of the headers, or those of the bag if no header has one.
+
+    Args:
+        rows: the n messages.
+        what: name of the rows, for messages.
+        warnings: list to which warnings are appended.
+
+    Raises:
+        SceneError: too many rows are out of order, see ``ascending_indices``.
+    """
     stamps = np.array([row[:2] for row in rows])
     clock = 0 if stamps[:, 0].any() else 1
     if clock:
@@ -170,6 +185,9 @@ def _merge_joints(
     """Return all joints at the times of the publisher with most rows, and warnings.
 
     If several publish the same joint, the one with more rows is used.
+
+    Args:
+        groups: rows by (topic, names of the joints), at least one.
     """
     warnings: list[str] = []
     base: JointLog | None = None
@@ -195,7 +213,20 @@ def _merge_joints(
 def _read_camera(
     path: Path, topic: str, rows: Sequence[_Row], infos: Mapping[str, Any], warnings: list[str]
 ) -> EpisodeCamera:
-    """Return the camera of a topic; its name is the topic."""
+    """Return the camera of a topic; its name is the topic, and its pose the identity.
+
+    It has no ``camera`` if the bag has no calibration for images of its size.
+
+    Args:
+        path: the bag.
+        topic: topic of the images.
+        rows: rows of the images.
+        infos: CameraInfo messages by topic.
+        warnings: list to which warnings are appended.
+
+    Raises:
+        SceneError: the first image is damaged, times run backwards, or the lens is unknown.
+    """
     times, kept = _ordered_times(rows, f"{topic}: pictures", warnings)
     source = _TopicPictures(path, topic, np.array([row[1] for row in rows])[kept])
     height, width = source.read(0).shape[:2]
@@ -217,7 +248,12 @@ def _read_camera(
 
 
 def _field(info: Any, name: str) -> Array:
-    """Return a field of a CameraInfo; ROS 1 has upper-case names."""
+    """Return the numbers of a CameraInfo's field.
+
+    Args:
+        info: the CameraInfo message.
+        name: name of the field in lower case; ROS 1 has it in upper case.
+    """
     return np.asarray(getattr(info, name, getattr(info, name.upper(), None)), dtype=np.float64)
 
 
@@ -225,7 +261,12 @@ def _lens(info: Any, *, is_rectified: bool, where: str) -> Lens:
     """Return the lens of a CameraInfo.
 
     The distortion applies to raw images. Rectified images have no distortion, and their camera
-    matrix is in P.
+    matrix is in P, or in K if P is 0.
+
+    Args:
+        info: the CameraInfo message.
+        is_rectified: whether the images are rectified.
+        where: start of error messages.
 
     Raises:
         SceneError: the distortion model is unknown.
@@ -241,7 +282,13 @@ def _lens(info: Any, *, is_rectified: bool, where: str) -> Lens:
 
 
 class _TopicPictures:
-    """Images of a topic, best read in sequence; any other than the next one needs a seek."""
+    """Images of a topic, best read in sequence; any other than the next one needs a seek.
+
+    Args:
+        path: the bag.
+        topic: topic of the images.
+        log_times: (n,) times in the bag [ns] of the images, by which they are found.
+    """
 
     def __init__(self, path: Path, topic: str, log_times: Indices) -> None:
         self._path, self._topic, self._log_times = path, topic, log_times

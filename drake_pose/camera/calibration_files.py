@@ -68,6 +68,7 @@ def calibrated_cameras(
 
     Args:
         content: content of the file, as from ``read_camera_content``.
+        path: the file, for messages and a camera without a name.
 
     Returns:
         By name, the lens and the pose X_WC (4, 4) [m] of each camera; None: the file has no pose.
@@ -129,11 +130,15 @@ def _numbers(value: Any) -> Array | None:
 def lens_of(size: Any, matrix: Any, distortion: Any, model: str, where: str) -> Lens:
     """Return a lens by the name that ROS and Kalibr give to its distortion model.
 
+    The first three arguments are checked; each may be a list, an array, or a mapping whose ``data``
+    is a list.
+
     Args:
         size: width and height [pixel].
-        matrix: (3, 3) camera matrix [pixel].
-        distortion: OpenCV's distortion coefficients.
+        matrix: (3, 3) camera matrix, or its 9 elements by rows [pixel].
+        distortion: OpenCV's distortion coefficients; empty: none.
         model: name of the distortion model.
+        where: start of error messages.
 
     Raises:
         CameraError: the model is unknown, or a value is invalid.
@@ -150,7 +155,15 @@ def lens_of(size: Any, matrix: Any, distortion: Any, model: str, where: str) -> 
 def _kalibr(
     chain: Mapping[str, Mapping[str, Any]], path: Path
 ) -> Iterator[tuple[str, tuple[Lens, Array | None]]]:
-    """Yield the cameras of a camchain; T_cn_cnm1 is the previous camera's pose in each camera."""
+    """Yield the name, lens and pose X_WC (4, 4) [m] of each camera of Kalibr's camchain.
+
+    The first camera is the world. Poses follow from T_cn_cnm1, the previous camera's pose in each
+    camera; a camera that lacks it, and all after it, have None.
+
+    Args:
+        chain: entries of the file by camera, in order.
+        path: the file, for messages.
+    """
     is_chain = any("T_cn_cnm1" in entry for entry in chain.values())
     X_CW: Array | None = np.eye(4) if is_chain else None
     for k, (name, entry) in enumerate(chain.items()):
@@ -183,10 +196,14 @@ def _lens(
     """Return a lens from a size [pixel], a camera matrix (3, 3) [pixel] and OpenCV's coefficients.
 
     Args:
-        size, matrix, distortion: values of the file.
+        size, matrix, distortion: values of the file, not yet checked.
         fisheye: whether the coefficients are those of OpenCV's fisheye.
+        where: start of error messages.
         largest_skew: maximum skew that is ignored [f_x]; it amounts to half a pixel at the edge of
             an image.
+
+    Raises:
+        CameraError: a value is missing or invalid.
     """
     sides, K, D = (_numbers(one) for one in (size, matrix, distortion))
     if sides is None or sides.size != 2:
@@ -222,8 +239,9 @@ def _pose(
     """Return X_WC (4, 4) of p_C = R p_W + T; None if there is neither R nor T.
 
     Args:
-        content: the mapping.
+        content: a camera's entry in the file.
         rotation, translation: keys of R, a matrix or a rotation vector [rad], and T [m].
+        where: start of error messages.
         farthest: maximum distance from the world's origin [m]; beyond it lengths are taken to be in
             millimetres.
     """

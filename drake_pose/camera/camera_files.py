@@ -101,7 +101,8 @@ def load_camera_file(path: str | Path, *, distorted: bool = False) -> CameraFile
     """Read a camera file as load_cameras does, but allow cameras without X_WC.
 
     Args:
-        distorted: allow cameras with `distortion`, which the caller removes from images.
+        distorted: allow cameras with `distortion`, which the caller removes from images; else they
+            are refused.
 
     Raises:
         CameraError: names the file, the camera and the field at fault.
@@ -168,7 +169,14 @@ def dump_cameras(
     links: Mapping[str, str] | None = None,
     unplaced: Iterable[str] = (),
 ) -> str:
-    """Return the text of a camera file; links and unplaced as of CameraFile."""
+    """Return the text of a camera file.
+
+    Args:
+        cameras: the cameras, by name or in sequence.
+        links: link of each camera that is mounted on one, by the camera's name, whose X_WC is
+            written as X_LC; None: no camera is.
+        unplaced: names of cameras that are written without a pose.
+    """
     content = {camera.name: describe_camera(camera) for camera in camera_tuple(cameras)}
     for name, link in (links or {}).items():
         if name in content:
@@ -179,7 +187,11 @@ def dump_cameras(
 
 
 def _find_configs(content: dict[Any, Any], path: Path) -> dict[str, Any] | None:
-    """Return unchecked CameraConfigs by name; None if the file is not one of Drake's."""
+    """Return unchecked CameraConfigs of a file's content by name; None if it is not one of Drake's.
+
+    Raises:
+        CameraError: there are several scenarios, or one without a mapping of cameras.
+    """
     if _is_config(content):
         # Drake's default name of a camera.
         return {str(content.get("name", "preview_camera")): content}
@@ -225,7 +237,7 @@ def _is_config(entry: dict[Any, Any]) -> bool:
 
 
 def _check_name(key: Any, path: Path) -> str:
-    """Return a camera's name; CameraError if it cannot be a folder's name."""
+    """Return a key of a camera file as a camera's name; CameraError if no folder can have it."""
     name = str(key)
     if not isinstance(key, str | int) or name in ("", ".", "..") or set(name) & set("/\\\0"):
         raise CameraError(f"{path}: {name[:40]!r} is not a valid camera name")
@@ -233,7 +245,18 @@ def _check_name(key: Any, path: Path) -> str:
 
 
 def _read_camera(name: str, entry: Any, path: Path) -> Camera:
-    """Return the camera of one entry of a file."""
+    """Return the camera of one entry of a file, ignoring its distortion.
+
+    Its X_WC is the entry's X_WC or X_LC, or else the identity.
+
+    Args:
+        name: the camera's name.
+        entry: the entry, not yet checked.
+        path: the file, for messages.
+
+    Raises:
+        CameraError: a field is missing, unknown or invalid.
+    """
     where = f"{path}: camera '{name}'"
     if not isinstance(entry, dict):
         raise CameraError(f"{where}: expected a mapping from field names to values")
@@ -279,7 +302,12 @@ def _read_camera(name: str, entry: Any, path: Path) -> Camera:
 
 
 def _read_lens(camera: Camera, value: Any, where: str) -> Lens | None:
-    """Return the lens with OpenCV's coefficients of a camera; None if there are none or all are 0.
+    """Return the lens of a camera with distortion; None if there is none.
+
+    Args:
+        camera: the camera, whose intrinsics are those of the distorted images.
+        value: OpenCV's coefficients as in the file, not yet checked; None or all 0: no distortion.
+        where: start of error messages.
 
     Raises:
         CameraError: the coefficients are invalid.
@@ -299,7 +327,7 @@ def _read_lens(camera: Camera, value: Any, where: str) -> Lens | None:
 
 
 def describe_camera(camera: Camera) -> dict[str, Any]:
-    """Return a camera's entry in a file, as plain values."""
+    """Return a camera's entry in a camera file, from field names to numbers, lists and texts."""
     is_parallel = isinstance(camera, ParallelCamera)
     focal = ("pixels_per_metre",) if is_parallel else ("focal_x", "focal_y")
     fields = ("width", "height", *focal, "center_x", "center_y")

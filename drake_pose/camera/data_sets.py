@@ -28,7 +28,7 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
 
     Args:
         path: folder of the data set.
-        joints: joint log to use instead of `observation.state`.
+        joints: joint log to use instead of `observation.state`; None: that, if there is one.
         episode: number of the episode; None: the only one that is present.
 
     Raises:
@@ -95,7 +95,12 @@ _Rows = Mapping[int, Mapping[str, Any]] | None
 
 
 def _episode_rows(path: Path, info: Mapping[str, Any], parquet: Any) -> _Rows:
-    """Return the rows of `meta/episodes` by episode; None for version 2.
+    """Return the rows of `meta/episodes` by episode; None for version 2, which has none.
+
+    Args:
+        path: folder of the data set.
+        info: content of `meta/info.json`.
+        parquet: the module pyarrow.parquet.
 
     Raises:
         SceneError: the data set has another version.
@@ -119,7 +124,15 @@ def _episode_rows(path: Path, info: Mapping[str, Any], parquet: Any) -> _Rows:
 
 
 def _file(path: Path, info: Mapping[str, Any], rows: _Rows, number: int, key: str = "") -> Path:
-    """Return the file of an episode's data, or of a camera's video if its key is given."""
+    """Return the file of an episode's data, or of a camera's video; it may be missing.
+
+    Args:
+        path: folder of the data set.
+        info: content of `meta/info.json`.
+        rows: metadata by episode, see ``_episode_rows``; None: version 2.
+        number: number of the episode.
+        key: the camera's key in the features; "": the data.
+    """
     chunk = number // int(info.get("chunks_size", 1000))
     values = {"video_key": key, "episode_index": number, "episode_chunk": chunk}
     if rows is not None:
@@ -130,7 +143,18 @@ def _file(path: Path, info: Mapping[str, Any], rows: _Rows, number: int, key: st
 
 
 def _choose_episode(path: Path, info: Mapping[str, Any], rows: _Rows, wanted: int | None) -> int:
-    """Return the wanted episode, or the only one whose data are present."""
+    """Return the number of the wanted episode, or of the only one whose data are present.
+
+    Args:
+        path: folder of the data set.
+        info: content of `meta/info.json`.
+        rows: metadata by episode, see ``_episode_rows``; None: version 2.
+        wanted: number of the wanted episode; None: the only one.
+
+    Raises:
+        UnknownNameError: the data of the wanted episode are not present.
+        SceneError: none was wanted, and the data of none or of several are present.
+    """
     numbers = list(rows or range(int(info["total_episodes"])))
     candidates = numbers if wanted is None else [one for one in numbers if one == wanted]
     present = [one for one in candidates if _file(path, info, rows, one).is_file()]
@@ -147,7 +171,13 @@ def _choose_episode(path: Path, info: Mapping[str, Any], rows: _Rows, wanted: in
 
 
 def _names(key: str, feature: Mapping[str, Any]) -> list[str]:
-    """Return names of a vector's entries, from possibly nested lists; by default numbers."""
+    """Return names of a vector feature's entries: those of the data set, or else numbered ones.
+
+    Args:
+        key: the feature's key, `observation.state` or one that begins with it.
+        feature: the feature in `meta/info.json`: its shape and, if any, its names, which may be
+            nested lists or a mapping of lists.
+    """
     size, names = int(np.prod(feature["shape"])), feature.get("names")
     if isinstance(names, dict):
         names = [one if isinstance(one, list) else name for name, one in names.items()]
@@ -160,20 +190,30 @@ def _names(key: str, feature: Mapping[str, Any]) -> list[str]:
 
 
 def _stored_pictures(stored: Sequence[bytes], file: Path) -> Callable[[int], Picture]:
-    """Return a function that decodes image k of a table's PNG or JPEG images."""
+    """Return a function that returns image k (H, W, 3) of a table of PNG or JPEG images.
+
+    Args:
+        stored: content of the image files.
+        file: the table, for messages.
+    """
     return lambda k: decode_colours(stored[k], file, SceneError)
 
 
 def _video_camera(
     name: str, file: Path, span: Array, half: float, count: int, warnings: list[str]
 ) -> EpisodeCamera:
-    """Return the camera of a video, restricted to a time span.
+    """Return the camera of a video, restricted to a time span; times start at 0 with the span.
 
     Args:
+        name: name of the camera.
+        file: the video.
         span: (2,) start and end of the episode in the video [s].
         half: half a period between images, by which the span is advanced [s].
         count: number of rows of the episode.
         warnings: list to which warnings are appended.
+
+    Raises:
+        SceneError: the video is unreadable, or has no image in the span.
     """
     video = TimedVideo(file)
     first, last = np.searchsorted(video.times, span - half).tolist()
@@ -203,7 +243,8 @@ def open_droid(path: Path, joints: JointLog | None) -> Episode:
     gripper_position is 0 for open and 1 for closed.
 
     Args:
-        joints: joint log to use instead of the trajectory's.
+        path: the folder.
+        joints: joint log to use instead of the trajectory's; None: the trajectory's.
 
     Raises:
         SceneError: names the file that is missing or damaged.
@@ -239,7 +280,13 @@ def open_droid(path: Path, joints: JointLog | None) -> Episode:
 
 
 def _dataset(file: Any, name: str, where: Path) -> Array:
-    """Return a table of the file; SceneError if it is missing."""
+    """Return the numbers of a table in an HDF5 file; SceneError if it is missing.
+
+    Args:
+        file: the open file (h5py.File).
+        name: path of the table in the file.
+        where: the file's path, for messages.
+    """
     found = file
     for part in name.split("/"):
         if part not in found:
@@ -259,7 +306,9 @@ def _zed_cameras(
     """Return the camera of a video, or both cameras of a side-by-side stereo video.
 
     Args:
-        file: the open trajectory.
+        file: the open trajectory (h5py.File).
+        path: the video, `<serial>.mp4` or `<serial>-stereo.mp4`.
+        warnings: list to which warnings are appended.
         stereo: minimum ratio of width to height of a stereo video.
         calibrated: width and height of the images to which the intrinsics apply: HD720 [pixel].
     """
@@ -290,7 +339,15 @@ def _zed_cameras(
 
 
 def _picture_times(file: Any, path: Path, serial: str, count: int, warnings: list[str]) -> Array:
-    """Return the times [s] of a video's images; fewer than ``count`` if some are missing."""
+    """Return the times [s] of a video's first images; at most ``count``, fewer if some are missing.
+
+    Args:
+        file: the open trajectory (h5py.File).
+        path: the video.
+        serial: serial number of the camera.
+        count: number of images of the video.
+        warnings: list to which warnings are appended.
+    """
     stamps = "observation/timestamp/cameras"
     kinds = ("estimated_capture", "frame_received", "read_end")
     available = [kind for kind in kinds if f"{stamps}/{serial}_{kind}" in file] or [kinds[0]]

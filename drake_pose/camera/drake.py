@@ -35,6 +35,7 @@ def camera_to_drake(
     middle of the depth range.
 
     Args:
+        camera: the camera.
         renderer_name: name of the renderer in the SceneGraph.
         depth_range: minimum and maximum visible depth [m]; None: `near` to 1 km. For a parallel
             camera: depths of the body in the camera's frame, possibly negative and as tight as
@@ -85,6 +86,7 @@ def camera_from_drake(
     """Return the camera of a Drake CameraInfo or RenderCameraCore.
 
     Args:
+        name: name of the returned camera.
         source: the intrinsics; a RenderCameraCore also provides the near plane and the sensor's
             pose X_BS in its body.
         X_WC: pose of the camera in the world; with a RenderCameraCore the pose of its body B.
@@ -101,7 +103,14 @@ def camera_from_drake(
 def _pinhole(
     name: str, source: CameraInfo | CameraConfig, X_WC: np.ndarray, near: float = PinholeCamera.near
 ) -> PinholeCamera:
-    """Return the camera with Drake's intrinsics at X_WC."""
+    """Return the camera with Drake's intrinsics, shifted by half a pixel to our convention.
+
+    Args:
+        name: name of the returned camera.
+        source: the intrinsics.
+        X_WC: (4, 4) pose of the camera in the world.
+        near: minimum visible depth [m].
+    """
     if isinstance(source, CameraInfo):
         size, center = (source.width(), source.height()), (source.center_x(), source.center_y())
     else:
@@ -173,7 +182,8 @@ def read_configs(entries: Mapping[str, Any], path: Path) -> dict[str, PinholeCam
     A camera's name is its ``name``, or else the entry's key.
 
     Args:
-        entries: entries by key.
+        entries: entries by key, not yet checked; None: all defaults.
+        path: the file, for messages.
 
     Raises:
         CameraError: names the file, the camera and the problem.
@@ -212,8 +222,9 @@ def dump_scenario(
     """Return the text of a Scenario, for ``LoadScenario``, with cameras that render label images.
 
     Args:
+        cameras: the cameras, by name or in sequence.
         links: link of each camera that is mounted on one, by the camera's name; its pose is in the
-            link's frame.
+            link's frame. None: all poses are in the world.
 
     Raises:
         CameraError: a parallel camera, or a principal point outside the image.

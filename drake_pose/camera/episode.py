@@ -29,7 +29,7 @@ class JointLog:
     frames: tuple[str, ...] = ()
 
     def at(self, times: Array) -> Array:
-        """Return (k, m) positions at times (k,) [s], interpolated linearly.
+        """Return (k, m) positions of all joints at times (k,) [s], interpolated linearly.
 
         Times more than half the median step outside the log give nan.
 
@@ -47,7 +47,10 @@ class JointLog:
         return found
 
     def of_frames(self, frames: Iterable[str]) -> Array:
-        """Return (k, m) positions by frame; 7 and 0007 are the same frame. Missing frames give nan.
+        """Return (k, m) positions of all joints in k frames; frames without a row give nan.
+
+        Args:
+            frames: names or numbers of the frames; 7, 7.0 and 0007 are the same.
 
         Raises:
             SceneError: the log has no frames.
@@ -61,17 +64,18 @@ class JointLog:
 
 @dataclass(frozen=True, eq=False)
 class EpisodeCamera:
-    """One camera of an episode, and its images.
+    """One camera of an episode, and its n images.
 
     Args:
+        name: name of the camera.
         width, height: size of the images [pixel].
         times: (n,) ascending times of the images [s]; nan if unknown.
-        camera: calibrated camera of the undistorted images, if recorded. Its X_WC is the pose in
-            ``link``; without a link the pose is unknown.
-        link: link on which the camera is mounted, named as in the recording.
-        read_recorded: returns image k (H, W, 3) as recorded.
-        frames: (n,) names of the images, if they have names.
-        lens: lens that undistorts the images.
+        camera: calibrated camera of the undistorted images; None: none was recorded. Its X_WC is
+            the pose in ``link``; without a link the pose is unknown.
+        link: link on which the camera is mounted, named as in the recording; None: unknown.
+        read_recorded: returns image k (H, W, 3) as recorded, with distortion.
+        frames: (n,) names of the images; empty: they have none.
+        lens: lens that undistorts the images; None: they have no distortion.
     """
 
     name: str
@@ -107,6 +111,7 @@ class Episode:
     """A recorded episode.
 
     Attributes:
+        path: folder or file of the recording.
         cameras: cameras by name.
         joints: joint log; None if there is none.
         warnings: problems of the recording that do not prevent its use.
@@ -125,9 +130,14 @@ class Episode:
         joints: JointLog | None,
         reader_warnings: Iterable[str] = (),
     ) -> "Episode":
-        """Return an episode; warnings about its times and positions are appended to given ones.
+        """Return an episode with warnings of its reader and about its times and positions.
+
+        Infinite positions become nan.
 
         Args:
+            path: folder or file of the recording.
+            cameras: the cameras.
+            joints: joint log; None: there is none, which is a warning.
             reader_warnings: warnings of the reader.
 
         Raises:
@@ -175,7 +185,9 @@ class Episode:
 def ascending_indices(
     times: Array, what: str, max_fraction: float = 0.1
 ) -> tuple[Indices, list[str]]:
-    """Return the indices of time stamps later than all before them, and a warning of the others.
+    """Return the indices of time stamps later than all before them, and warnings.
+
+    There is one warning if others were left out, else none; nan is left out, too.
 
     Args:
         times: (n,) time stamps [s].
@@ -183,7 +195,7 @@ def ascending_indices(
         max_fraction: maximum fraction of time stamps out of order.
 
     Raises:
-        SceneError: there are none, or more than this fraction are out of order.
+        SceneError: there are no time stamps, or more than this fraction are out of order.
     """
     stamps = np.where(np.isfinite(times), times, np.nan)
     before = np.fmax.accumulate(np.concatenate([[-np.inf], stamps]))[:-1]
@@ -206,7 +218,14 @@ def ascending_indices(
 
 
 def _gap_warnings(times: Array, what: str, one: str, gap: float = 1.5) -> list[str]:
-    """Return a warning if time steps are longer than ``gap`` times the median step."""
+    """Return a warning if there are long time steps or fewer than two times, else [].
+
+    Args:
+        times: (n,) ascending times [s].
+        what: what has these times, for messages.
+        one: noun of a single time, "picture" or "row".
+        gap: a step is long if it exceeds the median step by this factor.
+    """
     if len(times) < 2:
         return [f"{what}: has one {one} only"]
     steps = np.diff(times)
@@ -221,7 +240,19 @@ def _gap_warnings(times: Array, what: str, one: str, gap: float = 1.5) -> list[s
 
 
 def _comparison_warnings(path: Path, camera: EpisodeCamera, joints: JointLog) -> list[str]:
-    """Return warnings about mismatches between a camera's images and the joint log's rows."""
+    """Return a warning if a camera's images and the joint log's rows do not match, else [].
+
+    They are compared by frames if both have them, else by times: images outside the log's time
+    span, or else a span of images shorter than 3/4 of the log's.
+
+    Args:
+        path: the recording, for messages.
+        camera: the camera.
+        joints: the joint log.
+
+    Raises:
+        SceneError: no frame is in both, or they have neither frames nor times in common.
+    """
     count, where = len(camera.times), f"camera '{camera.name}'"
     if joints.frames and camera.frames:
         logged, pictured = ({*map(frame_key, one.frames)} for one in (joints, camera))

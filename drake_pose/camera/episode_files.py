@@ -34,9 +34,10 @@ JOINT_TABLE = "joint_angles.csv"
 
 
 def read_joint_table(path: Path) -> tuple[JointLog, list[str]]:
-    """Return a joint log from a CSV table, and warnings.
+    """Return a joint log from a CSV table, and warnings about rows that were left out.
 
-    The table has a column `time` [s] or `frame`, or both, and one column per joint.
+    The table has a column `time` [s] or `frame`, or both, and one column per joint. Empty cells
+    become nan.
 
     Raises:
         SceneError: the table is unreadable, has neither column, a cell that is not a number, a
@@ -73,8 +74,11 @@ def read_joint_table(path: Path) -> tuple[JointLog, list[str]]:
 def open_folder(path: Path, joints: JointLog | None) -> Episode:
     """Open a folder with `videos/<camera>.mp4` or `images/<camera>/<frame>.png`, and a joint table.
 
+    The cameras are those of the folders, the videos and `cameras.yaml`, which may be missing.
+
     Args:
-        joints: joint log to use instead of the folder's `joint_angles.csv`.
+        joints: joint log to use instead of the folder's `joint_angles.csv`; None: that, if it
+            exists.
 
     Raises:
         SceneError: images or the table are unusable.
@@ -116,7 +120,20 @@ def open_folder(path: Path, joints: JointLog | None) -> Episode:
 def _image_camera(
     name: str, folder: Path, scene: Path, joints: JointLog | None
 ) -> tuple[EpisodeCamera, list[str]]:
-    """Return a camera whose images are in a folder, and warnings about incomplete frames."""
+    """Return a camera whose images are in a folder, and warnings about incomplete frames.
+
+    The times of its images are those of the folder's `timestamps.csv`, or else those of the same
+    frames in the joint log, or else follow from the frame rate in scene.yaml, or else are nan.
+
+    Args:
+        name: name of the camera.
+        folder: folder of the images.
+        scene: path of the scene.yaml, which may be missing.
+        joints: joint log of the recording; None: none.
+
+    Raises:
+        SceneError: there is no image, or a file is unusable.
+    """
     files, stamps, warnings = find_pictures(folder, name), folder / TIME_STAMPS, list[str]()
     frames = in_order(files)
     times = np.full(len(frames), np.nan)
@@ -150,7 +167,8 @@ def read_sequence(path: Path, sequence: bool = False) -> tuple[bool, float | Non
     """Return whether frames are a sequence, and their rate [Hz] or None, by a scene.yaml.
 
     Args:
-        sequence: default if the file does not say.
+        path: the file, which may be missing.
+        sequence: whether frames are a sequence if the file does not say.
 
     Raises:
         SceneError: the file is unreadable or has other content.
@@ -177,7 +195,14 @@ def read_sequence(path: Path, sequence: bool = False) -> tuple[bool, float | Non
 
 
 def add_calibration(camera: EpisodeCamera, calibration: CameraFile, path: Path) -> EpisodeCamera:
-    """Return a camera with the calibration of the camera file, if it has any.
+    """Return a recorded camera with its intrinsics, pose, link and lens of a camera file.
+
+    A camera without entry in the file is returned as it is.
+
+    Args:
+        camera: the recorded camera.
+        calibration: content of the camera file.
+        path: the camera file, for messages.
 
     Raises:
         CameraError: the calibration does not fit the images.
@@ -229,7 +254,9 @@ def open_episode(
     """Open an episode of any of the formats in `tutorials/file_formats.md`.
 
     Args:
-        joints: table of joint positions to use instead of the recording's own.
+        path: folder or file of the recording.
+        joints: CSV table of joint positions to use instead of the recording's own; None: its own,
+            if it has any.
         episode: number of the episode in a LeRobot data set; None: the only one that is present.
 
     Raises:

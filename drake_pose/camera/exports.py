@@ -47,6 +47,7 @@ def ros_transforms(
     """Return a launch file (XML) of ROS 2 with a static_transform_publisher for each optical frame.
 
     Args:
+        cameras: the cameras, by name or in sequence.
         frames: parent frame of each pose X_WC [m], by the camera's name.
     """
     launch = ElementTree.Element("launch")
@@ -62,7 +63,9 @@ def ros_transforms(
 
 
 def mujoco_cameras(cameras: Mapping[str, Camera] | Iterable[Camera]) -> str:
-    """Return MuJoCo's <camera> elements, to be included in <worldbody> or the carrying body.
+    """Return XML with MuJoCo's <camera> elements, to be included in <worldbody>.
+
+    Cameras whose X_WC is the pose in a link belong into that link's <body> instead.
 
     Raises:
         CameraError: a parallel camera.
@@ -89,7 +92,11 @@ def mujoco_cameras(cameras: Mapping[str, Camera] | Iterable[Camera]) -> str:
 
 
 def _pinhole(camera: Camera, what: str) -> PinholeCamera:
-    """Return the camera if it is a pinhole, else raise CameraError."""
+    """Return the camera if it is a pinhole, else raise CameraError.
+
+    Args:
+        what: what needs a pinhole, for the message.
+    """
     if isinstance(camera, PinholeCamera):
         return camera
     raise CameraError(
@@ -98,7 +105,7 @@ def _pinhole(camera: Camera, what: str) -> PinholeCamera:
 
 
 def _matrix(values: Array) -> dict[str, object]:
-    """Return a matrix as ROS's YAML mapping."""
+    """Return a matrix as ROS's YAML mapping of rows, cols, and data by rows."""
     rows, cols = values.shape
     return {"rows": rows, "cols": cols, "data": values.ravel().tolist()}
 

@@ -69,11 +69,13 @@ def map_joints(
     """Convert a joint log to a model's names, order and units.
 
     Args:
+        log: the joint log, in its own names and units.
         names: (m,) joints of the model.
         lower, upper: (m,) their limits, infinite if there are none [rad or m].
         is_angle: (m,) whether a joint is revolute.
         units: unit of angles not in ``table``: "rad" or "deg"; None: inferred from the limits.
-        table: columns of some joints, as from `read_joint_map`.
+        table: column of some joints by the joint's name, as from `read_joint_map`; the columns of
+            other joints are found by `match_names`. None: of no joint.
 
     Raises:
         SceneError: no column is a joint, or the readings fit neither radians nor degrees.
@@ -142,6 +144,10 @@ def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str,
     ends as the other one. If a log has numbered names that are not the model's, they are its joints
     in order, provided the number of joints is the same.
 
+    Args:
+        logged: names of the log's columns.
+        wanted: names of the model's joints.
+
     Returns:
         The wanted name of each matched logged name, and the warnings.
     """
@@ -174,7 +180,10 @@ def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str,
 
 
 def _words(name: str) -> list[str]:
-    """Return a name's words and numbers, without affixes that only say that it is a joint."""
+    """Return a name's words in lower case and numbers, without affixes such as "joint".
+
+    These are a k before a capital letter, and the last words "joint" and "pos".
+    """
     words = [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name)]
     if len(words) > 1 and re.match("k[A-Z]", name):
         words = words[1:]
@@ -184,7 +193,10 @@ def _words(name: str) -> list[str]:
 
 
 def _is_suffix(a: Sequence[str], b: Sequence[str]) -> bool:
-    """Return whether one of two names ends as the other one, which is more than a number."""
+    """Return whether one of two names, given by `_words`, ends with all words of the other one.
+
+    A name of numbers only is not enough.
+    """
     short, long = sorted((a, b), key=len)
     return any(word.isalpha() for word in short) and long[-len(short) :] == short
 
@@ -199,19 +211,23 @@ def _find_unit(
     full_turn: float = 2.0 * math.pi,
     normalised: tuple[float, float] = (99.0, 100.001),
 ) -> tuple[str, str]:
-    """Return the unit of columns of angles, and the reason.
+    """Return the unit of columns of angles, "rad" or "deg", and the reason, for messages.
+
+    Readings within the limits as radians are radians. Otherwise they are degrees if they are within
+    the limits as degrees, and as radians exceed them by more than a full turn.
 
     Args:
         readings: readings (rows,) of the n columns of revolute joints, by name.
-        others: all readings whose units are unknown.
+        others: (k, rows) readings of all columns whose units are unknown, including these.
         lower, upper: (n,) limits of each column's joint [rad].
         slack: tolerance of the limits [rad].
         full_turn: readings further beyond the limits than this [rad] are not in radians; a joint
             without limits is assumed to stay within twice this.
-        normalised: range of the maximum of readings that LeRobot normalised to -100 ... 100.
+        normalised: if the largest magnitude of ``others`` is in this range, LeRobot may have
+            normalised the readings to -100 ... 100.
 
     Raises:
-        SceneError: the readings fit neither radians nor degrees.
+        SceneError: the readings fit neither radians nor degrees, or seem to be normalised.
     """
     low, high = np.maximum(lower, -2.0 * full_turn), np.minimum(upper, 2.0 * full_turn)
     # fmin and fmax ignore missing readings (nan).
@@ -252,10 +268,13 @@ def _positions(
 ) -> tuple[Array, Mask, list[str]]:
     """Return a joint's positions, which readings are at an end of their range, and anomalies.
 
+    The first two are (rows,); the third has the ends of warnings. Positions of a revolute joint
+    without limits are unwrapped.
+
     Args:
-        column: the column's linear map.
-        readings: (rows,) readings.
-        limits: lower and upper limit [rad or m].
+        column: the column's linear map and range.
+        readings: (rows,) readings [unit of the log].
+        limits: lower and upper limit of the joint [rad or m]; infinite: none.
         is_angle: whether the joint is revolute.
         slack: tolerance of the limits [rad; for lengths a fraction of the range].
         at_end: tolerance within which a reading is at an end of its range [fraction of the range].
@@ -288,7 +307,7 @@ def _positions(
 
 
 def read_joint_map(path: Path) -> dict[str, Column]:
-    """Read a joint map: the columns of joints.
+    """Return the column of each joint in a joint map, a YAML file, by the joint's name.
 
     An entry has `column` (default: the joint's name) and either `from` and `to` (two readings and
     the positions there [rad or m]), or `scale` and `offset` (position = scale * reading + offset),
@@ -310,7 +329,16 @@ def read_joint_map(path: Path) -> dict[str, Column]:
 
 
 def _read_column(joint: str, entry: Any, where: str) -> Column:
-    """Return the column of an entry of a joint map; CameraError if it is invalid."""
+    """Return the column of an entry of a joint map.
+
+    Args:
+        joint: name of the joint, and default name of the column.
+        entry: the entry, not yet checked.
+        where: start of error messages.
+
+    Raises:
+        CameraError: the entry is invalid.
+    """
     units = {**UNITS, "m": 1.0, "mm": 1e-3}
     ways = [{"from", "to"}, {"scale", "offset"}, {"scale"}, {"offset"}, {"unit"}, set[str]()]
     given = set(entry) - {"column"} if isinstance(entry, dict) else {None}
@@ -329,7 +357,12 @@ def _read_column(joint: str, entry: Any, where: str) -> Column:
 
 
 def _pair(value: Any, field: str, where: str) -> tuple[float, float]:
-    """Return two different numbers."""
+    """Return a file's list of two different numbers; CameraError if it is not one.
+
+    Args:
+        value: the list, not yet checked.
+        field, where: field and start of the error message.
+    """
     low, high = value if isinstance(value, list) and len(value) == 2 else (0.0, 0.0)
     low, high = (check_number(one, field, where) for one in (low, high))
     if low == high:

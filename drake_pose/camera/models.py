@@ -19,7 +19,10 @@ LARGEST_SIDE = 16384
 
 
 def check_side(value: Any, field: str, where: str) -> int:
-    """Return a width or height as an int from 1 to LARGEST_SIDE [pixel], or raise CameraError."""
+    """Return a width or height as an int from 1 to LARGEST_SIDE [pixel], or raise CameraError.
+
+    The arguments are those of ``check_number``.
+    """
     number = check_number(value, field, where)
     if number != math.floor(number) or not 1 <= number <= LARGEST_SIDE:
         raise CameraError(
@@ -33,6 +36,11 @@ def check_number(value: Any, field: str, where: str, *, positive: bool = False) 
     """Return a finite (and, if required, positive) number as a float, or raise CameraError.
 
     Text that spells a number is accepted, because YAML 1.1 reads ``1e-3`` as text.
+
+    Args:
+        value: the number, not yet checked.
+        field, where: field and start of the error message.
+        positive: refuse 0 and negative numbers.
     """
     try:
         if isinstance(value, bool) or not isinstance(
@@ -100,7 +108,7 @@ def check_pose(value: Any, field: str, where: str) -> np.ndarray:
 
 
 def write_file(path: str | Path, text: str, what: str) -> None:
-    """Write a text file; CameraError if it cannot be written.
+    """Write a text file, replacing an existing one; CameraError if it cannot be written.
 
     Args:
         what: name of the content, for the message.
@@ -184,7 +192,10 @@ class PinholeCamera(_PosedCamera):
     near: float = 0.01
 
     def project(self, p_W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Project world points (n, 3) [m] to (n, 2) pixels and (n,) depths; NaN if depth <= 0."""
+        """Project world points (n, 3) [m] to (n, 2) pixels and (n,) depths z_C [m].
+
+        The pixels of points whose depth is not positive are nan.
+        """
         p_C = self._in_camera(p_W)
         depth = p_C[:, 2]
         visible = np.where(depth > 0.0, depth, np.nan)
@@ -193,7 +204,7 @@ class PinholeCamera(_PosedCamera):
         return np.column_stack([u, v]), depth
 
     def resized(self, width: int, height: int) -> "PinholeCamera":
-        """Return the camera of the same images at another size [pixel]."""
+        """Return the camera of the same images resized to a width and height [pixel]."""
         x, y = width / self.width, height / self.height
         return dataclasses.replace(
             self,
@@ -210,7 +221,7 @@ class PinholeCamera(_PosedCamera):
         return dataclasses.replace(self, center_x=self.width - 1 - self.center_x)
 
     def kernel_parameters(self) -> np.ndarray:
-        """Return (8,) kind (0: pinhole), f_x, f_y, c_x, c_y, near, width, height."""
+        """Return (8,) kind (0: pinhole), f_x, f_y, c_x, c_y, near [m], width, height [pixel]."""
         projection = [0.0, self.focal_x, self.focal_y, self.center_x, self.center_y, self.near]
         return np.array([*projection, self.width, self.height], dtype=np.float64)
 
@@ -232,13 +243,13 @@ class ParallelCamera(_PosedCamera):
     X_WC: np.ndarray
 
     def project(self, p_W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Project world points (n, 3) [m] to (n, 2) pixels and (n,) depths [m]."""
+        """Project world points (n, 3) [m] to (n, 2) pixels and (n,) depths z_C [m], of any sign."""
         p_C = self._in_camera(p_W)
         uv = np.array([self.center_x, self.center_y]) + self.pixels_per_metre * p_C[:, :2]
         return uv, p_C[:, 2]
 
     def kernel_parameters(self) -> np.ndarray:
-        """Returns (8,) kind (1: parallel), f_x, f_y, c_x, c_y, near (unused), width, height."""
+        """Return (8,) kind (1: parallel), f_x, f_y [pixel/m], c_x, c_y, near (0), width, height."""
         scale = self.pixels_per_metre
         projection = [1.0, scale, scale, self.center_x, self.center_y, 0.0]
         return np.array([*projection, self.width, self.height], dtype=np.float64)
@@ -295,7 +306,7 @@ def circle_of_cameras(
     size: tuple[int, int] = (640, 480),
     face_camera: bool = True,
 ) -> dict[str, PinholeCamera]:
-    """Return cameras on a circle that look at its centre, and one that looks at the face.
+    """Return by name cameras on a circle that look at its centre, and one that looks at the face.
 
     Date et al. (figure 1) have eight "horizontal" cameras about 45 degrees apart and one for the
     face. The world's z axis points up; a person at the centre who faces +x looks into the face
@@ -305,7 +316,7 @@ def circle_of_cameras(
         count: number of cameras on the circle, camera_0, camera_1 ... counterclockwise from above;
             the x axis bisects the angle between the last and the first one.
         radius, height: radius of the circle and height of its cameras [m].
-        target: (3,) point they look at [m].
+        target: (3,) point they look at [m]; the face camera takes its x and y.
         field_of_view: vertical field of view of the cameras on the circle [rad].
         size: width and height of the images [pixel].
         face_camera: whether there is a camera for the face.
@@ -356,7 +367,14 @@ def look_at(
 
 
 def _camera(name: str, X_WC: Array, field_of_view: float, size: tuple[int, int]) -> PinholeCamera:
-    """Return a centred camera with square pixels and a vertical field of view [rad]."""
+    """Return a camera with square pixels and its principal point at the image's centre.
+
+    Args:
+        name: name of the camera.
+        X_WC: (4, 4) pose of the camera in the world.
+        field_of_view: vertical field of view [rad].
+        size: width and height of the images [pixel].
+    """
     width, height = size
     focal = 0.5 * height / math.tan(0.5 * field_of_view)
     center = 0.5 * (width - 1), 0.5 * (height - 1)
@@ -382,7 +400,7 @@ class Lens:
 
     @cached_property
     def undistorted_matrix(self) -> Array:
-        """(3, 3) camera matrix of the undistorted images, which have no blank pixels."""
+        """(3, 3) camera matrix [pixel] of the undistorted images, which have no blank pixels."""
         if not self.distortion.any():
             return self.matrix
         size = (self.width, self.height)
@@ -404,7 +422,7 @@ class Lens:
         )
 
     def camera(self, name: str, X_WC: Array) -> PinholeCamera:
-        """Return the camera at X_WC (4, 4) for the undistorted images."""
+        """Return the pinhole camera of the undistorted images, at pose X_WC (4, 4)."""
         (fx, _, cx), (_, fy, cy), _ = self.undistorted_matrix.tolist()
         return PinholeCamera(name, self.width, self.height, fx, fy, cx, cy, X_WC)
 

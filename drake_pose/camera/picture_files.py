@@ -34,14 +34,14 @@ def in_order(frames: Iterable[str]) -> tuple[str, ...]:
 
 
 def frame_number(frame: str) -> int | None:
-    """Return the number that a frame's name is, or None."""
+    """Return the number that a frame's name consists of; None if it has other characters."""
     # File names are shorter; Python refuses to parse numbers with thousands of digits.
     is_number = frame.isascii() and frame.isdigit() and len(frame) < 256
     return int(frame) if is_number else None
 
 
 def frame_key(cell: str) -> int | str:
-    """Return a frame's number, which a table may write as 3.0, or else its name."""
+    """Return the number in a table's cell for a frame, such as 3, 003 or 3.0, or else its name."""
     number = frame_number(cell.removesuffix(".0"))
     return cell if number is None else number
 
@@ -57,6 +57,11 @@ def read_picture(path: Path, error_type: type[DrakePoseError]) -> Picture:
 
 def decode_colours(data: bytes, path: Path, error_type: type[DrakePoseError]) -> Picture:
     """Return an image (H, W, 3) red, green, blue from the content of a PNG or JPEG file.
+
+    Args:
+        data: content of the file.
+        path: the file, for messages.
+        error_type: class of the exceptions.
 
     Raises:
         error_type: the content is invalid; the message names the file.
@@ -121,7 +126,11 @@ def read_binary_mask(
 
 
 def list_pictures(folder: Path, error_type: type[DrakePoseError]) -> dict[str, Path]:
-    """Return a folder's image files by frame, sorted by name; error if a frame occurs twice."""
+    """Return a folder's PNG and JPEG files by frame, the name without suffix, sorted by name.
+
+    Raises:
+        error_type: a frame occurs twice, with different suffixes.
+    """
     files: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
         # Skip hidden files, such as those of macOS.
@@ -133,7 +142,11 @@ def list_pictures(folder: Path, error_type: type[DrakePoseError]) -> dict[str, P
 
 
 def find_pictures(folder: Path, camera: str) -> dict[str, Path]:
-    """Return a camera's image files as list_pictures does; SceneError if there is none."""
+    """Return the image files of a camera's folder by frame, sorted by name, at least one.
+
+    Raises:
+        SceneError: there is no such folder or no image, or a frame occurs twice.
+    """
     if not folder.is_dir():
         raise SceneError(f"{folder}: no such folder of camera '{camera}'s pictures")
     files = list_pictures(folder, SceneError)
@@ -143,9 +156,10 @@ def find_pictures(folder: Path, camera: str) -> dict[str, Path]:
 
 
 def find_recorded_files(folder: Path, camera: str) -> dict[str, Path] | Path | None:
-    """Return a camera's images in a recording: files by frame, a video, or None.
+    """Return a camera's images in a recording's folder: files by frame, a video's path, or None.
 
-    These are the files in images/<camera>, or else videos/<camera>.mp4 or another video suffix.
+    These are the files in images/<camera>, if there is such a folder, or else
+    videos/<camera>.mp4 or another video suffix, or else None.
 
     Raises:
         SceneError: a frame occurs twice.
@@ -157,11 +171,15 @@ def find_recorded_files(folder: Path, camera: str) -> dict[str, Path] | Path | N
 
 
 def threshold_mask(picture: Picture, where: str, error_type: type[DrakePoseError]) -> Mask:
-    """Return the mask (H, W) of the bright pixels of a lossily compressed mask (H, W) or (H, W, 3).
+    """Return the mask (H, W) of the bright pixels of a lossily compressed mask.
+
+    Args:
+        picture: (H, W) grey values, or (H, W, 3) colours.
+        where: start of the error message.
+        error_type: class of the exception.
 
     Raises:
-        error_type: more than a tenth of the pixels are neither dark nor bright; the message begins
-            with ``where``.
+        error_type: more than a tenth of the pixels are neither dark nor bright.
     """
     grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     between = float(((grey > 64) & (grey < 192)).mean())
@@ -189,10 +207,13 @@ def _decode(
     *,
     only_png: bool = False,
 ) -> Picture:
-    """Return a complete PNG or JPEG image as OpenCV decodes it.
+    """Return a complete PNG or JPEG image as OpenCV decodes it: blue, green, red, or grey values.
 
     Args:
-        how: OpenCV's reading mode.
+        data: content of the file.
+        how: OpenCV's reading mode, which determines the shape.
+        path: the file, for messages.
+        error_type: class of the exceptions.
         only_png: refuse JPEG.
 
     Raises:
@@ -242,7 +263,15 @@ def _decode(
 
 
 def import_reader(library: str, path: Path) -> Any:
-    """Import a library of the extra `episodes`; SceneError names it and the file if missing."""
+    """Return the imported module of a library of the extra `episodes`.
+
+    Args:
+        library: name of the module.
+        path: file that needs it, for the message.
+
+    Raises:
+        SceneError: the library is not installed.
+    """
     try:
         return import_module(library)
     except ImportError as error:
@@ -284,7 +313,11 @@ class VideoPictures:
         return rate if rate > 0.0 else None
 
     def read(self, number: int) -> Picture:
-        """Return an image (H, W, 3), red, green, blue; SceneError if the video ends before it."""
+        """Return an image by its number (H, W, 3), red, green, blue, and set ``time``.
+
+        Raises:
+            SceneError: the video ends before it.
+        """
         if self._timed is not None:
             timed = self._timed.read(number)
             self.time = float(self._timed.times[number])
@@ -352,7 +385,10 @@ class TimedVideo:
         self.height, self.width = self.read(0).shape[:2]
 
     def _scan(self) -> Iterator[tuple[int, bool]]:
-        """Yield the time stamp of each displayed, complete image, and whether it is a keyframe."""
+        """Yield the time stamp [time base of the stream] of each displayed, complete image.
+
+        A flag says whether the image is a keyframe.
+        """
         try:
             for packet in self._container.demux(self._stream):
                 if packet.pts is not None and not (packet.is_corrupt or packet.is_discard):
@@ -361,13 +397,17 @@ class TimedVideo:
             return  # Use the images so far; _promised reveals that some are missing.
 
     def _decode(self) -> Iterator[Any]:
-        """Yield the images from the current position; truncated packets are skipped."""
+        """Yield PyAV's frames from the current position; truncated packets are skipped."""
         for packet in self._container.demux(self._stream):
             if not packet.is_corrupt:
                 yield from packet.decode()
 
     def read(self, number: int) -> Picture:
-        """Return an image (H, W, 3), red, green, blue; SceneError if it is missing or damaged."""
+        """Return an image by its number (H, W, 3), red, green, blue.
+
+        Raises:
+            SceneError: it is missing or damaged.
+        """
         if not 0 <= number < len(self._stamps):
             cut = "is truncated: it " if self._promised > len(self._stamps) else ""
             raise SceneError(f"{self._path}: {cut}has pictures 0 to {len(self._stamps) - 1} only")

@@ -44,6 +44,7 @@ class SourceSpecification:
     """Source of a camera's images; plain values, so that another machine can open it.
 
     Args:
+        camera: name of the camera.
         kind: folder: images `<frame>.png` or `.jpg`, optionally with a `timestamps.csv` (frame,
             time [s]); video: a file that OpenCV reads; device: a live camera.
         location: path of the folder or file; number or address of a device.
@@ -88,10 +89,11 @@ class SourceSpecification:
         return self.background is None
 
     def convert(self, picture: Picture, where: str) -> Picture | Mask:
-        """Return an image, or its mask if the source provides masks.
+        """Return an image, or its bright pixels (H, W) if the source provides masks.
 
         Args:
             picture: (H, W, 3) image.
+            where: start of the error message.
 
         Raises:
             SceneError: the image should be a mask and is not.
@@ -99,7 +101,7 @@ class SourceSpecification:
         return threshold_mask(picture, where, SceneError) if self.gives_masks else picture
 
     def size_problem(self, picture: Picture | Mask) -> str:
-        """Return a message about an image's size; "" if it is the calibrated one."""
+        """Return the end of a message about an image's size; "" if it is the calibrated one."""
         height, width = picture.shape[:2]
         if (width, height) == (self.width, self.height):
             return ""
@@ -111,7 +113,10 @@ class SourceSpecification:
 
 @dataclass(frozen=True, eq=False)
 class TimedPicture:
-    """An image (H, W, 3) red, green, blue, or a mask (H, W), with its time stamp [s] and frame."""
+    """An image (H, W, 3) red, green, blue, or a mask (H, W), with its time stamp [s] and frame.
+
+    The frame is the name of the image's file without suffix, or its number.
+    """
 
     time: float
     frame: str
@@ -165,12 +170,12 @@ class FrameSource(abc.ABC):
         return None
 
     def drop(self, reason: str, count: int = 1) -> None:
-        """Record that images were lost."""
+        """Report why images were lost, and add their number to ``dropped``."""
         self.dropped += count
         self.report(f"{reason}; it is left out")
 
     def report(self, problem: str) -> None:
-        """Record a problem."""
+        """Append a problem, with the camera's name, to ``problems``."""
         self.problems.append(f"camera '{self.specification.camera}': {problem}")
 
 
@@ -181,6 +186,7 @@ class DeviceSource(FrameSource):
     once and reopened repeatedly, with growing pauses.
 
     Args:
+        specification: the source.
         clock: returns the time [s].
         pauses: initial and maximum pause before reopening [s]; each pause doubles the previous one.
     """
@@ -250,7 +256,11 @@ class DeviceSource(FrameSource):
         return None
 
     def _keep_newest(self, capture: cv2.VideoCapture, count: int) -> int:
-        """Read until the camera fails or is closed; return the total number of images."""
+        """Read until the camera is closed or fails, or an image is unusable.
+
+        ``count`` is the number of images so far, from which frames are numbered. Return it with
+        the further images added.
+        """
         while not self.ended:
             found, picture = False, None
             with suppress(cv2.error):
@@ -325,7 +335,10 @@ class RecordedSource(FrameSource):
         return taken
 
     def _advance(self) -> TimedPicture | None:
-        """Return the next image of the calibrated size."""
+        """Return the next image of the calibrated size, or None; drop those of other sizes.
+
+        SceneError if the first image has another size.
+        """
         for path, one in self._pictures:
             wrong = self.specification.size_problem(one.picture)
             if not wrong:
@@ -336,7 +349,7 @@ class RecordedSource(FrameSource):
         return None
 
     def _of_folder(self) -> Generator[tuple[Path, TimedPicture]]:
-        """Yield the readable images of a folder, each with its file."""
+        """Yield the readable images of a folder in order, each with its file; drop the others."""
         given, folder = self.specification, Path(self.specification.location)
         files = find_pictures(folder, given.camera)
         stamped = folder / TIME_STAMPS
@@ -367,7 +380,7 @@ class RecordedSource(FrameSource):
             yield files[frame], TimedPicture(times[frame] + given.offset, frame, seen)
 
     def _of_video(self) -> Generator[tuple[Path, TimedPicture]]:
-        """Yield the images of a video, each with the video's path."""
+        """Yield the readable images of a video, each with the video's path; drop the others."""
         given, path = self.specification, Path(self.specification.location)
         try:
             video = VideoPictures(path)
@@ -393,7 +406,17 @@ class RecordedSource(FrameSource):
 
 
 def _times_from_rate(given: SourceSpecification, files: Mapping[str, Path]) -> dict[str, float]:
-    """Return the times [s] of a folder's frames from their order and rate."""
+    """Return the times [s] of frames by name, from their order and rate; the first one is 0.
+
+    Frames of the folders ``beside`` are included.
+
+    Args:
+        given: source of the folder.
+        files: image files of the folder, by frame.
+
+    Raises:
+        SceneError: there is no rate, or the order of the names is unclear.
+    """
     folder = Path(given.location)
     if given.rate_hz is None:
         raise SceneError(
@@ -418,7 +441,11 @@ def _times_from_rate(given: SourceSpecification, files: Mapping[str, Path]) -> d
 
 
 def read_time_stamps(path: Path) -> dict[str, float]:
-    """Return the times [s] by frame from a `timestamps.csv`; SceneError names the file and line."""
+    """Return the times [s] by frame, in the order of the lines of a `timestamps.csv`.
+
+    Raises:
+        SceneError: a column is missing, a frame occurs twice, or a time is not a finite number.
+    """
     header, rows = read_csv(path, SceneError)
     if not {"frame", "time"} <= set(header):
         raise SceneError(f"{path}: needs the columns frame and time [s] in its first line")
@@ -486,7 +513,11 @@ def load_sources(
 
 
 def open_source(specification: SourceSpecification, clock: Clock = time.monotonic) -> FrameSource:
-    """Open a source; the clock gives the time stamps of a live camera's images [s].
+    """Open a camera's source of images.
+
+    Args:
+        specification: the source.
+        clock: returns the time [s], from which a live camera's images get their time stamps.
 
     Raises:
         SceneError: a folder or video is unreadable, empty, or has images of another size than the
@@ -521,7 +552,16 @@ def load_background_pictures(specification: SourceSpecification) -> list[Picture
 
 
 def _read_entry(camera: Camera, entry: Any, path: Path) -> SourceSpecification:
-    """Return the specification of one entry of a file."""
+    """Return the specification of a camera's entry in a sources.yaml, with paths from its folder.
+
+    Args:
+        camera: the calibrated camera.
+        entry: the entry, not yet checked.
+        path: the sources.yaml.
+
+    Raises:
+        SceneError: a field is missing, unknown or invalid.
+    """
     where = f"{path}: camera '{camera.name}'"
     if not isinstance(entry, dict):
         raise SceneError(f"{where}: expected a mapping with kind, location and more")

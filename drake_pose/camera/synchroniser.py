@@ -24,6 +24,7 @@ class CameraChange(NamedTuple):
     """A camera that stopped or returned.
 
     Attributes:
+        camera: name of the camera.
         time: its last (stopped) or first (returned) time stamp [s]; nan if it never had an image.
         stopped: whether it stopped; else it returned.
     """
@@ -85,8 +86,12 @@ class Synchroniser(Generic[Item]):
     def add(self, camera: str, time: float, item: Item) -> bool:
         """Add a camera's next image; return whether it can be part of a group.
 
+        If not, because its group was taken or its time stamp is not later than the camera's last
+        one, the image is dropped and counted in `late`.
+
         Args:
             time: time stamp [s].
+            item: the image, or anything else that ``take`` shall return for it.
 
         Raises:
             UnknownNameError: there is no such camera.

@@ -57,8 +57,8 @@ class FrameRecord:
         E_total: area where body and silhouettes differ, divided by the silhouettes' area; None if
             no pose was found.
         seconds: the search's wall time [s].
-        first_E_total: E_total before the re-estimation.
-        runs: number of runs of the search's step 3.
+        first_E_total: E_total of the first whole pose, before it was refined or estimated again.
+        runs: number of times the search placed a segment, or compared contours.
         stopped_by: why the search ended: "end", "exact", "run_limit" or "time_limit"; "tracked" if
             the pose was tracked, "followed" if a person was.
         outside_limit: Kameda's r in each view: allowed area of a segment outside the mask [pixel].
@@ -377,10 +377,11 @@ def next_summary(begin: float, period: float = 2.0, work_ratio: float = 20.0) ->
 def describe_job(
     scene: Path, model: Path, settings: SceneSettings, cameras: Path | None = None
 ) -> dict[str, Any]:
-    """Return scene, model, settings and the files' SHA-256 digests as plain JSON values.
+    """Return ``scene``, ``model``, ``settings`` and ``sha256`` as plain JSON values.
 
-    The digest of an unreadable file is None. ``scene`` is the scene's folder, ``cameras`` a camera
-    file used instead of its cameras.yaml, or None.
+    ``sha256`` has the digests of the files ``model`` and ``cameras``. The digest of an unreadable
+    file is None. ``scene`` is the scene's folder, ``cameras`` a camera file used instead of its
+    cameras.yaml, or None.
     """
     return {
         "scene": str(scene),
@@ -483,7 +484,7 @@ def summarize(
 
 
 def describe_cameras(records: Mapping[str, FrameRecord]) -> dict[str, dict[str, float]]:
-    """Return the number of compared frames and the mean intersection over union by camera."""
+    """Return ``frames``, the number of compared frames, and ``mean_iou`` of each camera by name."""
     found: dict[str, list[float]] = {}
     for record in records.values():
         for camera, iou in record.ious.items():

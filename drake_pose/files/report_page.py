@@ -298,7 +298,10 @@ def _camera_row(estimate: SceneEstimate, camera: str, states: Sequence[str]) -> 
 
 
 def _picture_use(scene: Scene, estimate: SceneEstimate, camera: str) -> list[str]:
-    """Return "used", "left-out" or "no-picture" for a camera's picture in each frame's record."""
+    """Return "used", "left-out" or "no-picture" for a camera in each frame of an estimate.
+
+    A mask is used if it was compared with the body, a picture without mask if a pose was found.
+    """
     states = []
     for frame, record in estimate.records.items():
         has_mask, has_image = (camera, frame) in scene.masks, (camera, frame) in scene.images

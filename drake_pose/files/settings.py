@@ -40,7 +40,11 @@ class FromText:
     repeated: bool = False
 
     def __call__(self, hint: object, tokens: Sequence[Token]) -> Any:
-        """Return the parsed value; the message of a SettingsError begins with the option's name."""
+        """Return the value of an option's tokens; the type hint of the option is not used.
+
+        Raises:
+            SettingsError: a text cannot be parsed; the message begins with the option's name.
+        """
         texts = [token.value for token in tokens]
         try:
             return self.parse(texts if self.repeated else texts[0])
@@ -230,7 +234,11 @@ def readable(cls: _Settings) -> _Settings:
 
 
 def take_single_names(settings: Any) -> None:
-    """Replace a single name by a tuple in fields of names, as in ``zeros="elbow"``."""
+    """Replace a single name by a tuple in a settings dataclass's fields of names, as "elbow".
+
+    Raises:
+        SettingsError: such a field holds something else than names.
+    """
     hints = get_type_hints(type(settings))
     for one in fields(settings):
         value, (kind, *_) = getattr(settings, one.name), (*get_args(hints[one.name]), None)

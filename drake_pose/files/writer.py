@@ -69,9 +69,9 @@ class ResultWriter:
         job: from describe_job.
         folder: the result folder; None writes nothing.
         earlier: summary of the job to be resumed; None for a new job.
-        with_base: whether the base's pose is written, too.
-        frames: frames to be estimated.
-        warnings: warnings so far.
+        with_base: whether poses.csv has BASE_COLUMNS.
+        frames: names of the frames that this job estimates.
+        warnings: messages so far.
 
     Raises:
         OutputError: the folder cannot be written or resumed.
@@ -230,7 +230,7 @@ class ResultWriter:
         )  # fmt: skip
 
     def write_summary(self) -> None:
-        """Write summary.json, joints.csv and modes.csv of the frames finished so far."""
+        """Write summary.json, joints.csv and modes.csv (if known) of the frames finished so far."""
         if self.folder is None:
             return
         begin = time.monotonic()

@@ -139,6 +139,9 @@ def _scene_job(
         chunk: number of frames in a chunk.
         where: file and scene, for messages.
         base: folder of relative paths.
+
+    Raises:
+        SettingsError: a key is missing or belongs to the other job, or a value cannot be used.
     """
     values = {key: value for key, value in values.items() if value is not None}
     is_audit = "audit" in values

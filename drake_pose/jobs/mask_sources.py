@@ -120,8 +120,10 @@ class Source:
     def annotated_pictures(self) -> Iterator[tuple[str, str, Annotations, AnnotatedPicture]]:
         """Yield each picture of the COCO files: camera, frame, COCO file and annotated picture.
 
-        The camera is the last folder in the picture's path that is a camera's name, else the folder
-        in which the COCO file lies.
+        With a camera file, the camera is the last folder in the picture's path that is a camera's
+        name, else the COCO file's folder (in ``annotated``), else the only camera. Without, it is
+        the COCO file's folder, else the last folder in the picture's path, or "" if all pictures
+        lie in one folder.
 
         Raises:
             SceneError: the camera is unknown, or a frame occurs twice.

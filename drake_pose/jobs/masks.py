@@ -66,7 +66,7 @@ class FoundMask(NamedTuple):
         camera: the camera's name.
         frame: the frame's name.
         where: origin of the picture, for messages.
-        mask: (H, W).
+        mask: (H, W) bool.
         picture: (H, W, 3) RGB; None if only the mask is given.
         refusal: why the mask is rejected; "" if it is accepted.
         warnings: messages for the user.
@@ -392,11 +392,11 @@ def _by_empty_room(
     thresholds: Sequence[float] = (0.7, 1.4),
     changed: float = 0.6,
 ) -> Find:
-    """Return a function that segments the region of a picture that differs from the background.
+    """Return a `Find` that segments the region of a picture that differs from the background.
 
     Args:
-        source: the source.
-        background: as in ``MaskSettings.background``.
+        source: the source of the pictures.
+        background: picture, folder of pictures or "median", as in ``MaskSettings.background``.
         thresholds: factors of the background's noise for masks to compare with.
         changed: fraction of a picture in the mask above which a changed light or camera is
             suspected.
@@ -435,7 +435,7 @@ def _background(
     Args:
         source: the source.
         camera: the camera's name.
-        given: as in ``MaskSettings.background``.
+        given: picture, folder of pictures or "median", as in ``MaskSettings.background``.
         max_count: a median uses between this number and twice as many pictures of a long recording.
     """
     if given == "median":
@@ -571,7 +571,7 @@ def _check_pose(
     doubtful: float = 0.9,
     max_deviations: float = 3.0,
 ) -> tuple[str, tuple[str, ...]]:
-    """Return why a model's mask is rejected ("" if it is accepted), and warnings.
+    """Return why a model's mask is rejected ("" from MIN_AGREEMENT on), and warnings if it is not.
 
     Args:
         agreement: IoU of the model's silhouette and the segmentation by colour.

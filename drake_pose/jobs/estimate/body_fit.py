@@ -164,6 +164,8 @@ class _BodyFit:
     def _fit(self, tracker: ContourTracker, starts: Sequence[TrackedStart]) -> _Fitted | None:
         """Fit shape and poses to the sequence; return None if the mean E_total is not reduced.
 
+        The result is the best fit; its estimates have the others as alternative poses.
+
         Args:
             tracker: tracker of the body with the file's shape.
             starts: alternative tracks through all masks, best first.

@@ -68,6 +68,8 @@ def make_search(
 ) -> PoseSearch:
     """Return the search for a body with a known root position.
 
+    It is a PaperSearch for the method "paper", otherwise a MultiStartSearch.
+
     Args:
         model: the body's model.
         settings: method, root, root rotation, held positions and time limit.
@@ -254,6 +256,10 @@ class EstimateInputs:
                 pose was found.
             shown: masks or pictures by camera over which the body is drawn.
             more: other fields of FrameRecord by name.
+
+        Returns:
+            The record, without pose if none was found; and by camera of ``shown`` the mask or
+            picture, and its ``parts`` or None.
         """
         q, base, E_total = np.full(len(pose.q), np.nan), None, None
         if pose.found:

@@ -45,10 +45,11 @@ def follow_person(
         inputs: the inputs.
         result: writer of the result; gets lengths, radius scales, and finally warnings.
         overlay: whether overlays are drawn.
-        on_stage: called with the progress of each stage.
+        on_stage: called with the progress of each stage; None: not called.
 
     Returns:
-        The inputs with all frames to be written, and an iterator of their records and overlays.
+        The inputs with all frames to be written, and an iterator of their records and overlays. If
+        all frames are finished already: the given inputs, and an empty iterator.
 
     Raises:
         ModelError: the model has no landmarks of a person.
@@ -201,7 +202,8 @@ def _record_frame(
         X_WN: (nodes, 4, 4) poses of the body's nodes in the world [m].
         masks: masks by camera, of the cameras used.
         reader: reads all masks of the frame.
-        distance: mean distance of the contours [pixel], if the frame was tracked by colour.
+        distance: mean distance of the contours [pixel], if the frame was tracked by colour; else
+            nan.
         seconds: time per frame [s].
         overlay: whether overlays are drawn.
     """

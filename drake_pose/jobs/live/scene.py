@@ -215,6 +215,8 @@ def look_until(
 ) -> None:
     """Simulate a diagram until ``looks`` returns True, then close the sensors.
 
+    The simulation also ends when its recordings end, or with live cameras after ``patience``.
+
     Args:
         diagram: the diagram.
         sensors: its sensor system.

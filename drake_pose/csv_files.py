@@ -10,7 +10,7 @@ from drake_pose.regular_files import read_regular
 
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:
-    """Return the CSV text of a table's rows."""
+    """Return the CSV text of a table's rows, each a sequence of cells; lines end with LF."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()

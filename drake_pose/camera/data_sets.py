@@ -91,11 +91,14 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
 
 
 _Rows = Mapping[int, Mapping[str, Any]] | None
-"""Metadata row of each episode, in version 3 of the format."""
+"""Metadata of each episode in version 3 of the format, from column name to value, by the episode's
+number; None: version 2, which has none."""
 
 
 def _episode_rows(path: Path, info: Mapping[str, Any], parquet: Any) -> _Rows:
-    """Return the rows of `meta/episodes` by episode; None for version 2, which has none.
+    """Return the rows of `meta/episodes`, from column name to value, by the episode's number.
+
+    The result is None for version 2 of the format, which has no such rows.
 
     Args:
         path: folder of the data set.
@@ -153,7 +156,7 @@ def _choose_episode(path: Path, info: Mapping[str, Any], rows: _Rows, wanted: in
 
     Raises:
         UnknownNameError: the data of the wanted episode are not present.
-        SceneError: none was wanted, and the data of none or of several are present.
+        SceneError: none was wanted, and the data of none or of several episodes are present.
     """
     numbers = list(rows or range(int(info["total_episodes"])))
     candidates = numbers if wanted is None else [one for one in numbers if one == wanted]
@@ -208,7 +211,8 @@ def _video_camera(
         name: name of the camera.
         file: the video.
         span: (2,) start and end of the episode in the video [s].
-        half: half a period between images, by which the span is advanced [s].
+        half: half a period between images [s]; images up to this much before the start belong to
+            the episode, and those after the end less this do not.
         count: number of rows of the episode.
         warnings: list to which warnings are appended.
 

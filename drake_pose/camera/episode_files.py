@@ -222,7 +222,12 @@ def add_calibration(camera: EpisodeCamera, calibration: CameraFile, path: Path) 
 
 
 def recording_format(path: Path) -> Literal["lerobot", "droid", "bag", "folder", ""]:
-    """Return the format of a recording, recognised by file names; "" for none, such as masks."""
+    """Return the format of a recording, by the first of these names; "" for none, such as masks.
+
+    "lerobot": the folder has `meta/info.json`. "droid": it has `trajectory.h5` or is that file.
+    "bag": it has a bag's suffix or `metadata.yaml`. "folder": it has `images` or `videos`. "bag":
+    it has a file with a bag's suffix.
+    """
     inside = sorted(one.name for one in path.iterdir()) if path.is_dir() else []
     if (path / INFO).exists():
         return "lerobot"

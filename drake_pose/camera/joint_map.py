@@ -24,7 +24,7 @@ class Column(NamedTuple):
 
     Attributes:
         name: name of the column.
-        scale, offset: the linear map.
+        scale, offset: the linear map [rad or m per unit of the readings; rad or m].
         ends: range of the readings, if they are clipped to one; a reading at an end means that the
             joint is there or beyond.
     """

@@ -59,7 +59,8 @@ def check_number(value: Any, field: str, where: str, *, positive: bool = False) 
 def check_pose(value: Any, field: str, where: str) -> np.ndarray:
     """Return a rigid transform, Drake's or a matrix, as a read-only (4, 4) float64 array.
 
-    A rounded rotation is replaced by the nearest exact one, as Drake requires.
+    A rounded rotation R, with R R^T within 1e-4 of the identity, is replaced by the nearest exact
+    one, as Drake requires.
 
     Args:
         value: the transform.

@@ -127,6 +127,7 @@ class FrameSource(abc.ABC):
     """Images of one camera, in the order of their time stamps.
 
     Attributes:
+        specification: the source.
         problems: problems so far, each with the camera's name; the caller may clear the list.
         dropped: number of images lost to problems.
     """

@@ -77,7 +77,8 @@ def estimate_gain(picture: Picture | Floats, reference: Floats, rounds: int = 4)
     Args:
         picture: (H, W, 3) image.
         reference: (H, W, 3) reference image.
-        rounds: number of fits; after each fit outliers are removed.
+        rounds: number of fits; each uses the pixels that deviate from the previous one by no more
+            than three median deviations plus 2 [of 255].
 
     Returns:
         (3, 4) slopes and offsets of the channels, as ``cv2.transform`` takes them.
@@ -156,7 +157,7 @@ class Backgrounds:
 
     @cached_property
     def sums(self) -> PixelSums:
-        """Log-likelihoods for ``explain``."""
+        """Log-likelihoods and edges of the images, for ``explain``."""
         size, count = self.deviations.shape, len(self.colours)
         visible = np.zeros((*size, count), np.float32)
         covered = np.empty((*size, len(self.pictures), count), np.float32)
@@ -201,6 +202,9 @@ class Backgrounds:
     def shows_background(self, covered: Mask) -> Mask:
         """Return (f, H, W) whether a frame shows the likeliest background of a pixel.
 
+        The colour must be within MODEL.match_deviations standard deviations of that background's,
+        and the pixel more than MODEL.margin from the body.
+
         Args:
             covered: (f, H, W) approximate silhouettes of the body.
         """
@@ -235,7 +239,7 @@ class KnownBackground:
     def estimate(
         pictures: Sequence[Picture], gains: Sequence[Floats], showing: Mask, covered: Mask
     ) -> "KnownBackground":
-        """Estimate the background from images of any size.
+        """Estimate the background from images of a static camera, of any size.
 
         Args:
             pictures: images (H, W, 3) of the f frames.
@@ -313,7 +317,8 @@ def mask_of_foreground(
         foreground: (H, W) log-odds.
         covered: (H, W) approximate silhouette of the body.
         smooth: standard deviation of the Gaussian that smooths the log-odds [pixel].
-        reach: the mask stays within this distance of ``covered`` [square root of its area].
+        reach: the mask stays within this distance of ``covered`` [square root of its area], or
+            within MODEL.margin if that is larger.
     """
     limit = max(MODEL.margin, round(reach * float(np.sqrt(np.count_nonzero(covered)))))
     near = _grown(covered[None], limit)[0]

@@ -170,7 +170,11 @@ class PartColours:
 
 
 def search_line_step(number: int) -> int:
-    """Return the distance between offsets of search lines [pixel] in a round, counted from 0."""
+    """Return the distance between edge offsets of search lines [pixel] in a round.
+
+    Args:
+        number: number of the round of a fit, from 0; LINES.steps has the distances.
+    """
     return LINES.steps[min(number, len(LINES.steps) - 1)]
 
 
@@ -226,7 +230,7 @@ def add_pictures(
         histograms: (cameras, nodes, 3, COLOURS) colour histograms, in rows by ``Colour``.
         stage: scale of the residuals and spacing of the lines [pixel].
         noise: noise of search lines [pixel].
-        pixels: distance between offsets along a line [pixel].
+        pixels: distance between the edge offsets that are evaluated along a line [pixel].
     """
     placement = compared.placement
     packed = pack_cameras(cameras)
@@ -276,7 +280,7 @@ def part_distances(sums: Array, closest: float = 0.7, shortest: float = 20.0) ->
     camera does not count against a part that another camera sees.
 
     Args:
-        sums: (cameras, nodes + 1, 6) sums over images, as of `compare_contours`.
+        sums: (cameras, nodes + 1, 6) by ``Sum`` of the lines of each node; the last row is unused.
         closest: minimum of a distance [pixel].
         shortest: a part with less contour than this is not evaluated [pixel].
     """
@@ -341,11 +345,17 @@ def compare_lines(
         X_WN: (nodes, 4, 4) poses of the nodes.
         camera: X_CW (4, 4) and kernel parameters (8,).
         picture: (H, W, 3 or 4) image.
-        histograms: (nodes, 3, COLOURS) colour histograms, in rows by ``Colour``.
-        weights: (4,) one camera's weights as of `compare_contours`; the spacing is that of lines.
-        step: distance between offsets [pixel].
-        A, b, sums, bias_terms: (nodes, 12, 12), (nodes, 12), (nodes + 1, 6) and (nodes, 13), added
-            to, as of `compare_contours`. A line's length is weighted by its information.
+        histograms: (nodes, 3, COLOURS) of each node the frequencies of colours on it, of colours
+            beside it, and their ratio.
+        weights: (4,) units of length per pixel, scale of the cost [pixel], distance between search
+            lines along the contour [pixel], and weight per pixel of contour length.
+        step: distance between the edge offsets that are evaluated along a line [pixel]; on thin
+            parts they are closer.
+        A, b: (nodes, 12, 12), lower triangles, and (nodes, 12), added to: the quadratic cost
+            x^T A x - 2 b^T x of each node's affine motion x (12,).
+        sums: (nodes + 1, 6) by ``Sum`` of each node's contour, added to; the last row stays. A
+            line's length is weighted by its information.
+        bias_terms: (nodes, 13) derivatives of b and of half the cost by the bias, added to.
         bias: boundary bias: the image shows the body wider by this on all sides [pixel].
     """
     contour = sample_contour(packed, poses_in_camera(camera[0], X_WN), camera[1], weights[2])
@@ -395,15 +405,16 @@ def _find_edge(
     step: int,
     scratch: Array,
 ) -> tuple[float, float]:
-    """Locate the edge on a search line.
+    """Locate the edge of a node on a search line across its contour.
 
     Args:
         picture: (H, W, 3 or 4) image.
-        histograms: (3, COLOURS) histograms of the node.
+        histograms: (3, COLOURS) histograms of the node, in rows by ``Colour``.
         uv, normal: (2,) point of the contour and its outward normal [pixel].
         clearance: (2,) distance inwards and outwards [pixel] over which the line crosses no other
             contour.
-        step: distance between offsets [pixel]; it is reduced on thin parts.
+        step: distance between the LINES.offsets edge offsets that are evaluated [pixel]; on thin
+            parts they are closer.
         scratch: (3, 2 LINES.blocks + 2) working memory, overwritten.
 
     Returns:
@@ -488,11 +499,13 @@ def learn_colours(
         spacing: distance between search lines along the contour [pixel].
         strip_widths: (2,) widths of the strips inside and outside the contour that are counted
             [pixel].
-        rate: weight of the new colours; 1 where a node has no colours yet.
+        rate: weight of the new colours against the old histograms; where a node's histogram is
+            empty, it becomes the new colours.
         max_residual: a line whose edge is further from the contour than this is ignored [pixel];
             inf: no line is ignored.
-        step: distance between offsets [pixel] of the lines that locate the edge, on both sides of
-            which colours are then counted; 0: colours are counted on both sides of the contour.
+        step: distance between the edge offsets [pixel] that are evaluated to locate the edge, on
+            both sides of which colours are then counted; 0: colours are counted on both sides of
+            the contour, and the edge is only located for ``max_residual``, with a step of 1.
         region: (H, W) known silhouette of the body, which decides what is on the body and what is
             beside it; (0, 0): unknown.
         rare: added to frequencies, so that rarer colours count as unobserved [fraction of pixels].

@@ -144,7 +144,7 @@ def inlier_ratio_of(sums: Array) -> float:
 
 
 def pack_views(cameras: Sequence[Camera], edges: Sequence[EdgePoints]) -> Views:
-    """Return cameras and the edge of each one's silhouette, which may be empty."""
+    """Return cameras and the edge of each one's silhouette, which may be empty, for kernels."""
     return Views(pack_cameras(cameras), pack_evidence(edges))
 
 
@@ -243,8 +243,9 @@ class ContourFit:
         """Compare the contours with all cameras' edges at theta and the scale of a stage.
 
         Args:
-            theta: (m,) tree values, or (n,) all parameters of the body, as of
-                ``BodyParameters.place``.
+            views: the cameras and edges.
+            theta: (m,) tree values, or (n,) all parameters of the body.
+            stage: scale and spacing [``pixels`` or m].
         """
         placement = self.body.place(theta)
         return compare_views(views, placement, self.weights(views.cameras, placement, stage))
@@ -252,8 +253,11 @@ class ContourFit:
     def tile_costs(self, views: Views, theta: Array, stage: AnnealingStage, side: float) -> Array:
         """Return the cost (cameras, 64, 64) in image tiles at theta (m,) or (n,), without prior.
 
-        Tile (row, column) has its upper left corner at (row side, column side) and indices modulo
-        64. The arguments are those of ``compare``, and the side of a tile [pixel].
+        Args:
+            views: the cameras and edges.
+            theta: (m,) tree values, or (n,) all parameters of the body.
+            stage: scale and spacing [``pixels`` or m].
+            side: side of a tile [pixel]; indices (row, column) of tiles are taken modulo 64.
         """
         placement = self.body.place(theta)
         weights = self.weights(views.cameras, placement, stage)
@@ -273,7 +277,9 @@ def compare_views(
     """Compare a placed body's contours with all cameras' edges.
 
     Args:
-        weights: (c, 4) as of `compare_contours`, see ``camera_weights``.
+        views: c cameras and their silhouettes' edges.
+        placement: the body at a pose.
+        weights: (c, 4) scale, spacing and weights of the cameras, see ``camera_weights``.
         with_bias: compute derivatives by the silhouettes' boundary bias; else they are 0.
     """
     placed = placement.packed, placement.X_WN
@@ -290,8 +296,9 @@ def camera_weights(
 ) -> Array:
     """Return (c, 4) weights of cameras, as `compare_contours` takes them.
 
-    Columns: units of length per pixel; scale of the cost and spacing of the body's contour points
-    [pixel], at least FINEST_SCALE and 1; half the weight per pixel of contour length.
+    Columns: units of length per pixel; scale of the cost [pixel], at least FINEST_SCALE; spacing
+    of the body's contour points [pixel], at least 1; and weight per pixel of length of either
+    contour, half of that of the noise.
 
     Args:
         cameras: X_CW (c, 4, 4) and kernel parameters (c, 8).

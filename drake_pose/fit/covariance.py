@@ -142,7 +142,7 @@ def distances_in_masks(
 
     Args:
         outlines: surface of each node.
-        pictures: comparisons with the masks, all with the same values.
+        pictures: comparisons with the masks, of any frames and cameras, all with the same m values.
         max_count: maximum number of residuals; those with the largest information are kept.
         with_bias: append each mask's boundary bias [unit of errors] to the m values, so that X and
             the information have m + masks of them.

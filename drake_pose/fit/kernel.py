@@ -212,9 +212,10 @@ def robust_weight(
     """Return the weight and cost of a residual, and add it to a row of the sums.
 
     Args:
-        sums: (rows, 6) sums of `compare_contours`, added to.
-        row: row of the sums.
-        weights: (4,) as of `compare_contours`.
+        sums: (rows, 6) columns by ``Sum``, added to.
+        row: row of the sums, such as the index of a node.
+        weights: (4,) units of length per pixel, scale of the cost [pixel], an unused element, and
+            weight per pixel of contour length.
         length: length of contour that the point represents [pixel].
         r: the residual [pixel].
 
@@ -263,14 +264,17 @@ def accumulate_residuals(
     All residuals at one point of a contour must have been summed by `add_residual` first.
 
     Args:
-        A, b, bias_terms: (nodes, 12, 12), (nodes, 12) and (nodes, 13) added to, as of
-            `compare_contours`.
+        A, b: (nodes, 12, 12) and (nodes, 12), added to: the quadratic cost x^T A x - 2 b^T x of
+            each node's affine motion x (12,), the rows of (M v).
+        bias_terms: (nodes, 13), whose first 12 columns, the derivative of b by the boundary bias,
+            are added to.
         X_WN: (nodes, 4, 4) poses of the nodes.
         camera: X_CW (4, 4) and kernel parameters (8,).
         p_N: (n, 3) positions of the points in their nodes [m].
         nodes, owners: (n,) the node in which a point is given, and the node that moves it.
-        point_sums: (n, 7) weighted sums over the residuals r with normal n at each point: n n^T
-            (00, 01, 11), n r, and n times the derivative of r by the boundary bias.
+        point_sums: (n, 7) weighted sums over the residuals r [pixel] with normal n (2,) at each
+            point: n n^T (elements 00, 01, 11), n r (2), and n times the derivative of r by the
+            boundary bias (2).
     """
     X_CW, lens = camera
     p, rows, H = np.ones(4), np.zeros((2, 3)), np.zeros((3, 3))

@@ -52,6 +52,8 @@ class AnnealingStage:
 class StepSettings:
     """Settings of the steps.
 
+    The damping is divided by 5 after a step that reduces the cost, and else multiplied by 10.
+
     Args:
         max_step: maximum change of an unknown per step [rad, m or a logarithm].
         damping: initial fraction of the diagonal that is added to it.
@@ -138,8 +140,9 @@ def minimise(
         coupling: prior that couples the own unknowns of several frames; None: none.
 
     Returns:
-        Own and shared unknowns; the cost at the last evaluation, which precedes the last step if
-        that was taken without checking the cost; and the number of evaluations.
+        (frames, p) own and (q,) shared unknowns; their cost, or that before the last step if the
+        last stage has a single one, which is taken without checking the cost; and the number of
+        evaluations.
     """
     settings = settings or StepSettings()
     curvature = None if coupling is None else coupling.curvature()
@@ -226,7 +229,9 @@ def _solve_coupled(
     fractions: tuple[float, float],
     curvature: csc_array,
 ) -> tuple[Array, Array]:
-    """Return damped steps (frames, p) and (q,) as _solve_frames, with coupled own unknowns.
+    """Return damped steps (frames, p) of coupled own unknowns, and (q,) of shared ones.
+
+    Unknowns at a limit that they would leave are fixed; others may step beyond a limit.
 
     Args:
         equations: equations without the coupling's H, but with its g.
@@ -277,11 +282,14 @@ def _solve_frames(
     upper: Array,
     fractions: tuple[float, float],
 ) -> tuple[Array, Array]:
-    """Return damped steps of own (frames, p) and shared (q,) unknowns that leave no limit.
+    """Return damped steps of own (frames, p) and shared (q,) unknowns.
+
+    Unknowns at a limit that they would leave are fixed; others may step beyond a limit.
 
     Args:
-        H, g: (frames, u, u) and (frames, u) as of ``Equations``.
-        own, shared: current unknowns.
+        H, g: (frames, u, u) and (frames, u) normal equations H dx = -g of each frame, u = p + q:
+            its own unknowns first, then the shared ones.
+        own, shared: (frames, p) and (q,) current unknowns.
         lower, upper: (p + q,) limits.
         fractions: fractions of each diagonal element and of the diagonal's mean that are added.
     """

@@ -299,9 +299,12 @@ class Problem:
         """Return the equations with priors, and the inlier ratios (frames, cameras).
 
         Args:
+            observations: evidence and known values of each frame.
             at: own (frames, p) and shared (q,) unknowns.
             about: mean of their prior, of the same shapes.
-            shared_information: as of ``solve``.
+            stage: scale of the residuals.
+            shared_information: (q, q) information matrix of a further prior of the shared unknowns;
+                None: none.
         """
         p, u, frames = self.own_count, len(self.names), len(observations)
         H, g, cost = np.zeros((frames, u, u)), np.zeros((frames, u)), 0.0
@@ -331,10 +334,12 @@ class Problem:
     def _frame(
         self, frame: Observation, theta: Array, stage: AnnealingStage
     ) -> tuple[Array, Array, Array]:
-        """Return H (u, u) and g (u,) of a frame without priors, and its ``Comparison.sums``.
+        """Return H (u, u) and g (u,) of a frame without priors, and sums (cameras, nodes + 1, 6).
 
         Args:
+            frame: evidence of the frame.
             theta: (n,) all parameters of the frame.
+            stage: scale of the residuals.
         """
         compared, (_, _, motions) = self.compare(frame, theta, stage)
         if self._cameras_fixed:
@@ -377,7 +382,8 @@ class Problem:
             stage: scale of the residuals.
 
         Returns:
-            The comparison, and the cameras as of ``CameraParameters.place``.
+            The comparison with both, and the cameras: X_CW (c, 4, 4), kernel parameters (c, 8), and
+            affine motions (c, 9, 12) of all nodes caused by each camera parameter.
         """
         packed_cameras = self.place_cameras(theta)
         views = self._views(frame, theta)
@@ -405,11 +411,12 @@ class Problem:
     def tile_costs(
         self, frame: Observation, theta: Array, stage: AnnealingStage, side: float
     ) -> Array:
-        """Return the cost of a frame's silhouettes in tiles, as ``ContourFit.tile_costs`` does.
+        """Return the cost of a frame's silhouettes in square tiles of the images.
 
         Args:
             theta: (n,) all parameters of the frame.
-            side: side of a tile [pixel].
+            stage: scale of the residuals.
+            side: side of a tile [pixel]; indices (row, column) of tiles are taken modulo 64.
 
         Returns:
             (cameras, 64, 64) costs without priors and foreground images.
@@ -443,7 +450,11 @@ class Problem:
         return Views(self.place_cameras(theta)[:2], edges)
 
     def place_cameras(self, theta: Array) -> tuple[Array, Array, Array]:
-        """Return the cameras at a frame's parameters (n,), as ``CameraParameters.place`` does."""
+        """Return the cameras at all parameters theta (n,) of a frame.
+
+        They are X_CW (c, 4, 4), kernel parameters (c, 8), and affine motions (c, 9, 12) of all
+        nodes caused by each camera parameter.
+        """
         camera_part = theta[self._first_camera : self._first_bias]
         # Successive frames mostly have the same camera parameters.
         if camera_part.tobytes() != self._last_cameras[0]:
@@ -491,8 +502,7 @@ class Problem:
 
         Args:
             compared: comparison, whose placement is used.
-            motions: (cameras, 9, 12) motions caused by camera parameters, as of
-                ``CameraParameters.place``.
+            motions: (cameras, 9, 12) affine motions of all nodes caused by camera parameters.
             camera: index of the camera.
             rates: (m,) velocities of the tree's values; None: the time offset moves no node.
         """

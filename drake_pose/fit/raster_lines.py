@@ -39,7 +39,7 @@ class Border(NamedTuple):
 
     @classmethod
     def empty(cls, height: int, width: int) -> "Border":
-        """Return the border of an empty mask."""
+        """Return the border of an empty mask (height, width), without crossings."""
         return cls(
             (np.zeros(height + 1, dtype=np.int64), np.zeros(0)),
             (np.zeros(width + 1, dtype=np.int64), np.zeros(0)),
@@ -107,7 +107,8 @@ def compare_raster(
         scale: residual at which the weight drops to a half [pixel].
         slack: only the excess of a distance along the line over this counts [pixel], and with 0.03
             of the weight the whole distance; 0: the whole distance counts.
-        A, b: (nodes, 12, 12), lower triangles, and (nodes, 12), added to, as of `compare_contours`.
+        A, b: (nodes, 12, 12), lower triangles, and (nodes, 12), added to: the cost
+            x^T A x - 2 b^T x of each node's affine motion x (12,), the rows of (M v).
 
     Returns:
         Number of pixels covered by exactly one of body and silhouette, estimated from the rows; sum
@@ -310,7 +311,8 @@ def _compare_line(
         border: positions of the silhouette's crossings; those of this line are ``first`` to
             ``end``.
         extent: end of the image along the line [pixel].
-        scale, slack: as of compare_raster.
+        scale: residual at which the weight drops to a half [pixel].
+        slack: distance along the line that hardly counts [pixel], see compare_raster; 0: none.
         weights, residuals: (count,) output: sum over the matches of the weights, and of the
             weights times the residuals (contour minus silhouette) [pixel].
     """

@@ -106,8 +106,7 @@ def _simplify(outline: Outline, count: int) -> Outline:
 
     In each pass the simplifier allows larger errors, in absolute units, until there are few enough
     triangles. It never merges slivers: with many of them it folds the rest of the surface or leaves
-    many triangles. Such a surface is also simplified in another way, and the closer result is
-    kept.
+    many triangles. Such a surface is also simplified in another way, see _simplify_uncached.
     """
     if len(outline.triangles) <= count:
         return outline
@@ -142,9 +141,10 @@ def _simplify_cached(vertices: bytes, triangles: bytes, count: int) -> Outline:
 def _simplify_uncached(outline: Outline, count: int) -> Outline:
     """Return a surface with about ``count`` triangles, in one of two ways.
 
-    If edge collapses leave too many triangles or a distant surface, the surface is also simplified
-    with merged vertices, and that result is returned if it is clearly closer, or close and the
-    first one has too many triangles.
+    First edges are collapsed. If more than 3 count triangles remain, or the root mean square
+    distance exceeds 2 / count of the bounding box's diagonal, the surface is also simplified in
+    another unit, with close vertices merged. That result is returned if its distance is less than
+    3/4 of the first one's, or if it is within the limit and the first one has too many triangles.
     """
     simplified = collapse_edges(outline, count)
     size = float(np.linalg.norm(np.ptp(outline.vertices, axis=0)))

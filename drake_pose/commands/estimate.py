@@ -190,6 +190,7 @@ def _print_demo(result: SceneEstimate) -> None:
 
 
 def _print_totals(console: Console, result: SceneEstimate) -> None:
+    """Print numbers of frames, mean errors, the median time, and the files written."""
     from drake_pose.files.folder import POSES, REPLAY, REPORT
 
     summary = result.summary

@@ -237,7 +237,7 @@ def _bar(
     is_open: bool,
     least_width: float = 1.0,
 ) -> list[dict[str, Any]]:
-    """Return the rectangles of a bar between a joint's limits, [] if a limit is infinite.
+    """Return the rectangles of a bar between a joint's limits, [] if its range is infinite or 0.
 
     Args:
         limits, estimate, interval: smallest and largest value in one unit; nan where unknown.

@@ -76,6 +76,7 @@ def within(low: float, high: float = math.inf) -> Parameter:
     """Return the cyclopts parameter of an option that is None or a finite number in [low, high]."""
 
     def check(hint: object, value: float | None) -> None:
+        """Raise a ValueError if the value is out of range; the type hint is not used."""
         if value is not None and not (math.isfinite(value) and low <= value <= high):
             wanted = f"{low:g} or more" if high == math.inf else f"{low:g} to {high:g}"
             raise ValueError(f"It must be {wanted}.")
@@ -234,7 +235,7 @@ def readable(cls: _Settings) -> _Settings:
 
 
 def take_single_names(settings: Any) -> None:
-    """Replace a single name by a tuple in a settings dataclass's fields of names, as "elbow".
+    """Replace a single name, such as "elbow", by a tuple in the fields of names of settings.
 
     Raises:
         SettingsError: such a field holds something else than names.

@@ -119,6 +119,7 @@ class ResultWriter:
             )
 
     def _digests(self, frame: str) -> dict[str, str]:
+        """Return the digests of a frame's mask files by camera."""
         return mask_digests(self.scene, self.scene.cameras, frame)
 
     def begin(self) -> None:

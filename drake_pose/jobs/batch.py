@@ -227,6 +227,7 @@ def perform(task: Task) -> Outcome:
 
 
 def _describe_failure(error: BaseException) -> str:
+    """Return the message of a task's error; that of unexpected ones begins with their type."""
     if isinstance(error, DrakePoseError):
         return str(error)
     if isinstance(error, SystemExit):

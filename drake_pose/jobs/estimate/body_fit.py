@@ -265,6 +265,7 @@ class _BodyFit:
         return other, better
 
     def _tracker(self, search: RootPlacementSearch) -> ContourTracker:
+        """Return a tracker of the body of a search in the only camera."""
         return make_tracker(search.tree, [self._camera], self._period, self._tracking)
 
     def _estimate_of(

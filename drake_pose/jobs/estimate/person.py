@@ -81,6 +81,7 @@ def follow_person(
         result.more |= {"lengths_m": known.lengths, "radius_scales": known.radius_scales}
 
     def finished() -> Iterator[tuple[FrameRecord, Drawn]]:
+        """Yield record and overlays of each frame, then add the warnings to the result."""
         values = [captured.tree.values_from_positions(q) for q in captured.q]
         nodes = [np.array(own) for own in zip(*values, strict=True)]
         for index, X_WN in enumerate(captured.tree.node_poses_batch(nodes)):
@@ -178,6 +179,7 @@ class _Reader:
         self._tell("tracking", self._followed, len(self._frames))
 
     def _tell(self, what: str, done: int, of: int | None) -> None:
+        """Call ``on_stage`` with a stage, the work done, and all its work (None if unknown)."""
         if self.on_stage is not None:
             self.on_stage(what, done, of)
 
@@ -248,6 +250,7 @@ def describe_views(views: ViewFaults, frames: Sequence[str]) -> tuple[str, ...]:
     """
 
     def listed(*several: Sequence[int]) -> str:
+        """Return a text of the names of frames, given as sequences of indices."""
         return frame_ranges({frames[k] for own in several for k in own}, frames)
 
     found = []

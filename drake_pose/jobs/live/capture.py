@@ -199,6 +199,7 @@ def _fit_first_frames(
     time, last = sensors.GetOutputPort("time"), np.nan
 
     def look(context: Context) -> bool:
+        """Store the silhouettes of a new frame; return whether there are enough frames."""
         nonlocal last
         before, last = last, float(evaluate(time, context)[0])
         if last != before and not np.isnan(last):
@@ -312,6 +313,7 @@ def _best_registered_frame(
     since = 0
 
     def look(context: Context) -> bool:
+        """Compare a new frame with the registered pose; return whether the best one is final."""
         nonlocal registered, best, shown, since
         if evaluate(sensors.GetOutputPort("fresh"), context)[0]:
             since += 1

@@ -125,6 +125,7 @@ def live_player(
     sensors = scene.open_sensors(live=True) if open_sensors is None else open_sensors()
 
     def add(builder: DiagramBuilder) -> OutputPort:
+        """Add sensors and tracker; return the port of the person's positions (nq,)."""
         person, _ = add_person_tracker(
             builder, tracker, scene.cameras, scene.backgrounds, sensors.period, source=sensors
         )

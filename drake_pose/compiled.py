@@ -261,7 +261,7 @@ def kernel_folder() -> Path | None:
 
 
 def is_stored(kernel: Callable[..., Any]) -> bool:
-    """Return whether a compiled kernel is stored, for any argument types."""
+    """Return whether a function decorated with ``compiled`` is stored, for any argument types."""
     cache = getattr(kernel, "_cache", None)
     if not isinstance(cache, _SharedCache):
         return False

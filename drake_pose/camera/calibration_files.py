@@ -115,7 +115,10 @@ def _plain(node: Any) -> Any:
 
 
 def _numbers(value: Any) -> Array | None:
-    """Return the numbers (n,) of an array, a list, or a mapping with ``data``; else None."""
+    """Return the numbers (n,), by rows, of an array, a list, or a mapping with ``data``.
+
+    The result is None for anything else, and if an entry is not a finite number.
+    """
     if isinstance(value, dict):
         value = value.get("data")
     if not isinstance(value, list | tuple | np.ndarray):

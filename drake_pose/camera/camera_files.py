@@ -156,7 +156,9 @@ def load_camera_file(path: str | Path, *, distorted: bool = False) -> CameraFile
 
 
 def save_cameras(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Camera]) -> None:
-    """Write cameras to a YAML file for load_cameras, without rounding.
+    """Write cameras, given by name or in sequence, to a YAML file for load_cameras.
+
+    Numbers are not rounded. An existing file is replaced.
 
     Raises:
         CameraError: the file cannot be written.
@@ -216,7 +218,10 @@ def _find_configs(content: dict[Any, Any], path: Path) -> dict[str, Any] | None:
 
 
 def _is_scenario(entry: Any) -> bool:
-    """Return whether an entry has cameras, and is not our file with a camera named `cameras`."""
+    """Return whether an entry of a YAML file is a Drake Scenario: a mapping with `cameras`.
+
+    A file of ours with a camera named `cameras` is not one.
+    """
     if not isinstance(entry, dict) or "cameras" not in entry:
         return False
     cameras = entry["cameras"]
@@ -224,7 +229,7 @@ def _is_scenario(entry: Any) -> bool:
 
 
 def _is_config(entry: dict[Any, Any]) -> bool:
-    """Return whether an entry has fields of a CameraConfig, and none that only our cameras have."""
+    """Return whether an entry has a CameraConfig's fields, and none that only our cameras have."""
     drake_fields = {
         *("focal", "X_PB", "X_BC", "X_BD", "name", "fps", "rgb", "depth", "label", "show_rgb"),
         *("clipping_far", "z_near", "z_far", "renderer_name", "renderer_class", "background"),

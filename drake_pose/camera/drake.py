@@ -121,7 +121,7 @@ def _pinhole(
 
 
 def camera_from_config(config: CameraConfig) -> PinholeCamera:
-    """Return the camera of a CameraConfig's colour and label sensor, at X_PB X_BC.
+    """Return the camera of a CameraConfig's colour and label sensor, with X_WC = X_PB X_BC.
 
     Raises:
         CameraError: the camera is attached to a frame other than the world, a pose is stochastic,
@@ -144,7 +144,10 @@ def camera_from_config(config: CameraConfig) -> PinholeCamera:
 
 
 def camera_to_config(camera: Camera) -> CameraConfig:
-    """Return a CameraConfig with label images enabled and Drake's defaults otherwise.
+    """Return the CameraConfig of a pinhole camera, with label images enabled.
+
+    Its depth range and far clipping plane are Drake's defaults, or larger if the near plane is far
+    away; all else that a camera does not say is Drake's default.
 
     Raises:
         CameraError: a parallel camera, or a principal point outside the image.
@@ -240,7 +243,9 @@ def dump_scenario(
 
 
 def save_scenario(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Camera]) -> None:
-    """Write the ``cameras`` of a Drake Scenario, which ``load_cameras`` also reads.
+    """Write cameras, given by name or in sequence, as a Drake Scenario.
+
+    ``load_cameras`` reads it, too. An existing file is replaced.
 
     Raises:
         CameraError: as for ``dump_scenario``, or the file cannot be written.

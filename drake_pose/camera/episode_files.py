@@ -40,8 +40,8 @@ def read_joint_table(path: Path) -> tuple[JointLog, list[str]]:
     become nan.
 
     Raises:
-        SceneError: the table is unreadable, has neither column, a cell that is not a number, a
-            duplicate frame, or times that run backwards.
+        SceneError: the table is unreadable or empty, has neither column or no joint, a duplicate
+            column or frame, a cell that is not a number, or times that run backwards.
     """
     header, rows = read_csv(path, SceneError)
     columns = dict(zip(header, zip(*(cells for _, cells in rows), strict=True), strict=False))
@@ -241,7 +241,10 @@ def recording_format(path: Path) -> Literal["lerobot", "droid", "bag", "folder",
 
 
 def require_recording(path: Path) -> None:
-    """Raise SceneError if a folder has neither masks nor images; name subfolders that do."""
+    """Raise SceneError if a folder has no ``masks`` and is no recording of any format.
+
+    The message names subfolders that have masks or are recordings.
+    """
     inside = sorted(one for one in path.iterdir() if one.is_dir()) if path.is_dir() else []
     found = [
         one.name for one in (path, *inside) if (one / "masks").is_dir() or recording_format(one)

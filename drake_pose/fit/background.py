@@ -291,7 +291,11 @@ class KnownBackground:
 
 
 def foreground_picture(foreground: Floats) -> Picture:
-    """Return an image (H, W, 3) that encodes log-odds (H, W), see ``foreground_of_colours``."""
+    """Return an image (H, W, 3) that encodes the log-odds (H, W) that pixels show the body.
+
+    They are clipped to MODEL.max_log_odds; their histogram index as a colour grows linearly with
+    them. ``foreground_of_colours`` has the tables to decode the image.
+    """
     limit = MODEL.max_log_odds
     fraction = (np.clip(foreground, -limit, limit) + limit) / (2.0 * limit)
     number = np.rint(fraction * (COLOURS - 1)).astype(np.uint16)
@@ -300,7 +304,11 @@ def foreground_picture(foreground: Floats) -> Picture:
 
 
 def foreground_of_colours(nodes: int) -> Floats:
-    """Return (nodes, 3, COLOURS) tables with which `compare_lines` decodes a foreground_picture."""
+    """Return (nodes, 3, COLOURS) tables with which `compare_lines` decodes a foreground_picture.
+
+    For each of a number of nodes, row ``Colour.FOREGROUND`` has the odds that each colour encodes;
+    the other rows are 0.
+    """
     tables = np.zeros((nodes, len(Colour), COLOURS), np.float32)
     tables[:, Colour.FOREGROUND] = np.exp(
         np.linspace(-MODEL.max_log_odds, MODEL.max_log_odds, COLOURS)
@@ -449,7 +457,7 @@ def explain(
         X_CN: (f, nodes, 3, 4) poses of the nodes in the frames.
         is_static: (nodes,) whether a node is static in all frames. Static nodes belong to the
             background; only their outline is scored.
-        camera: (8,) kernel parameters.
+        camera: (8,) `Camera.kernel_parameters`.
         sums: log-likelihoods and edges of the f frames' images.
         side: side of a tile in which the gain is also summed [pixel].
         tiles_per_side: t, number of tiles per row and column, to which their indices are taken

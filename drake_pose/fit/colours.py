@@ -156,8 +156,12 @@ class PartColours:
     ) -> Array:
         """Return (nodes,) fraction of each part's pixels with own colours in all views.
 
-        It is nan for parts with fewer than 100 visible pixels. The arguments are those of
-        ``relative_fractions``.
+        It is nan for parts with fewer than 100 visible pixels.
+
+        Args:
+            outlines: surface of each node.
+            X_WN: (nodes, 4, 4) poses of the nodes.
+            views: cameras, and an image (H, W, 3) of each.
         """
         counts = np.zeros((2, len(outlines)))
         for camera, picture in views:
@@ -343,7 +347,7 @@ def compare_lines(
     Args:
         packed: surfaces of the nodes.
         X_WN: (nodes, 4, 4) poses of the nodes.
-        camera: X_CW (4, 4) and kernel parameters (8,).
+        camera: X_CW (4, 4) and `Camera.kernel_parameters` (8,).
         picture: (H, W, 3 or 4) image.
         histograms: (nodes, 3, COLOURS) of each node the frequencies of colours on it, of colours
             beside it, and their ratio.
@@ -493,7 +497,7 @@ def learn_colours(
     Args:
         packed: surfaces of the nodes.
         X_WN: (nodes, 4, 4) poses of the nodes.
-        camera: X_CW (4, 4) and kernel parameters (8,).
+        camera: X_CW (4, 4) and `Camera.kernel_parameters` (8,).
         picture: (H, W, 3 or 4) image.
         histograms: (nodes, 3, COLOURS) histograms, in rows by ``Colour``, changed.
         spacing: distance between search lines along the contour [pixel].

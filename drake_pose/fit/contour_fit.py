@@ -149,7 +149,7 @@ def pack_views(cameras: Sequence[Camera], edges: Sequence[EdgePoints]) -> Views:
 
 
 def pack_cameras(cameras: Sequence[Camera]) -> tuple[Array, Array]:
-    """Return X_CW (c, 4, 4) and kernel parameters (c, 8) of cameras."""
+    """Return X_CW (c, 4, 4) and ``Camera.kernel_parameters`` (c, 8) of c cameras."""
     return (
         np.array([camera.X_CW for camera in cameras]).reshape(-1, 4, 4),
         np.array([camera.kernel_parameters() for camera in cameras]).reshape(-1, 8),
@@ -267,7 +267,13 @@ class ContourFit:
     def weights(
         self, cameras: tuple[Array, Array], placement: Placement, stage: AnnealingStage
     ) -> Array:
-        """Return (c, 4) weights of packed cameras, see ``camera_weights``."""
+        """Return (c, 4) weights of cameras by ``camera_weights``, with this fit's noise and unit.
+
+        Args:
+            cameras: X_CW (c, 4, 4) and kernel parameters (c, 8).
+            placement: the body, whose root gives the unit of length if ``pixels`` is None.
+            stage: scale and spacing [``pixels`` or m].
+        """
         return camera_weights(cameras, placement, stage, self.noise, self._pixels)
 
 
@@ -329,7 +335,7 @@ def normal_equations(compared: Comparison, size: int) -> tuple[Array, Array]:
 
 
 def symmetric(A: Array) -> Array:
-    """Return the symmetric matrices (..., n, n) with the given lower triangles."""
+    """Return symmetric matrices (..., n, n) with the lower triangles of A, ignoring the upper."""
     return np.asarray(np.tril(A) + np.swapaxes(np.tril(A, -1), -1, -2))
 
 

@@ -127,7 +127,7 @@ def compare_contours(
     Args:
         packed: surfaces of the nodes.
         X_WN: (nodes, 4, 4) poses of the nodes.
-        cameras: X_CW (c, 4, 4) and kernel parameters (c, 8).
+        cameras: X_CW (c, 4, 4) and `Camera.kernel_parameters` (c, 8).
         edges: edges of the c silhouettes; a camera without edge points contributes 0.
         weights: (c, 4) per camera: units of length per pixel, scale of the cost [pixel], spacing of
             the body's contour points [pixel], and weight per pixel of contour length.
@@ -269,7 +269,7 @@ def accumulate_residuals(
         bias_terms: (nodes, 13), whose first 12 columns, the derivative of b by the boundary bias,
             are added to.
         X_WN: (nodes, 4, 4) poses of the nodes.
-        camera: X_CW (4, 4) and kernel parameters (8,).
+        camera: X_CW (4, 4) and `Camera.kernel_parameters` (8,).
         p_N: (n, 3) positions of the points in their nodes [m].
         nodes, owners: (n,) the node in which a point is given, and the node that moves it.
         point_sums: (n, 7) weighted sums over the residuals r [pixel] with normal n (2,) at each

@@ -100,7 +100,7 @@ def compare_raster(
             node's parent; (nodes,) indices of the parents.
         X_WN: (nodes, 4, 4) poses of the nodes.
         is_moving: (nodes,) whether a node moves.
-        camera: X_CW (4, 4) and kernel parameters (8,).
+        camera: X_CW (4, 4) and `Camera.kernel_parameters` (8,).
         static_border: border of the union of all other nodes, see `find_body_border`.
         border: border of the silhouette.
         lines: step between the rows and columns used, and index of the first one [pixel].
@@ -210,7 +210,7 @@ def find_body_border(
         packed: surfaces of all nodes.
         X_WN: (nodes, 4, 4) poses of the nodes.
         is_moving: (nodes,) whether a node belongs to the union.
-        camera: X_CW (4, 4) and kernel parameters (8,).
+        camera: X_CW (4, 4) and `Camera.kernel_parameters` (8,).
     """
     segments = find_segments(packed, poses_in_camera(camera[0], X_WN), camera[1], is_moving)
     spans = np.empty((segments.ends.shape[0] + 1, 2), dtype=np.int64)

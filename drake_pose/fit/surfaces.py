@@ -26,12 +26,15 @@ _SIMPLIFIER = Lock()
 
 
 def simplify_rigid_parts(surfaces: TreeSurfaces, count: int) -> TreeSurfaces:
-    """Return surfaces with about ``count`` triangles per rigid part; skin bands stay and bend."""
+    """Return a tree's surfaces with rigid parts simplified to about ``count`` triangles each.
+
+    Parts with fewer triangles stay. Skin bands stay, too, and bend.
+    """
     return surfaces.with_rigid([_simplify(rigid, count) for rigid in surfaces.rigid])
 
 
 def simplify_surfaces(surfaces: TreeSurfaces, count: int = FEW) -> tuple[Outline, ...]:
-    """Return each node's surface, with skin at rest, simplified to about ``count`` triangles.
+    """Return the surface of each node of a tree, with skin at rest, of about ``count`` triangles.
 
     A surface with fewer triangles stays.
     """
@@ -79,7 +82,8 @@ def simplify_or_hull(
 ) -> tuple[Outline, ...]:
     """Return surfaces with about ``count`` triangles each.
 
-    A surface that cannot be simplified below ``limit * count`` triangles becomes its convex hull.
+    A surface with fewer stays. One that keeps more than ``limit * count`` triangles is replaced by
+    its convex hull, which is simplified likewise.
     """
     found = []
     for outline in outlines:

@@ -161,7 +161,8 @@ def _kalibr(
     """Yield the name, lens and pose X_WC (4, 4) [m] of each camera of Kalibr's camchain.
 
     The first camera is the world. Poses follow from T_cn_cnm1, the previous camera's pose in each
-    camera; a camera that lacks it, and all after it, have None.
+    camera. The pose is None for all cameras if none has it, and else for a later camera that lacks
+    it and those after it.
 
     Args:
         chain: entries of the file by camera, in order.

@@ -192,7 +192,7 @@ def ascending_indices(
     Args:
         times: (n,) time stamps [s].
         what: what has these times, for messages.
-        max_fraction: maximum fraction of time stamps out of order.
+        max_fraction: maximum fraction of all time stamps that may be left out.
 
     Raises:
         SceneError: there are no time stamps, or more than this fraction are out of order.

@@ -81,9 +81,11 @@ def read_binary_mask(
     """Return a mask (H, W) from a PNG image of black and one other colour on the object.
 
     Args:
+        path: the file.
+        error_type: class of the exceptions.
         size: required width and height [pixel]; None: any.
         may_be_empty: accept a mask without any object.
-        lossy: accept JPEG files, whose values are thresholded.
+        lossy: accept JPEG files, too; their pixels of 128 or brighter are the object.
 
     Raises:
         error_type: the file is unreadable, damaged, of another size, empty or full, or has more

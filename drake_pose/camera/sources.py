@@ -189,7 +189,7 @@ class DeviceSource(FrameSource):
     Args:
         specification: the source.
         clock: returns the time [s].
-        pauses: initial and maximum pause before reopening [s]; each pause doubles the previous one.
+        pauses: initial and maximum pause before reopening [s]; they double until an image arrives.
     """
 
     def __init__(

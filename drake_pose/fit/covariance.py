@@ -37,7 +37,7 @@ class ErrorSizes(NamedTuple):
         repeated: noise repeated in all images of a part that is static relative to a camera,
             likewise; 0 if there is none.
         surface, mask, camera: displacement of contours by an error of a part's surface, of its edge
-            in one mask, and of a camera's extrinsics [unit of the ``ComparedMask``].
+            in one mask, and of a camera's extrinsics [unit of errors, see ``ComparedMask``].
         nuisances: each group of nuisance parameters [unit of the group].
     """
 
@@ -138,7 +138,7 @@ def distances_in_masks(
     max_count: int = 400,
     with_bias: bool = False,
 ) -> Distances:
-    """Return the residuals in several masks, each with an error of its own.
+    """Return the residuals of the contours in several masks, at the values that were compared.
 
     Args:
         outlines: surface of each node.
@@ -308,7 +308,7 @@ def estimate_sizes(
     Args:
         residuals: the residuals; each group of their nuisances gets a size, too.
         is_angle: (m,) which values are angles; the others are lengths.
-        min_camera: minimum returned error of a camera [unit of errors].
+        min_camera: minimum returned error of a camera [unit of errors, see ``ComparedMask``].
         prior_deviation: standard deviation of the prior of the sizes' logarithms, whose mean is 0.
         tolerance: iterations end when no log size changes by more than this, after 20, or when
             the log-likelihood gains less than 0.05. Repeated noise is estimated only if an element

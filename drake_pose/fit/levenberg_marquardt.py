@@ -107,6 +107,7 @@ class LinearPrior:
         """Return equations with the prior's gradient and cost added; H stays, see ``curvature``.
 
         Args:
+            equations: equations of all frames at ``own``.
             own: (frames, p) own unknowns.
         """
         residual = self.rows @ own.ravel() - self.mean

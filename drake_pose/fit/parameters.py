@@ -265,7 +265,7 @@ class CameraParameters:
         names: names of all parameters.
 
     Args:
-        cameras: the cameras at zero parameters.
+        cameras: the cameras when all parameters are 0.
         pivot: (3,) or (cameras, 3) point in the world about which they rotate [m].
     """
 
@@ -350,6 +350,7 @@ def scale_surfaces(packed: PackedOutlines, scale: Array) -> PackedOutlines:
     """Return packed surfaces scaled about the origins of their nodes' frames.
 
     Args:
+        packed: surfaces of the nodes; they stay unchanged.
         scale: (nodes, 3) factors along the axes of each node's frame.
     """
     points, planes = packed.points.copy(), packed.planes.copy()

@@ -378,6 +378,7 @@ class Problem:
         """Compare the body's contours with a frame's silhouettes and foreground images.
 
         Args:
+            frame: evidence of the frame.
             theta: (n,) all parameters of the frame.
             stage: scale of the residuals.
 
@@ -414,6 +415,7 @@ class Problem:
         """Return the cost of a frame's silhouettes in square tiles of the images.
 
         Args:
+            frame: evidence of the frame.
             theta: (n,) all parameters of the frame.
             stage: scale of the residuals.
             side: side of a tile [pixel]; indices (row, column) of tiles are taken modulo 64.
@@ -444,7 +446,12 @@ class Problem:
         return own[: self._values] if self._values_only and not own[self._values :].any() else own
 
     def _views(self, frame: Observation, theta: Array) -> Views:
-        """Return the cameras at theta (n,), and a frame's edges moved in by the boundary biases."""
+        """Return the cameras, and a frame's edges moved inwards by the boundary biases.
+
+        Args:
+            frame: evidence of the frame.
+            theta: (n,) all parameters of the frame.
+        """
         biases = theta[self._first_bias :]
         edges = offset_edges(frame.edges, -biases) if biases.any() else frame.edges
         return Views(self.place_cameras(theta)[:2], edges)

@@ -175,7 +175,7 @@ class ProportionedBody(BodyParameters):
         return joint_shifts
 
     def place(self, theta: Array) -> Placement:
-        """Return the body at all parameters theta (n,)."""
+        """Return the body, with its proportions and their motions, at all parameters theta (n,)."""
         kinematics = self.kinematics
         count = len(kinematics.names)
         at_rest = kinematics.motions(theta[:count])

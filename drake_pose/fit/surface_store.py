@@ -27,8 +27,9 @@ def load_or_make(
     """Return a surface from its file, or make and store it.
 
     Args:
-        made_of: everything the surface depends on, including versions of the code that makes it.
-        make: makes the surface.
+        made_of: everything the surface depends on, including versions of the code that makes it;
+            its digest is the file's name.
+        make: makes the surface; it is called if there is no valid file.
         least_time: minimum time [s] of making a surface for it to be stored. Fits of persons make
             many surfaces faster than this, and a file saves little.
         most_files: maximum number of files (60 kB for 2500 triangles); the least recently used ones

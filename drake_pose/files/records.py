@@ -273,7 +273,8 @@ def record_deviations(model: ArticulatedModel, q: Array, deviations: Array) -> J
     """Return the 95 % interval of each position by name, clipped to its limits; no ``value``.
 
     A position is determined if its interval, before clipping, is less than half of its range.
-    Positions with an infinite interval are left out; the result is {} if q is not finite.
+    It is not if its deviation is unknown: the interval is then the whole range. Positions with an
+    infinite interval are left out; the result is {} if q is not finite.
 
     Args:
         model: the model of the positions.
@@ -518,7 +519,10 @@ def camera_warnings(
 
 
 def frame_warnings(records: Mapping[str, FrameRecord]) -> tuple[str, ...]:
-    """Return warnings of the frames (keys) without a pose, and with a search ended by a limit."""
+    """Return warnings of the frames (keys) without a pose, and with a search ended by a limit.
+
+    Frames without a pose of the method person are not named.
+    """
     found: dict[str, list[str]] = {}
     limits = {"run_limit": "run limit", "time_limit": "time limit; raise it (time_limit)"}
     for frame, record in records.items():

@@ -376,7 +376,7 @@ def run_batch(
         out: folder of the batch; it must be new or empty, unless ``resume``.
         client: Dask client of the workers; None: this process does the work.
         resume: continue the batch in ``out``, and try failed scenes again.
-        on_progress: called when a task is finished or has failed.
+        on_progress: called after planning, and when a task is finished or has failed.
         work: runs a task and returns its outcome; picklable if there is a client.
         tries: number of attempts for a task that kills its process; used with a client only.
 

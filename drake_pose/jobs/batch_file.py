@@ -30,7 +30,7 @@ class SceneJob:
         chunk: number of frames in a chunk; recordings of a person and audits are not cut.
         audit: table of joint positions to be audited; True: the episode's own joint log; None: the
             scene is estimated.
-        camera_file: camera file of an audit, used instead of the scene's cameras.yaml; None: that.
+        camera_file: camera file of an audit; None: the scene's cameras.yaml.
     """
 
     name: str

@@ -317,7 +317,7 @@ def read_inputs(
         settings: the settings.
         truth_path: measured joint positions; None: the scene's joint_angles.csv, if it exists, or
             the episode's joint log.
-        camera_path: camera file used instead of the scene's own; None: that.
+        camera_path: camera file; None: the scene's own.
 
     Raises:
         DrakePoseError: the message names the file, camera, frame, link or joint at fault.

@@ -259,8 +259,8 @@ def cameras_of(
 
     Args:
         episode: the episode.
-        camera_path: camera file used instead of the episode's own; None: cameras.yaml in the
-            episode; without that file no camera has a pose.
+        camera_path: camera file; None: the episode's cameras.yaml, without which no camera has a
+            pose.
         settings: names of the cameras; all if none are given.
 
     Raises:
@@ -392,8 +392,8 @@ def read_episode_scene(
     Args:
         path: the episode.
         settings: cameras, frames and joint log.
-        joints: table of joint positions used instead of the episode's own; None: that.
-        cameras: camera file used instead of the episode's own; None: that.
+        joints: table of joint positions; None: the episode's own.
+        cameras: camera file; None: the episode's own.
 
     Raises:
         DrakePoseError: the message names the file, camera or frame at fault; or no camera's pose is

@@ -70,7 +70,7 @@ def estimate_scene(
         out: folder for the result; None writes nothing.
         settings: cameras, frames, root and method; None: defaults.
         truth: measured joint positions to compare with; None: joint_angles.csv or joint log.
-        cameras: camera file used instead of the scene's own; None: that.
+        cameras: camera file; None: the scene's own.
         resume: continue the interrupted result in ``out``.
         replay, overlay: whether replay.html and overlays are written.
         on_frame: called before the first and after each frame; None: not called.

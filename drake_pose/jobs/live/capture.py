@@ -182,7 +182,8 @@ def _fit_first_frames(
         settings: tolerance of synchronised pictures.
         tree: the person's pose tree.
         on_report: called with messages about live cameras.
-        count: number of frames; fewer if the recordings end or no more come within a minute.
+        count: number of frames; fewer if recordings end before, or live cameras are read for a
+            minute.
 
     Returns:
         Link lengths and radius scales; None for a model without shape joints.

@@ -168,7 +168,8 @@ def run_live(
     Args:
         diagram: the diagram.
         sensors: its sensor system; None: it has none.
-        seconds: duration [s], of the clock if a source is live, else simulated; None: unlimited.
+        seconds: duration [s], of the clock if the sensors are live, else simulated; None:
+            unlimited.
         on_report: called with messages about cameras and pictures.
         monitor: called with the diagram's context after every step; ends the run by returning
             ReachedTermination; None: no monitor.

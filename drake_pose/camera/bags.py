@@ -297,10 +297,10 @@ class _TopicPictures:
         self._next = -1
 
     def read(self, k: int) -> Picture:
-        """Return image k (H, W, 3), red, green, blue.
+        """Return image k, from 0 in the order of ``log_times``, (H, W, 3) red, green, blue.
 
         Raises:
-            SceneError: it is damaged.
+            SceneError: it is damaged, or the bag's index is wrong.
         """
         wanted, where = int(self._log_times[k]), f"{self._path}: {self._topic}, picture {k}"
         with _translate_errors(self._path):

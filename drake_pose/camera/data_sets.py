@@ -345,6 +345,10 @@ def _zed_cameras(
 def _picture_times(file: Any, path: Path, serial: str, count: int, warnings: list[str]) -> Array:
     """Return the times [s] of a video's first images; at most ``count``, fewer if some are missing.
 
+    They are those in `<video>_timestamps.json`, minus the camera's median delay, if that file
+    exists, or else those of the trajectory's rows: of capture, reception or reading, by the first
+    that there is.
+
     Args:
         file: the open trajectory (h5py.File).
         path: the video.

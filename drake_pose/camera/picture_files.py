@@ -173,7 +173,9 @@ def find_recorded_files(folder: Path, camera: str) -> dict[str, Path] | Path | N
 
 
 def threshold_mask(picture: Picture, where: str, error_type: type[DrakePoseError]) -> Mask:
-    """Return the mask (H, W) of the bright pixels of a lossily compressed mask.
+    """Return the mask (H, W) of the pixels with grey values of 128 or more.
+
+    The image is a lossily compressed mask, so its values are only near black and white.
 
     Args:
         picture: (H, W) grey values, or (H, W, 3) colours.
@@ -181,7 +183,7 @@ def threshold_mask(picture: Picture, where: str, error_type: type[DrakePoseError
         error_type: class of the exception.
 
     Raises:
-        error_type: more than a tenth of the pixels are neither dark nor bright.
+        error_type: more than a tenth of the grey values are between 64 and 192.
     """
     grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     between = float(((grey > 64) & (grey < 192)).mean())
@@ -315,7 +317,7 @@ class VideoPictures:
         return rate if rate > 0.0 else None
 
     def read(self, number: int) -> Picture:
-        """Return an image by its number (H, W, 3), red, green, blue, and set ``time``.
+        """Return an image (H, W, 3) by its number from 0, red, green, blue, and set ``time``.
 
         Raises:
             SceneError: the video ends before it.
@@ -405,7 +407,7 @@ class TimedVideo:
                 yield from packet.decode()
 
     def read(self, number: int) -> Picture:
-        """Return an image by its number (H, W, 3), red, green, blue.
+        """Return an image (H, W, 3) by its number from 0, red, green, blue.
 
         Raises:
             SceneError: it is missing or damaged.

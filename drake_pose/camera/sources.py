@@ -101,7 +101,7 @@ class SourceSpecification:
         return threshold_mask(picture, where, SceneError) if self.gives_masks else picture
 
     def size_problem(self, picture: Picture | Mask) -> str:
-        """Return the end of a message about an image's size; "" if it is the calibrated one."""
+        """Return what is wrong with an image's size, for messages; "" if it is as calibrated."""
         height, width = picture.shape[:2]
         if (width, height) == (self.width, self.height):
             return ""

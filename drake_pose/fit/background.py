@@ -348,7 +348,9 @@ def _slopes(picture: Floats) -> tuple[Floats, Floats]:
 
 
 def _deviations(picture: Floats, noise: float) -> Floats:
-    """Return (H, W) standard deviations of a background's colours.
+    """Return (H, W) standard deviations of a background's colours [of 255].
+
+    They combine the noise, at least MODEL.min_noise, and shake, in proportion to the gradient.
 
     Args:
         picture: (H, W, 3) the background.

@@ -506,10 +506,10 @@ def learn_colours(
         rate: weight of the new colours against the old histograms; where a node's histogram is
             empty, it becomes the new colours.
         max_residual: a line whose edge is further from the contour than this is ignored [pixel];
-            inf: no line is ignored.
+            inf, or with a region: no line is ignored, and no edge is located.
         step: distance between the edge offsets [pixel] that are evaluated to locate the edge, on
             both sides of which colours are then counted; 0: colours are counted on both sides of
-            the contour, and the edge is only located for ``max_residual``, with a step of 1.
+            the contour, and the edge is only compared with ``max_residual``, with a step of 1.
         region: (H, W) known silhouette of the body, which decides what is on the body and what is
             beside it; (0, 0): unknown.
         rare: added to frequencies, so that rarer colours count as unobserved [fraction of pixels].

@@ -241,9 +241,10 @@ def add_residual(point_sums: Array, i: int, n0: float, n1: float, r: float, weig
     """Add a weighted squared residual to the first five columns of a row of point sums, in place.
 
     Args:
-        point_sums: (n, 7) as of `accumulate_residuals`, changed.
+        point_sums: (n, 7) one row per point, columns n0^2, n0 n1, n1^2, n0 r, n1 r, and two that
+            stay.
         i: the row.
-        n0, n1: unit vector along u and v in which the point should move.
+        n0, n1: elements along u and v of the unit normal along which the point should move.
         r: the residual [pixel], the distance to move.
         weight: weight of the squared residual.
     """

@@ -245,7 +245,8 @@ def link_scale_name(link: str) -> str:
 def carried_joints(tree: PoseTree, links: Collection[str] | None = None) -> list[LinkVector]:
     """Return the vectors from links' joints to the robot's joints that they carry at a distance.
 
-    The joints that position a target (TARGET_POSITIONS) are left out.
+    Vectors of at most a millimetre, and joints that position a target (TARGET_POSITIONS), are left
+    out.
 
     Args:
         tree: the pose tree.

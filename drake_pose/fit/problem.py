@@ -334,7 +334,10 @@ class Problem:
     def _frame(
         self, frame: Observation, theta: Array, stage: AnnealingStage
     ) -> tuple[Array, Array, Array]:
-        """Return H (u, u) and g (u,) of a frame without priors, and sums (cameras, nodes + 1, 6).
+        """Return a frame's contribution to the normal equations H dx = -g of the u unknowns.
+
+        The results are H (u, u) and g (u,), without priors, and sums (cameras, nodes + 1, 6) by
+        ``Sum`` of each node's contour and, last, the silhouette's edge.
 
         Args:
             frame: evidence of the frame.

@@ -128,9 +128,9 @@ def _simplify_cached(vertices: bytes, triangles: bytes, count: int) -> Outline:
     """Return the simplified surface, cached in the process and on disk.
 
     Args:
-        vertices: bytes of (v, 3) float64.
+        vertices: bytes of (v, 3) float64 [m].
         triangles: bytes of (t, 3) int32.
-        count: number of triangles.
+        count: number of triangles to reach.
     """
     # The simplification does not need the edges.
     outline = Outline(

@@ -127,7 +127,7 @@ def centres_as_csv(frames: Sequence[str], names: Sequence[str], places: Array) -
 
 
 def centres_as_trc(names: Sequence[str], places: Array, rate_hz: float) -> str:
-    """Return a TRC file of joint centres: in millimetres, y up, frames counted from 1.
+    """Return the text of a TRC file of joint centres: millimetres, y up, frames counted from 1.
 
     Args:
         names: (joints,) names of the markers.
@@ -158,11 +158,11 @@ def centres_as_trc(names: Sequence[str], places: Array, rate_hz: float) -> str:
 def positions_as_mot(
     model: ArticulatedModel, q: Array, rate_hz: float, X_WB: Array | None = None
 ) -> str:
-    """Return a MOT file of positions in degrees and metres, without frames that have no pose.
+    """Return the text of a MOT file of positions in degrees and metres, with columns by name.
 
     Args:
         model: the model of the positions.
-        q: (frames, nq) positions [rad or m].
+        q: (frames, nq) positions [rad or m]; frames with a nan have no row.
         rate_hz: frame rate [Hz].
         X_WB: (frames, 4, 4) poses of the plant's world in the scene's world, for BASE_COLUMNS
             [m and unit quaternion]; None: no such columns.

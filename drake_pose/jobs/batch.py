@@ -271,7 +271,7 @@ def _require_same_masks(task: Task) -> None:
 
 
 def _make(task: Task) -> None:
-    """Write a task's result to a temporary folder, then rename it."""
+    """Write a task's result to a temporary folder, then rename it to ``task.place``."""
     job, settings = task.job, task.job.settings
     task.work.mkdir(parents=True, exist_ok=True)
     part = task.work / f"{task.place.name}.part-{uuid.uuid4().hex[:12]}"
@@ -465,7 +465,7 @@ class Batch:
                     path.unlink()
 
     def plan(self) -> None:
-        """Plan all scenes and queue the tasks that have no result yet."""
+        """Queue the tasks of all scenes that have no result yet; scenes that cannot be read fail."""
         for folder in (self.out / ".chunks").glob("*/*.part-*"):
             shutil.rmtree(folder, ignore_errors=True)
         for state in self.scenes.values():

@@ -88,7 +88,7 @@ class _CombinedPose:
         self._information, self._weighted = np.zeros((6, 6)), np.zeros(6)
 
     def add(self, one: FoundCamera) -> None:
-        """Add the camera's pose in another episode."""
+        """Add the camera, as found in another episode, to the combined pose."""
         information = np.linalg.inv(np.array(one["covariance"]))
         self._information += information
         self._weighted += information @ pose_difference(np.array(one["X_WC"]), self._first)

@@ -223,7 +223,7 @@ def _write_scene(source: Source, folder: Path, summary: Mapping[str, Any]) -> No
 
 
 def _draw_outline(picture: Picture, mask: Mask, refused: bool) -> bytes:
-    """Return the JPEG file of a picture (H, W, 3) with a mask's contour, dark if it is rejected."""
+    """Return the JPEG file of a picture (H, W, 3) with a mask's contour, dark if ``refused``."""
     drawn = np.array(picture[:, :, ::-1] // (3 if refused else 1))
     contours, _ = cv2.findContours(mask.view(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     vermilion_bgr = (0, 94, 213)
@@ -313,7 +313,7 @@ def find_masks(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
 
 
 def _read_given(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
-    """Yield the masks that other tools wrote to COCO files, pictures or videos."""
+    """Yield the masks of other tools in COCO files (of ``settings.classes``), pictures or videos."""
     known = sorted({name for _, coco in source.annotated for name in coco.classes})
     if not settings.classes and len(known) > 1:
         raise MaskError(
@@ -408,6 +408,7 @@ def _by_empty_room(
         rooms[name] = [room.with_noise(k) for k in (1.0, *thresholds)]
 
     def find(camera: str, picture: Picture) -> tuple[Mask, float, tuple[str, ...]]:
+        """Return mask (H, W), agreement and warnings of a camera's picture (H, W, 3)."""
         room = rooms[camera][0]
         if picture.shape != room.mean.shape:
             height, width = room.mean.shape[:2]

@@ -233,7 +233,7 @@ class EstimateInputs:
         return dict(zip(self.truth.names, errors.tolist(), strict=True))
 
     def pictures(self, frame: str) -> dict[str, np.ndarray]:
-        """Return the pictures (H, W, 3) of a frame by camera."""
+        """Return a frame's pictures (H, W, 3) uint8 RGB by camera; {} in a scene of masks only."""
         names = [name for name in self.scene.cameras if (name, frame) in self.scene.images]
         return {name: self.scene.read_image(name, frame) for name in names}
 

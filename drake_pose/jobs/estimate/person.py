@@ -153,7 +153,7 @@ class _Reader:
         self._read_count = self._followed = 0
 
     def __call__(self, index: int) -> dict[str, Mask]:
-        """Return the masks of the frame of this index by camera."""
+        """Return the readable masks (H, W) of the frame of this index by camera."""
         frame, masks = self._frames[index], {}
         for camera in self._scene.cameras_of(frame):
             if (camera, frame) not in self.refused:

@@ -166,7 +166,7 @@ def estimate_frames(
 
 
 def _views(scene: Scene, frame: str) -> list[View]:
-    """Return the masks of a frame with their cameras."""
+    """Return a view, camera and mask, of each camera with a mask of the frame."""
     return [View(scene.cameras[name], scene.read(name, frame)) for name in scene.cameras_of(frame)]
 
 

@@ -465,7 +465,7 @@ class Batch:
                     path.unlink()
 
     def plan(self) -> None:
-        """Queue the tasks of all scenes that have no result yet; scenes that cannot be read fail."""
+        """Queue all scenes' tasks that have no result yet; scenes that cannot be read fail."""
         for folder in (self.out / ".chunks").glob("*/*.part-*"):
             shutil.rmtree(folder, ignore_errors=True)
         for state in self.scenes.values():

@@ -313,7 +313,7 @@ def find_masks(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
 
 
 def _read_given(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
-    """Yield the masks of other tools in COCO files (of ``settings.classes``), pictures or videos."""
+    """Yield the masks of other tools in COCO files (``settings.classes``), pictures or videos."""
     known = sorted({name for _, coco in source.annotated for name in coco.classes})
     if not settings.classes and len(known) > 1:
         raise MaskError(

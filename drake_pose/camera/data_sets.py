@@ -174,7 +174,10 @@ def _choose_episode(path: Path, info: Mapping[str, Any], rows: _Rows, wanted: in
 
 
 def _names(key: str, feature: Mapping[str, Any]) -> list[str]:
-    """Return names of a vector feature's entries: those of the data set, or else numbered ones.
+    """Return names of a vector feature's entries: those of the data set, if there are as many.
+
+    Otherwise they are the last part of the key, or "joint", and a number from 0; a single entry has
+    no number.
 
     Args:
         key: the feature's key, `observation.state` or one that begins with it.

@@ -223,8 +223,8 @@ def _find_unit(
         slack: tolerance of the limits [rad].
         full_turn: readings further beyond the limits than this [rad] are not in radians; a joint
             without limits is assumed to stay within twice this.
-        normalised: if the largest magnitude of ``others`` is in this range, LeRobot may have
-            normalised the readings to -100 ... 100.
+        normalised: if the largest magnitude of ``others`` is in this range, or a column's name
+            ends in ".pos", LeRobot may have normalised the readings to -100 ... 100.
 
     Raises:
         SceneError: the readings fit neither radians nor degrees, or seem to be normalised.

@@ -122,7 +122,8 @@ def compare_contours(
     """Return the quadratic cost of the nodes' affine motions for each camera.
 
     The cost is x^T A x - 2 b^T x plus the current cost. x (12,) are the rows of a node's affine
-    motion (M v) (3, 4), which moves a point at p_W by M p_W + v.
+    motion (M v) (3, 4), which moves a point at p_W by M p_W + v. Points are matched within REACH
+    scales of the cost; an unmatched one adds its maximum cost.
 
     Args:
         packed: surfaces of the nodes.

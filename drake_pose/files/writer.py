@@ -158,7 +158,7 @@ class ResultWriter:
                 on_frame(count, len(asked), record.frame, self.records[record.frame])
 
     def add(self, record: FrameRecord) -> None:
-        """Write a frame's row of poses.csv, which marks it as finished, and seldom the summary."""
+        """Append a frame's row to poses.csv, which marks it as finished; renew an old summary."""
         if self._table is not None:
             self._table.append(record)
         self.records[record.frame] = replace(record, masks=self._digests(record.frame))

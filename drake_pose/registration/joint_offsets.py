@@ -206,8 +206,7 @@ def calibrate_joints(
                 values = {k: replace(one, significant=k in beside) for k, one in values.items()}
         parameters |= values
         kept = [name for name in sought if values[name].determined]
-    found = found._replace(shared=shrink_constants(fit, found, covariance, sought))
-    covariance, gauges = widen_with_cameras(fit, covariance, still_factor)
+    found, covariance, gauges = shrink_widened(fit, found, covariance, sought, still_factor)
     again = describe_constants(
         fit, found, freedom, least, covariance, sought, determined=0.2 * still_factor
     )
@@ -231,6 +230,26 @@ def calibrate_joints(
         tuple(ratios[fit.rows == c] for c in range(len(views))),
         tuple(fit.inliers(ratios)[fit.rows == c] for c in range(len(views))),
     )
+
+
+def shrink_widened(
+    fit: SharedFit, found: SharedValues, covariance: Array, names: Sequence[str], factor: float
+) -> tuple[SharedValues, Array, dict[str, tuple[str, ...]]]:
+    """Widen the covariance along constants correlated with a camera, then shrink the constants.
+
+    In this order, constants that are less certain than the fit says shrink further.
+
+    Args:
+        fit, found, covariance: the fit, its values, and their covariance (u, u).
+        names: of the constants that shrink.
+        factor: of the standard deviations (``widen_with_cameras``).
+
+    Returns:
+        the shrunk values, the widened covariance, and the gauges of ``widen_with_cameras``.
+    """
+    covariance, gauges = widen_with_cameras(fit, covariance, factor)
+    shared = shrink_constants(fit, found, covariance, names)
+    return found._replace(shared=shared), covariance, gauges
 
 
 def shrink_constants(

@@ -25,6 +25,7 @@ from drake_pose.registration.hand_eye import hand_eye_starts, rotation_spread
 from drake_pose.registration.joint_offsets import (
     describe_constants,
     shrink_constants,
+    shrink_widened,
     significant_constants,
     widen_to_cost_curvature,
     widen_with_cameras,
@@ -593,6 +594,27 @@ def test_shrinkage_reduces_the_mean_squared_error(size: float, least: float, mos
     after, before = np.mean(errors, axis=0)
     for ratio in (after[0] / before[0], after[1:].sum() / before[1:].sum()):
         assert least <= ratio < most
+
+
+def test_constants_that_are_less_certain_than_the_fit_says_shrink_further() -> None:
+    """Monte Carlo: errors of a first offset are 4 times as large as the fit's covariance says."""
+    rng, names = np.random.default_rng(5), ("first", *"bcdef")
+    kinematics = SimpleNamespace(names=names, is_angle=np.ones(6, bool))
+    views = [SimpleNamespace(kinematics=kinematics)]
+    fit = SimpleNamespace(names=("eye.turn_y", *names), constants=names, views=views)
+    A = np.diag([0.0005, 0.01, *([0.001] * 5)])
+    A[0, 1] = -0.01
+    actual = A.copy()
+    actual[:, 1] *= 4.0
+    errors: dict[float, list[float]] = {1.0: [], 4.0: []}
+    for _ in range(200):
+        true = np.append(0.0, 0.01 * rng.normal(size=6))
+        seen = SharedValues(true + actual @ rng.normal(size=7), np.zeros(0))
+        for factor, squares in errors.items():
+            found, C, _ = shrink_widened(fit, seen, A @ A.T, names, factor)
+            squares.append((found.shared[0] - true[0]) ** 2)
+            np.testing.assert_allclose(C[1, 1], (0.01 * factor) ** 2)
+    assert np.mean(errors[4.0]) < 0.4 * np.mean(errors[1.0])
 
 
 def test_still_factor_enlarges_constants_correlated_with_a_camera() -> None:

@@ -77,6 +77,10 @@ def map_joints(
         table: column of some joints by the joint's name, as from `read_joint_map`; the columns of
             other joints are found by `match_names`. None: of no joint.
 
+    Returns:
+        the positions in the model's order [rad or m], nan for joints without a column. Readings
+        outside the limits are kept, with a warning.
+
     Raises:
         SceneError: no column is a joint, or the readings fit neither radians nor degrees.
         UnknownNameError: the table has an unknown joint or column.

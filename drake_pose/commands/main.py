@@ -44,12 +44,13 @@ class _Formatter(DefaultFormatter):
 
 
 def _program(name: str, help: str, *commands: Callable[..., None]) -> App:
-    """Return a program whose commands are functions; their docstrings are the help texts.
+    """Return a program whose commands are functions; help texts are their docstrings before Args.
 
     Args:
         name: the program's name.
         help: its help text, before the list of commands.
-        commands: functions, whose names without ``reproduce_`` are the commands' names.
+        commands: functions; a command has its function's name, without ``reproduce_`` and with
+            hyphens for underscores.
     """
 
     def show_default(value: object) -> str | None:

@@ -121,12 +121,12 @@ class HandObservation:
         return project_hand(x[hand.visible], hand.chains, self.pixels_per_metre, self.shortest)
 
     def mirrors(self, belief: Belief) -> list[Array]:
-        """Return states (n,), each the belief's mean with one joint mirrored at the image plane.
+        """Return states (n,), each the belief's mean with one flexion mirrored at the image plane.
 
         A segment that points slightly towards the camera looks like one that points as much away
         from it. Only the angle at the segment's root changes. A joint is mirrored if its rotation
-        moves the segment's end mostly in depth (``mirror_slope``) and the change is between
-        ``smallest_change`` and ``mirror_reach``.
+        moves the segment's end mostly in depth (``mirror_slope``) and its change is more than
+        ``smallest_change`` [rad] and less than ``mirror_reach`` of its standard deviations.
         """
         hand, x, found = self.hand, belief.mean, []
         _, _, points, J = self._project(x)

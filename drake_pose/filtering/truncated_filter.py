@@ -491,7 +491,8 @@ class TruncatedFilter:
     def _repeat(self, hypothesis: Hypothesis, measurement: Measurement) -> Branch:
         """Update a predicted hypothesis by a measurement of another frame of its static view.
 
-        The measurement is linearised where the view's first frame was.
+        The measurement is linearised where the view's first frame was. Returns the hypothesis with
+        the view's belief, and the update.
         """
         repeated = hypothesis.repeated
         if repeated is None:

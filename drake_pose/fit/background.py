@@ -464,8 +464,8 @@ def explain(
         side: side of a tile in which the gain is also summed [pixel].
         tiles_per_side: t, number of tiles per row and column, to which their indices are taken
             modulo; 0: there are no tiles.
-        always_covered: factor of the gain of pixels that the body covers in all frames, whose
-            background is unknown.
+        always_covered: factor of the positive gain of pixels that the body covers in all frames,
+            whose background is unknown; a negative gain there counts 0.
 
     Returns:
         (4,) sums by ``Explained``, and (t, t) the gain of each tile (row, column).

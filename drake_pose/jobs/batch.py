@@ -523,8 +523,8 @@ class Batch:
     def note(self, task: Task, outcome: Outcome) -> None:
         """Record the outcome of a task.
 
-        After a scene's last chunk the task that joins them is queued; a whole scene with another
-        number of frames than planned fails.
+        An error fails its scene. After a scene's last chunk the joining task is queued; a finished
+        scene's work folder is deleted, or the scene fails if its number of frames is not planned.
         """
         state = self.scenes[task.job.name]
         state.seconds += outcome.seconds

@@ -161,10 +161,17 @@ def make_sequence(
 
 
 def first_guess(x: Array, generator: np.random.Generator) -> Belief:
-    """Draw table 2's belief about a true state x (n,): errors up to its values, its variances.
+    """Draw table 2's belief about a true state.
 
-    Table 2 does not list the palm's rotation, which gets the joint angles' error and variance. The
-    scale is 1 with variance 0, so it is no part of the covariance.
+    Table 2 does not list the palm's rotation, which gets the joint angles' error and variance.
+
+    Args:
+        x: (n,) the true state in the order of `HAND_STATE`: wrist [pixel], quaternion, its squared
+            norm being the scale, angles [rad] and lengths, then their rates.
+        generator: draws the errors, which are uniform up to table 2's values.
+
+    Returns:
+        the mean, with scale 1 and rates 0, and a diagonal covariance.
     """
     mean = x.copy()
     moving = len(HAND_STATE.moving)

@@ -557,7 +557,7 @@ def explained_frames(
 
     Args:
         ratios: for each frame the fitted inlier ratios by camera.
-        of_best, least: each ratio must be at least `of_best` of its camera's best, and `least`.
+        of_best, least: minimum, relative to the mean of the camera's best quarter, and absolute.
     """
     limits = {}
     for name in {name for one in ratios for name in one}:

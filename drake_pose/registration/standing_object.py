@@ -444,7 +444,7 @@ class TargetSearch:
         Args:
             choices: for each picture one or more masks that may be the target's.
             poses: (n, 2, 4, 4).
-            side: see ``overlap_areas``.
+            side: square root of the mask's area in the downscaled picture [pixel].
         """
         off = [
             np.min([self._misfit(camera, one, poses, side) for one in own], axis=0)
@@ -461,7 +461,7 @@ class TargetSearch:
     ) -> Array:
         """Return E_total (n,) of ``HandEye`` poses (n, 2, 4, 4) in one frame, clipped at 1.
 
-        side: see ``overlap_areas``.
+        side: square root of the mask's area in the downscaled picture [pixel].
         """
         body = self._target.in_own_frame
         alone = PosedFrame(one.name, np.zeros(0), one.mask)

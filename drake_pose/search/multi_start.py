@@ -422,7 +422,7 @@ class _MultiStartRun:
     def _values(self, coarse: CoarsePoses, values: np.ndarray | None = None) -> list[np.ndarray]:
         """Return the values (m,) of each coarse pose [rad or m].
 
-        ``values``: (m,) the values of nodes that were not searched; None: zeros.
+        ``values``: (m,) of the whole tree, replaced for nodes that were searched; None: zeros.
         """
         grids = self._body.sampled.values
         base = np.zeros(len(self._kinematics.names)) if values is None else values

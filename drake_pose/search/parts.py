@@ -57,7 +57,7 @@ def find_parts(tree: PoseTree, longest: int = 3) -> tuple[Part, ...]:
     """Return the parts that are placed anew.
 
     They are the ends of all limbs with one to ``longest`` nodes, and each other node alone, with
-    its children held.
+    its children held. Nodes that follow their parent neither start an end nor are parts alone.
     """
     chains = []
     for leaf in tree.leaves:

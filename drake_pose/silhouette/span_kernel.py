@@ -321,7 +321,7 @@ def score(
     Args:
         packed: the surfaces of the body's nodes; their bands are deformed in place.
         parts: (b, 4) int64 the skin bands, as in ``bend``; b may be 0.
-        bands: (n, v, 3) vertices of all bands, one band after the other, at each pose [m].
+        bands: (n, v, 3) all bands' vertices at each pose, in the frames of the bands' nodes [m].
         X_CN: (n, nodes, 3, 4) poses of the surfaces in the camera.
         camera: (8,) ``Camera.kernel_parameters()``.
         prefixes: (k, H, W + 1) int32 row-wise ``prefix_sums`` of the pixel sets' masks.
@@ -560,7 +560,7 @@ def _draw_triangle(
             -depth [m].
         b, c: indices of the second and third point.
         label, image: the label to write, and the (H, W) int16 image that gets it.
-        bounds: (4,) bounds of the contested pixels, as in ``_paint_span``.
+        bounds: (4,) first row, row after the last, first and last column + 1 of contested pixels.
         depths: float32 nearness drawn so far in the bounds, updated; inf: not contested.
     """
     # Nearness increases towards the camera and is linear in the image: 1 / z, or -z (parallel).

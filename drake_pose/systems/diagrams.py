@@ -372,7 +372,14 @@ def _matcher(
 ) -> SilhouetteMatcher:
     """Return a SilhouetteMatcher if ``tracking`` is None, else a SilhouetteTracker.
 
-    ``color_cameras``: names of the cameras whose pictures the tracker uses.
+    The tracker's search has no time limit, so that results are repeatable.
+
+    Args:
+        search: finds poses without a prediction.
+        cameras: the cameras of the masks.
+        period: time between two updates [s].
+        tracking: the tracker's settings.
+        color_cameras: names of the cameras whose pictures the tracker uses.
     """
     if tracking is None:
         return SilhouetteMatcher(search, cameras, period)

@@ -224,8 +224,9 @@ def check_focal_length(
         most: maximum number of frames in a first, quick estimate.
 
     Returns:
-        the pose's covariance (6, 6), and a warning or none. With a warning, the covariance is that
-        with a fitted focal length, plus the difference between the poses with both focal lengths.
+        the covariance (6, 6) of the camera's pose, rotation vector [rad] then translation [m] along
+        the world's axes, and a warning or none. With a warning, it is that with a fitted
+        focal length, plus the outer product of the difference between the poses with itself.
 
     Raises:
         RegistrationError: the focal length is wrong, and with it the camera's distance.

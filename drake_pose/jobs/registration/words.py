@@ -21,9 +21,10 @@ def shift_unit(kind: str) -> tuple[str, float]:
 def describe_error(one: Finding, verb: str = "off") -> str:
     """Return in words what is wrong, by how much, with standard deviations, and alternatives.
 
-    one: of kind "joint", "camera", "base", "focal", "center", "clock" or "rate".
-    verb: "off" or "is off", before the amount of a camera, the base or a principal point; other
-        kinds have their own verbs.
+    Args:
+        one: of kind "joint", "camera", "base", "focal", "center", "clock" or "rate".
+        verb: "off" or "is off", before the amount of a camera, the base or a principal point; other
+            kinds have their own verbs.
     """
     if one.kind == "clock":
         word = "later" if one.shift > 0.0 else "earlier"

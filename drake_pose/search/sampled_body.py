@@ -180,8 +180,8 @@ class Scoring:
             regions: the uncovered part of the silhouette in each view.
 
         Returns:
-            (views, n) area of P_i outside S in each view, equation (4) [pixel]; and (n,) area of P_i
-            in the uncovered part of S, summed over the views, equations (5) and (7) [pixel].
+            (views, n) area of P_i outside S in each view, equation (4) [pixel]; and (n,) area of
+            P_i in the uncovered part of S, summed over the views, equations (5) and (7) [pixel].
         """
         outside, covered = [], np.zeros(len(X_WN))
         for view, (_, prefixes), X_CW in zip(self.views, regions, self.X_CW, strict=True):

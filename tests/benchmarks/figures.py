@@ -1,9 +1,9 @@
-"""Write the measured tables of tutorials/figures.md (``make figures``).
+"""Write the measured tables of tutorials/figures.md and tutorials/speed.md (``make figures``).
 
 Run as ``python -m tests.benchmarks.figures DATA [NAME ...]``; DATA is the folder of recorded
 scenes, NAME a section of ``SECTIONS`` (default: all, about an hour on two cores). Each section runs
 its commands, turns the tables that they print into Markdown, and replaces what stands between its
-two markers in the page. A command that fails leaves its section as it was.
+two markers in its page. A command that fails leaves its section as it was.
 """
 
 import argparse
@@ -17,7 +17,9 @@ from collections.abc import Iterator, Sequence
 from datetime import date
 from pathlib import Path
 
-PAGE = Path(__file__).parents[2] / "tutorials" / "figures.md"
+PAGES = tuple(
+    Path(__file__).parents[2] / "tutorials" / f"{name}.md" for name in ("figures", "speed")
+)
 
 SECTIONS: dict[str, tuple[str, ...]] = {
     "kameda": ("drake-pose reproduce kameda --method beam --seed 2026",),
@@ -51,7 +53,7 @@ SECTIONS: dict[str, tuple[str, ...]] = {
     "memory": ("python -m tests.benchmarks.memory",),
     "cluster": ("python -m tests.benchmarks.cluster",),
 }
-"""Commands by section of the page. ``DATA`` stands for the folder of recorded scenes."""
+"""Commands by section of the pages. ``DATA`` stands for the folder of recorded scenes."""
 
 
 def markers(name: str) -> tuple[str, str]:
@@ -139,14 +141,14 @@ def replaced(page: str, name: str, text: str) -> str:
     """
     begin, end = markers(name)
     if page.count(begin) != 1 or page.count(end) != 1:
-        raise ValueError(f"{PAGE.name}: lacks the markers of section '{name}'")
+        raise ValueError(f"the page lacks the markers of section '{name}'")
     head, tail = page.split(begin)[0], page.split(end)[1]
     return f"{head}{begin}\n\n{text}\n\n{end}{tail}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Write the sections that are asked for, each as soon as it is measured."""
-    parser = argparse.ArgumentParser(description="Write the tables of tutorials/figures.md.")
+    parser = argparse.ArgumentParser(description="Write the tables of figures.md and speed.md.")
     parser.add_argument("data", type=Path, help="folder of recorded scenes")
     parser.add_argument("names", nargs="*", help="sections; default: all")
     given = parser.parse_args(arguments)
@@ -159,7 +161,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         except (subprocess.CalledProcessError, ValueError) as error:
             print(f"{name}: left as it was: {error}", file=sys.stderr)
             continue
-        PAGE.write_text(replaced(PAGE.read_text(), name, text))
+        page = next(page for page in PAGES if markers(name)[0] in page.read_text())
+        page.write_text(replaced(page.read_text(), name, text))
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array, Picture
 from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending_indices
@@ -28,7 +29,7 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
 
     Args:
         path: folder of the data set.
-        joints: joint log to use instead of `observation.state`; None: that, if there is one.
+        joints: joint log to use instead of `observation.state` (or `state`); None: that, if any.
         episode: number of the episode; None: the only one that is present.
 
     Raises:
@@ -41,8 +42,8 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
         info = json.loads(read_regular(path / INFO))
         rows = _episode_rows(path, info, parquet)
         number, features = _choose_episode(path, info, rows, episode), info["features"]
-        states = [key for key in features if key == state or key.startswith(f"{state}.")]
-        states = [state] if state in states else states
+        states = [key for key in features if key.startswith(f"{state}.")]
+        states = [key for key in (state, "state") if key in features][:1] or states
         pictures = [key for key, one in features.items() if one["dtype"] in ("video", "image")]
         stored = [key for key in pictures if features[key]["dtype"] == "image"]
         file, wanted = _file(path, info, rows, number), ["timestamp", *states, *stored]
@@ -51,6 +52,12 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
         columns = {key: table[key].to_pylist() for key in wanted}
         times = np.array(columns["timestamp"], dtype=np.float64).ravel()
         kept, warnings = ascending_indices(times, f"{file}: episode {number}")
+        warnings += [
+            f"{path}: '{key}' is not used, as the data set has no intrinsics: give both in a "
+            "camera file (--cameras), or estimate the pose: drake-pose register"
+            for key in features
+            if "extrinsics" in key
+        ]
         if joints is None and states:
             values = [np.array(columns[key], dtype=np.float64) for key in states]
             positions = np.column_stack([one.reshape(len(times), -1) for one in values])
@@ -329,20 +336,66 @@ def _zed_cameras(
     sides = ("_left", "_right") if video.width > stereo * video.height else ("",)
     width, cameras = video.width // len(sides), []
     for k, side in enumerate(sides):
-        name, camera = f"{serial}{side}", None
+        name, camera, is_posed = f"{serial}{side}", None, False
         matrix = file.get(f"observation/camera_intrinsics/{serial}{side or '_left'}")
         if matrix is not None:
             fx, _, cx, _, fy, cy = np.ravel(matrix[()])[:6].tolist()
             camera = PinholeCamera(name, *calibrated, fx, fy, cx, cy, np.eye(4))
             camera = camera.resized(width, video.height)
+            rows = file.get(f"observation/camera_extrinsics/{serial}{side or '_left'}")
+            if rows is not None and (hand is None or np.any(hand[()])):
+                pose = recorded_pose(rows[()], name, warnings)
+                camera = camera if pose is None else camera.with_pose(pose)
+                is_posed = pose is not None
 
         def recorded(number: int, begin: int = k * width) -> Picture:
             picture = video.read(int(kept[number]))
             return np.ascontiguousarray(picture[:, begin : begin + width])
 
         size = width, video.height
-        cameras.append(EpisodeCamera(name, *size, times[kept], camera, None, recorded))
+        cameras.append(
+            EpisodeCamera(name, *size, times[kept], camera, None, recorded, is_posed=is_posed)
+        )
     return cameras
+
+
+def recorded_pose(
+    rows: Any, name: str, warnings: list[str], moved: float = 0.005, turned: float = 0.005
+) -> Array | None:
+    """Return the pose X_WC (4, 4) of a still camera, W being the robot's base, as DROID records it.
+
+    DROID's rows are the position [m], and the angles of rotations about the fixed axes x, y and z
+    in this order [rad]. The result is the rows' median.
+
+    Args:
+        rows: (n, 6) rows; an array of another shape, or with values that are not finite, is ignored
+            with a warning.
+        name: the camera's name, for messages.
+        warnings: list to which warnings are appended.
+        moved, turned: range of a row's positions [m] and angles [rad] above which a warning says
+            that the camera moved.
+    """
+    values = np.asarray(rows, dtype=np.float64)
+    values = values.reshape(-1, 6) if values.shape[-1:] == (6,) and values.size else values
+    if values.shape[1:] != (6,) or not np.isfinite(values).all():
+        warnings.append(
+            f"camera '{name}': its recorded extrinsics are not x, y, z, roll, pitch, yaw in each "
+            "row and are ignored; give X_WC in a camera file (--cameras)"
+        )
+        return None
+    # Angles near half a turn change their sign from row to row.
+    values = np.column_stack([values[:, :3], np.unwrap(values[:, 3:], axis=0)])
+    spread = np.ptp(values, axis=0)
+    if spread[:3].max() > moved or spread[3:].max() > turned:
+        warnings.append(
+            f"camera '{name}': its recorded extrinsics vary by {1e3 * spread[:3].max():.0f} mm and "
+            f"{np.degrees(spread[3:].max()):.1f} degrees; their median is used"
+        )
+    middle = np.median(values, axis=0)
+    X_WC = np.eye(4)
+    X_WC[:3, :3] = Rotation.from_euler("xyz", middle[3:]).as_matrix()
+    X_WC[:3, 3] = middle[:3]
+    return X_WC
 
 
 def _picture_times(file: Any, path: Path, serial: str, count: int, warnings: list[str]) -> Array:

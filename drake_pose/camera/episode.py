@@ -71,11 +71,12 @@ class EpisodeCamera:
         width, height: size of the images [pixel].
         times: (n,) ascending times of the images [s]; nan if unknown.
         camera: calibrated camera of the undistorted images; None: none was recorded. Its X_WC is
-            the pose in ``link``; without a link the pose is unknown.
+            the pose in ``link``; without a link it is unknown, unless ``is_posed``.
         link: link on which the camera is mounted, named as in the recording; None: unknown.
         read_recorded: returns image k (H, W, 3) as recorded, with distortion.
         frames: (n,) names of the images; empty: they have none.
         lens: lens that undistorts the images; None: they have no distortion.
+        is_posed: whether X_WC was recorded, as the pose in the robot's base.
     """
 
     name: str
@@ -87,6 +88,7 @@ class EpisodeCamera:
     read_recorded: Callable[[int], Picture]
     frames: tuple[str, ...] = ()
     lens: Lens | None = None
+    is_posed: bool = False
 
     def read(self, k: int) -> Picture:
         """Return image k (H, W, 3), red, green, blue, without distortion.

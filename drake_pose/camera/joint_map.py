@@ -146,7 +146,8 @@ def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str,
 
     Names match if they differ only in case, separators, a leading k or a final "joint"; then if one
     ends as the other one. If a log has numbered names that are not the model's, they are its joints
-    in order, provided the number of joints is the same.
+    in order, provided that there are as many, or as many with numbered names
+    that begin alike.
 
     Args:
         logged: names of the log's columns.
@@ -173,6 +174,10 @@ def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str,
         matched = {a: b for a, b in matched.items() if a not in series}
         guesses = {a: b for a, b in guesses.items() if a not in series}
         free = [name for name in wanted if name not in matched.values()]
+        if len(free) != len(series):
+            # The model's own numbered names, such as panda_joint1 to panda_joint7 beside a gripper.
+            free = [name for name in free if numbered.fullmatch(name)]
+            free = free if len({numbered.sub(r"\1", name) for name in free}) == 1 else []
         if len(free) == len(series):
             inorder = sorted(series, key=lambda name: int(_words(name)[-1]))
             guesses |= dict(zip(inorder, free, strict=True))

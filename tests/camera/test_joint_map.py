@@ -44,7 +44,10 @@ def map_log(logged, readings, model, **more):
         # Numbered names that start at another number are the model's joints in order.
         ("joint_0 joint_2 joint_1", "j1 j2 j3", [0, 2, 1]),
         ("joint_0 joint_1", "panda_joint1 panda_joint2", [0, 1]),
-        ("joint_0 joint_1", "panda_joint1 panda_joint2 finger", [None, None]),
+        # Beside joints without number, if the numbered ones are as many and begin alike.
+        ("joint_0 joint_1", "panda_joint1 panda_joint2 finger", [0, 1]),
+        ("joint_0 joint_1", "a1 a2 a3 finger", [None, None]),
+        ("joint_0 joint_1", "left_1 right_1 finger", [None, None]),
         ("m0 m1 finger", "a1 a2 finger", [0, 1, 2]),
     ],
 )

@@ -259,8 +259,8 @@ def cameras_of(
 
     Args:
         episode: the episode.
-        camera_path: camera file; None: the episode's cameras.yaml, without which no camera has a
-            pose.
+        camera_path: camera file; None: the episode's cameras.yaml. Without either, cameras have the
+            poses that were recorded with the episode.
         settings: names of the cameras; all if none are given.
 
     Raises:
@@ -274,7 +274,7 @@ def cameras_of(
     chosen = [one for one in episode.cameras.values() if one.name in wanted]
     file = camera_path or episode.path / CAMERA_FILE
     if camera_path is None and not file.is_file():
-        return PlacedCameras(chosen, frozenset())
+        return PlacedCameras(chosen, frozenset(one.name for one in chosen if one.is_posed))
     given = load_camera_file(file, distorted=True)
     chosen = [add_calibration(one, given, file) for one in chosen]
     return PlacedCameras(chosen, frozenset(given.cameras) - {*given.unplaced, *given.links})

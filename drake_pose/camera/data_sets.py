@@ -330,29 +330,31 @@ def _zed_cameras(
     times = _picture_times(file, path, serial, len(video.times), warnings)
     kept, late = ascending_indices(times, f"{path}: pictures")
     hand = file.get(f"observation/camera_type/{serial}")
-    if hand is not None and not np.any(hand[()]):
+    is_on_hand = hand is not None and not np.any(hand[()])
+    if is_on_hand:
         late.append(f"camera '{serial}' is on the hand (camera_type 0): it moves with the arm")
     warnings += [*video.warnings, *late]
     sides = ("_left", "_right") if video.width > stereo * video.height else ("",)
     width, cameras = video.width // len(sides), []
     for k, side in enumerate(sides):
-        name, camera, is_posed = f"{serial}{side}", None, False
-        matrix = file.get(f"observation/camera_intrinsics/{serial}{side or '_left'}")
+        name, camera, pose = f"{serial}{side}", None, None
+        # A video of one camera is that of the left one.
+        given = f"{serial}{side or '_left'}"
+        matrix = file.get(f"observation/camera_intrinsics/{given}")
         if matrix is not None:
             fx, _, cx, _, fy, cy = np.ravel(matrix[()])[:6].tolist()
-            camera = PinholeCamera(name, *calibrated, fx, fy, cx, cy, np.eye(4))
-            camera = camera.resized(width, video.height)
-            rows = file.get(f"observation/camera_extrinsics/{serial}{side or '_left'}")
-            if rows is not None and (hand is None or np.any(hand[()])):
+            rows = file.get(f"observation/camera_extrinsics/{given}")
+            if rows is not None and not is_on_hand:
                 pose = recorded_pose(rows[()], name, warnings)
-                camera = camera if pose is None else camera.with_pose(pose)
-                is_posed = pose is not None
+            X_WC = np.eye(4) if pose is None else pose
+            camera = PinholeCamera(name, *calibrated, fx, fy, cx, cy, X_WC)
+            camera = camera.resized(width, video.height)
 
         def recorded(number: int, begin: int = k * width) -> Picture:
             picture = video.read(int(kept[number]))
             return np.ascontiguousarray(picture[:, begin : begin + width])
 
-        size = width, video.height
+        size, is_posed = (width, video.height), pose is not None
         cameras.append(
             EpisodeCamera(name, *size, times[kept], camera, None, recorded, is_posed=is_posed)
         )

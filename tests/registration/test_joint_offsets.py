@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,10 +11,15 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.jobs.registration.diagnosis import likely_offset_warnings
-from drake_pose.registration.joint_offsets import calibrate_joints
+from drake_pose.registration.joint_offsets import (
+    calibrate_joints,
+    shrink_constants,
+    shrink_widened,
+    widen_with_cameras,
+)
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import CameraSearch, RegisteredCamera
-from drake_pose.registration.shared_fit import SHARED, SharedFit
+from drake_pose.registration.shared_fit import SHARED, SharedFit, SharedValues
 from tests.registration.arm_pictures import errors, looking_at, see
 
 MIDDLE = np.array([0.0, 0.0, 0.4])
@@ -132,3 +138,60 @@ def test_a_missing_offset_is_suspected_from_common_residuals(
     word = "low" if degrees > 0.0 else "high"
     assert re.search(rf"'elbow_turn' reads [23]\.\d+ \+- \d\.\d+ degrees too {word};", text)
     assert "--zeros all" in text
+
+
+@pytest.mark.parametrize(
+    ("size", "least", "most"), [(0.0, 0.0, 0.3), (0.01, 0.3, 0.8), (0.15, 0.9, 1.05)]
+)
+def test_shrinkage_reduces_the_mean_squared_error(size: float, least: float, most: float) -> None:
+    """Monte Carlo, against the unshrunk errors of six offsets and of a pose."""
+    rng, names = np.random.default_rng(2), tuple("abcdef")
+    kinematics = SimpleNamespace(names=names, is_angle=np.ones(6, bool))
+    fit = SimpleNamespace(names=("pose", *names), views=[SimpleNamespace(kinematics=kinematics)])
+    # The pose absorbs the error of the first offset.
+    A = np.diag([0.002, *([0.01] * 6)])
+    A[0, 1] = -0.02
+    errors = []
+    for _ in range(200):
+        true = np.append(0.0, size * rng.normal(size=6))
+        seen = true + A @ rng.normal(size=7)
+        drawn = shrink_constants(fit, SharedValues(seen, np.zeros(0)), A @ A.T, names)
+        errors.append([np.square(drawn - true), np.square(seen - true)])
+    after, before = np.mean(errors, axis=0)
+    for ratio in (after[0] / before[0], after[1:].sum() / before[1:].sum()):
+        assert least <= ratio < most
+
+
+def test_constants_that_are_less_certain_than_the_fit_says_shrink_further() -> None:
+    """Monte Carlo: errors of a first offset are 4 times as large as the fit's covariance says."""
+    rng, names = np.random.default_rng(5), ("first", *"bcdef")
+    kinematics = SimpleNamespace(names=names, is_angle=np.ones(6, bool))
+    views = [SimpleNamespace(kinematics=kinematics)]
+    fit = SimpleNamespace(names=("eye.turn_y", *names), constants=names, views=views)
+    A = np.diag([0.0005, 0.01, *([0.001] * 5)])
+    A[0, 1] = -0.01
+    actual = A.copy()
+    actual[:, 1] *= 4.0
+    errors: dict[float, list[float]] = {1.0: [], 4.0: []}
+    for _ in range(200):
+        true = np.append(0.0, 0.01 * rng.normal(size=6))
+        seen = SharedValues(true + actual @ rng.normal(size=7), np.zeros(0))
+        for factor, squares in errors.items():
+            found, C, _ = shrink_widened(fit, seen, A @ A.T, names, factor)
+            squares.append((found.shared[0] - true[0]) ** 2)
+            np.testing.assert_allclose(C[1, 1], (0.01 * factor) ** 2)
+    assert np.mean(errors[4.0]) < 0.4 * np.mean(errors[1.0])
+
+
+def test_still_factor_enlarges_constants_correlated_with_a_camera() -> None:
+    """The variances of the constant and of the camera grow by the factor's square."""
+    fit = SimpleNamespace(names=("eye.turn_y", "base", "elbow"), constants=("base", "elbow"))
+    A = np.array([[1.0, 0.1, 0.0], [1.0, 0.0, 0.0], [0.2, 0.0, 1.0]])
+    covariance = A @ A.T
+    same, none = widen_with_cameras(fit, covariance, 1.0)
+    np.testing.assert_array_equal(same, covariance)
+    wider, gauges = widen_with_cameras(fit, covariance, 2.5)
+    assert (none, gauges) == ({}, {"base": ("eye.turn_y",)})
+    np.testing.assert_allclose(wider[1, 1], 2.5**2 * covariance[1, 1])
+    np.testing.assert_allclose(wider[0, 0] - covariance[0, 0], 2.5**2 - 1.0)
+    np.linalg.cholesky(wider)

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from drake_pose.body import ArticulatedModel, load_model
-from drake_pose.registration.picture_registration import Recording
+from drake_pose.registration.recording import Recording
 from drake_pose.registration.register import RegistrationBody
 from tests.registration.episodes import LATE, PaintedEpisode, painted_episode
 from tests.search.arms import arm_urdf

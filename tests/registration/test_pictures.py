@@ -11,15 +11,13 @@ from scipy.spatial.transform import Rotation
 from drake_pose.errors import RegistrationError
 from drake_pose.fit.background import Explained
 from drake_pose.fit.problem import TIME_OFFSET
-from drake_pose.registration.picture_registration import (
+from drake_pose.registration.picture_acceptance import (
     PictureRegistration,
     PictureStart,
-    Recording,
-    TimeOffset,
-    choose_pictures,
     evaluate_pictures,
+)
+from drake_pose.registration.picture_registration import (
     fit_pictures,
-    posed_pictures,
     register_pictures,
     scan_time_offsets,
 )
@@ -32,6 +30,7 @@ from drake_pose.registration.picture_search import (
     node_places,
     upright_rotations,
 )
+from drake_pose.registration.recording import Recording, TimeOffset, choose_pictures, posed_pictures
 from drake_pose.registration.standing_object import require_detections
 from tests.benchmarks.registration import pose_error
 from tests.registration.arm_pictures import errors

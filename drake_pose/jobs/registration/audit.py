@@ -44,13 +44,12 @@ from drake_pose.jobs.registration.words import (
 )
 from drake_pose.registration.diagnosis import DIAGNOSIS
 from drake_pose.registration.findings import Diagnosis, Finding
-from drake_pose.registration.picture_registration import (
+from drake_pose.registration.picture_acceptance import (
     PictureRegistration,
     PictureStart,
     evaluate_pictures,
-    fit_pictures,
-    register_pictures,
 )
+from drake_pose.registration.picture_registration import fit_pictures, register_pictures
 from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges

@@ -19,13 +19,14 @@ from drake_pose.registration.diagnosis import DIAGNOSIS
 from drake_pose.registration.findings import Finding
 from drake_pose.registration.joint_offsets import JointCalibration, calibrate_joints
 from drake_pose.registration.online_registration import pose_difference, squared_distance
-from drake_pose.registration.picture_registration import PictureRegistration, Recording
+from drake_pose.registration.picture_acceptance import PictureRegistration
 from drake_pose.registration.posed_frames import (
     MultiViewFrame,
     PosedFrame,
     PosedFrames,
     placed_points,
 )
+from drake_pose.registration.recording import Recording
 from drake_pose.registration.register import (
     LAST_SPACING,
     SEARCH,

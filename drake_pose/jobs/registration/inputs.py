@@ -41,8 +41,8 @@ from drake_pose.registration.joint_offsets import (
     require_parameters,
     scalable_links,
 )
-from drake_pose.registration.picture_registration import Recording
 from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrame
+from drake_pose.registration.recording import Recording
 from drake_pose.registration.standing_object import (
     CalibrationTarget,
     fixed_link_error,

@@ -50,14 +50,10 @@ from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.person.shape import shape_parts, shape_values
 from drake_pose.registration.bundle import adjust_bundle
 from drake_pose.registration.joint_offsets import KinematicParameter, calibrate_joints
-from drake_pose.registration.picture_registration import (
-    PictureRegistration,
-    choose_pictures,
-    evaluate_pictures,
-    posed_pictures,
-    register_pictures,
-)
+from drake_pose.registration.picture_acceptance import PictureRegistration, evaluate_pictures
+from drake_pose.registration.picture_registration import register_pictures
 from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrames
+from drake_pose.registration.recording import choose_pictures, posed_pictures
 from drake_pose.registration.register import (
     CameraSearch,
     E_total,

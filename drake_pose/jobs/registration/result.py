@@ -29,7 +29,7 @@ from drake_pose.jobs.registration.inputs import RegistrationInputs
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.jobs.registration.words import describe_drift, describe_reading
 from drake_pose.registration.joint_offsets import JointCalibration, KinematicParameter
-from drake_pose.registration.picture_registration import PictureRegistration
+from drake_pose.registration.picture_acceptance import PictureRegistration
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import RegisteredCamera, TargetPose
 from drake_pose.silhouette.outline import outline_from_mesh

@@ -10,7 +10,7 @@ from drake_pose.jobs.registration.result import (
     make_registration_report,
     plot_offset,
 )
-from drake_pose.registration.picture_registration import TimeOffset
+from drake_pose.registration.recording import TimeOffset
 from tests.search.arms import arm_cameras
 
 

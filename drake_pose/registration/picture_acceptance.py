@@ -1,0 +1,226 @@
+"""Accept a camera that was fitted to pictures, and evaluate all its pictures."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from drake_pose.arrays import Array, Picture
+from drake_pose.camera.models import PinholeCamera
+from drake_pose.errors import RegistrationError
+from drake_pose.fit.background import estimate_gain
+from drake_pose.fit.problem import TIME_OFFSET
+from drake_pose.fit.surfaces import simplify_or_hull
+from drake_pose.registration.picture_search import (
+    PICTURES,
+    PictureFit,
+    PosedPicture,
+    evidence,
+    segment_picture,
+)
+from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
+from drake_pose.registration.recording import NO_CLOCK, Recording, TimeOffset, posed_pictures
+from drake_pose.registration.register import (
+    FrameMisfit,
+    RegisteredCamera,
+    RegistrationBody,
+    frame_misfits,
+)
+from drake_pose.registration.shared_fit import SharedFit, inlier_threshold
+from drake_pose.silhouette.scoring import draw_mask
+from drake_pose.workers import map_ordered
+
+
+@dataclass(frozen=True, eq=False)
+class PictureRegistration:
+    """A camera registered from its pictures.
+
+    Args:
+        found: the camera.
+        frames: its frames, with masks and foreground log-odds, at the logged joint values.
+        pictures: the pictures of these frames, by name.
+        fit: the final fit.
+        time_offset: of the camera's clock; None: the log has no times.
+        focal_deviation: relative standard deviation of the focal length; 0: it was not fitted.
+        recording: the recording, with the drift of its clock removed.
+        joint_offsets: (m,) added to the frames' values for their masks and log-odds.
+    """
+
+    found: RegisteredCamera
+    frames: tuple[PosedFrame, ...]
+    pictures: dict[str, Picture]
+    fit: PictureFit
+    time_offset: TimeOffset | None
+    focal_deviation: float
+    recording: Recording
+    joint_offsets: Array
+
+
+class PictureStart(NamedTuple):
+    """Result of a search.
+
+    camera: at its approximate pose. rows: indices of the recording's pictures to fit. clock: the
+    time offset. alternatives: other poses X_CW (4, 4) that explain the pictures about as well.
+    """
+
+    camera: PinholeCamera
+    rows: Sequence[int]
+    clock: TimeOffset
+    alternatives: Sequence[Array]
+
+    @classmethod
+    def of(cls, one: PictureRegistration) -> "PictureStart":
+        """Return a start from an earlier registration."""
+        rows = [one.recording.names.index(frame.name) for frame in one.frames]
+        others = [np.linalg.inv(X) for X in one.found.alternatives]
+        return cls(one.found.camera, rows, one.time_offset or NO_CLOCK, others)
+
+
+def accept_fit(
+    best: PictureFit,
+    recording: Recording,
+    start: PictureStart,
+    joint_offsets: Array,
+    focal: bool,
+    *,
+    min_explained: float = 0.12,
+    min_ratio: float = 0.42,
+    min_contour: float = 0.16,
+    min_evidence: float = 1.05,
+    max_sd: float = 0.04,
+    max_clock_sd: float = 0.1,
+) -> PictureRegistration:
+    """Return the registration of a fit, if it explains the pictures.
+
+    The first four arguments are what `_fit_until_stable` returns.
+
+    Args:
+        min_explained: minimum explained fraction; correct poses have 0.2 or more, a wrong one that
+            few frames supported 0.09.
+        min_ratio: minimum mean inlier ratio; correct poses have 0.5 or more, the best wrong ones
+            0.3, one with a fitted focal length 0.6.
+        min_contour: minimum strength of edges along contours beyond chance; correct poses have 0.17
+            or more, the best wrong ones 0.13, one with a fitted focal length 0.17.
+        min_evidence: minimum of both together; correct poses have 1.2 or more, wrong ones 0.9.
+        max_sd: maximum standard deviation of the pose [distance from the body; rad]. Correct poses
+            have 0.01; mirrored pictures fit a pose from behind, with 0.05.
+        max_clock_sd: a time offset with a larger standard deviation is not determined [s].
+
+    Raises RegistrationError: a criterion is not met.
+    """
+    fit, (posed,) = best.fit, best.fit.views
+    ratio = float(best.ratios[best.inliers].mean())
+    score = evidence(best.explained, best.contour)
+    least = (min_explained, min_ratio, min_contour, min_evidence)
+    if (np.array([best.explained, ratio, best.contour, score]) < least).any():
+        raise unexplained_error(
+            start.camera,
+            f"the best one explains {max(best.explained, 0.0):.0%} of all changes (minimum "
+            f"{min_explained:.0%}), {ratio:.0%} of the contours fit (minimum {min_ratio:.0%}), and "
+            f"edges along them are stronger than elsewhere by {best.contour:.2f} (minimum "
+            f"{min_contour}); the first plus {PICTURES.contour_weight:g} times the last is "
+            f"{score:.2f} (minimum {min_evidence})",
+        )
+    deviations = np.sqrt(np.diag(best.covariance))
+    pose = fit.camera_covariances(best.found, best.covariance)[0]
+    found = RegisteredCamera(
+        best.camera, pose, frame_misfits(posed, best.camera.X_CW, best.ratios, best.inliers),
+        np.array([np.linalg.inv(X) for X in start.alternatives]).reshape(-1, 4, 4),
+    )  # fmt: skip
+    distance = float(np.linalg.norm(best.camera.X_WC[:3, 3] - posed.middle))
+    if found.translation_sd > max_sd * distance or found.rotation_sd > max_sd:
+        raise unexplained_error(
+            start.camera,
+            f"the best, {distance:.1f} m away, has a standard deviation of "
+            f"{1e3 * found.translation_sd:.0f} mm and {np.degrees(found.rotation_sd):.1f} degrees",
+        )
+    clock = None
+    if TIME_OFFSET in fit.names:
+        deviation = float(deviations[fit.names.index(TIME_OFFSET)])
+        clock = replace(start.clock, deviation=deviation if deviation < max_clock_sd else np.inf)
+    return PictureRegistration(
+        found,
+        tuple(replace(frame, values=frame.values - joint_offsets) for frame in posed.frames),
+        {one.name: recording.picture(one.name) for one in posed.frames},
+        best,
+        clock,
+        float(deviations[fit.per_camera - 1]) if focal else 0.0,
+        recording,
+        joint_offsets,
+    )
+
+
+def unexplained_error(camera: PinholeCamera, why: str) -> RegistrationError:
+    """Return the error for pictures that no pose explains; why: words in its message."""
+    return RegistrationError(
+        f"camera '{camera.name}': no pose explains its pictures: {why}. Does the camera stand "
+        "still, does the robot move much in its view, are the joint positions those at the "
+        "pictures' times (no picture dropped or repeated), in the model's zeros and signs, and is "
+        "the focal length about right? Nothing was written"
+    )
+
+
+def evaluate_pictures(
+    body: RegistrationBody,
+    one: PictureRegistration,
+    found: RegisteredCamera,
+    *,
+    most: int = 300,
+    at_once: int = 20,
+    shown: float = 0.01,
+    min_overlap: float = 0.9,
+) -> tuple[tuple[PosedFrame, ...], tuple[FrameMisfit, ...], tuple[str, ...]]:
+    """Evaluate all pictures of a recording with a registered camera.
+
+    Args:
+        body: the robot's surfaces.
+        one: the registration from some of them.
+        found: the camera at its final pose.
+        most, at_once: maximum number of pictures, evenly spaced, and of those in memory together.
+        shown: minimum fraction of the picture that the body covers; other pictures are skipped.
+        min_overlap: a frame is an inlier, too, if its intersection over union is at least this
+            fraction of the fit's median: dark and blurred contours fit badly even in correct poses.
+
+    Returns:
+        the frames that show the body, with masks and logged values; the misfit of each; and the
+        names of frames in which the body is not visible although it covers enough of the picture.
+    """
+    count = len(one.recording.names)
+    rows = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
+    overlaps = [frame.iou for frame in one.found.frames if frame.is_inlier]
+    min_iou = min_overlap * float(np.median(overlaps))
+    least = inlier_threshold(one.fit.ratios)
+    known, camera = one.fit.background, found.camera
+    outlines = simplify_or_hull(body.coarse, PICTURES.triangles[-1])
+    offset = 0.0 if one.time_offset is None else one.time_offset.value
+
+    def segment(posed: PosedPicture) -> tuple[str, PosedFrame | None] | None:
+        covered = draw_mask(outlines, camera.X_CW @ body.kinematics.poses(posed.values), camera)
+        if covered.mean() < shown:
+            return None
+        gain = estimate_gain(posed.picture, known.colours)
+        return posed.name, segment_picture(posed, known, gain, covered)
+
+    frames, misfits, lost = list[PosedFrame](), list[FrameMisfit](), list[str]()
+    for k in range(0, len(rows), at_once):
+        pictures = posed_pictures(
+            one.recording.with_offsets(one.joint_offsets), rows[k : k + at_once], offset
+        )
+        named = [each for each in map_ordered(segment, pictures) if each is not None]
+        lost += [name for name, frame in named if frame is None]
+        posed_frames = [frame for _, frame in named if frame is not None]
+        if posed_frames:
+            full = PosedFrames(body.kinematics, body.full, camera, posed_frames)
+            fit = SharedFit([full], [camera.X_CW], fit_biases=False)
+            ratios = fit.inlier_ratios(fit.start)
+            misfits += [
+                replace(each, is_inlier=each.is_inlier or each.iou >= min_iou)
+                for each in frame_misfits(full, camera.X_CW, ratios, ratios >= least)
+            ]
+            # Log-odds are dropped to save memory.
+            frames += [
+                replace(frame, values=frame.values - one.joint_offsets, foreground=None, rates=None)
+                for frame in posed_frames
+            ]
+    return tuple(frames), tuple(misfits), tuple(lost)

@@ -1,0 +1,161 @@
+"""A recording of one camera: pictures with a joint log, its clock, and the frames of a search."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drake_pose.arrays import Array, Picture
+from drake_pose.camera.models import PinholeCamera
+from drake_pose.errors import RegistrationError
+from drake_pose.registration.picture_search import (
+    PICTURES,
+    PosedPicture,
+    choose_frames,
+    node_places,
+)
+from drake_pose.registration.register import RegistrationBody
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Pictures of one camera, and a joint log.
+
+    Args:
+        names: names of the n pictures.
+        values_at: returns the pose tree's values (n, m) at the pictures' times plus an offset [s],
+            one for all pictures or (n,); NaN for times without a log.
+        read: returns picture k (H, W, 3).
+        times: (n,) times of the pictures [s]; None: the log has no times, and the values do not
+            depend on the offset.
+    """
+
+    names: tuple[str, ...]
+    values_at: Callable[[float | Array], Array]
+    read: Callable[[int], Picture]
+    times: Array | None
+
+    def rates_at(self, offset: float) -> Array | None:
+        """Return the values' velocities (n, m) [rad/s or m/s] at an offset [s]; None: unknown."""
+        if self.times is None:
+            return None
+        step = PICTURES.rate_step
+        ahead, behind = (self.values_at(offset + by) for by in (step, -step))
+        return np.asarray(np.nan_to_num((ahead - behind) / (2.0 * step)))
+
+    def picture(self, name: str) -> Picture:
+        """Return a picture (H, W, 3) by its name."""
+        return self.read(self.names.index(name))
+
+    def mirrored(self) -> "Recording":
+        """Return the same recording with all pictures mirrored left to right."""
+        return replace(self, read=lambda k: np.ascontiguousarray(self.read(k)[:, ::-1]))
+
+    def with_offsets(self, joint_offsets: Array) -> "Recording":
+        """Return the same recording with offsets (m,) [rad or m] added to all values."""
+        return replace(self, values_at=lambda offset: self.values_at(offset) + joint_offsets)
+
+    def with_drift(self, drift: float, since: float) -> "Recording":
+        """Return the recording with a log clock faster by a drift [s/s], right at `since` [s]."""
+        if not drift or self.times is None:
+            return self
+        later = drift * (self.times - since)
+        return replace(self, values_at=lambda offset: self.values_at(offset + later))
+
+
+@dataclass(frozen=True, eq=False)
+class TimeOffset:
+    """Time offset of a camera: how much later than the pictures' times their joints are logged.
+
+    Args:
+        value, deviation: the offset at the frames' mean time, and its standard deviation [s];
+            infinite if the pictures do not determine it.
+        scores: (k, 2) scanned offsets [s], and their scores over the best one's.
+        drift, drift_deviation: growth of the offset and its standard deviation [s/s]; the drift is
+            0 where it is not significant, and its deviation infinite where it was not fitted.
+    """
+
+    value: float
+    deviation: float
+    scores: Array
+    drift: float = 0.0
+    drift_deviation: float = np.inf
+
+    @property
+    def determined(self) -> bool:
+        """Whether the pictures determine it."""
+        return bool(np.isfinite(self.deviation))
+
+
+NO_CLOCK = TimeOffset(0.0, np.inf, np.zeros((0, 2)))
+"""The offset of pictures without information about it."""
+
+
+def mean_time(recording: Recording, rows: Sequence[int]) -> float:
+    """Return the mean time [s] of the pictures with indices `rows`; 0 if the log has no times."""
+    return 0.0 if recording.times is None else float(recording.times[list(rows)].mean())
+
+
+def choose_pictures(
+    body: RegistrationBody,
+    camera: PinholeCamera,
+    recording: Recording,
+    count: int = PICTURES.search_frames,
+    *,
+    moving: int = 8,
+    slow_fraction: float = 0.6,
+    min_motion: float = 0.05,
+) -> tuple[list[int], list[int]]:
+    """Choose the frames of a search, and the fastest others.
+
+    Args:
+        count, moving: maximum number of search frames, and of fast frames.
+        slow_fraction: search frames are among the slower ones, up to this quantile of the speed.
+        min_motion: minimum motion of any part [m].
+
+    Returns:
+        the indices of both, most dissimilar frames first; no fast ones without velocities.
+
+    Raises RegistrationError: too few pictures have joint positions, or the robot does not move.
+    """
+    values = recording.values_at(0.0)
+    known = np.flatnonzero(np.isfinite(values).all(axis=1))
+    if len(known) < 3:
+        raise RegistrationError(
+            f"camera '{camera.name}': {len(known)} of its {len(values)} pictures have joint "
+            "positions at their times; three or more with different poses are needed: do pictures "
+            "and joints belong to one episode and one clock?"
+        )
+    places = node_places(body, values[known])
+    spread = float(np.linalg.norm(np.ptp(places, axis=0), axis=1).max())
+    if spread < min_motion:
+        raise RegistrationError(
+            f"camera '{camera.name}': the robot hardly moves, by {1e3 * spread:.0f} mm at most, so "
+            "pictures do not separate it from the background; give an episode in which it moves"
+        )
+    rates = recording.rates_at(0.0)
+    if rates is None:
+        return known[choose_frames(places, count)].tolist(), []
+    ahead = node_places(body, values[known] + PICTURES.rate_step * rates[known])
+    speed = np.linalg.norm(ahead - places, axis=2).mean(axis=1)
+    slow = np.flatnonzero(speed <= np.quantile(speed, slow_fraction))
+    if len(slow) < count:
+        slow = np.arange(len(known))
+    chosen = slow[choose_frames(places[slow], count)]
+    rest = np.setdiff1d(np.argsort(-speed)[: max(moving, len(known) // 4)], chosen)
+    fast = rest[choose_frames(places[rest], moving)] if len(rest) else rest
+    return known[chosen].tolist(), known[fast].tolist()
+
+
+def posed_pictures(
+    recording: Recording, indices: Sequence[int], offset: float
+) -> list[PosedPicture]:
+    """Return pictures, by their indices, that have logged values at a time offset [s]."""
+    values, rates = recording.values_at(offset), recording.rates_at(offset)
+    return [
+        PosedPicture(
+            recording.names[k], values[k], recording.read(k), None if rates is None else rates[k]
+        )
+        for k in indices
+        if np.isfinite(values[k]).all()
+    ]

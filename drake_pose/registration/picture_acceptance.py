@@ -13,13 +13,12 @@ from drake_pose.fit.background import estimate_gain
 from drake_pose.fit.problem import TIME_OFFSET
 from drake_pose.fit.surfaces import simplify_or_hull
 from drake_pose.registration.picture_search import (
-    PICTURES,
     PictureFit,
     PosedPicture,
-    evidence,
     segment_picture,
 )
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
+from drake_pose.registration.pyramid_level import PICTURES, evidence
 from drake_pose.registration.recording import NO_CLOCK, Recording, TimeOffset, posed_pictures
 from drake_pose.registration.register import (
     FrameMisfit,

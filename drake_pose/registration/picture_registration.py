@@ -27,8 +27,8 @@ from drake_pose.registration.picture_acceptance import (
 from drake_pose.registration.picture_search import (
     PictureFit,
     PictureSearch,
-    evidence,
 )
+from drake_pose.registration.pyramid_level import evidence
 from drake_pose.registration.recording import (
     NO_CLOCK,
     Recording,

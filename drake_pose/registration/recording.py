@@ -9,11 +9,11 @@ from drake_pose.arrays import Array, Picture
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.registration.picture_search import (
-    PICTURES,
     PosedPicture,
     choose_frames,
     node_places,
 )
+from drake_pose.registration.pyramid_level import PICTURES
 from drake_pose.registration.register import RegistrationBody
 
 

@@ -29,8 +29,9 @@ from drake_pose.errors import RegistrationError, SettingsError
 from drake_pose.fit.background import KnownBackground
 from drake_pose.fit.surfaces import FEW, simplify_surfaces, surface_distance
 from drake_pose.registration.hand_eye import hand_eye_starts, rotation_spread
-from drake_pose.registration.picture_search import PICTURES, PosedPicture, segment_picture
+from drake_pose.registration.picture_search import PosedPicture, segment_picture
 from drake_pose.registration.posed_frames import LAST_SPACING, PosedFrame, PosedFrames
+from drake_pose.registration.pyramid_level import PICTURES
 from drake_pose.registration.register import (
     SEARCH,
     CameraSearch,

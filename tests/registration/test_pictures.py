@@ -24,12 +24,10 @@ from drake_pose.registration.picture_registration import (
 from drake_pose.registration.picture_search import (
     PictureSearch,
     PosedPicture,
-    PyramidLevel,
     choose_frames,
-    evidence,
     node_places,
-    upright_rotations,
 )
+from drake_pose.registration.pyramid_level import PyramidLevel, evidence, upright_rotations
 from drake_pose.registration.recording import Recording, TimeOffset, choose_pictures, posed_pictures
 from drake_pose.registration.standing_object import require_detections
 from tests.benchmarks.registration import pose_error

@@ -12,8 +12,9 @@ import numpy as np
 from drake_pose.arrays import Picture
 from drake_pose.camera.bags import BAGS, open_bag
 from drake_pose.camera.camera_files import CameraFile, load_camera_file
-from drake_pose.camera.data_sets import INFO, TRAJECTORY, open_droid, open_lerobot
+from drake_pose.camera.droid import TRAJECTORY, open_droid
 from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending_indices
+from drake_pose.camera.lerobot import INFO, open_lerobot
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.camera.picture_files import (
     VIDEOS,

@@ -36,6 +36,7 @@ from drake_pose.registration.register import (
     RegistrationBody,
     TargetPose,
     evenly_spaced,
+    frame_misfits,
     overlap_areas,
 )
 from drake_pose.registration.shared_fit import SHARED, SharedFit
@@ -212,7 +213,7 @@ def check_focal_length(
     off_by_sds: float = 4.0,
     wrong_by: float = 0.06,
     most: int = 60,
-) -> tuple[Array, list[str]]:
+) -> tuple[RegisteredCamera, float, list[str]]:
     """Compare a camera's focal length with that estimated from its masks.
 
     Args:
@@ -221,42 +222,47 @@ def check_focal_length(
         frames: its frames, of which the inliers are used.
         off_by, off_by_sds: minimum difference of the logarithms, absolute and in standard
             deviations. Published focal lengths of recorded arms differ by 2 % at most.
-        wrong_by: a larger difference is an error.
+        wrong_by: with a larger difference the camera gets the estimated focal length.
         most: maximum number of frames in a first, quick estimate.
 
     Returns:
-        the covariance (6, 6) of the camera's pose, rotation vector [rad] then translation [m] along
-        the world's axes, and a warning or none. With a warning, it is that with a fitted
-        focal length, plus the outer product of the difference between the poses with itself.
-
-    Raises:
-        RegistrationError: the focal length is wrong, and with it the camera's distance.
+        the camera; the relative standard deviation of its focal length if that is an estimate, and
+        0 if it is as given; and a warning or none. If the focal lengths differ by no more than
+        `wrong_by`, the camera stays, and the outer product of the difference between the poses with
+        itself is added to the covariance of a pose with a fitted focal length.
     """
     given = found.camera
     counted = [frame for frame, fit in zip(frames, found.frames, strict=True) if fit.is_inlier]
     some = evenly_spaced(counted, most)
     if len(some) < 2:
-        return found.covariance, []
+        return found, 0.0, []
     posed = PosedFrames(body.kinematics, body.full, given, some)
     fit = SharedFit([posed], [given.X_CW], camera_unknowns=len(POSE_NAMES) + 1)
     camera = fit.cameras(fit.fit((*SEARCH.fine, *SEARCH.last)))[0]
     if abs(math.log(camera.focal_x / given.focal_x)) < 0.6 * off_by:
-        return found.covariance, []
+        return found, 0.0, []
     fitted = calibrate_joints(body, [found], [counted], (), focal=True)
     camera, deviation = fitted.cameras[0], float(fitted.focal_deviations[0])
     off = math.log(camera.focal_x / given.focal_x)
     if abs(off) < max(off_by, off_by_sds * deviation):
-        return found.covariance, []
+        return found, 0.0, []
     text = (
-        f"camera '{given.name}': its pictures tell a focal length of {camera.focal_x:.0f} pixels "
-        f"(standard deviation {deviation * camera.focal_x:.0f}), but {given.focal_x:.0f} is given; "
-        "is it that of this camera, and of pictures of this size? A wrong focal length gives a "
-        "wrong distance; calibrate it"
+        f"camera '{given.name}': its pictures determine a focal length of {camera.focal_x:.0f} "
+        f"pixels (standard deviation {deviation * camera.focal_x:.0f}), but {given.focal_x:.0f} is "
+        "given; is it that of this camera, and of pictures of this size?"
     )
-    if abs(off) > wrong_by:
-        raise RegistrationError(f"{text}. Nothing was written")
-    by = pose_difference(camera.X_WC, given.X_WC)
-    return fitted.covariances[0] + np.outer(by, by), [text]
+    if abs(off) <= wrong_by:
+        by = pose_difference(camera.X_WC, given.X_WC)
+        covariance = fitted.covariances[0] + np.outer(by, by)
+        text += " A wrong focal length gives a wrong distance; calibrate it"
+        return replace(found, covariance=covariance), 0.0, [text]
+    posed = PosedFrames(body.kinematics, body.full, camera, frames)
+    fit = SharedFit([posed], [camera.X_CW])
+    ratios = fit.inlier_ratios(fit.start)
+    misfits = frame_misfits(posed, camera.X_CW, ratios, fit.inliers(ratios))
+    text += " The camera was written with the focal length that was found"
+    checked = replace(found, camera=camera, covariance=fitted.covariances[0], frames=misfits)
+    return checked, deviation, [text]
 
 
 def compare_camera(

@@ -137,6 +137,7 @@ def register_scene(
         if work.inputs.positions.is_estimate:
             work.refit_poses()
         urdf = work.fit_constants(folder) if work.has_constants else None
+        work.check_focal_lengths()
         work.evaluate()
         described = work.describe((time.perf_counter() - start) / len(work.registered))
     placed = {
@@ -320,14 +321,41 @@ class _Registration:
             require_detections(name, inlier_count, len(self.target_pictures[name]))
             self.seconds[name] += seconds / len(self.registered)
 
+    def check_focal_lengths(self) -> None:
+        """Compare given focal lengths and joint zeros with the masks, and warn of errors.
+
+        A camera whose focal length is clearly wrong gets the estimated one, and its pose.
+        """
+        inputs, body = self.inputs, self.body.with_tree(self.inputs.tree)
+        if inputs.positions.is_estimate:
+            return
+        for name, found in self.registered.items():
+            picture, own = self.pictures.get(name), inputs.of(name)
+            fitted = found
+            if picture is not None:
+                fitted = replace(found, frames=picture.found.frames)
+                own = [replace(k, values=k.values + self._joint_offsets) for k in picture.frames]
+            if not self._settings.zeros:
+                self.warnings += likely_offset_warnings(body, fitted, own)
+            if self._settings.focal or (picture is not None and picture.focal_deviation):
+                continue
+            checked, deviation, texts = check_focal_length(body, fitted, own)
+            self.warnings += texts
+            self.registered[name] = replace(
+                found, camera=checked.camera, covariance=checked.covariance,
+                frames=checked.frames if deviation else found.frames,
+            )  # fmt: skip
+            if picture is not None and deviation:
+                own_found = replace(picture.found, camera=checked.camera)
+                self.pictures[name] = replace(picture, found=own_found, focal_deviation=deviation)
+
     def evaluate(self, shown: int = 20) -> None:
         """Evaluate all frames with the final cameras, and warn of what looks wrong.
 
         shown: maximum number of outlier pictures of each camera that are kept.
 
-        Raises RegistrationError: a focal length is wrong, and with it the camera's distance; the
-            frames do not determine a camera's pose on its link; or half of a camera's masks or more
-            are outliers.
+        Raises RegistrationError: the frames do not determine a camera's pose on its link, or half
+            of a camera's masks or more are outliers.
         """
         inputs, body, frames = self.inputs, self.body.with_tree(self.inputs.tree), []
         # All pictures of cameras that were registered from some of them.
@@ -353,18 +381,6 @@ class _Registration:
             if inputs.target is not None:
                 require_determined(found)
             picture = self.pictures.get(name)
-            focal_found = picture is not None and picture.focal_deviation
-            fitted, own = found, inputs.of(name)
-            if picture is not None:
-                # Checks use the pictures of the fit.
-                fitted = replace(found, frames=picture.found.frames)
-                own = [replace(k, values=k.values + self._joint_offsets) for k in picture.frames]
-            if not (inputs.positions.is_estimate or self._settings.zeros):
-                self.warnings += likely_offset_warnings(body, fitted, own)
-            if not (inputs.positions.is_estimate or self._settings.focal or focal_found):
-                covariance, texts = check_focal_length(body, fitted, own)
-                self.warnings += texts
-                found = self.registered[name] = replace(found, covariance=covariance)
             self.warnings += outlier_warnings(
                 found, picture is not None or name in self.target_pictures
             )

@@ -8,6 +8,7 @@ import numpy as np
 
 from drake_pose.arrays import Array, Indices, Picture
 from drake_pose.camera.models import Lens, PinholeCamera
+from drake_pose.camera.motor_calibration import Servos
 from drake_pose.camera.picture_files import frame_key
 from drake_pose.errors import SceneError, UnknownNameError
 
@@ -21,12 +22,14 @@ class JointLog:
         times: (n,) ascending times [s]; None: rows are identified by frames only.
         positions: (n, m) positions; nan where there is no reading.
         frames: (n,) names or numbers of the rows' frames; empty: rows are identified by times only.
+        servos: motors of the robot that LeRobot recorded; None: another recorder.
     """
 
     names: tuple[str, ...]
     times: Array | None
     positions: Array
     frames: tuple[str, ...] = ()
+    servos: Servos | None = None
 
     def at(self, times: Array) -> Array:
         """Return (k, m) positions of all joints at times (k,) [s], interpolated linearly.

@@ -2,37 +2,30 @@
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, get_args
 
 import numpy as np
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.camera.episode import JointLog
 from drake_pose.camera.models import check_number
+from drake_pose.camera.motor_calibration import Servos
+from drake_pose.camera.servo_readings import (
+    Column,
+    Encoding,
+    ServoJoint,
+    is_gripper_name,
+    servo_columns,
+    servo_encoding,
+)
 from drake_pose.errors import CameraError, SceneError, SettingsError, UnknownNameError
 from drake_pose.yaml_files import read_yaml
 
 UNITS = {"rad": 1.0, "deg": math.pi / 180.0}
 """Units of angles [rad]."""
-
-
-class Column(NamedTuple):
-    """Linear map from a column to a joint: position = scale * reading + offset [rad or m].
-
-    Attributes:
-        name: name of the column.
-        scale, offset: the linear map [rad or m per unit of the readings; rad or m].
-        ends: range of the readings, if they are clipped to one; a reading at an end means that the
-            joint is there or beyond.
-    """
-
-    name: str
-    scale: float = 1.0
-    offset: float = 0.0
-    ends: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +40,9 @@ class MappedJoints:
         not_logged: joints of the model without a column.
         unused: columns without a joint.
         warnings: assumptions that were made, and anomalies.
+        columns: linear map from a column to each logged joint.
+        encoding: what the columns hold, if LeRobot recorded them of servos; None: they are angles
+            or lengths.
     """
 
     log: JointLog
@@ -54,6 +50,8 @@ class MappedJoints:
     not_logged: tuple[str, ...]
     unused: tuple[str, ...]
     warnings: tuple[str, ...]
+    columns: Mapping[str, Column]
+    encoding: Encoding | None = None
 
 
 def map_joints(
@@ -73,7 +71,8 @@ def map_joints(
         names: (m,) joints of the model.
         lower, upper: (m,) their limits, infinite if there are none [rad or m].
         is_angle: (m,) whether a joint is revolute.
-        units: unit of angles not in ``table``: "rad" or "deg"; None: inferred from the limits.
+        units: unit of angles not in ``table``: "rad" or "deg", or how LeRobot encodes them,
+            "normalised" or "steps"; None: inferred from readings and limits.
         table: column of some joints by the joint's name, as from `read_joint_map`; the columns of
             other joints are found by `match_names`. None: of no joint.
 
@@ -86,8 +85,8 @@ def map_joints(
         UnknownNameError: the table has an unknown joint or column.
         SettingsError: unknown units.
     """
-    if units not in (None, *UNITS):
-        raise SettingsError(f"units must be {' or '.join(UNITS)}, not {units!r}")
+    if units not in (None, *get_args(Encoding)):
+        raise SettingsError(f"units must be {' or '.join(get_args(Encoding))}, not {units!r}")
     columns = dict(table or {})
     for joint, column in columns.items():
         if joint not in names:
@@ -95,36 +94,47 @@ def map_joints(
         if column.name not in log.names:
             raise UnknownNameError("column", column.name, log.names, "the joint log")
     used = {column.name for column in columns.values()}
-    free = [name for name in names if name not in columns]
-    matched, warnings = match_names([name for name in log.names if name not in used], free)
+    readings_of = dict(zip(log.names, log.positions.T, strict=True))
+    others = {name: one for name, one in readings_of.items() if name not in used}
+    matched, warnings = _match(others, [name for name in names if name not in columns])
     if not (matched or columns):
         raise SceneError(
             f"no column of the joint log is a joint of the model: its columns are "
             f"{', '.join(log.names)}, the joints {', '.join(names)}; give a joint map "
             "(JOINT: {column: COLUMN})"
         )
-    revolute = {c: list(names).index(j) for c, j in matched.items()}
-    revolute = {column: k for column, k in revolute.items() if is_angle[k]}
+    limits = {name: (low, high) for name, low, high in zip(names, lower, upper, strict=True)}
+    angular = {name for name, turns in zip(names, is_angle, strict=True) if turns}
+    servos = log.servos or Servos()
+    joints = _servo_joints(matched, others, limits, angular, servos)
+    encoding, texts = servo_encoding(joints, log.servos, units)
+    warnings += texts
+    if encoding is not None:
+        found, texts = servo_columns(joints, servos, encoding)
+        columns, warnings = columns | found, warnings + texts
+        taken = {one.column for one in joints}
+        matched = {column: joint for column, joint in matched.items() if column not in taken}
+    else:
+        matched, texts = _without_openings(matched, others, limits, UNITS.get(units or "rad", 1.0))
+        warnings += texts
+    revolute = {column: joint for column, joint in matched.items() if joint in angular}
     if revolute and units is None:
-        readings_of = dict(zip(log.names, log.positions.T, strict=True))
-        angles, rows = {column: readings_of[column] for column in revolute}, [*revolute.values()]
-        others = np.array([one for name, one in readings_of.items() if name not in used])
-        units, why = _find_unit(angles, others, lower[rows], upper[rows])
+        angles = {column: readings_of[column] for column in revolute}
+        low, high = np.array([limits[joint] for joint in revolute.values()]).T
+        units, why = _find_unit(angles, np.array([*others.values()]), low, high)
         warnings.append(
             f"angles of the joint log are assumed to be in {units}: {why}; if they are not, give "
             "the unit (units)"
         )
-    scale = UNITS[units or "rad"]
+    scale = UNITS.get(units or "rad", 1.0)
     columns |= {j: Column(c, scale if c in revolute else 1.0) for c, j in matched.items()}
     positions = np.full((len(log.positions), len(names)), np.nan)
     clipped = np.zeros(positions.shape, dtype=np.bool_)
     for k, joint in enumerate(names):
         if joint in columns:
             column = columns[joint]
-            readings = log.positions[:, log.names.index(column.name)]
-            limits = float(lower[k]), float(upper[k])
             positions[:, k], clipped[:, k], anomalies = _positions(
-                column, readings, limits, is_angle[k]
+                column, readings_of[column.name], limits[joint], is_angle[k]
             )
             warnings += [f"joint '{joint}': column '{column.name}' {text}" for text in anomalies]
     missing = tuple(name for name in names if name not in columns)
@@ -137,8 +147,97 @@ def map_joints(
         )
     if unused:
         warnings.append(f"columns of the joint log that are not joints: {', '.join(unused)}")
-    mapped = JointLog(tuple(names), log.times, positions, log.frames)
-    return MappedJoints(mapped, clipped, missing, unused, tuple(warnings))
+    mapped = JointLog(tuple(names), log.times, positions, log.frames, log.servos)
+    return MappedJoints(mapped, clipped, missing, unused, tuple(warnings), columns, encoding)
+
+
+def _match(
+    readings: Mapping[str, Array], wanted: Sequence[str]
+) -> tuple[dict[str, str], list[str]]:
+    """Match columns to joints by `match_names`, if need be without a gripper's opening at the end.
+
+    Args:
+        readings: (n,) readings by column.
+        wanted: names of the joints.
+    """
+    matched, warnings = match_names([*readings], wanted)
+    *series, last = readings or ("",)
+    if not matched and _is_opening(readings.get(last, np.zeros(0))):
+        return match_names(series, wanted)
+    return matched, warnings
+
+
+def _servo_joints(
+    matched: Mapping[str, str],
+    readings: Mapping[str, Array],
+    limits: Mapping[str, tuple[float, float]],
+    angular: Collection[str],
+    servos: Servos,
+) -> list[ServoJoint]:
+    """Return the matched joints that servos may move: those that turn, and those of grippers.
+
+    Args:
+        matched: joint by column.
+        readings: (n,) readings by column.
+        limits: by joint [rad or m].
+        angular: names of the joints that turn.
+        servos: the robot's motors.
+    """
+    motors = match_names([*readings], [*servos.motors])[0] if servos.motors else {}
+    return [
+        ServoJoint(
+            joint, column, readings[column], *limits[joint], joint in angular,
+            is_gripper_name(_words(joint)), servos.motors.get(motors.get(column, "")),
+        )
+        for column, joint in matched.items()
+        if joint in angular or is_gripper_name(_words(joint))
+    ]  # fmt: skip
+
+
+def _is_opening(readings: Array) -> bool:
+    """Return whether readings (n,) can be a gripper's opening, 0 to 1."""
+    known = readings[np.isfinite(readings)]
+    return bool(known.size) and known.min() >= -0.001 and known.max() <= 1.001
+
+
+def _without_openings(
+    matched: Mapping[str, str],
+    readings: Mapping[str, Array],
+    limits: Mapping[str, tuple[float, float]],
+    unit: float,
+    slack: float = 0.1,
+) -> tuple[dict[str, str], list[str]]:
+    """Return the matched columns, without those that only their place gives to a gripper's joint.
+
+    Such a column is kept if it leaves 0 ... 1, an opening's range, but not the joint's limits.
+
+    Args:
+        matched: joint by column.
+        readings: (n,) readings by column.
+        limits: by joint [rad or m].
+        unit: unit of the readings [rad].
+        slack: tolerance of the limits [rad or m].
+
+    Returns:
+        The columns that are kept, and warnings about the others.
+    """
+    kept, warnings = dict(matched), list[str]()
+    for column, joint in matched.items():
+        if column == joint or is_gripper_name(_words(column)) or not is_gripper_name(_words(joint)):
+            continue
+        low, high = limits[joint][0] - slack, limits[joint][1] + slack
+        own = readings[column][np.isfinite(readings[column])]
+        if _is_opening(own) or not (
+            low <= unit * own.min(initial=0.0) <= unit * own.max(initial=0.0) <= high
+        ):
+            del kept[column]
+            warnings.append(
+                f"column '{column}' of the joint log, {own.min(initial=0.0):.3g} to "
+                f"{own.max(initial=0.0):.3g}, is not taken for joint '{joint}': it seems to be a "
+                f"gripper's opening; map it if it is known ({joint}: {{column: {column}, from: [0, "
+                "1], to: [OPEN, CLOSED]})"
+            )
+    return kept, warnings
 
 
 def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str, str], list[str]]:
@@ -166,9 +265,13 @@ def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str,
             if sum(a == c for c, _ in pairs) == 1 and sum(b == d for _, d in pairs) == 1:
                 matched[a] = b
                 guesses |= {a: b} if is_match is _is_suffix else {}
-    numbered = re.compile(r"(\D*?)[_\-. ]?(\d+)")
-    series = [name for name in logged if numbered.fullmatch(name)]
-    starts = {numbered.sub(r"\1", name) for name in series}
+    starts_of = {
+        name: found[1]
+        for name in (*logged, *wanted)
+        if (found := re.fullmatch(r"(.*?)[_\-. ]?(\d+)", name))
+    }
+    series = [name for name in logged if name in starts_of]
+    starts = {starts_of[name] for name in series}
     if len(series) > 1 and len(starts) == 1 and any(name not in matched for name in series):
         # joint_1 of joint_0 to joint_6 is not joint1 of joint1 to joint7.
         matched = {a: b for a, b in matched.items() if a not in series}
@@ -176,8 +279,9 @@ def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str,
         free = [name for name in wanted if name not in matched.values()]
         if len(free) != len(series):
             # The model's own numbered names, such as panda_joint1 to panda_joint7 beside a gripper.
-            free = [name for name in free if numbered.fullmatch(name)]
-            free = free if len({numbered.sub(r"\1", name) for name in free}) == 1 else []
+            begin = [starts_of.get(name) for name in free]
+            fitting = [one for one in {*begin} - {None} if begin.count(one) == len(series)]
+            free = [a for a, b in zip(free, begin, strict=True) if fitting == [b]]
         if len(free) == len(series):
             inorder = sorted(series, key=lambda name: int(_words(name)[-1]))
             guesses |= dict(zip(inorder, free, strict=True))

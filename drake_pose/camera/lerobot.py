@@ -9,6 +9,7 @@ import numpy as np
 
 from drake_pose.arrays import Array, Picture
 from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending_indices
+from drake_pose.camera.motor_calibration import find_motors
 from drake_pose.camera.picture_files import TimedVideo, decode_colours, import_reader
 from drake_pose.errors import SceneError, UnknownNameError, listed
 from drake_pose.regular_files import read_regular
@@ -57,7 +58,9 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
             names = [name for key in states for name in _names(key, features[key])]
             # Append the index to duplicate names.
             names = [n if names.count(n) == 1 else f"{n}_{k}" for k, n in enumerate(names)]
-            joints = JointLog(tuple(names), times[kept], positions[kept])
+            servos, texts = find_motors(path, str(info.get("robot_type") or ""), names)
+            warnings += texts
+            joints = JointLog(tuple(names), times[kept], positions[kept], servos=servos)
         cameras = []
         for key in pictures:
             metadata = {**features[key], **(features[key].get("info") or {})}

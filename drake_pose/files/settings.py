@@ -311,9 +311,11 @@ class EpisodeSettings(SceneSettings):
     episode: Annotated[int | None, Parameter(metavar="N")] = None
     """Number of the episode in a LeRobot data set. Default: the only one."""
     joint_map: Path | None = None
-    """YAML file that assigns columns of an episode's joint log to joints, with their units."""
-    units: Literal["rad", "deg"] | None = None
-    """Unit of the angles in an episode's joint log. Default: inferred from the joints' limits."""
+    """YAML file that assigns columns of an episode's joint log to joints, with their units; or the
+    calibration file of a LeRobot robot (JSON)."""
+    units: Literal["rad", "deg", "normalised", "steps"] | None = None
+    """Unit of the angles in an episode's joint log; normalised: LeRobot's -100 to 100 of a motor's
+    range; steps: of its encoder. Default: inferred from the readings and the joints' limits."""
     workers: Annotated[int | None, Parameter(metavar="N")] = None
     """Number of threads; the result does not depend on it. Default: one for each core."""
 

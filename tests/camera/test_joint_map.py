@@ -101,7 +101,9 @@ def test_units_are_given_or_inferred_from_the_limits():
         map_log(names, beyond, wide)
     warning = map_log(names, beyond, wide, units="rad").warnings[0]
     assert "joint 'panda_joint1': column 'panda_joint1' gives 3.3 in row 0" in warning
-    with pytest.raises(SettingsError, match="units must be rad or deg, not 'turns'"):
+    with pytest.raises(
+        SettingsError, match="units must be rad or deg or normalised or steps, not 'turns'"
+    ):
         map_log(names, POSES, ARM, units="turns")
 
 

@@ -16,6 +16,7 @@ from drake_pose.camera.camera_files import load_camera_file
 from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog
 from drake_pose.camera.episode_files import add_calibration, open_episode, recording_format
 from drake_pose.camera.joint_map import map_joints, read_joint_map
+from drake_pose.camera.motor_calibration import Servos, read_motors
 from drake_pose.camera.picture_files import frame_key
 from drake_pose.csv_files import read_csv, read_number
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
@@ -305,7 +306,11 @@ def map_log(path: Path, joints: JointLog, tree: PoseTree, settings: EpisodeSetti
     held = {tree.model.position_names[index] for index in tree.held}
     asked = np.array([k for k, name in enumerate(kinematics.names) if name not in held], np.intp)
     names = [kinematics.names[k] for k in asked]
-    table = None if settings.joint_map is None else read_joint_map(settings.joint_map)
+    table, servos = None, joints.servos or Servos()
+    if settings.joint_map is not None:
+        given = read_motors(settings.joint_map, servos.robot)
+        joints = joints if given is None else replace(joints, servos=given)
+        table = read_joint_map(settings.joint_map) if given is None else None
     mapped = map_joints(
         joints, names, kinematics.lower[asked], kinematics.upper[asked],
         kinematics.is_angle[asked], units=settings.units, table=table,

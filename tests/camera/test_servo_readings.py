@@ -1,0 +1,238 @@
+"""Readings of LeRobot's servos become the angles of a simulated arm with encoders."""
+
+import json
+
+import numpy as np
+import pytest
+
+from drake_pose.camera.episode import JointLog
+from drake_pose.camera.joint_map import map_joints
+from drake_pose.camera.motor_calibration import Servos, find_motors, read_motors
+from drake_pose.errors import SceneError
+
+BODY = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
+NAMES = (*BODY, "gripper")
+# Limits of the SO-101's URDF.
+LOWER = np.array([-1.91986, -1.74533, -1.69, -1.65806, -2.74385, -0.174533])
+UPPER = np.array([1.91986, 1.74533, 1.69, 1.65806, 2.84121, 1.74533])
+STEP = 2.0 * np.pi / 4096
+
+
+class Encoder:
+    """A motor whose encoder is mounted at any angle, calibrated as LeRobot does, in whole steps."""
+
+    def __init__(self, rng, lower, upper, *, full=False, dynamixel=False, inverted=False):
+        self.dynamixel, self.inverted = dynamixel, inverted
+        self.sign = -1.0 if inverted else 1.0
+        self.mount = int(rng.integers(0, 4096))
+        middle = self.raw(0.5 * (lower + upper) if not full else 0.0)
+        # Homing makes the middle half a turn.
+        self.homing = 2047 - middle if dynamixel else middle - 2047
+        ends = sorted(self.homed(np.array([lower, upper])).tolist())
+        self.low, self.high = (0, 4095) if full else ends
+
+    def raw(self, angle):
+        return np.round(self.sign * np.asarray(angle) / STEP).astype(int) + self.mount
+
+    def homed(self, angle):
+        return self.raw(angle) + (self.homing if self.dynamixel else -self.homing)
+
+    def entry(self, number):
+        return {"id": number, "drive_mode": int(self.inverted), "homing_offset": int(self.homing),
+                "range_min": int(self.low), "range_max": int(self.high)}  # fmt: skip
+
+    def read(self, angle, mode):
+        """LeRobot's formulas for its three modes, and raw steps."""
+        P = self.homed(angle)
+        inside = (np.clip(P, self.low, self.high) - self.low) / (self.high - self.low)
+        flips = self.inverted and not self.dynamixel
+        if mode == "steps":
+            return P.astype(float)
+        if mode == "deg":
+            return (P - 0.5 * (self.low + self.high)) * 360 / 4095
+        if mode == "opening":
+            return 100 * (1 - inside) if flips else 100 * inside
+        norm = 200 * inside - 100
+        return -norm if flips else norm
+
+
+def arm_of(seed, **more):
+    rng = np.random.default_rng(seed)
+    arm = {
+        name: Encoder(rng, low, high, full=name == "wrist_roll", **more)
+        for name, low, high in zip(NAMES, LOWER, UPPER, strict=True)
+    }
+    spread = 0.7 * np.sin(
+        np.linspace(0, 3, 40)[:, None] * rng.uniform(1, 2, 6) + rng.uniform(0, 6, 6)
+    )
+    return arm, 0.5 * (LOWER + UPPER) + spread * 0.5 * (UPPER - LOWER)
+
+
+def log_of(arm, angles, mode, suffix=".pos", servos=None):
+    modes = [mode] * 5 + ["steps" if mode == "steps" else "opening"]
+    columns = [arm[n].read(a, m) for n, a, m in zip(NAMES, angles.T, modes, strict=True)]
+    names = tuple(name + suffix for name in NAMES)
+    readings = np.column_stack(columns).astype(np.float32).astype(float)
+    return JointLog(names, 0.1 * np.arange(len(angles)), readings, servos=servos or Servos())
+
+
+def map_arm(log, **more):
+    return map_joints(log, NAMES, LOWER, UPPER, np.ones(6, bool), **more)
+
+
+def write_file(path, arm):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({n: one.entry(k + 1) for k, (n, one) in enumerate(arm.items())}))
+    return path
+
+
+@pytest.mark.parametrize("robot", ["so101_follower", "koch_follower", "my_arm"])
+@pytest.mark.parametrize("mode", ["normalised", "deg", "steps"])
+def test_a_calibration_file_gives_the_models_angles(tmp_path, robot, mode):
+    arm, angles = arm_of(3, dynamixel=robot.startswith("koch"))
+    servos = read_motors(write_file(tmp_path / "arm.json", arm), robot)
+    found = map_arm(log_of(arm, angles, mode, servos=servos))
+    # A step of the encoder, and one of the calibration.
+    np.testing.assert_allclose(found.log.positions, angles, atol=2.1 * STEP)
+    assert (found.encoding, found.not_logged) == (mode, ())
+    assert all(text in found.warnings[0] for text in ("arm.json", "--zeros all"))
+
+
+def test_an_inverted_motor_is_told_in_every_encoding(tmp_path):
+    arm, angles = arm_of(4, inverted=True)
+    servos = read_motors(write_file(tmp_path / "arm.json", arm), "so101_follower")
+    for mode in ("normalised", "steps"):
+        found = map_arm(log_of(arm, angles, mode, servos=servos))
+        np.testing.assert_allclose(found.log.positions, angles, atol=2.1 * STEP)
+
+
+def test_readings_that_are_not_whole_steps_are_told_by_their_range(tmp_path):
+    """Filtered or simulated readings have no steps; ranges tell degrees only beyond 100."""
+    arm, angles = arm_of(5)
+    servos = read_motors(write_file(tmp_path / "arm.json", arm), "so101_follower")
+    log = log_of(arm, angles, "normalised", servos=servos)
+    smooth = JointLog(log.names, log.times, log.positions + 0.004, servos=servos)
+    found = map_arm(smooth)
+    np.testing.assert_allclose(found.log.positions, angles, atol=3 * STEP)
+    assert "could be degrees" in found.warnings[0]
+    wide = angles.copy()
+    wide[3, 4] = 2.7
+    log = log_of(arm, wide, "deg", servos=servos)
+    smooth = JointLog(log.names, log.times, log.positions + 0.004, servos=servos)
+    assert map_arm(smooth).encoding == "deg"
+
+
+@pytest.mark.parametrize("mode", ["normalised", "deg"])
+def test_without_a_file_the_steps_in_the_readings_give_the_ranges(mode):
+    """The range in steps follows from normalised readings, as encoders count in whole steps."""
+    arm, angles = arm_of(6)
+    fine = np.repeat(angles, 4, axis=0) + np.tile([[0.0], [0.011], [0.023], [0.04]], (40, 1))
+    found = map_arm(log_of(arm, fine, mode))
+    np.testing.assert_allclose(found.log.positions[:, :5], fine[:, :5], atol=3 * STEP)
+    assert found.encoding == mode
+
+
+def test_a_robot_without_a_file_has_its_models_limits():
+    arm, angles = arm_of(7)
+    log = log_of(arm, angles[:12], "normalised")
+    with pytest.raises(SceneError, match=r"normalised.*their ranges are not known.*--joint-map"):
+        map_arm(log)
+    known = JointLog(log.names, log.times, log.positions, servos=Servos("so100_follower"))
+    found = map_arm(known)
+    np.testing.assert_allclose(found.log.positions, angles[:12], atol=3 * STEP)
+    text = " ".join(found.warnings)
+    assert all(one in text for one in ("ranges of the motors of shoulder_pan", "--zeros all"))
+
+
+def test_degrees_of_old_data_sets_have_another_zero():
+    """LeRobot's page on backward compatibility: lift is -(x - 90), elbow x - 90."""
+    _, angles = arm_of(8)
+    degrees = np.rad2deg(angles)
+    degrees[:, 1], degrees[:, 2] = 90.0 - degrees[:, 1], degrees[:, 2] + 90.0
+    degrees[:, 5] = 100 * (angles[:, 5] - LOWER[5]) / (UPPER[5] - LOWER[5])
+    names = tuple(f"main_{name}" for name in NAMES)
+    found = map_arm(JointLog(names, np.arange(40.0), degrees, servos=Servos("so100")))
+    np.testing.assert_allclose(found.log.positions, angles, atol=1e-9)
+    assert "before June 2025" in " ".join(found.warnings)
+
+
+def test_lists_of_older_files_home_raw_steps(tmp_path):
+    _, angles = arm_of(9)
+    old = np.rad2deg(angles)
+    old[:, 1], old[:, 2] = 90.0 - old[:, 1], old[:, 2] + 90.0
+    homing, modes = np.array([2048, -1024, 300, -2048, 10, 0]), np.array([0, 1, 0, 0, 1, 0])
+    steps = np.where(modes, -1, 1) * (old * 2048 / 180 - homing)
+    steps[:, 5] = 1000 + 900 * (angles[:, 5] - LOWER[5]) / (UPPER[5] - LOWER[5])
+    content = {
+        "homing_offset": homing.tolist(), "drive_mode": modes.tolist(), "motor_names": [*NAMES],
+        "start_pos": [0, 0, 0, 0, 0, 1000], "end_pos": [1] * 5 + [1900],
+        "calib_mode": ["DEGREE"] * 5 + ["LINEAR"],
+    }  # fmt: skip
+    path = tmp_path / "main_follower.json"
+    path.write_text(json.dumps(content))
+    servos = read_motors(path, "so100")
+    names = tuple(f"main_{name}" for name in NAMES)
+    found = map_arm(JointLog(names, np.arange(40.0), np.round(steps), servos=servos))
+    np.testing.assert_allclose(found.log.positions[:, :5], angles[:, :5], atol=STEP)
+    np.testing.assert_allclose(found.log.positions[:, 5], angles[:, 5], atol=0.01)
+
+
+def test_steps_without_a_file_have_their_zero_at_half_a_turn():
+    rng = np.random.default_rng(1)
+    angles = rng.uniform(-1, 1, (20, 3))
+    names, model = ("arm1_j1", "arm1_j2", "arm1_j3"), ("joint1", "joint2", "finger_joint")
+    log = JointLog(names, np.arange(20.0), 2048 + angles / STEP, servos=Servos("franka"))
+    found = map_joints(log, model, -2 * np.ones(3), 2 * np.ones(3), np.ones(3, bool))
+    np.testing.assert_allclose(found.log.positions[:, :2], angles[:, :2], atol=1e-9)
+    # What lies between motor and finger is not known.
+    assert found.not_logged == ("finger_joint",)
+    assert "encoder steps, 4096 a turn" in " ".join(found.warnings)
+
+
+def test_an_opening_is_not_an_angle():
+    rng = np.random.default_rng(2)
+    arm = rng.uniform(-1, 1, (20, 2))
+    model = ("panda_joint1", "panda_joint2", "finger_joint")
+    limits = -2 * np.ones(3), 2 * np.ones(3), np.ones(3, bool)
+    names = tuple(f"joint_{k}" for k in range(3))
+
+    def mapped(last, count=3):
+        log = JointLog(names, np.arange(20.0), np.column_stack([arm, last]))
+        return map_joints(log, model[:count], *(one[:count] for one in limits))
+
+    found = mapped(np.linspace(0.0, 0.7, 20))
+    assert found.not_logged == ("finger_joint",)
+    assert (
+        "'joint_2' of the joint log, 0 to 0.7, is not taken for joint 'finger_joint'"
+        in " ".join(found.warnings)
+    )
+    np.testing.assert_array_equal(found.log.positions[:, :2], arm)
+    assert mapped(np.linspace(-0.3, 0.7, 20)).not_logged == ()
+    # A model without gripper has the same arm.
+    np.testing.assert_array_equal(mapped(np.linspace(0.0, 1.0, 20), 2).log.positions, arm)
+
+
+def test_files_are_found_beside_the_data_set(tmp_path):
+    arm, _ = arm_of(10)
+    folder = tmp_path / "sets" / "pick"
+    (folder / "meta").mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text('{"robot_type": "so101_follower"}')
+    names = tuple(f"{name}.pos" for name in NAMES)
+    assert find_motors(folder, "so101_follower", names)[0].path is None
+    beside = write_file(tmp_path / "sets" / "my_follower.json", arm)
+    assert find_motors(folder, "", names)[0].path == beside
+    write_file(folder / "calibration" / "teleoperators" / "my_leader.json", arm)
+    own = write_file(folder / "calibration" / "robots" / "blue.json", arm)
+    found, warnings = find_motors(folder, "", names)
+    assert (found.path, found.motors["gripper"].low, warnings) == (own, arm["gripper"].low, [])
+    write_file(folder / "calibration" / "robots" / "red.json", arm)
+    with pytest.raises(SceneError, match=r"several calibrations.*blue.json.*red.json.*--joint-map"):
+        find_motors(folder, "", names)
+    other = folder.with_name("other")
+    write_file(other / "arm.json", {"axis": arm["gripper"]})
+    found, warnings = find_motors(other, "", ("pan", "lift"))
+    assert (found.path, "not those of the data set: axis" in warnings[0]) == (None, True)
+    damaged = folder / "damaged.json"
+    damaged.write_text('{"a": {"range_min": 5, "range_max": 5, "homing_offset": 0}}')
+    with pytest.raises(SceneError, match=r"damaged.json: motor 'a': range_min 5 must be less"):
+        read_motors(damaged)

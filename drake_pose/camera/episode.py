@@ -134,6 +134,7 @@ class Episode:
         cameras: Iterable[EpisodeCamera],
         joints: JointLog | None,
         reader_warnings: Iterable[str] = (),
+        lacking: str = "",
     ) -> "Episode":
         """Return an episode with warnings of its reader and about its times and positions.
 
@@ -144,22 +145,20 @@ class Episode:
             cameras: the cameras.
             joints: joint log; None: there is none, which is a warning.
             reader_warnings: warnings of the reader.
+            lacking: what the recording has instead of joint positions, and what is wanted; "": no
+                more is known. It is the last warning if there is no log.
 
         Raises:
             SceneError: there is no camera or no row, or images cannot be associated with rows.
         """
         found, warnings = {camera.name: camera for camera in cameras}, list(reader_warnings)
         if not found:
-            raise SceneError(f"{path}: has no camera's pictures {'; '.join(warnings)}".rstrip())
+            raise SceneError(f"{path}: has no camera's pictures: {'; '.join(warnings) or 'none'}")
         for name, camera in found.items():
             warnings += _gap_warnings(camera.times, f"camera '{name}'", "picture")
         if joints is None:
-            return cls(
-                path,
-                found,
-                None,
-                (*warnings, f"{path}: has no joint positions; give a table of them (--joints)"),
-            )
+            lacking = lacking or f"{path}: has no joint positions; give a table of them (--joints)"
+            return cls(path, found, None, (*warnings, lacking))
         if not joints.positions.size:
             raise SceneError(f"{path}: the joint log has no row, or no joint")
         is_number = np.isfinite(joints.positions)

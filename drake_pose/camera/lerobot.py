@@ -1,29 +1,45 @@
 """Read episodes of LeRobot data sets, versions 2.0, 2.1 and 3.0."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from drake_pose.arrays import Array, Picture
+from drake_pose.arrays import Array, Indices, Picture
 from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending_indices
+from drake_pose.camera.lerobot_tables import (
+    StoredPictures,
+    column_names,
+    describe,
+    find_states,
+    is_picture,
+    read_numbers,
+    row_times,
+)
 from drake_pose.camera.motor_calibration import find_motors
-from drake_pose.camera.picture_files import TimedVideo, decode_colours, import_reader
+from drake_pose.camera.picture_files import TimedVideo, import_reader
 from drake_pose.errors import SceneError, UnknownNameError, listed
 from drake_pose.regular_files import read_regular
 
 INFO = Path("meta", "info.json")
 """File by which LeRobot data sets are recognised."""
 
+_Rows = Mapping[int, Mapping[str, Any]]
+"""Metadata of each episode, from column name to value, by the episode's number; {} for an episode
+without metadata."""
+
 
 def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Episode:
     """Open an episode of a LeRobot data set, which may be incomplete.
 
+    Times are counted from the start of the episode.
+
     Args:
         path: folder of the data set.
-        joints: joint log to use instead of `observation.state` (or `state`); None: that, if any.
+        joints: joint log to use instead of the data set's, see `find_states`; None: that, if any.
         episode: number of the episode; None: the only one that is present.
 
     Raises:
@@ -31,77 +47,102 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
             present and none was chosen.
         UnknownNameError: the episode is not present.
     """
-    parquet, state = import_reader("pyarrow.parquet", path), "observation.state"
+    parquet, warnings = import_reader("pyarrow.parquet", path), list[str]()
     try:
-        info = json.loads(read_regular(path / INFO))
+        info = _read_info(path)
         rows = _episode_rows(path, info, parquet)
         number, features = _choose_episode(path, info, rows, episode), info["features"]
-        states = [key for key in features if key.startswith(f"{state}.")]
-        states = [key for key in (state, "state") if key in features][:1] or states
-        pictures = [key for key, one in features.items() if one["dtype"] in ("video", "image")]
-        stored = [key for key in pictures if features[key]["dtype"] == "image"]
-        file, wanted = _file(path, info, rows, number), ["timestamp", *states, *stored]
-        filters = [("episode_index", "=", number)]
-        table = parquet.read_table(file, columns=wanted, filters=filters)
-        columns = {key: table[key].to_pylist() for key in wanted}
-        times = np.array(columns["timestamp"], dtype=np.float64).ravel()
-        kept, warnings = ascending_indices(times, f"{file}: episode {number}")
+        table, file = _read_table(path, info, rows, number, parquet, warnings)
+        stamps = row_times(table, _rate(info), str(file), warnings)
+        kept, late = ascending_indices(stamps, f"{file}: episode {number}")
+        stamps = stamps[kept]
         warnings += [
-            f"{path}: '{key}' is not used, as the data set has no intrinsics: give both in a "
-            "camera file (--cameras), or estimate the pose: drake-pose register"
-            for key in features
-            if "extrinsics" in key
+            *late,
+            *(
+                f"{path}: '{key}' is not used, as the data set has no intrinsics: give both in a "
+                "camera file (--cameras), or estimate the pose: drake-pose register"
+                for key in features
+                if "extrinsics" in key
+            ),
         ]
-        if joints is None and states:
-            values = [np.array(columns[key], dtype=np.float64) for key in states]
-            positions = np.column_stack([one.reshape(len(times), -1) for one in values])
-            names = [name for key in states for name in _names(key, features[key])]
-            # Append the index to duplicate names.
-            names = [n if names.count(n) == 1 else f"{n}_{k}" for k, n in enumerate(names)]
-            servos, texts = find_motors(path, str(info.get("robot_type") or ""), names)
-            warnings += texts
-            joints = JointLog(tuple(names), times[kept], positions[kept], servos=servos)
-        cameras = []
+        cameras, names = [], list[str]()
+        pictures = [key for key, one in features.items() if is_picture(key, one)]
+        if not pictures:
+            raise SceneError(
+                f"{path / INFO}: has no feature of colour pictures (dtype video or image, or "
+                f"arrays of height x width x 3); it has: {describe(features)}"
+            )
         for key in pictures:
-            metadata = {**features[key], **(features[key].get("info") or {})}
-            if any("is_depth" in field and value is True for field, value in metadata.items()):
-                continue
             name = key.removeprefix("observation.").removeprefix("images.")
-            if key in stored:
-                read = _stored_pictures([columns[key][k]["bytes"] for k in kept], file)
-                height, width = read(0).shape[:2]
-                cameras.append(EpisodeCamera(name, width, height, times[kept], None, None, read))
+            names.append(key if name in names else name)
+            try:
+                camera = _read_camera(path, info, rows, number, key, table, file, warnings)
+            except SceneError as error:
+                warnings.append(f"camera '{names[-1]}' is left out: {error}")
                 continue
-            video = _file(path, info, rows, number, key)
-            if not video.is_file():
-                warnings.append(f"camera '{name}' is left out: {video} is missing")
-                continue
-            span = np.array([0.0, np.inf])
-            if rows is not None:
-                ends = ("from_timestamp", "to_timestamp")
-                span = np.array([float(rows[number][f"videos/{key}/{end}"]) for end in ends])
-            half = 0.5 / float(info["fps"])
-            cameras.append(_video_camera(name, video, span, half, len(times), warnings))
+            if not len(camera.times):
+                camera = _of_rows(camera, stamps, kept)
+            cameras.append(replace(camera, name=names[-1]))
+        own, lacking = None, ""
+        if joints is None:
+            own, lacking = _read_joints(path, info, table, file, stamps, kept, warnings)
+        cameras, own, joints = _from_start(file, stamps, cameras, own, joints, warnings)
+    except OSError as error:
+        what = f"{error.filename or path}: cannot be read: {error.strerror or error}"
+        raise SceneError(f"{path}: a file of it is damaged: {what}") from error
     # Python and pyarrow raise these errors on damaged or incomplete files.
-    except (
-        OSError, ValueError, LookupError, TypeError, AttributeError, NotImplementedError
-    ) as error:  # fmt: skip
+    except (ValueError, LookupError, TypeError, AttributeError, NotImplementedError) as error:
         raise SceneError(
             f"{path}: not a LeRobot data set of version 2 or 3, or a file of it is damaged "
             f"({type(error).__name__}: {error})"
         ) from error
-    return Episode.checked(path, cameras, joints, warnings)
+    return Episode.checked(path, cameras, joints or own, warnings, lacking)
 
 
-_Rows = Mapping[int, Mapping[str, Any]] | None
-"""Metadata of each episode in version 3 of the format, from column name to value, by the episode's
-number; None: version 2, which has none."""
+def _read_info(path: Path) -> Mapping[str, Any]:
+    """Return the content of `meta/info.json`.
+
+    Raises:
+        SceneError: it is no JSON, has no features, or the data set has another version.
+    """
+    file = path / INFO
+    try:
+        info = json.loads(read_regular(file))
+    except ValueError as error:
+        raise SceneError(f"{file}: a file of it is damaged: it is no JSON: {error}") from error
+    features = info.get("features") if isinstance(info, dict) else None
+    if not isinstance(features, dict) or not all(
+        isinstance(one, dict) for one in features.values()
+    ):
+        found = listed([*info], 20) if isinstance(info, dict) else type(info).__name__
+        raise SceneError(
+            f"{file}: has no 'features', which name the columns and videos of the data set; it "
+            f"has: {found or 'nothing'}"
+        )
+    version = str(info.get("codebase_version", "")).removeprefix("v")
+    if not version:
+        # The metadata of episodes are in tables since version 3.
+        version = "3.0" if any(path.glob("meta/episodes/*/*.parquet")) else "2.1"
+    if not version.startswith(("2.", "3.")):
+        raise SceneError(
+            f"{file}: a LeRobot data set of version v{version}, but only 2.0, 2.1 and 3.0 are "
+            "supported: convert it with LeRobot's scripts"
+        )
+    return {**info, "codebase_version": version}
+
+
+def _rate(info: Mapping[str, Any]) -> float | None:
+    """Return the rows per second of `meta/info.json`; None: it has none that is positive."""
+    rate = info.get("fps")
+    is_rate = isinstance(rate, int | float) and np.isfinite(rate) and rate > 0
+    return float(rate) if rate is not None and is_rate else None
 
 
 def _episode_rows(path: Path, info: Mapping[str, Any], parquet: Any) -> _Rows:
-    """Return the rows of `meta/episodes`, from column name to value, by the episode's number.
+    """Return the metadata of the episodes, see `_Rows`.
 
-    The result is None for version 2 of the format, which has no such rows.
+    They are in `meta/episodes/*/*.parquet` (version 3) or `meta/episodes.jsonl` (version 2).
+    Without either file the episodes are numbered from 0 to `total_episodes` - 1.
 
     Args:
         path: folder of the data set.
@@ -109,43 +150,75 @@ def _episode_rows(path: Path, info: Mapping[str, Any], parquet: Any) -> _Rows:
         parquet: the module pyarrow.parquet.
 
     Raises:
-        SceneError: the data set has another version.
+        SceneError: the metadata are damaged.
     """
-    version = str(info["codebase_version"])
-    if not version.startswith(("v2.", "v3.")):
-        raise SceneError(
-            f"{path / INFO}: a LeRobot data set of version {version}, but only 2.0, 2.1 and 3.0 "
-            "are supported: convert it with LeRobot's scripts"
-        )
-    if version.startswith("v2."):
-        return None
-    rows: dict[int, dict[str, Any]] = {}
+    rows: dict[int, Mapping[str, Any]] = {}
     for file in sorted(path.glob("meta/episodes/*/*.parquet")):
         # Skip the statistics, which are most of the columns.
         columns = parquet.read_schema(file).names
         used = [name for name in columns if name.startswith(("episode_index", "data/", "videos/"))]
         found = parquet.read_table(file, columns=used).to_pylist()
         rows |= {row["episode_index"]: row for row in found}
-    return rows
+    lines = path / "meta" / "episodes.jsonl"
+    if not rows and lines.is_file():
+        for k, line in enumerate(read_regular(lines).decode("utf-8", "replace").splitlines(), 1):
+            try:
+                rows |= {int(json.loads(line)["episode_index"]): {}} if line.strip() else {}
+            except (ValueError, LookupError, TypeError) as error:
+                raise SceneError(
+                    f"{lines}: a file of it is damaged: line {k} is no JSON with episode_index"
+                ) from error
+    count = info.get("total_episodes")
+    if not rows and count is None:
+        count = len([*path.glob("data/**/*.parquet")])
+    return rows or {k: {} for k in range(int(count or 0))}
 
 
 def _file(path: Path, info: Mapping[str, Any], rows: _Rows, number: int, key: str = "") -> Path:
     """Return the file of an episode's data, or of a camera's video; it may be missing.
 
+    The words in the templates of `meta/info.json` may be those of either version. Without a
+    template it is the version's own.
+
     Args:
         path: folder of the data set.
         info: content of `meta/info.json`.
-        rows: metadata by episode, see ``_episode_rows``; None: version 2.
+        rows: metadata by episode, see ``_Rows``.
         number: number of the episode.
         key: the camera's key in the features; "": the data.
+
+    Raises:
+        SceneError: the template has an unknown word, or one whose value is not known.
     """
-    chunk = number // int(info.get("chunks_size", 1000))
-    values = {"video_key": key, "episode_index": number, "episode_chunk": chunk}
-    if rows is not None:
-        where = f"videos/{key}" if key else "data"
-        for name in ("chunk_index", "file_index"):
-            values[name] = rows[number][f"{where}/{name}"]
-    return path / info["video_path" if key else "data_path"].format(**values)
+    is_v3, which = info["codebase_version"].startswith("3."), "video_path" if key else "data_path"
+    folder, suffix = ("videos", "mp4") if key else ("data", "parquet")
+    own = f"{folder}/" + ("{video_key}/" if key and is_v3 else "") + "chunk-{chunk_index:03d}/"
+    own += ("{video_key}/" if key and not is_v3 else "") + (
+        "file-{file_index:03d}." if is_v3 else "episode_{episode_index:06d}."
+    )
+    template = str(info.get(which) or own + suffix)
+    size = info.get("chunks_size") or 1000
+    chunk, row, where = number // int(size), rows[number], f"videos/{key}" if key else "data"
+    values: dict[str, Any] = dict.fromkeys(("video_key", "image_key", "camera_key", "key"), key)
+    values |= dict.fromkeys(("episode_index", "episode_id", "episode"), number)
+    values |= dict.fromkeys(("episode_chunk", "chunk"), chunk)
+    values["chunk_index"] = row.get(f"{where}/chunk_index", chunk)
+    if is_v3 and "{file_index" in template and f"{where}/file_index" not in row:
+        raise SceneError(
+            f"{path}: the file of episode {number} is not known: {path / INFO} has the {which} "
+            f"'{template}', and the column {where}/file_index of meta/episodes/*/*.parquet is "
+            "missing: copy the whole folder meta"
+        )
+    # In version 2 each episode has its own file, numbered on or from 0 in each chunk.
+    indices = [row.get(f"{where}/file_index", number), number % int(size)]
+    try:
+        files = [path / template.format(**values, file_index=index) for index in indices]
+    except (LookupError, ValueError, AttributeError) as error:
+        raise SceneError(
+            f"{path / INFO}: the {which} '{template}' cannot be filled in ({error}); known words "
+            f"are {', '.join(values)}, file_index"
+        ) from error
+    return next((file for file in files if file.is_file()), files[0])
 
 
 def _choose_episode(path: Path, info: Mapping[str, Any], rows: _Rows, wanted: int | None) -> int:
@@ -154,82 +227,219 @@ def _choose_episode(path: Path, info: Mapping[str, Any], rows: _Rows, wanted: in
     Args:
         path: folder of the data set.
         info: content of `meta/info.json`.
-        rows: metadata by episode, see ``_episode_rows``; None: version 2.
+        rows: metadata by episode, see ``_Rows``.
         wanted: number of the wanted episode; None: the only one.
 
     Raises:
         UnknownNameError: the data of the wanted episode are not present.
         SceneError: none was wanted, and the data of none or of several episodes are present.
     """
-    numbers = list(rows or range(int(info["total_episodes"])))
+    numbers = list(rows)
     candidates = numbers if wanted is None else [one for one in numbers if one == wanted]
     present = [one for one in candidates if _file(path, info, rows, one).is_file()]
     if len(present) == 1:
         return present[0]
     present = [one for one in numbers if _file(path, info, rows, one).is_file()]
     names = listed([*map(str, present)], 20)
-    if wanted is not None:
-        raise UnknownNameError("episode", str(wanted), [names] if names else [], str(path))
+    if wanted is not None and present:
+        raise UnknownNameError("episode", str(wanted), [names], str(path))
+    expected = f"; expected, for one, {_file(path, info, rows, numbers[0])}" if numbers else ""
     raise SceneError(
         f"{path}: choose an episode (--episode N); of {len(numbers)} these are present: "
-        f"{names or 'none'}"
+        f"{names or 'none' + expected}"
     )
 
 
-def _names(key: str, feature: Mapping[str, Any]) -> list[str]:
-    """Return names of a vector feature's entries: those of the data set, if there are as many.
-
-    Otherwise they are the last part of the key, or "joint", and a number from 0; a single entry has
-    no number.
-
-    Args:
-        key: the feature's key, `observation.state` or one that begins with it.
-        feature: the feature in `meta/info.json`: its shape and, if any, its names, which may be
-            nested lists or a mapping of lists.
-    """
-    size, names = int(np.prod(feature["shape"])), feature.get("names")
-    if isinstance(names, dict):
-        names = [one if isinstance(one, list) else name for name, one in names.items()]
-    while names and isinstance(names[0], list):
-        names = [name for part in names for name in part]
-    if names and len(names) == size:
-        return [str(name) for name in names]
-    last = key.removeprefix("observation.state").lstrip(".") or "joint"
-    return [f"{last}_{k}" for k in range(size)] if size > 1 else [last]
-
-
-def _stored_pictures(stored: Sequence[bytes], file: Path) -> Callable[[int], Picture]:
-    """Return a function that returns image k (H, W, 3) of a table of PNG or JPEG images.
+def _read_table(
+    path: Path,
+    info: Mapping[str, Any],
+    rows: _Rows,
+    number: int,
+    parquet: Any,
+    warnings: list[str],
+) -> tuple[Any, Path]:
+    """Return the table (pyarrow.Table) of an episode, and its file.
 
     Args:
-        stored: content of the image files.
-        file: the table, for messages.
+        path: folder of the data set.
+        info: content of `meta/info.json`.
+        rows: metadata by episode, see ``_Rows``.
+        number: number of the episode.
+        parquet: the module pyarrow.parquet.
+        warnings: list to which warnings are appended.
+
+    Raises:
+        SceneError: the table is damaged, or has no row of the episode.
     """
-    return lambda k: decode_colours(stored[k], file, SceneError)
+    file, features = _file(path, info, rows, number), info["features"]
+    try:
+        available = parquet.read_schema(file).names
+        used = [key for key in available if key in {*features, "timestamp", "frame_index"}]
+        filters = [("episode_index", "=", number)] if "episode_index" in available else None
+        table = parquet.read_table(file, columns=used, filters=filters)
+        if table.num_rows or filters is None:
+            if not table.num_rows:
+                raise SceneError(f"{file}: is empty: it has no row")
+            return table, file
+        others = set(parquet.read_table(file, columns=["episode_index"])[0].to_pylist())
+        if len(others) == 1 and "episode" in str(info.get("data_path") or "episode"):
+            warnings.append(
+                f"{file}: its column episode_index is {others.pop()}, not {number}; all its rows "
+                "are used"
+            )
+            return parquet.read_table(file, columns=used), file
+    except (ValueError, TypeError, NotImplementedError) as error:
+        raise SceneError(f"{file}: a file of it is damaged: not a whole table: {error}") from error
+    raise SceneError(
+        f"{file}: has no row of episode {number}: its column episode_index has "
+        f"{listed([*map(str, sorted(others, key=str))], 20) or 'no row'}"
+    )
+
+
+def _read_joints(
+    path: Path,
+    info: Mapping[str, Any],
+    table: Any,
+    file: Path,
+    stamps: Array,
+    kept: Indices,
+    warnings: list[str],
+) -> tuple[JointLog | None, str]:
+    """Return the joint log of an episode, None if there is none, and what is wrong with it.
+
+    Args:
+        path: folder of the data set.
+        info: content of `meta/info.json`.
+        table: the episode's table (pyarrow.Table).
+        file: the table's file, for messages.
+        stamps: (k,) times of the rows to use [s].
+        kept: (k,) indices of these rows.
+        warnings: list to which warnings are appended.
+    """
+    features = info["features"]
+    keys = [key for key in find_states(features) if key in table.column_names]
+    if not keys:
+        actions = [key for key in features if key.startswith("action")]
+        lacking = (
+            f"{path}: has no joint positions; give a table of them (--joints). Wanted is a feature "
+            "observation.state, state, or one named after joints, with rows of numbers in "
+            f"{file.name}; the data set has: {describe(features)}"
+        )
+        if actions:
+            lacking += (
+                f"; '{actions[0]}' is not used: it holds what was commanded, not what was measured"
+            )
+        return None, lacking
+    values = [read_numbers(table, key, str(file)) for key in keys]
+    names = column_names(keys, [one.shape[1] for one in values], features)
+    servos, texts = find_motors(path, str(info.get("robot_type") or ""), names)
+    warnings += texts
+    return JointLog(names, stamps, np.column_stack(values)[kept], servos=servos), ""
+
+
+def _read_camera(
+    path: Path,
+    info: Mapping[str, Any],
+    rows: _Rows,
+    number: int,
+    key: str,
+    table: Any,
+    file: Path,
+    warnings: list[str],
+) -> EpisodeCamera:
+    """Return a camera of an episode: of a video with its times, or of images without times (0,).
+
+    Args:
+        path: folder of the data set.
+        info: content of `meta/info.json`.
+        rows: metadata by episode, see ``_Rows``.
+        number: number of the episode.
+        key: the camera's feature.
+        table: the episode's table (pyarrow.Table).
+        file: the table's file, for messages.
+        warnings: list to which warnings are appended.
+
+    Raises:
+        SceneError: the camera's images are missing or damaged.
+    """
+    feature, count = info["features"][key], table.num_rows
+    if feature.get("dtype") == "video":
+        video = _file(path, info, rows, number, key)
+        if video.is_file():
+            return _video_camera(key, video, info, rows, number, count, warnings)
+        if key not in table.column_names:
+            raise SceneError(f"{video} is missing")
+    column = table[key] if key in table.column_names else None
+    stored = StoredPictures(path, file, key, column, feature.get("shape") or (), number)
+    height, width = stored.read(0).shape[:2]
+    return EpisodeCamera(key, width, height, np.empty(0), None, None, stored.read)
+
+
+def _of_rows(camera: EpisodeCamera, stamps: Array, kept: Indices) -> EpisodeCamera:
+    """Return a camera of stored images that has the rows ``kept`` (k,), at their times (k,) [s]."""
+    return replace(camera, times=stamps, read_recorded=lambda k: camera.read_recorded(int(kept[k])))
 
 
 def _video_camera(
-    name: str, file: Path, span: Array, half: float, count: int, warnings: list[str]
+    key: str,
+    file: Path,
+    info: Mapping[str, Any],
+    rows: _Rows,
+    number: int,
+    count: int,
+    warnings: list[str],
 ) -> EpisodeCamera:
-    """Return the camera of a video, restricted to a time span; times start at 0 with the span.
+    """Return the camera of a video, restricted to an episode; times start at 0 with the episode.
+
+    Images up to half a period before the start belong to the episode, and those after the end less
+    this do not. A video with as many images as rows, which begins at another time than the
+    metadata say, has the rows' images in order.
 
     Args:
-        name: name of the camera.
+        key: the camera's feature.
         file: the video.
-        span: (2,) start and end of the episode in the video [s].
-        half: half a period between images [s]; images up to this much before the start belong to
-            the episode, and those after the end less this do not.
+        info: content of `meta/info.json`.
+        rows: metadata by episode, see ``_Rows``.
+        number: number of the episode.
         count: number of rows of the episode.
         warnings: list to which warnings are appended.
 
     Raises:
-        SceneError: the video is unreadable, or has no image in the span.
+        SceneError: the video is unreadable, or has no image in the episode.
     """
-    video = TimedVideo(file)
+    video, name = TimedVideo(file), key.removeprefix("observation.").removeprefix("images.")
+    where = f"videos/{key}"
+    ends = [f"{where}/{end}_timestamp" for end in ("from", "to")]
+    spans = np.array([[0.0, np.inf]])
+    span = spans[0]
+    if all(isinstance(rows[number].get(end), int | float) for end in ends):
+        places = [f"{where}/chunk_index", f"{where}/file_index"]
+        same = [
+            one
+            for one in rows.values()
+            if all(one.get(place) == rows[number].get(place) for place in places)
+        ]
+        spans = np.array([[float(one[end]) for end in ends] for one in same])
+        span = np.array([float(rows[number][end]) for end in ends])
+    steps = np.diff(video.times)
+    rate = _rate(info) or (1.0 / float(np.median(steps)) if len(steps) else 1.0)
+    half = 0.5 / rate
+    begin = float(spans[:, 0].min())
+    total = (float(spans[:, 1].max()) - begin) * rate
+    for first, expected in ((float(span[0]), count), (begin, total)):
+        late = float(video.times[0]) - first
+        if abs(late) > half and abs(len(video.times) - expected) < 0.5:
+            warnings.append(
+                f"camera '{name}': {file} begins at {video.times[0]:.3f} s, not at {first:.3f} s, "
+                "but has as many pictures as the table has rows: they are paired in their order"
+            )
+            span = span + late
+            break
     first, last = np.searchsorted(video.times, span - half).tolist()
     if first == last:
         raise SceneError(
-            f"{file}: ends at {video.times[-1]:.3f} s, but the episode is from {span[0]:.3f} s on"
+            f"{file}: has pictures from {video.times[0]:.3f} to {video.times[-1]:.3f} s, but the "
+            f"episode is from {span[0]:.3f} to {span[1]:.3f} s"
         )
     warnings += video.warnings
     if last - first != count:
@@ -243,3 +453,43 @@ def _video_camera(
 
     times = video.times[first:last] - span[0]
     return EpisodeCamera(name, video.width, video.height, times, None, None, recorded)
+
+
+def _from_start(
+    file: Path,
+    stamps: Array,
+    cameras: Sequence[EpisodeCamera],
+    own: JointLog | None,
+    given: JointLog | None,
+    warnings: list[str],
+) -> tuple[list[EpisodeCamera], JointLog | None, JointLog | None]:
+    """Return cameras and joint logs of an episode, their times counted from its start.
+
+    The rows' times begin elsewhere, such as 1970, if they end after all videos. The times of videos
+    begin with the episode.
+
+    Args:
+        file: the table's file, for messages.
+        stamps: (n,) ascending times of the rows [s].
+        cameras: the cameras; those of stored images have the times ``stamps``.
+        own: the data set's own log, with the times ``stamps``; None: none.
+        given: the user's log; None: none. It is moved, too, if it is from the rows' times.
+        warnings: list to which warnings are appended.
+    """
+    period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+    videos = [one.times for one in cameras if one.times is not stamps]
+    end = max((float(times[-1]) for times in videos), default=float(stamps[-1] - stamps[0]))
+    start = float(stamps[0])
+    if start <= 0.5 * period or stamps[-1] <= end + 1.5 * period:
+        return [*cameras], own, given
+    warnings.append(
+        f"{file}: the rows' times begin at {start:.6g} s, so they are counted from the first row"
+    )
+    moved = [
+        one if any(one.times is times for times in videos) else replace(one, times=stamps - start)
+        for one in cameras
+    ]
+    own = own and replace(own, times=stamps - start)
+    if given is not None and given.times is not None and given.times[-1] > 0.5 * start:
+        given = replace(given, times=given.times - start)
+    return moved, own, given

@@ -248,22 +248,35 @@ def _decode(
         raise error_type(
             f"{path}: {width} x {height} pixels are too many: at most {LARGEST_SIDE} a side"
         )
+    is_deep = how == cv2.IMREAD_COLOR and data[24:25] == b"\x10" and not is_jpeg
+    how |= cv2.IMREAD_ANYDEPTH if is_deep else 0
     try:
         decoded = cv2.imdecode(np.frombuffer(data, np.uint8), how)
     except cv2.error:
         decoded = None
     if decoded is None:
         raise error_type(f"{path}: not a whole PNG or JPEG picture")
-    # OpenCV keeps the upper 8 of 16 bits, so 12-bit values would turn black.
-    if how == cv2.IMREAD_COLOR and data[24:25] == b"\x10" and not is_jpeg:
-        deep = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        brightest = 0 if deep is None else int(deep.max())
-        if 0 < brightest < 1 << 12:
-            raise error_type(
-                f"{path}: has 16 bits per pixel, but no value above {brightest} of 65535: scale "
-                "its values to the whole range, or save the picture with 8 bits"
-            )
-    return np.asarray(decoded)
+    return upper_bits(decoded, str(path), error_type) if is_deep else np.asarray(decoded)
+
+
+def upper_bits(picture: Any, where: str, error_type: type[DrakePoseError]) -> Picture:
+    """Return the upper 8 bits of an image's 16-bit values, in the same shape.
+
+    Args:
+        picture: array of uint16 values, of any shape.
+        where: start of the error message.
+        error_type: class of the exception.
+
+    Raises:
+        error_type: the values use fewer than 13 bits, so that the result would be black.
+    """
+    brightest = int(picture.max())
+    if 0 < brightest < 1 << 12:
+        raise error_type(
+            f"{where}: has 16 bits per pixel, but no value above {brightest} of 65535: scale its "
+            "values to the whole range, or save the picture with 8 bits"
+        )
+    return np.asarray(picture >> 8, dtype=np.uint8)
 
 
 def import_reader(library: str, path: Path) -> Any:
@@ -289,7 +302,7 @@ class VideoPictures:
     """Images of a video, counted from 0, decoded by OpenCV, or by TimedVideo for AV1.
 
     Attributes:
-        time: time of the last image read [s].
+        time: time of the last image read, relative to the first one [s].
 
     Raises:
         SceneError: the video cannot be read.
@@ -302,13 +315,27 @@ class VideoPictures:
         self.time = 0.0
         if not self._capture.isOpened():
             raise SceneError(f"{path}: not a video that OpenCV can read")
+        self._missing = self._missing_pictures()
         codec = int(self._capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little")
         self._timed = TimedVideo(path) if codec.upper() == b"AV01" else None
+
+    def _missing_pictures(self) -> int:
+        """Return how many images OpenCV counts before the first one of a file that starts late.
+
+        OpenCV counts the images of Matroska and WebM from their duration.
+        """
+        if self._path.suffix.lower() not in (".mkv", ".webm") or not hasattr(cv2, "CAP_PROP_PTS"):
+            return 0
+        self._capture.grab()
+        missing = int(self._capture.get(cv2.CAP_PROP_PTS))
+        self._capture.release()
+        self._capture = cv2.VideoCapture(str(self._path))
+        return max(0, missing)
 
     @property
     def count(self) -> int:
         """Number of images according to the file."""
-        return int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        return int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) - self._missing
 
     @property
     def rate_hz(self) -> float | None:
@@ -324,7 +351,7 @@ class VideoPictures:
         """
         if self._timed is not None:
             timed = self._timed.read(number)
-            self.time = float(self._timed.times[number])
+            self.time = float(self._timed.times[number] - self._timed.times[0])
             return timed
         if number < self._next:
             self._capture.release()
@@ -351,7 +378,9 @@ class TimedVideo:
     The next image costs one decoding; any other one is decoded from the preceding keyframe.
 
     Attributes:
-        times: (n,) ascending times of the images, relative to the first one [s].
+        times: (n,) ascending times of the images [s]. Those of MP4, MOV, Matroska and WebM are the
+            file's presentation times, so the first one may be later than 0. The clocks of AVI and
+            MPEG begin anywhere: their times are relative to the first image.
         width, height: size of the images [pixel].
         warnings: problems of the file.
 
@@ -378,7 +407,8 @@ class TimedVideo:
         self._stamps = np.array([pts for pts, _ in sorted(self._packets)])
         self._keys = np.array([pts for pts, is_key in sorted(self._packets) if is_key] or [0])
         seconds = float(self._stream.time_base)
-        self.times = (self._stamps - self._stamps[0]) * seconds
+        is_timeline = {"mp4", "webm"} & {*self._container.format.name.split(",")}
+        self.times = (self._stamps - (0 if is_timeline else self._stamps[0])) * seconds
         self._promised = self._stream.frames or len(self.times)
         self.warnings: list[str] = []
         if self._promised > len(self.times):

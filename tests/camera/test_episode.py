@@ -237,7 +237,7 @@ def test_anomalies_of_times_are_warned_of():
 
 
 def test_unusable_episodes_are_refused():
-    with pytest.raises(SceneError, match="here: has no camera's pictures because"):
+    with pytest.raises(SceneError, match="here: has no camera's pictures: because"):
         Episode.checked(Path("here"), [], log(TIMES), ["because"])
     with pytest.raises(SceneError, match="has no row"):
         episode(TIMES, JointLog((), TIMES, np.zeros((20, 0))))

@@ -235,7 +235,7 @@ def _read_episode(
     if episode.joints is None:
         raise SceneError(
             f"{path}: holds no joint positions, and none are given (--joints FILE): pictures alone "
-            "do not determine a robot's pose"
+            f"do not determine a robot's pose. {episode.warnings[-1]}"
         )
     robot, target = load_model(model, package_paths=settings.packages), None
     if isinstance(settings, RegistrationSettings):

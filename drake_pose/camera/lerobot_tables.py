@@ -1,0 +1,326 @@
+"""Read numbers, times and images from the columns of a LeRobot episode's table."""
+
+import itertools
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path, PurePath
+from typing import Any
+
+import cv2
+import numpy as np
+
+from drake_pose.arrays import Array, Picture
+from drake_pose.camera.picture_files import decode_colours, import_reader, read_picture, upper_bits
+from drake_pose.errors import SceneError, listed
+
+Features = Mapping[str, Mapping[str, Any]]
+"""Features of a data set by name, as in `meta/info.json`."""
+
+
+def read_numbers(table: Any, key: str, where: str) -> Array:
+    """Return a column (n, m) of numbers or of lists of m numbers; missing rows are nan.
+
+    Args:
+        table: the table (pyarrow.Table).
+        key: name of the column.
+        where: the table's file, for messages.
+
+    Raises:
+        SceneError: the column has other content, or rows of different lengths.
+    """
+    column = table[key]
+    if import_reader("pyarrow", Path(where)).types.is_temporal(column.type):
+        column = column.cast("int64")
+    try:
+        rows = [
+            None if row is None else np.ravel(np.array(row, np.float64))
+            for row in column.to_pylist()
+        ]
+    except (ValueError, TypeError) as error:
+        raise SceneError(
+            f"{where}: column '{key}' holds {column.type}, but numbers are expected ({error})"
+        ) from error
+    sizes = [1 if row is None else len(row) for row in rows]
+    width = next((len(row) for row in rows if row is not None), 1)
+    for k, row in enumerate(rows):
+        if row is not None and len(row) != width:
+            raise SceneError(
+                f"{where}: column '{key}' has {sizes[k]} numbers in row {k} (counted from 0), but "
+                f"{width} in the rows before"
+            )
+    return np.array([np.full(width, np.nan) if row is None else row for row in rows])
+
+
+def row_times(table: Any, rate_hz: float | None, where: str, warnings: list[str]) -> Array:
+    """Return the times (n,) [s] of a table's rows.
+
+    They are those of the column `timestamp`, whose unit follows from the rate: s, ms, us or ns. If
+    the column is missing or stands still, they are `frame_index` divided by the rate.
+
+    Args:
+        table: the table (pyarrow.Table).
+        rate_hz: rows per second (`fps`); None: unknown, and the unit is s.
+        where: the table's file, for messages.
+        warnings: list to which warnings are appended.
+
+    Raises:
+        SceneError: there are neither times nor a rate.
+    """
+    count, names = table.num_rows, table.column_names
+    times = np.full(count, np.nan)
+    if "timestamp" in names:
+        times = read_numbers(table, "timestamp", where)[:, 0]
+    step = float(np.nanmedian(np.diff(times))) if np.isfinite(times).sum() > 1 else 0.0
+    if not np.isfinite(times).any() or (count > 1 and step == 0.0):
+        # Seconds since 1970 as float32 have steps of 128 s.
+        why = "stands still or is no number" if "timestamp" in names else "is missing"
+        if rate_hz is None:
+            raise SceneError(
+                f"{where}: the column 'timestamp' {why}, and meta/info.json has no fps; it has: "
+                f"{', '.join(names)}"
+            )
+        is_counted = "frame_index" in names
+        frames = read_numbers(table, "frame_index", where)[:, 0] if is_counted else range(count)
+        warnings.append(
+            f"{where}: the column 'timestamp' {why}: the times are "
+            f"{'frame_index' if is_counted else 'the row numbers'} divided by {rate_hz:g} Hz (fps)"
+        )
+        return np.asarray(frames, np.float64) / rate_hz
+    if rate_hz is None or step <= 0.0:
+        return times
+    ratio = step * rate_hz
+    power = 3 * round(math.log10(ratio) / 3)
+    units = {3: "ms", 6: "microseconds", 9: "ns"}
+    if power in units and abs(math.log10(ratio) - power) < 0.5:
+        warnings.append(
+            f"{where}: 'timestamp' is taken to be in {units[power]}: it grows by {step:g} a row at "
+            f"{rate_hz:g} Hz (fps)"
+        )
+        return times * 10.0**-power
+    if not 0.8 < ratio < 1.25:
+        warnings.append(
+            f"{where}: the rows' times are {step:.4g} s apart, but at {rate_hz:g} Hz (fps) they "
+            f"would be {1.0 / rate_hz:.4g} s; the times are used"
+        )
+    return times
+
+
+def find_states(features: Features) -> list[str]:
+    """Return the features that are measured joint positions, in their order; [] if there are none.
+
+    They are `observation.state` or `state`, or else all features that begin with one of these and a
+    dot, or else those that are named after joints, such as `observation.joint_positions`, with the
+    grippers. Features named after joints come first if the state is Cartesian or has no names.
+    Actions, velocities, efforts and commands are never positions.
+    """
+    others = "action|velocit|vel$|effort|torque|current|acc|command|target|desired|goal|leader"
+    numeric = [
+        key
+        for key, one in features.items()
+        if len(one.get("shape") or ()) < 3
+        and re.match(r"float|double|u?int", str(one.get("dtype", "")))
+        and not re.search(rf"(?:^|[._/])(?:{others}|next|index|task|timestamp|env)", key.lower())
+        and not re.search(r"(?:index|velocit(?:y|ies)|vel|effort|torque|current)s?$", key.lower())
+    ]
+    states = ("observation.state", "state", "observation.states", "states", "observations.state")
+    plain = [key for key in states if key in numeric][:1]
+    grouped = [key for key in numeric if key.startswith(tuple(f"{one}." for one in states))]
+    joints = [key for key in numeric if re.search(r"joint|qpos|servo|motor", key.lower())]
+    if joints:
+        hand = [key for key in numeric if re.search(r"gripper|finger", key.lower())]
+        joints = [key for key in numeric if key in {*joints, *hand} and key not in plain]
+    if plain and not (joints and _is_cartesian(plain[0], features[plain[0]])):
+        return plain
+    return joints if plain else grouped or joints
+
+
+def _is_cartesian(key: str, feature: Mapping[str, Any]) -> bool:
+    """Return whether a feature's names are coordinates of a pose, or it has no names of its own."""
+    words = "|".join(("[xyzw]", "[rq][xyzw]", "roll", "pitch", "yaw", "gripper", "pad", "state"))
+    names = feature_names(key, {**feature, "shape": feature.get("shape") or [1]})
+    found = [re.fullmatch(rf"(?:.*[_. ])?(?:{words})(?:_?\d+)?", one.lower()) for one in names]
+    return all(found) or names[0] == "joint_0"
+
+
+def describe(features: Features) -> str:
+    """Return the names of features with their types and shapes, for messages."""
+    texts = [f"{k} ({one.get('dtype')} {one.get('shape', '')})" for k, one in features.items()]
+    return listed(texts, 20) or "none"
+
+
+def feature_names(key: str, feature: Mapping[str, Any]) -> list[str]:
+    """Return names of a vector feature's entries: those of the data set, if there are as many.
+
+    Otherwise they are the last part of the key, or "joint", and a number from 0; a single entry has
+    no number.
+
+    Args:
+        key: the feature's key.
+        feature: the feature in `meta/info.json`: its shape and, if any, its names, which may be
+            nested lists or a mapping of lists.
+    """
+    size, names = int(np.prod(feature["shape"])), feature.get("names")
+    if isinstance(names, dict):
+        names = [one if isinstance(one, list) else name for name, one in names.items()]
+    while names and isinstance(names[0], list):
+        names = [name for part in names for name in part]
+    if names and len(names) == size:
+        return [str(name) for name in names]
+    last = key.rpartition(".")[2]
+    last = "joint" if last in ("state", "states") else last
+    return [f"{last}_{k}" for k in range(size)] if size > 1 else [last]
+
+
+def column_names(keys: Sequence[str], widths: Iterable[int], features: Features) -> tuple[str, ...]:
+    """Return unique names of the numbers of several features.
+
+    A name that occurs in several features begins with its feature's key, and one that still occurs
+    twice ends with its index.
+
+    Args:
+        keys: the features.
+        widths: number of numbers of each feature in a row of the table.
+        features: all features.
+    """
+    parts = [
+        feature_names(key, {**features[key], "shape": [width]})
+        for key, width in zip(keys, widths, strict=True)
+    ]
+    every = [name for part in parts for name in part]
+    names = []
+    for key, part in zip(keys, parts, strict=True):
+        own = key.removeprefix("observation.")
+        names += [f"{own}.{n}" if every.count(n) > part.count(n) else n for n in part]
+    return tuple(n if names.count(n) == 1 else f"{n}_{k}" for k, n in enumerate(names))
+
+
+def is_picture(key: str, feature: Mapping[str, Any]) -> bool:
+    """Return whether a feature holds colour images: of type image or video, or arrays (H, W, 3)."""
+    shape = [*(feature.get("shape") or ())]
+    metadata = {**feature, **(feature.get("info") or {})}
+    if any("is_depth" in field and value is True for field, value in metadata.items()):
+        return False
+    if "depth" in key.lower() and len(shape) == 3 and 1 in (shape[0], shape[-1]):
+        return False
+    kind = str(feature.get("dtype", ""))
+    is_array = len(shape) == 3 and not {3, 4}.isdisjoint((shape[0], shape[-1]))
+    return kind in ("video", "image") or (is_array and kind.startswith(("uint8", "float")))
+
+
+class StoredPictures:
+    """Images of a table: files inside it, paths of files, or arrays.
+
+    Args:
+        root: folder of the data set.
+        file: the table, for messages.
+        key: the images' feature.
+        column: the cells (pyarrow array or list); None: the table has no such column, and images
+            are in the format's folders.
+        shape: shape of an image in `meta/info.json`; empty: unknown.
+        number: number of the episode.
+    """
+
+    def __init__(
+        self, root: Path, file: Path, key: str, column: Any, shape: Sequence[int], number: int
+    ) -> None:
+        self._root, self._file, self._key = root, file, key
+        self._column, self._shape, self._number = column, tuple(shape), number
+
+    def read(self, k: int) -> Picture:
+        """Return the image (H, W, 3) of row k, red, green, blue.
+
+        Raises:
+            SceneError: it is missing or damaged.
+        """
+        where = Path(f"{self._file}: '{self._key}', row {k}")
+        cell: Any = None
+        if self._column is not None:
+            cell = self._column[k]
+            kind = str(cell.type)
+            if kind.startswith(("list", "fixed_size_list", "large_list")):
+                return _array_picture(self._array(cell), str(where))
+            cell = cell.as_py()
+            if isinstance(cell, dict):
+                cell = cell.get("bytes") or cell.get("path")
+            if isinstance(cell, bytes):
+                return decode_colours(cell, where, SceneError)
+            if not isinstance(cell, str):
+                raise SceneError(
+                    f"{where}: holds {kind if cell is not None else 'nothing'}, but an image file, "
+                    "its path, or an array of height x width x 3 is expected"
+                )
+        tried = [*self._places(cell, k)]
+        for path in tried:
+            if path.is_file():
+                return read_picture(path, SceneError)
+        raise SceneError(f"{where}: no such image file; tried: {', '.join(map(str, tried))}")
+
+    def _places(self, stored: str | None, k: int) -> Iterable[Path]:
+        """Yield the paths at which the image of row k may be, by its stored path, if any."""
+        folders = [
+            self._root / "images" / key / f"episode{mark}{self._number:06d}"
+            for key in dict.fromkeys((self._key, self._key.rpartition(".")[2]))
+            for mark in "_-"
+        ]
+        if stored is None:
+            for folder in folders:
+                mark = folder.name[len("episode")]
+                yield from (folder / f"frame{mark}{k:06d}{end}" for end in (".png", ".jpg"))
+            return
+        path = PurePath(stored.replace("\\", "/"))
+        yield self._root / path
+        yield self._file.parent / path
+        if "images" in path.parts:
+            yield self._root.joinpath(*path.parts[path.parts.index("images") :])
+        yield self._root / "images" / path
+        yield from (folder / path.name for folder in folders)
+
+    def _array(self, cell: Any) -> Array:
+        """Return a cell of nested lists (pyarrow) as an array, in the shape of the lists."""
+        shape, values = list[int](), cell.values
+        while values is not None and str(values.type).partition("<")[0].endswith("list"):
+            inner = values.flatten()
+            shape.append(len(values))
+            values, outer = inner, len(values)
+            if outer == 0 or len(inner) % outer:
+                raise SceneError(f"{self._file}: '{self._key}': rows of an image differ in length")
+        flat = np.asarray(values.to_numpy(zero_copy_only=False))
+        sizes = [*shape, len(flat)]
+        lengths = [sizes[0], *(b // a for a, b in itertools.pairwise(sizes))]
+        # A flat list has the shape that the data set states.
+        given = self._shape if len(lengths) == 1 and math.prod(self._shape) == len(flat) else ()
+        return flat.reshape(given or lengths)
+
+
+def _array_picture(values: Any, where: str) -> Picture:
+    """Return an image (H, W, 3) of an array (H, W), (H, W, c) or (c, H, W), c being 1, 3 or 4.
+
+    Args:
+        values: numbers of any type; floating-point numbers up to 1 are fractions of 255.
+        where: start of the error message.
+
+    Raises:
+        SceneError: it has another shape, or its numbers are no intensities.
+    """
+    layers = values[:, :, None] if values.ndim == 2 else values
+    if layers.ndim == 3 and layers.shape[2] not in (1, 3, 4) and layers.shape[0] in (1, 3, 4):
+        layers = np.moveaxis(layers, 0, 2)
+    if layers.ndim != 3 or layers.shape[2] not in (1, 3, 4) or layers.dtype.kind not in "uif":
+        raise SceneError(
+            f"{where}: is an array of {layers.dtype} of shape {values.shape}, but height x width x "
+            "3 or 3 x height x width numbers are expected"
+        )
+    if layers.dtype == np.uint16:
+        layers = upper_bits(layers, where, SceneError)
+    if layers.dtype.kind == "f":
+        layers = layers * (255.0 if np.nanmax(layers) <= 1.0 else 1.0)
+    if not np.isfinite(layers).all() or layers.min() < 0 or layers.max() > 255:
+        raise SceneError(
+            f"{where}: has numbers from {layers.min():g} to {layers.max():g}, but intensities from "
+            "0 to 255 or from 0 to 1 are expected"
+        )
+    picture = np.rint(layers).astype(np.uint8)
+    if picture.shape[2] == 1:
+        return np.asarray(cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
+    return np.ascontiguousarray(picture[:, :, :3])

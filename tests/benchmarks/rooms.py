@@ -1,5 +1,6 @@
 """Simulated episodes of arms in rooms, rendered by Drake."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -166,9 +167,20 @@ def _around(rng: np.random.Generator, height: float) -> Array:
 
 
 def simulate(
-    model: ArticulatedModel, folder: Path, seed: int, grey: bool = False, late: float = 0.0
+    model: ArticulatedModel,
+    folder: Path,
+    seed: int,
+    grey: bool = False,
+    late: float = 0.0,
+    moved: Callable[[int], Array] | None = None,
 ) -> SimulatedEpisode:
-    """An arm that swings, seen by a camera on any side; pictures are late by some time [s]."""
+    """Simulate an arm that swings, seen by a camera on any side.
+
+    Args:
+        late: how late the pictures are [s].
+        moved: returns the pose (4, 4) of the camera that takes picture k in the returned one;
+            None: it stands still.
+    """
     rng = np.random.default_rng([9, seed])
     moving = np.isfinite(model.lower) & (model.upper - model.lower > 0.1)
     lower, upper = model.lower[moving], model.upper[moving]
@@ -199,11 +211,12 @@ def simulate(
     room, angles = Room(model, folder, seed, grey, behind), behind + rng.uniform(-1.6, 1.6, 3)
     walk = rng.uniform(1.0, 2.2, (3, 1)) * np.column_stack([np.cos(angles), np.sin(angles)])
     pictures = []
-    for t, q in zip(times, at(times + late), strict=True):
+    for n, (t, q) in enumerate(zip(times, at(times + late), strict=True)):
         progress = t / times[-1] * 2.0
         k = min(int(progress), 1)
         place = walk[k] + (progress - k) * (walk[k + 1] - walk[k])
-        picture = room.picture(q, [place[0], place[1], progress], camera)
+        own = camera if moved is None else camera.with_pose(camera.X_WC @ moved(n))
+        picture = room.picture(q, [place[0], place[1], progress], own)
         noisy = picture + rng.normal(0.0, _NOISE, picture.shape)
         pictures.append(np.clip(noisy, 0, 255).astype(np.uint8))
     return SimulatedEpisode(np.array(pictures), times, log_times, at(log_times), camera)

@@ -1,0 +1,308 @@
+"""Detect in its pictures that a camera which should stand still was nudged, drifts or shakes.
+
+Corners of the background are tracked from one reference picture into the others. Their common
+motion is the background's shift. A body, people and shadows move fewer corners than the background
+has. A step of the shift is a nudge, a slow change a drift.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.arrays import Array, Floats, Picture
+from drake_pose.camera.models import PinholeCamera
+
+
+@dataclass(frozen=True)
+class MotionSettings:
+    """How the motion of a background is measured, and what counts as one.
+
+    Chosen on recordings of DROID and LeRobot, and on rooms drawn with nudges of 1 to 13 pixels.
+
+    Args:
+        width: maximum width of the pictures in which corners are tracked [pixel].
+        most: number of pictures that are compared, evenly spaced, before a nudge is bracketed.
+        tiles: number of tiles along a picture's width; each gives its best corner.
+        near, close: distances within which a corner follows a motion, and within which motions
+            are told apart [pixel of the tracked pictures].
+        least_corners: minimum number of tracked corners.
+        least_share: minimum fraction of the tracked corners that follow the common motion.
+        static_share: a background is static if so many corners do not move, as a fraction of those
+            that follow the best common motion. An object with many corners that fills a quarter of
+            the picture leaves 0.17, a camera nudged by 1.6 pixels 0.02.
+        least_step: minimum root mean square shift of a nudge or drift, and least shake
+            [pixel of the tracked pictures].
+        noises: the same, in standard deviations of the shifts about their median.
+        abrupt: minimum fraction of a nudge's shift that happens between the pictures next to it.
+        most_during: maximum number of compared pictures that are taken during a nudge.
+        around: number of compared pictures before and after a nudge whose medians differ.
+    """
+
+    width: int = 640
+    most: int = 60
+    tiles: int = 20
+    near: float = 1.0
+    close: float = 0.4
+    least_corners: int = 16
+    least_share: float = 0.3
+    static_share: float = 0.12
+    least_step: float = 0.5
+    noises: float = 5.0
+    abrupt: float = 0.75
+    most_during: int = 3
+    around: int = 8
+
+
+MOTION = MotionSettings()
+
+
+class Nudge(NamedTuple):
+    """A camera's sudden motion.
+
+    Args:
+        before, after: indices of the last picture before and of the first one after it.
+        pixels: root mean square shift of the background [pixel].
+        rotation: (3,) rotation vector of directions in the camera's frame if it only turned [rad].
+    """
+
+    before: int
+    after: int
+    pixels: float
+    rotation: Array
+
+
+class CameraMotion(NamedTuple):
+    """The motion of a camera that should stand still.
+
+    Args:
+        nudges: sudden motions, in order.
+        drift: largest slow motion of the background between two nudges [pixel]; 0: none.
+        shake: median distance of the background's shift from its slow course [pixel]; 0: none.
+    """
+
+    nudges: tuple[Nudge, ...]
+    drift: float = 0.0
+    shake: float = 0.0
+
+
+def find_camera_motion(
+    read: Callable[[int], Picture], count: int, camera: PinholeCamera
+) -> CameraMotion:
+    """Return how a camera moved while it took pictures.
+
+    Args:
+        read: returns picture k (H, W, 3).
+        count: number of pictures, in the order of their times.
+        camera: its intrinsics; its pose is not used.
+    """
+    if count < 4:
+        return CameraMotion(())
+    rows = np.linspace(0, count - 1, min(count, MOTION.most)).round().astype(int)
+    rows = np.unique([*range(3), *rows.tolist(), *range(count - 3, count)])
+    tracker = _Background(read, int(rows[len(rows) // 2]), camera)
+    shifts = np.array([tracker.shift(k) for k in rows])
+    known = np.isfinite(shifts).all(axis=1)
+    # Where the background is often hidden or lost, nothing is known of the camera's motion.
+    if known.sum() < max(4, 0.5 * len(rows)):
+        return CameraMotion(())
+    rows, shifts = rows[known], shifts[known]
+    steps = find_steps(shifts, tracker.least)
+    begins, ends = [0, *(k for _, k in steps)], [*(k for k, _ in steps), len(rows) - 1]
+    parts = [shifts[a : b + 1] for a, b in zip(begins, ends, strict=True)]
+    levels = [np.median(part, axis=0) for part in parts]
+    nudges = []
+    for (last, first), (one, other) in zip(steps, pairwise(levels), strict=True):
+        by = other - one
+        near = 0.3 * float(np.linalg.norm(by))
+        before, after = _bracket(read, camera, int(rows[last]), int(rows[first]), near)
+        pixels = float(np.linalg.norm(by)) / tracker.scale
+        nudges.append(Nudge(before, after, pixels, tracker.rotation(by)))
+    drift, shake = (max(sizes) for sizes in zip(*map(_drift_and_shake, parts), strict=True))
+    least = tracker.least
+    return CameraMotion(
+        tuple(nudges),
+        drift / tracker.scale if drift >= max(least, MOTION.noises * shake) else 0.0,
+        shake / tracker.scale if shake >= least else 0.0,
+    )
+
+
+def find_steps(shifts: Array, least: float) -> list[tuple[int, int]]:
+    """Return the steps in samples, in order: the last one before and the first one after each.
+
+    Args:
+        shifts: (n, d) samples.
+        least: minimum norm of a step.
+    """
+    count, around = len(shifts), MOTION.around
+    for taken in range(MOTION.most_during + 1):
+        # Samples that were taken during the step belong to neither side.
+        best, found = 0.0, (0, 0)
+        for first in range(2 + taken, count - 1):
+            last = first - taken - 1
+            before, after = shifts[max(0, last - around + 1) : last + 1], shifts[first:][:around]
+            one, other = np.median(before, axis=0), np.median(after, axis=0)
+            step = float(np.linalg.norm(other - one))
+            off = np.linalg.norm(np.concatenate([before - one, after - other]), axis=1)
+            near = max(off[len(before) - 1], off[len(before)]) < (1.0 - MOTION.abrupt) * step
+            noise = 1.4826 * float(np.median(off))
+            if near and step > max(best, least, MOTION.noises * noise):
+                best, found = step, (last, first)
+        if best:
+            last, first = found
+            later = [(first + a, first + b) for a, b in find_steps(shifts[first:], least)]
+            return [*find_steps(shifts[: last + 1], least), found, *later]
+    return []
+
+
+def _drift_and_shake(shifts: Array) -> tuple[float, float]:
+    """Return the size of the slow change of samples (n, d), and the median distance from it."""
+    half = MOTION.around // 2
+    smooth = np.array(
+        [np.median(shifts[max(0, k - half) : k + half + 1], axis=0) for k in range(len(shifts))]
+    )
+    change = float(np.linalg.norm(smooth - smooth[0], axis=1).max())
+    return change, float(np.median(np.linalg.norm(shifts - smooth, axis=1)))
+
+
+def _bracket(
+    read: Callable[[int], Picture], camera: PinholeCamera, low: int, high: int, near: float
+) -> tuple[int, int]:
+    """Return the last picture before a nudge, and the first one after it.
+
+    Args:
+        read, camera: as of `find_camera_motion`.
+        low, high: indices of pictures before and after it.
+        near: maximum shift between pictures on one side of it [pixel of the tracked pictures].
+    """
+
+    def bisect(reference: int, low: int, high: int, from_low: bool) -> tuple[int, int]:
+        tracker = _Background(read, reference, camera)
+        while high - low > 1:
+            k = (low + high) // 2
+            is_near = float(np.linalg.norm(tracker.shift(k))) < near
+            low, high = (k, high) if is_near == from_low else (low, k)
+        return low, high
+
+    low, top = bisect(low, low, high, from_low=True)
+    return low, bisect(high, low, high, from_low=False)[1] if top < high else high
+
+
+class _Background:
+    """Shifts of the background against a reference picture.
+
+    Attributes:
+        scale: width of the tracked pictures over that of the camera's.
+        least: minimum step [pixel of the tracked pictures].
+
+    Args:
+        read: returns picture k (H, W, 3).
+        reference: index of the reference picture.
+        camera: its intrinsics.
+    """
+
+    def __init__(
+        self, read: Callable[[int], Picture], reference: int, camera: PinholeCamera
+    ) -> None:
+        self._read, self.least = read, MOTION.least_step
+        self.scale = min(1.0, MOTION.width / camera.width)
+        size = max(8, round(self.scale * camera.width)), max(8, round(self.scale * camera.height))
+        self._camera = camera.resized(*size)
+        # The root mean square distance of a picture's pixels from its centre.
+        self._radius = float(np.hypot(*size)) / np.sqrt(12.0)
+        self._reference = self._even(reference)
+        self._corners = _spread_corners(self._reference)
+
+    def _even(self, k: int) -> NDArray[np.uint8]:
+        """Return picture k (H, W) grey, with brightness and contrast made even everywhere."""
+        size = self._camera.width, self._camera.height
+        grey = cv2.cvtColor(self._read(k), cv2.COLOR_RGB2GRAY)
+        small: Floats = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        small = np.asarray(cv2.GaussianBlur(small, (0, 0), 1.0))
+        side = (2 * (size[0] // 40) + 1,) * 2
+        off = small - cv2.blur(small, side)
+        spread = np.sqrt(cv2.blur(off * off, side))
+        return np.clip(128.0 + 40.0 * off / (spread + 4.0), 0.0, 255.0).astype(np.uint8)
+
+    def shift(self, k: int) -> Array:
+        """Return the shift (4,) of picture k's background; nan: it is not determined.
+
+        It is the motion of the picture's centre along u and v, the rotation, and the relative
+        growth times a picture's root mean square radius, all [pixel of the tracked pictures].
+        """
+        unknown, corners = np.full(4, np.nan), self._corners
+        if len(corners) < MOTION.least_corners:
+            return unknown
+        found, is_tracked = _track(self._reference, self._even(k), corners)
+        one, other = corners[is_tracked], found[is_tracked]
+        if len(one) < MOTION.least_corners:
+            return unknown
+        centre = np.array([self._camera.center_x, self._camera.center_y])
+        one, other = one - centre, other - centre
+        matrix, follows = cv2.estimateAffinePartial2D(
+            one, other, method=cv2.RANSAC, ransacReprojThreshold=MOTION.near, maxIters=500
+        )
+        if matrix is None:
+            return unknown
+        off = np.linalg.norm(one @ matrix[:, :2].T + matrix[:, 2] - other, axis=1)
+        still = np.count_nonzero(np.linalg.norm(other - one, axis=1) < MOTION.close)
+        follow = np.count_nonzero(off < MOTION.close)
+        if still >= max(MOTION.static_share * follow, MOTION.least_corners / 2):
+            return np.zeros(4)
+        if np.count_nonzero(follows) < MOTION.least_share * len(one):
+            return unknown
+        # The best pair of corners is noisy, all that follow it are less so.
+        # Of a turned camera corners farther out are shifted more (the last two columns).
+        (x, y), zero = one.T, np.zeros(len(one))
+        fx, fy = self._camera.kernel_parameters()[1:3]
+        more = [x * x / fx**2, x * y / fy**2], [x * y / fx**2, y * y / fy**2]
+        rows = np.array([[x, -y, zero + 1.0, zero, *more[0]], [y, x, zero, zero + 1.0, *more[1]]])
+        for _ in range(3):
+            own = rows[..., off < MOTION.near].transpose(0, 2, 1).reshape(-1, len(rows[0]))
+            fit = np.linalg.lstsq(own, other[off < MOTION.near].T.ravel(), rcond=None)[0]
+            off = np.linalg.norm(np.einsum("cjn,j->nc", rows, fit) - other, axis=1)
+        turn, grow = np.arctan2(fit[1], fit[0]), np.hypot(*fit[:2]) - 1.0
+        return np.array([*fit[2:4], self._radius * turn, self._radius * grow])
+
+    def rotation(self, by: Array) -> Array:
+        """Return the rotation vector (3,) of directions that gives a shift (4,) [rad]."""
+        (fx, fy), turn = self._camera.kernel_parameters()[1:3], by[2] / self._radius
+        return np.array([-by[1] / fy, by[0] / fx, turn])
+
+
+def _spread_corners(picture: NDArray[np.uint8]) -> Floats:
+    """Return the best corner (n, 2) of each tile of a picture (H, W) that has one."""
+    side = max(4, picture.shape[1] // MOTION.tiles)
+    strength = cv2.cornerMinEigenVal(picture, 7)
+    corners, best = [], []
+    for v in range(0, picture.shape[0] - side + 1, side):
+        for u in range(0, picture.shape[1] - side + 1, side):
+            tile = strength[v : v + side, u : u + side]
+            row, column = divmod(int(tile.argmax()), side)
+            corners.append((u + column, v + row))
+            best.append(float(tile[row, column]))
+    keep = np.array(best) > 0.1 * np.median(best)
+    return np.array(corners, np.float32)[keep]
+
+
+def _track(
+    one: NDArray[np.uint8], other: NDArray[np.uint8], corners: Floats
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return where corners (n, 2) of one picture (H, W) are in another, and which were found.
+
+    A corner is found if it is tracked back to where it was.
+    """
+    window, levels, start = (15, 15), 3, corners[:, None]
+    found, there, _ = cv2.calcOpticalFlowPyrLK(
+        one, other, start, np.empty_like(start), winSize=window, maxLevel=levels
+    )
+    again, back, _ = cv2.calcOpticalFlowPyrLK(
+        other, one, found, np.empty_like(start), winSize=window, maxLevel=levels
+    )
+    is_found = np.concatenate([np.asarray(there), np.asarray(back)], axis=1).all(axis=1)
+    near = np.abs(np.asarray(again) - start).max(axis=(1, 2)) < MOTION.close
+    return np.asarray(found, np.float32)[:, 0], is_found & near

@@ -15,13 +15,14 @@ from drake_pose.arrays import Array, Indices, Picture
 from drake_pose.camera.calibration_files import lens_of
 from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending_indices
 from drake_pose.camera.models import Lens
-from drake_pose.camera.picture_files import decode_colours, import_reader
+from drake_pose.camera.picture_files import decode_colours, import_reader, upper_bits
 from drake_pose.errors import CameraError, DrakePoseError, SceneError
 
 BAGS = (".bag", ".mcap", ".db3")
 """Suffixes of bags."""
 
-# Bytes per pixel, and OpenCV's conversion to red, green, blue.
+# Bytes per pixel, and OpenCV's conversion to red, green, blue. Encodings of 16 bits, such as
+# mono16, have twice the bytes of those of 8.
 _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "rgb8": (3, None),
     "bgr8": (3, cv2.COLOR_BGR2RGB),
@@ -32,7 +33,15 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "bayer_bggr8": (1, cv2.COLOR_BayerBGGR2RGB),
     "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2RGB),
     "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2RGB),
+    "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
+    "nv12": (1, cv2.COLOR_YUV2RGB_NV12),
+    "nv21": (1, cv2.COLOR_YUV2RGB_NV21),
 }
+
+# Other names of encodings. Types of OpenCV tell no order of colours: OpenCV's own is assumed.
+_ALIASES = {"8uc1": "mono8", "8uc3": "bgr8", "8uc4": "bgra8", "16uc3": "bgr16", "16uc4": "bgra16"}
+_ALIASES |= {"uyvy": "yuv422", "yuyv": "yuv422_yuy2", "yuy2": "yuv422_yuy2"}
 
 # A message: its times in the header (0: none) and in the bag [ns], and its content, which is the
 # frame's name for an image and the positions (m,) for joints.
@@ -43,9 +52,9 @@ def open_bag(path: Path, joints: JointLog | None) -> Episode:
     """Open a bag: a file of ROS 1, or a folder, mcap or db3 file of ROS 2.
 
     A camera's name is its topic without slashes and `image_raw` (`/hand/image_raw` becomes `hand`).
-    The times of images and joint positions are those of the message headers. Joints published
-    separately are interpolated at the times of the publisher with most messages. A camera whose
-    frame is attached to others by `/tf_static` is mounted on the last of these.
+    The times of images and joint positions are those of the message headers, see `_clock_shifts`.
+    Joints published separately are interpolated at the times of the publisher with most messages.
+    A camera whose frame is attached to others by `/tf_static` is mounted on the last of these.
 
     Args:
         joints: joint log to use instead of the bag's; None: the bag's, if it has any.
@@ -53,10 +62,13 @@ def open_bag(path: Path, joints: JointLog | None) -> Episode:
     Raises:
         SceneError: the bag is unreadable, truncated, or has no images.
     """
-    pictures, states, infos, parents, ignored = _scan(path)
+    pictures, states, infos, parents, ignored, kinds = _scan(path)
     warnings = [f"{topic} is left out: {why}" for topic, why in ignored.items() if why != "depths"]
+    warnings += _name_joints(states)
+    shifts, texts = _clock_shifts(pictures, states)
+    warnings += texts
     if joints is None and states:
-        joints, merge_warnings = _merge_joints(states)
+        joints, merge_warnings = _merge_joints(states, shifts)
         warnings += merge_warnings
     cameras: dict[str, EpisodeCamera] = {}
     # If a camera was recorded twice, prefer the uncompressed topic.
@@ -67,7 +79,7 @@ def open_bag(path: Path, joints: JointLog | None) -> Episode:
         if (name := "_".join(parts)) in cameras:
             continue
         try:
-            camera = _read_camera(path, topic, pictures[topic], infos, warnings)
+            camera = _read_camera(path, topic, pictures[topic], shifts[topic], infos, warnings)
         except SceneError as error:
             warnings.append(f"camera '{name}' is left out: {error}")
             continue
@@ -79,22 +91,33 @@ def open_bag(path: Path, joints: JointLog | None) -> Episode:
             X_LC, frame = X_LF @ X_LC, link
         mounted = camera.camera and camera.camera.with_pose(X_LC)
         cameras[name] = replace(camera, name=name, camera=mounted, link=link)
-    return Episode.checked(path, cameras.values(), joints, warnings)
+    lacking = (
+        f"{path}: has no joint positions; give a table of them (--joints). Wanted is a topic of "
+        f"sensor_msgs/JointState with names and positions; the topics are: {_topics(kinds)}"
+    )
+    return Episode.checked(path, cameras.values(), joints, warnings, lacking)
 
 
-def _scan(path: Path) -> tuple[Any, Any, Any, Any, Any]:
+def _topics(kinds: Mapping[str, str]) -> str:
+    """Return topics with the types of their messages, for messages."""
+    return ", ".join(f"{topic} ({kind})" for topic, kind in kinds.items()) or "none"
+
+
+def _scan(path: Path) -> tuple[Any, Any, Any, Any, Any, Any]:
     """Read a bag once, without decoding images.
 
     Returns:
-        Rows of images by topic; rows of joint positions by (topic, names of the joints); the last
-        CameraInfo message by topic; (parent frame's name, pose (4, 4) in it [m]) of each static
-        frame by name; and the reason why a topic of images is ignored, by topic.
+        Rows of images by topic; rows of joint positions by (topic, names of the joints), without
+        names by (topic, their number); the last CameraInfo message by topic; (parent frame's name,
+        pose (4, 4) in it [m]) of each static frame by name; the reason why a topic is ignored, by
+        topic; and the type of message by topic.
 
     Raises:
         SceneError: the bag is damaged, or has no images.
     """
     pictures, states = defaultdict[str, list[_Row]](list), defaultdict[Any, list[_Row]](list)
-    infos, parents, ignored = {}, {}, {}
+    infos, parents, ignored = {}, {}, dict[str, str]()
+    orders: dict[tuple[str, frozenset[str]], tuple[str, ...]] = {}
     sensors = "Image", "CompressedImage", "JointState", "CameraInfo"
     with _translate_errors(path), _make_reader(path) as reader:
         wanted = [
@@ -119,20 +142,131 @@ def _scan(path: Path) -> tuple[Any, Any, Any, Any, Any]:
             stamps = stamp.sec * 10**9 + stamp.nanosec, log_time
             if kind == "CameraInfo":
                 infos[topic] = message
-            elif kind != "JointState":
+                continue
+            if kind != "JointState":
                 coding = (message.encoding if kind == "Image" else message.format).lower()
                 if any(one in coding for one in ("16uc1", "32fc1", "compresseddepth")):
                     ignored[topic] = "depths"
-                elif kind == "Image" and coding not in _ENCODINGS:
-                    ignored[topic] = f"{coding} is not one of {', '.join(_ENCODINGS)}"
+                elif kind == "Image" and _encoding(coding) is None:
+                    known = ", ".join((*_ENCODINGS, *_ALIASES))
+                    ignored[topic] = f"{coding} is not one of {known}, or of these with 16 bits"
                 else:
                     pictures[topic].append((*stamps, message.header.frame_id.strip("/")))
-            elif len(message.name) and len(message.position) == len(message.name):
-                states[topic, tuple(message.name)].append((*stamps, np.array(message.position)))
+                continue
+            names, positions = tuple(message.name), np.array(message.position, dtype=np.float64)
+            if names and len(positions) == len(names) == len(set(names)):
+                # The order of names may change from message to message.
+                order = orders.setdefault((topic, frozenset(names)), names)
+                row = positions if order == names else positions[[names.index(n) for n in order]]
+                states[topic, order].append((*stamps, row))
+            elif len(positions) and not names:
+                states[topic, len(positions)].append((*stamps, positions))
+            else:
+                ignored.setdefault(
+                    topic,
+                    f"a JointState has {len(positions)} positions for {len(set(names))} different "
+                    f"names of {len(names)}",
+                )
     if not pictures:
-        topics = ", ".join(f"{topic} ({kind})" for topic, kind in (kinds | ignored).items())
-        raise SceneError(f"{path}: has no pictures of cameras; its topics are: {topics or 'none'}")
-    return pictures, states, infos, parents, ignored
+        found = _topics(kinds | ignored)
+        raise SceneError(f"{path}: has no pictures of cameras; its topics are: {found}")
+    left_out = {topic for topic in ignored if any(topic == one for one, _ in states)}
+    return (
+        pictures,
+        states,
+        infos,
+        parents,
+        {k: v for k, v in ignored.items() if k not in left_out},
+        kinds,
+    )
+
+
+def _encoding(coding: str) -> tuple[int, int | None, bool] | None:
+    """Return bytes per pixel, OpenCV's conversion, and whether values have 16 bits; None: unknown.
+
+    Args:
+        coding: name of the encoding in lower case.
+    """
+    coding = _ALIASES.get(coding, coding)
+    if coding in _ENCODINGS:
+        return (*_ENCODINGS[coding], False)
+    eight = f"{coding.removesuffix('16')}8"
+    if not coding.endswith("16") or eight not in _ENCODINGS:
+        return None
+    size, how = _ENCODINGS[eight]
+    return 2 * size, how, True
+
+
+def _name_joints(states: dict[Any, list[_Row]]) -> list[str]:
+    """Name positions without names joint_0 and so on, or remove them; return warnings.
+
+    They are named only if no message has names, and all have as many positions and one topic.
+
+    Args:
+        states: rows by (topic, names), or (topic, number of positions); they are changed.
+    """
+    bare = [key for key in states if isinstance(key[1], int)]
+    if len(bare) == len(states) == 1:
+        topic, count = bare[0]
+        states[topic, tuple(f"joint_{k}" for k in range(count))] = states.pop(bare[0])
+        return [
+            f"{topic}: its JointState has no names: its {count} positions are taken for joints in "
+            "the model's order, if it has as many; record the names, or give a joint map"
+        ]
+    for key in bare:
+        del states[key]
+    return [
+        f"{topic} is left out: its JointState has {count} positions without names; record the names"
+        for topic, count in bare
+    ]
+
+
+def _clock_shifts(
+    pictures: Mapping[str, Sequence[_Row]],
+    states: Mapping[Any, Sequence[_Row]],
+    *,
+    differs: float = 1.0,
+) -> tuple[dict[Any, int | None], list[str]]:
+    """Return what is added to the stamps in the headers of each stream [ns], and warnings.
+
+    The result is 0 where the headers have the clock of the joints, and None where most headers have
+    no stamp, so that the times in the bag are used. Headers of another clock are moved by the
+    median difference of the times in the bag.
+
+    Args:
+        pictures, states: rows by topic, and by (topic, names).
+        differs: clocks differ if headers lag behind the times in the bag by so much more or less
+            than those of the joints [s]: more than recorders delay messages.
+    """
+    streams: dict[Any, Sequence[_Row]] = {**states, **pictures}
+    lags: dict[Any, float | None] = {}
+    for key, rows in streams.items():
+        stamps = np.array([row[:2] for row in rows])
+        stamped = stamps[stamps[:, 0] > 0]
+        lag = 1e-9 * (stamped[:, 1] - stamped[:, 0])
+        lags[key] = float(np.median(lag)) if 2 * len(stamped) > len(stamps) else None
+        # Times in the bag that do not follow the headers tell nothing.
+        if len(lag) and np.median(np.abs(lag - np.median(lag))) > differs:
+            lags[key] = np.nan
+    first = max(states or streams, key=lambda key: len(streams[key]))
+    # A stream that has the bag's times only needs those of the others, too.
+    joint_lag = lags[first] if None not in lags.values() else None
+    shifts, warnings = dict[Any, int | None](), list[str]()
+    for key, one in lags.items():
+        what = f"{key}: pictures" if key in pictures else f"{key[0]}: rows of {key[1][0]}"
+        shifts[key] = None
+        if one is None:
+            warnings.append(f"{what}: headers without time stamps: using the times of recording")
+            continue
+        off = one - (joint_lag or 0.0)
+        shifts[key] = round(1e9 * off) if abs(off) > differs else 0
+        if shifts[key]:
+            other = "the bag" if joint_lag is None else first if first in pictures else first[0]
+            warnings.append(
+                f"{what}: by the times of recording, the clock of the headers is {off:.6g} s "
+                f"behind that of {other}: this is added"
+            )
+    return shifts, warnings
 
 
 def _make_reader(path: Path) -> Any:
@@ -156,13 +290,14 @@ def _translate_errors(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _ordered_times(rows: Sequence[_Row], what: str, warnings: list[str]) -> tuple[Array, Indices]:
+def _ordered_times(
+    rows: Sequence[_Row], shift: int | None, what: str, warnings: list[str]
+) -> tuple[Array, Indices]:
     """Return ascending times (k,) [s], and indices (k,) of their rows; other rows are left out.
-
-    The times are those of the headers, or those of the bag if no header has one.
 
     Args:
         rows: the n messages.
+        shift: added to the stamps in the headers [ns]; None: use the times in the bag.
         what: name of the rows, for messages.
         warnings: list to which warnings are appended.
 
@@ -170,17 +305,14 @@ def _ordered_times(rows: Sequence[_Row], what: str, warnings: list[str]) -> tupl
         SceneError: too many rows are out of order, see ``ascending_indices``.
     """
     stamps = np.array([row[:2] for row in rows])
-    clock = 0 if stamps[:, 0].any() else 1
-    if clock:
-        warnings.append(f"{what}: headers without time stamps: using the times of recording")
-    times = 1e-9 * stamps[:, clock]
+    times = 1e-9 * (stamps[:, 1] if shift is None else stamps[:, 0] + shift)
     kept, late = ascending_indices(times, what)
     warnings += late
     return times[kept], kept
 
 
 def _merge_joints(
-    groups: Mapping[tuple[str, tuple[str, ...]], Sequence[_Row]],
+    groups: Mapping[tuple[str, tuple[str, ...]], Sequence[_Row]], shifts: Mapping[Any, int | None]
 ) -> tuple[JointLog, list[str]]:
     """Return all joints at the times of the publisher with most rows, and warnings.
 
@@ -188,13 +320,15 @@ def _merge_joints(
 
     Args:
         groups: rows by (topic, names of the joints), at least one.
+        shifts: of the groups' stamps, see `_clock_shifts`.
     """
     warnings: list[str] = []
     base: JointLog | None = None
     columns: dict[str, Array] = {}
     owners: dict[str, str] = {}
     for (topic, names), rows in sorted(groups.items(), key=lambda one: -len(one[1])):
-        times, kept = _ordered_times(rows, f"{topic}: rows of {names[0]}", warnings)
+        shift = shifts[topic, names]
+        times, kept = _ordered_times(rows, shift, f"{topic}: rows of {names[0]}", warnings)
         log = JointLog(names, times, np.array([row[2] for row in rows])[kept])
         base = base or log
         assert base.times is not None
@@ -211,7 +345,12 @@ def _merge_joints(
 
 
 def _read_camera(
-    path: Path, topic: str, rows: Sequence[_Row], infos: Mapping[str, Any], warnings: list[str]
+    path: Path,
+    topic: str,
+    rows: Sequence[_Row],
+    shift: int | None,
+    infos: Mapping[str, Any],
+    warnings: list[str],
 ) -> EpisodeCamera:
     """Return the camera of a topic; its name is the topic, and its pose the identity.
 
@@ -221,15 +360,21 @@ def _read_camera(
         path: the bag.
         topic: topic of the images.
         rows: rows of the images.
+        shift: of their stamps, see `_clock_shifts`.
         infos: CameraInfo messages by topic.
         warnings: list to which warnings are appended.
 
     Raises:
         SceneError: the first image is damaged, times run backwards, or the lens is unknown.
     """
-    times, kept = _ordered_times(rows, f"{topic}: pictures", warnings)
-    source = _TopicPictures(path, topic, np.array([row[1] for row in rows])[kept])
+    times, kept = _ordered_times(rows, shift, f"{topic}: pictures", warnings)
+    source = _TopicPictures(path, topic, [row[1] for row in rows], kept)
     height, width = source.read(0).shape[:2]
+    if source.encoding.startswith(("8uc3", "8uc4", "16uc")):
+        warnings.append(
+            f"{topic}: its encoding {source.encoding} does not tell the order of colours: blue, "
+            "green, red is assumed"
+        )
     base = topic.removesuffix("/compressed")
     beside = f"{base.rpartition('/')[0]}/camera_info"
     info, camera, lens = infos.get(beside, infos.get(f"{base}/camera_info")), None, None
@@ -287,43 +432,101 @@ class _TopicPictures:
     Args:
         path: the bag.
         topic: topic of the images.
-        log_times: (n,) times in the bag [ns] of the images, by which they are found.
+        log_times: times in the bag [ns] of all messages of the topic, in the bag's order.
+        kept: (n,) indices of the messages of the images.
+
+    Attributes:
+        encoding: encoding of the image that was read last, in lower case.
     """
 
-    def __init__(self, path: Path, topic: str, log_times: Indices) -> None:
-        self._path, self._topic, self._log_times = path, topic, log_times
+    def __init__(self, path: Path, topic: str, log_times: Sequence[int], kept: Indices) -> None:
+        self._path, self._topic = path, topic
+        # Messages may have the same time in the bag.
+        counts = defaultdict[int, int](int)
+        found = []
+        for time in log_times:
+            found.append((time, counts[time]))
+            counts[time] += 1
+        self._places = [found[k] for k in kept]
         self._reader: Any = None
         self._messages: Iterator[Any] = iter(())
-        self._next = -1
+        self._last = (-1, 0)
+        self.encoding = ""
 
     def read(self, k: int) -> Picture:
-        """Return image k, from 0 in the order of ``log_times``, (H, W, 3) red, green, blue.
+        """Return image k, from 0 in the order of ``kept``, (H, W, 3) red, green, blue.
 
         Raises:
             SceneError: it is damaged, or the bag's index is wrong.
         """
-        wanted, where = int(self._log_times[k]), f"{self._path}: {self._topic}, picture {k}"
+        wanted, where = self._places[k], f"{self._path}: {self._topic}, picture {k}"
         with _translate_errors(self._path):
             if self._reader is None:
                 self._reader = _make_reader(self._path)
                 self._reader.open()
-            if k != self._next:
+            if not k or self._last != self._places[k - 1]:
                 own = [one for one in self._reader.connections if one.topic == self._topic]
-                self._messages = self._reader.messages(own, start=wanted)
-            for one, log_time, data in self._messages:
-                if log_time == wanted:
-                    self._next = k + 1
+                self._messages = self._reader.messages(own, start=wanted[0])
+                self._last = (-1, 0)
+            for one, time, data in self._messages:
+                same = self._last[1] + 1 if time == self._last[0] else 0
+                self._last = (time, same)
+                if self._last == wanted:
                     message = self._reader.deserialize(data, one.msgtype)
-                    if one.msgtype.endswith("CompressedImage"):
-                        return decode_colours(bytes(message.data), Path(where), SceneError)
-                    size, how = _ENCODINGS[message.encoding.lower()]
-                    height, width, step = message.height, message.width, message.step
-                    if not (len(message.data) >= height * step > 0 and step >= width * size):
-                        raise SceneError(
-                            f"{where}: has fewer bytes than {width} x {height} pixels need"
-                        )
-                    rows = np.frombuffer(message.data, np.uint8, height * step)
-                    used = rows.reshape(height, step)[:, : width * size]
-                    used = used.reshape(height, width, size)
-                    return np.ascontiguousarray(used if how is None else cv2.cvtColor(used, how))
+                    is_file = one.msgtype.endswith("CompressedImage")
+                    self.encoding = (message.format if is_file else message.encoding).lower()
+                    return (_decode_file if is_file else _decode)(message, where)
         raise SceneError(f"{where}: is not where the bag's index says; reindex the bag")
+
+
+def _decode_file(message: Any, where: str) -> Picture:
+    """Return the image (H, W, 3) of a CompressedImage, red, green, blue.
+
+    The file has its colours in the usual order, whatever the encodings in the message's format.
+
+    Args:
+        message: the message.
+        where: start of error messages.
+
+    Raises:
+        SceneError: it is damaged, or no PNG or JPEG.
+    """
+    coding, _, rest = message.format.lower().partition(";")
+    try:
+        picture = decode_colours(bytes(message.data), Path(where), SceneError)
+    except SceneError as error:
+        raise SceneError(f"{error} (its format is '{message.format}')") from None
+    # A mosaic is usually converted to bgr8 first, which the format then ends with.
+    mosaic = _encoding(coding.strip()) if coding.startswith("bayer") else None
+    if mosaic is None or not rest.endswith(("compressed", coding)):
+        return picture
+    return np.asarray(cv2.cvtColor(picture[:, :, 0], mosaic[1] or 0), dtype=np.uint8)
+
+
+def _decode(message: Any, where: str) -> Picture:
+    """Return the image (H, W, 3) of an Image with a known encoding, red, green, blue.
+
+    Args:
+        message: the message.
+        where: start of error messages.
+
+    Raises:
+        SceneError: it has too few bytes, or 16 bits whose upper ones are not used.
+    """
+    known = _encoding(message.encoding.lower())
+    if known is None:
+        raise SceneError(f"{where}: its encoding changes to {message.encoding}")
+    size, how, is_deep = known
+    height, width, step = message.height, message.width, message.step
+    # These have a plane of colours of half the height below the intensities.
+    lines = height * 3 // 2 if how in (cv2.COLOR_YUV2RGB_NV12, cv2.COLOR_YUV2RGB_NV21) else height
+    if not (len(message.data) >= lines * step > 0 and step >= width * size):
+        raise SceneError(f"{where}: has fewer bytes than {width} x {height} pixels need")
+    rows = np.frombuffer(message.data, np.uint8, lines * step)
+    used = rows.reshape(lines, step)[:, : width * size]
+    if is_deep:
+        order = ">u2" if message.is_bigendian else "<u2"
+        used = upper_bits(np.ascontiguousarray(used).view(order), where, SceneError)
+        size //= 2
+    used = used.reshape(lines, width, size)
+    return np.ascontiguousarray(used if how is None else cv2.cvtColor(used, how))

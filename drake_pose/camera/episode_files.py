@@ -299,6 +299,11 @@ def open_episode(
         found = open_folder(path, log)
     elif kind == "bag" and (path.is_file() or "metadata.yaml" in inside or len(bags) == 1):
         found = open_bag(path if path.is_file() or "metadata.yaml" in inside else bags[0], log)
+    elif len(bags) > 1:
+        raise SceneError(
+            f"{path}: has {len(bags)} bags and no metadata.yaml: give one of them, "
+            f"{listed([one.name for one in bags])}, or write the file (ros2 bag reindex)"
+        )
     else:
         what = ", ".join(inside[:8]) if path.is_dir() else "a file of another kind"
         raise SceneError(f"{path}: is not an episode: {what or 'empty'}; {expected}")

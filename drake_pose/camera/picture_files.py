@@ -229,7 +229,7 @@ def _decode(
         raise error_type(f"{path}: the JPEG picture is truncated")
     # Check completeness here, because OpenCV's versions differ in decoding truncated images.
     if not (is_jpeg or data.startswith(b"\x89PNG\r\n\x1a\n")):
-        raise error_type(f"{path}: not a PNG picture")
+        raise error_type(f"{path}: not a PNG{'' if only_png else ' or JPEG'} picture")
     try:
         # Pillow only warns of decompression bombs up to twice its limit: raise there, too.
         with warnings.catch_warnings():

@@ -1,5 +1,6 @@
 """Bags written by rosbags, of ROS 1 and both kinds of ROS 2."""
 
+import re
 from typing import Any
 
 import cv2
@@ -60,22 +61,30 @@ class Bag:
         data = pack(self.new(kind, **fields), kind)
         self.writer.write(self.topics[topic], START + round(1e9 * logged), data)
 
-    def image(self, topic, time, picture, coding, logged=0.0):
-        height, width = picture.shape[:2]
-        padded = np.pad(picture.reshape(height, -1), ((0, 0), (0, 5)))
-        fields = {"height": height, "width": width, "encoding": coding, "is_bigendian": 0}
+    def image(self, topic, time, picture, coding, logged=0.0, big=0):
+        padded = np.pad(picture.reshape(len(picture), -1), ((0, 0), (0, 5)))
+        height, width = (SIDE, SIDE) if picture.shape[1] != 4 else picture.shape[:2]
+        fields = {"height": height, "width": width, "encoding": coding, "is_bigendian": big}
         fields |= {"header": self.header(time, "lens"), "step": padded.shape[1]}
         self.write(topic, "sensor_msgs/msg/Image", logged, data=padded.ravel(), **fields)
 
-    def compressed(self, topic, time, number, kind="jpeg"):
-        data = cv2.imencode(".jpg", numbered(number)[:, :, ::-1])[1].ravel()
+    def compressed(self, topic, time, number, kind="jpeg", data=None):
+        if data is None:
+            data = cv2.imencode(".jpg", numbered(number)[:, :, ::-1])[1].ravel()
         fields = {"header": self.header(time, "lens"), "format": kind, "data": data}
         self.write(topic, "sensor_msgs/msg/CompressedImage", time, **fields)
 
-    def joints(self, topic, time, **positions):
-        fields = {"header": self.header(time), "name": [*positions], "velocity": NONE}
-        fields |= {"position": np.array([*positions.values()], dtype=float), "effort": NONE}
-        self.write(topic, "sensor_msgs/msg/JointState", time, **fields)
+    def joints(self, topic, time, logged=None, **positions):
+        self._state(topic, time, logged, [*positions], [*positions.values()])
+
+    def bare(self, topic, time, positions):
+        self._state(topic, time, None, [], positions)
+
+    def _state(self, topic, time, logged, names, positions):
+        fields = {"header": self.header(time), "name": names, "velocity": NONE}
+        fields |= {"position": np.array(positions, dtype=float), "effort": NONE}
+        logged = time if logged is None else logged
+        self.write(topic, "sensor_msgs/msg/JointState", logged, **fields)
 
     def info(self, topic, model, D, P=(0.0,) * 12):
         sides = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
@@ -159,8 +168,8 @@ def test_images_of_all_encodings_are_decoded(tmp_path):
             place = np.tile(np.reshape(["rgb".index(c) for c in pattern], (2, 2)), (32, 32))
             mosaic = np.take_along_axis(red, place[:, :, None], axis=2)[:, :, 0]
             bag.image(f"/{pattern}", 0.0, mosaic, f"bayer_{pattern}8")
-        bag.image("/strange", 0.0, grey, "bayer_rggb16")
-        bag.image("/deep", 0.0, np.dstack([grey, grey]), "mono16")
+        bag.image("/strange", 0.0, grey, "yuv444")
+        bag.image("/dark", 0.0, np.dstack([grey, grey // 20]), "mono16")
         bag.image("/depth", 0.0, np.dstack([grey, grey]), "16UC1")
     episode = open_episode(bag.path)
     for name in ("rgb", "bgr", "bgra"):
@@ -169,11 +178,176 @@ def test_images_of_all_encodings_are_decoded(tmp_path):
     for pattern in ("rggb", "bggr", "gbrg", "grbg"):
         found = episode.camera(pattern).read(0).astype(int)
         assert np.abs(found - red)[2 : SIDE // 4 - 2, 2:-2].max() < 3, pattern
-    assert not {"depth", "strange", "deep"} & set(episode.cameras)
+    assert not {"depth", "strange", "dark"} & set(episode.cameras)
     warnings = "\n".join(episode.warnings)
-    assert "/strange is left out: bayer_rggb16 is not one of rgb8, bgr8" in warnings
-    assert "/deep is left out: mono16 is not one of rgb8, bgr8" in warnings
+    assert "/strange is left out: yuv444 is not one of rgb8, bgr8" in warnings
+    assert "/dark, picture 0: has 16 bits per pixel, but no value above 1932 of 65535" in warnings
     assert "/depth" not in warnings
+
+
+def yuv_of(picture):
+    """Return intensities and colour differences (H, W, 3) of an image by ITU-R BT.601."""
+    red, green, blue = np.moveaxis(picture / 255.0, 2, 0)
+    Y = 16 + 65.481 * red + 128.553 * green + 24.966 * blue
+    U = 128 - 37.797 * red - 74.203 * green + 112.0 * blue
+    V = 128 + 112.0 * red - 93.786 * green - 18.214 * blue
+    return np.rint(np.dstack([Y, U, V])).astype(np.uint8)
+
+
+def test_raw_and_deep_encodings_are_decoded(tmp_path):
+    bag, picture = Bag(tmp_path, "mcap"), numbered(5)
+    Y, U, V = np.moveaxis(yuv_of(picture), 2, 0)
+    U, V = (one.reshape(SIDE, -1, 2)[:, :, 0] for one in (U, V))
+    colours = np.dstack([U, V]).reshape(SIDE, SIDE)
+    planes = np.vstack([Y, colours[::2]])
+    mosaic = picture[:, :, 1]
+    deep = {"<u2": 0, ">u2": 1}
+    with bag.writer:
+        bag.joints("/joint_states", 0.0, x=0.0)
+        for name in ("yuv422", "uyvy"):
+            bag.image(f"/{name}", 0.0, np.dstack([colours, Y]), name)
+        for name in ("yuv422_yuy2", "yuyv"):
+            bag.image(f"/{name}", 0.0, np.dstack([Y, colours]), name)
+        bag.image("/nv12", 0.0, planes, "nv12")
+        bag.image("/8UC3", 0.0, picture[:, :, ::-1], "8UC3")
+        bag.image("/8UC4", 0.0, np.dstack([picture[:, :, ::-1], Y]), "8UC4")
+        bag.image("/8UC1", 0.0, mosaic, "8UC1")
+        for kind, big in deep.items():
+            wide = (257 * picture[:, :, ::-1].astype(np.uint16)).astype(kind)
+            bag.image(f"/bgr{big}", 0.0, wide.view(np.uint8), "bgr16", big=big)
+            bag.image(f"/mono{big}", 0.0, wide[:, :, 1].copy().view(np.uint8), "mono16", big=big)
+            bayer = wide[:, :, 1].copy().view(np.uint8)
+            bag.image(f"/bayer{big}", 0.0, bayer, "bayer_rggb16", big=big)
+    episode = open_episode(bag.path)
+    for name in ("yuv422", "uyvy", "yuv422_yuy2", "yuyv", "nv12"):
+        found = episode.camera(name).read(0).astype(int)
+        assert np.abs(found - picture)[:, 2:-2].max() < 5, name
+    for name in ("8UC3", "8UC4", "bgr0", "bgr1"):
+        np.testing.assert_array_equal(episode.camera(name).read(0), picture)
+    for name in ("8UC1", "mono0", "mono1"):
+        np.testing.assert_array_equal(episode.camera(name).read(0)[:, :, 2], picture[:, :, 1])
+    bayer = [episode.camera(f"bayer{big}").read(0) for big in (0, 1)]
+    np.testing.assert_array_equal(*bayer)
+    np.testing.assert_array_equal(
+        bayer[0][5:60, 5:60, 1], cv2.cvtColor(mosaic, cv2.COLOR_BayerRGGB2RGB)[5:60, 5:60, 1]
+    )
+    guesses = [text for text in episode.warnings if "does not tell the order of colours" in text]
+    assert [text.partition(":")[0] for text in guesses] == ["/8UC3", "/8UC4"]
+
+
+def test_formats_of_compressed_pictures(tmp_path):
+    bag = Bag(tmp_path, "mcap")
+    formats = (
+        "jpeg",
+        "rgb8; jpeg compressed bgr8",
+        "bgr8; jpeg compressed bgr8",
+        "bayer_rggb8; jpeg compressed bgr8",
+    )
+    mosaic = numbered(3)[:, :, 1]
+    with bag.writer:
+        bag.joints("/joint_states", 0.0, x=0.0)
+        for k, kind in enumerate(formats):
+            bag.compressed(f"/a{k}/compressed", 0.0, 3, kind)
+        data = cv2.imencode(".png", mosaic)[1].ravel()
+        bag.compressed("/raw/compressed", 0.0, 3, "bayer_rggb8; png compressed", data)
+        bag.compressed("/film/compressed", 0.0, 3, "h264", np.zeros(99, np.uint8))
+    episode = open_episode(bag.path)
+    assert [number_of(episode.camera(f"a{k}").read(0)) for k in range(4)] == [3] * 4
+    np.testing.assert_array_equal(
+        episode.camera("raw").read(0), cv2.cvtColor(mosaic, cv2.COLOR_BayerRGGB2RGB)
+    )
+    assert "camera 'film' is left out" in (text := "\n".join(episode.warnings))
+    assert "not a PNG or JPEG picture (its format is 'h264')" in text
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_positions_without_names_and_names_in_any_order(tmp_path, kind):
+    for case in ("bare", "two", "both", "order", "none"):
+        folder = tmp_path / case
+        folder.mkdir()
+        bag = Bag(folder, kind)
+        with bag.writer:
+            for k in range(COUNT):
+                bag.image("/a", 0.1 * k, numbered(k), "rgb8", logged=0.1 * k)
+                if case in ("bare", "two", "both"):
+                    bag.bare("/joint_states", 0.1 * k, [0.1 * k, -1.0])
+                if case == "two":
+                    bag.bare("/others", 0.1 * k, [1.0, 2.0, 3.0])
+                if case == "both":
+                    bag.joints("/named", 0.1 * k, elbow=0.1 * k, wrist=-1.0)
+                if case == "order":
+                    pair = {"elbow": 0.1 * k, "wrist": -1.0}
+                    bag.joints(
+                        "/joint_states", 0.1 * k, **dict([*pair.items()][:: 1 - 2 * (k % 2)])
+                    )
+        episode = open_episode(bag.path)
+        texts, joints = "\n".join(episode.warnings), episode.joints
+        if case in ("two", "none"):
+            assert joints is None
+            assert "Wanted is a topic of sensor_msgs/JointState with names" in texts
+            assert ("/others is left out: its JointState has 3 positions" in texts) == (
+                case == "two"
+            )
+            continue
+        expected = ("joint_0", "joint_1") if case == "bare" else ("elbow", "wrist")
+        assert joints.names == expected
+        np.testing.assert_allclose(joints.positions, [[0.1 * k, -1.0] for k in range(COUNT)])
+        assert ("2 positions are taken for joints in the model's order" in texts) == (
+            case == "bare"
+        )
+        assert ("2 positions without names" in texts) == (case == "both")
+
+
+@pytest.mark.parametrize(
+    ("camera", "joint", "later", "text"),
+    [
+        (0.0, 0.0, 0.0, ""),
+        (0.4, 0.0, 0.4, ""),
+        (-1e9, 0.0, 0.02, r"the clock of the headers is 1e\+09 s behind that of /joint_states"),
+        (5.0, 0.0, 0.02, "/a: pictures: by .* is -4.98 s behind that of /joint_states: this is ad"),
+        (-1e9, -1e9, 0.0, ""),
+        (np.nan, 0.0, 0.02, "/a: pictures: headers without time stamps"),
+        (np.nan, -1e9, 0.02, "/joint_states: rows of x: by the times of .* behind that of the bag"),
+        (0.0, np.nan, 0.0, "/joint_states: rows of x: headers without time stamps"),
+    ],
+)
+def test_clocks_of_headers_that_differ_are_moved_by_the_times_of_recording(
+    tmp_path, camera, joint, later, text
+):
+    bag = Bag(tmp_path, "mcap")
+    with bag.writer:
+        for k in range(COUNT):
+            bag.image("/a", 0.1 * k + camera, numbered(k), "rgb8", logged=0.1 * k + 0.02)
+            bag.joints("/joint_states", 0.1 * k + joint, logged=0.1 * k, x=0.1 * k)
+    episode = open_episode(bag.path)
+    one, texts = episode.camera("a"), "\n".join(episode.warnings)
+    found = episode.joints.at(one.times)[:5, 0]
+    np.testing.assert_allclose(found, 0.1 * np.arange(5) + later, rtol=0, atol=1e-6)
+    assert re.search(text, texts), texts
+    assert bool(text) == ("clock" in texts or "without time stamps" in texts)
+    assert [number_of(one.read(k)) for k in (3, 1)] == [3, 1]
+
+
+def test_messages_of_equal_times_in_the_bag_are_told_apart(tmp_path):
+    bag = Bag(tmp_path, "sqlite3")
+    with bag.writer:
+        for k in range(COUNT):
+            bag.image("/a", 0.1 * k, numbered(k), "rgb8", logged=0.0 if k < 9 else 1.0)
+            bag.joints("/joint_states", 0.1 * k, logged=0.0, x=0.1 * k)
+    one = open_episode(bag.path).camera("a")
+    order = [*range(COUNT), 3, 3, 11, 0, 10]
+    assert [number_of(one.read(k)) for k in order] == order
+
+
+def test_folders_of_several_bags_are_refused(tmp_path):
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        bag = Bag(tmp_path / name, "mcap")
+        with bag.writer:
+            bag.joints("/joint_states", 0.0, x=0.0)
+        next(bag.path.glob("*.mcap")).rename(tmp_path / f"{name}.mcap")
+    with pytest.raises(SceneError, match=r"has 2 bags and no metadata\.yaml: .* one\.mcap, two"):
+        open_episode(tmp_path)
 
 
 def test_images_are_undistorted_by_their_lens_models(tmp_path):

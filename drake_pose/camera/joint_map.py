@@ -43,6 +43,7 @@ class MappedJoints:
         columns: linear map from a column to each logged joint.
         encoding: what the columns hold, if LeRobot recorded them of servos; None: they are angles
             or lengths.
+        joints: the joints whose columns hold that.
     """
 
     log: JointLog
@@ -52,6 +53,7 @@ class MappedJoints:
     warnings: tuple[str, ...]
     columns: Mapping[str, Column]
     encoding: Encoding | None = None
+    joints: tuple[ServoJoint, ...] = ()
 
 
 def map_joints(
@@ -115,7 +117,9 @@ def map_joints(
         taken = {one.column for one in joints}
         matched = {column: joint for column, joint in matched.items() if column not in taken}
     else:
-        matched, texts = _without_openings(matched, others, limits, UNITS.get(units or "rad", 1.0))
+        matched, texts = _without_openings(
+            matched, others, limits, UNITS.get(units or "rad", 1.0), is_mapped=bool(table)
+        )
         warnings += texts
     revolute = {column: joint for column, joint in matched.items() if joint in angular}
     if revolute and units is None:
@@ -148,7 +152,17 @@ def map_joints(
     if unused:
         warnings.append(f"columns of the joint log that are not joints: {', '.join(unused)}")
     mapped = JointLog(tuple(names), log.times, positions, log.frames, log.servos)
-    return MappedJoints(mapped, clipped, missing, unused, tuple(warnings), columns, encoding)
+    return MappedJoints(
+        mapped, clipped, missing, unused, tuple(warnings), columns, encoding, tuple(joints)
+    )
+
+
+def motors_of(mapped: MappedJoints) -> list[tuple[ServoJoint, str]]:
+    """Return the joints that are mapped and calibrated, each with the name of its motor."""
+    servos = mapped.log.servos or Servos()
+    pairs = match_names([one.column for one in mapped.joints], [*servos.motors])[0]
+    used = [one for one in mapped.joints if one.column in pairs and one.name in mapped.columns]
+    return [(one, pairs[one.column]) for one in used]
 
 
 def _match(
@@ -205,6 +219,8 @@ def _without_openings(
     readings: Mapping[str, Array],
     limits: Mapping[str, tuple[float, float]],
     unit: float,
+    *,
+    is_mapped: bool,
     slack: float = 0.1,
 ) -> tuple[dict[str, str], list[str]]:
     """Return the matched columns, without those that only their place gives to a gripper's joint.
@@ -216,6 +232,8 @@ def _without_openings(
         readings: (n,) readings by column.
         limits: by joint [rad or m].
         unit: unit of the readings [rad].
+        is_mapped: whether a joint map has the other joints; then a column that has a gripper's name
+            is kept only within the joint's limits, too.
         slack: tolerance of the limits [rad or m].
 
     Returns:
@@ -223,17 +241,18 @@ def _without_openings(
     """
     kept, warnings = dict(matched), list[str]()
     for column, joint in matched.items():
-        if column == joint or is_gripper_name(_words(column)) or not is_gripper_name(_words(joint)):
+        is_named = column == joint or is_gripper_name(_words(column))
+        if not is_gripper_name(_words(joint)) or (is_named and not is_mapped):
             continue
         low, high = limits[joint][0] - slack, limits[joint][1] + slack
         own = readings[column][np.isfinite(readings[column])]
-        if _is_opening(own) or not (
-            low <= unit * own.min(initial=0.0) <= unit * own.max(initial=0.0) <= high
-        ):
+        least, most = own.min(initial=0.0), own.max(initial=0.0)
+        is_within = low <= unit * least <= unit * most <= high
+        if not is_within or (_is_opening(own) and not is_named):
             del kept[column]
             warnings.append(
-                f"column '{column}' of the joint log, {own.min(initial=0.0):.3g} to "
-                f"{own.max(initial=0.0):.3g}, is not taken for joint '{joint}': it seems to be a "
+                f"column '{column}' of the joint log, {least:.3g} to {most:.3g}, "
+                f"is not taken for joint '{joint}': it seems to be a "
                 f"gripper's opening; map it if it is known ({joint}: {{column: {column}, from: [0, "
                 "1], to: [OPEN, CLOSED]})"
             )

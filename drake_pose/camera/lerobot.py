@@ -1,7 +1,7 @@
 """Read episodes of LeRobot data sets, versions 2.0, 2.1 and 3.0."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ import numpy as np
 
 from drake_pose.arrays import Array, Indices, Picture
 from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending_indices
+from drake_pose.camera.lerobot_cameras import with_fields
 from drake_pose.camera.lerobot_tables import (
     StoredPictures,
     column_names,
@@ -73,7 +74,7 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
                 f"arrays of height x width x 3); it has: {describe(features)}"
             )
         for key in pictures:
-            name = key.removeprefix("observation.").removeprefix("images.")
+            name = camera_name(key)
             names.append(key if name in names else name)
             try:
                 camera = _read_camera(path, info, rows, number, key, table, file, warnings)
@@ -82,7 +83,9 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
                 continue
             if not len(camera.times):
                 camera = _of_rows(camera, stamps, kept)
-            cameras.append(replace(camera, name=names[-1]))
+            fields = {**features[key], **(features[key].get("info") or {})}
+            camera = replace(camera, name=names[-1])
+            cameras.append(with_fields(camera, fields, str(path / INFO)))
         own, lacking = None, ""
         if joints is None:
             own, lacking = _read_joints(path, info, table, file, stamps, kept, warnings)
@@ -97,6 +100,16 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
             f"({type(error).__name__}: {error})"
         ) from error
     return Episode.checked(path, cameras, joints or own, warnings, lacking)
+
+
+def camera_name(key: str) -> str:
+    """Return the usual name of the camera with a key in the features of `meta/info.json`."""
+    return key.removeprefix("observation.").removeprefix("images.")
+
+
+def camera_key(features: Iterable[str], name: str) -> str:
+    """Return the key of the camera with a name, which may be the key itself."""
+    return next(key for key in features if name in (key, camera_name(key)))
 
 
 def _read_info(path: Path) -> Mapping[str, Any]:

@@ -5,6 +5,7 @@ motor, as 200 (P - low) / (high - low) - 100, for a gripper as 100 (P - low) / (
 it uses degrees, as (P - middle) 360 / 4095, with the ends of the motor's calibrated range.
 """
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -396,3 +397,91 @@ def _require_ranges(joints: Sequence[ServoJoint], servos: Servos) -> None:
 def is_gripper_name(words: Sequence[str]) -> bool:
     """Return whether a name, given by its words, is of a gripper's joint or opening."""
     return not {*words}.isdisjoint({"gripper", "finger", "fingers", "jaw", "claw", "knuckle"})
+
+
+@dataclass(frozen=True)
+class HomingCorrection:
+    """A motor's corrected homing offset.
+
+    Attributes:
+        motor: name of the motor.
+        before, after: homing offset in the file, and corrected [steps].
+        shift: by how much its positions become larger [steps].
+        reason: why it is not corrected; "": it is.
+    """
+
+    motor: str
+    before: int
+    after: int
+    shift: int
+    reason: str = ""
+
+
+def correct_homing(
+    joint: ServoJoint,
+    motor_name: str,
+    column: Column,
+    offset: float,
+    servos: Servos,
+    encoding: Encoding,
+    *,
+    most_lost: float = 0.5,
+) -> HomingCorrection:
+    """Return the homing offset with which LeRobot reads the model's angle of a joint.
+
+    The middle of the motor's range, where LeRobot reads 0, becomes the model's zero. The range
+    stays: its ends are the same angles to both sides of the zero.
+
+    Args:
+        joint: the joint; its readings are not used.
+        motor_name: name of the motor in the calibration file.
+        column: the joint's column, as recorded.
+        offset: the joint's offset, to be added to the recorded positions [rad].
+        servos: the robot's motors.
+        encoding: what the column holds.
+        most_lost: largest correction [half the range]; beyond it the model's zero is another one
+            than the motor's, as in a model whose limits are all on one side of 0.
+    """
+    motor, step = servos.motors[motor_name], 2.0 * math.pi / servos.turn
+    before = motor.homing
+    if joint.is_gripper:
+        reason = "its readings are an opening of 0 to 100, not an angle"
+        return HomingCorrection(motor_name, before, before, 0, reason)
+    sign = -1.0 if motor.is_inverted and not servos.is_dynamixel and encoding != "deg" else 1.0
+    if servos.has_lists:
+        # Lists add their offset to what the motor counts, after inverting it.
+        counted = sign if encoding == "steps" else 1.0
+        shift = round(math.copysign(offset / step, counted * column.scale * offset))
+        return HomingCorrection(motor_name, before, before + shift, shift)
+    middle = 0.5 * (motor.low + motor.high) if encoding == "steps" else 0.0
+    zero = column.scale * middle + column.offset + offset
+    shift, half = round(sign * zero / step), 0.5 * (motor.high - motor.low)
+    if abs(shift) > most_lost * half:
+        reason = (
+            f"the middle of its range is {math.degrees(zero):.0f} degrees in the model, too far "
+            "from its zero: calibrate it again with the arm in the middle of its range"
+        )
+        return HomingCorrection(motor_name, before, before, 0, reason)
+    # Feetech: position = counted - homing offset; Dynamixel: plus.
+    after = before + shift if servos.is_dynamixel else before - shift
+    if not servos.is_dynamixel and abs(after) >= servos.turn // 2:
+        # The register has a sign and 11 bits; positions are modulo a turn.
+        after = max(after - int(math.copysign(servos.turn, after)), 1 - servos.turn // 2)
+    return HomingCorrection(motor_name, before, after, shift)
+
+
+def dump_column(joint: str, column: Column, offset: float) -> str:
+    """Return a joint's line of a joint map [rad or m].
+
+    Args:
+        joint: name of the joint.
+        column: its column.
+        offset: added to its positions [rad or m].
+    """
+    scale, constant = float(column.scale), float(column.offset + offset)
+    name = json.dumps(column.name)
+    if column.ends is None:
+        return f"{joint}: {{column: {name}, scale: {scale!r}, offset: {constant!r}}}\n"
+    ends = [float(one) for one in column.ends]
+    values = [scale * one + constant for one in ends]
+    return f"{joint}: {{column: {name}, from: {ends}, to: {values}}}\n"

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from drake_pose.camera.episode import JointLog
-from drake_pose.camera.joint_map import map_joints
+from drake_pose.camera.joint_map import map_joints, motors_of, read_joint_map
 from drake_pose.camera.motor_calibration import Servos, find_motors, read_motors
+from drake_pose.camera.servo_readings import Column, ServoJoint, correct_homing, dump_column
 from drake_pose.errors import SceneError
 
 BODY = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
@@ -21,14 +22,20 @@ STEP = 2.0 * np.pi / 4096
 class Encoder:
     """A motor whose encoder is mounted at any angle, calibrated as LeRobot does, in whole steps."""
 
-    def __init__(self, rng, lower, upper, *, full=False, dynamixel=False, inverted=False):
+    def __init__(
+        self, rng, lower, upper, *, full=False, dynamixel=False, inverted=False, wrong=0.0
+    ):
+        """wrong: middle of the range as calibrated, less the true one [rad]."""
         self.dynamixel, self.inverted = dynamixel, inverted
-        self.sign = -1.0 if inverted else 1.0
+        # Dynamixel's motors invert what they count, so that a joint counts up with its angle.
+        self.sign = -1.0 if inverted and not dynamixel else 1.0
         self.mount = int(rng.integers(0, 4096))
-        middle = self.raw(0.5 * (lower + upper) if not full else 0.0)
+        middle = self.raw((0.5 * (lower + upper) if not full else 0.0) + wrong)
         # Homing makes the middle half a turn.
         self.homing = 2047 - middle if dynamixel else middle - 2047
-        ends = sorted(self.homed(np.array([lower, upper])).tolist())
+        # The joint was not moved to one of its ends.
+        reached = np.array([lower + 2 * max(wrong, 0.0), upper + 2 * min(wrong, 0.0)])
+        ends = sorted(self.homed(reached).tolist())
         self.low, self.high = (0, 4095) if full else ends
 
     def raw(self, angle):
@@ -56,11 +63,11 @@ class Encoder:
         return -norm if flips else norm
 
 
-def arm_of(seed, **more):
+def arm_of(seed, wrong=(0.0,) * 6, **more):
     rng = np.random.default_rng(seed)
     arm = {
-        name: Encoder(rng, low, high, full=name == "wrist_roll", **more)
-        for name, low, high in zip(NAMES, LOWER, UPPER, strict=True)
+        name: Encoder(rng, low, high, full=name == "wrist_roll", wrong=off, **more)
+        for name, low, high, off in zip(NAMES, LOWER, UPPER, wrong, strict=True)
     }
     spread = 0.7 * np.sin(
         np.linspace(0, 3, 40)[:, None] * rng.uniform(1, 2, 6) + rng.uniform(0, 6, 6)
@@ -210,6 +217,76 @@ def test_an_opening_is_not_an_angle():
     assert mapped(np.linspace(-0.3, 0.7, 20)).not_logged == ()
     # A model without gripper has the same arm.
     np.testing.assert_array_equal(mapped(np.linspace(0.0, 1.0, 20), 2).log.positions, arm)
+
+
+WRONG = (0.11, -0.16, 0.05, -0.3, 0.2, 0.0)
+"""Errors of a calibration by hand [rad]."""
+
+
+@pytest.mark.parametrize("mode", ["normalised", "deg", "steps"])
+@pytest.mark.parametrize("inverted", [False, True])
+@pytest.mark.parametrize("robot", ["so101_follower", "so100", "koch_follower"])
+def test_a_corrected_file_reads_the_models_angles(tmp_path, mode, robot, inverted):
+    """An encoder that is homed by the corrected file reads degrees of the model in LeRobot."""
+    if mode == "deg" and inverted and not robot.startswith("koch"):
+        pytest.skip("in degrees LeRobot ignores the drive mode, and such a joint is mirrored")
+    dynamixel = robot.startswith("koch")
+    arm, angles = arm_of(11, WRONG, dynamixel=dynamixel, inverted=inverted)
+    angles = 0.5 * angles
+    servos = read_motors(write_file(tmp_path / "arm.json", arm), robot)
+    found = map_arm(log_of(arm, angles, mode, servos=servos))
+    off = np.median(angles - found.log.positions, axis=0)
+    np.testing.assert_allclose(off[:5], WRONG[:5], atol=3 * STEP)
+    # A joint map with these offsets maps the data set as recorded to the model.
+    lines = [dump_column(n, one, off[NAMES.index(n)]) for n, one in found.columns.items()]
+    path = tmp_path / "joint_map.yaml"
+    path.write_text("".join(lines))
+    again = map_arm(log_of(arm, angles, mode, servos=servos), table=read_joint_map(path))
+    np.testing.assert_allclose(again.log.positions, angles, atol=3 * STEP)
+    corrections = {}
+    for joint, motor in motors_of(found):
+        k = NAMES.index(joint.name)
+        column = found.columns[joint.name]
+        corrections[motor] = correct_homing(joint, motor, column, off[k], servos, mode)
+    assert corrections["gripper"].after == arm["gripper"].homing
+    for k, name in enumerate(BODY):
+        encoder = arm[name]
+        encoder.homing = corrections[name].after
+        read = encoder.read(angles[:, k], "deg")
+        if encoder.inverted and not dynamixel:
+            # Only normalised readings regard the drive mode.
+            read = encoder.read(angles[:, k], "normalised") * 180 * (encoder.high - encoder.low)
+            read = read / 100 / 4096
+        turned = np.mod(read - np.rad2deg(angles[:, k]) + 180, 360) - 180
+        np.testing.assert_allclose(turned, 0, atol=0.3)
+        assert dynamixel or abs(encoder.homing) < 2048
+
+
+def test_a_zero_far_from_the_motors_middle_is_not_corrected(tmp_path):
+    arm = {"joint4": Encoder(np.random.default_rng(0), -3.0, -0.1)}
+    servos = read_motors(write_file(tmp_path / "arm.json", arm), "so100")
+    joint = ServoJoint("joint4", "joint4.pos", np.zeros(0), -3.0, -0.1, True, False, None)
+    column = Column("joint4.pos", 0.01, -1.55)
+    found = correct_homing(joint, "joint4", column, 0.1, servos, "normalised")
+    assert found.before == found.after
+    assert "-83 degrees" in found.reason
+
+
+def test_lists_are_corrected_in_their_own_sense(tmp_path):
+    """reading = (sign steps + homing) 180 / 2048, as LeRobot read until June 2025."""
+    content = {"homing_offset": [100, -50], "drive_mode": [0, 1], "motor_names": ["pan", "tilt"]}
+    path = tmp_path / "old.json"
+    path.write_text(json.dumps(content))
+    servos, off = read_motors(path, "so100"), np.array([0.1, -0.2])
+    readings = np.random.default_rng(3).uniform(-40, 40, (9, 2)).round(3)
+    log = JointLog(("main_pan", "main_tilt"), np.arange(9.0), readings, servos=servos)
+    found = map_joints(log, ("pan", "tilt"), -2 * np.ones(2), 2 * np.ones(2), np.ones(2, bool))
+    counted = readings * 2048 / 180 - content["homing_offset"]
+    for k, (joint, motor) in enumerate(motors_of(found)):
+        column = found.columns[joint.name]
+        homing = correct_homing(joint, motor, column, off[k], servos, "deg").after
+        read = np.deg2rad((counted[:, k] + homing) * 180 / 2048)
+        np.testing.assert_allclose(read, found.log.positions[:, k] + off[k], atol=STEP)
 
 
 def test_files_are_found_beside_the_data_set(tmp_path):

@@ -15,7 +15,7 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import load_camera_file
 from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog
 from drake_pose.camera.episode_files import add_calibration, open_episode, recording_format
-from drake_pose.camera.joint_map import map_joints, read_joint_map
+from drake_pose.camera.joint_map import MappedJoints, map_joints, read_joint_map
 from drake_pose.camera.motor_calibration import Servos, read_motors
 from drake_pose.camera.picture_files import frame_key
 from drake_pose.csv_files import read_csv, read_number
@@ -232,6 +232,7 @@ class TreeLog(NamedTuple):
         posed: nodes that only logged or held joints move.
         unposed: all other nodes.
         warnings: messages for the user.
+        mapped: how the columns were mapped.
     """
 
     log: JointLog
@@ -240,6 +241,7 @@ class TreeLog(NamedTuple):
     posed: tuple[str, ...]
     unposed: tuple[str, ...]
     warnings: list[str]
+    mapped: MappedJoints
 
 
 def is_episode(path: Path, settings: EpisodeSettings) -> bool:
@@ -342,7 +344,7 @@ def map_log(path: Path, joints: JointLog, tree: PoseTree, settings: EpisodeSetti
     missing = np.array([name in mapped.not_logged for name in names])
     log = replace(mapped.log, positions=np.where(missing, default, positions))
     logged = tuple(name for name in names if name not in mapped.not_logged)
-    return TreeLog(log, asked, logged, posed, unposed, warnings)
+    return TreeLog(log, asked, logged, posed, unposed, warnings, mapped)
 
 
 def frames_of(camera: EpisodeCamera) -> tuple[str, ...]:

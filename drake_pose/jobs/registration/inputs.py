@@ -14,7 +14,8 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import CameraFile, load_camera_file, load_cameras
 from drake_pose.camera.episode import EpisodeCamera
 from drake_pose.camera.episode_files import JOINT_TABLE, open_episode, require_recording
-from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.camera.joint_map import MappedJoints
+from drake_pose.camera.models import Camera, Lens, PinholeCamera
 from drake_pose.errors import CameraError, MaskError, SceneError, SettingsError, UnknownNameError
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.inputs import make_tree, missing_for_person
@@ -76,6 +77,7 @@ class RegistrationInputs:
         target: the calibration target of cameras on a link; at the world's origin in the tree until
             its pose is estimated. None: the masks show the robot.
         offset_joints, scaled_links: the joints and links whose offsets and scales are estimated.
+        mapped, lenses: of an episode: how columns are mapped to joints, and lenses by camera.
     """
 
     scene: Scene
@@ -97,6 +99,8 @@ class RegistrationInputs:
     target: CalibrationTarget | None = None
     offset_joints: tuple[str, ...] = ()
     scaled_links: tuple[str, ...] = ()
+    mapped: MappedJoints | None = None
+    lenses: Mapping[str, Lens] = field(default_factory=dict)
 
     @property
     def camera_file(self) -> Path:
@@ -262,7 +266,8 @@ def _read_episode(
         assumed_focal=frozenset(one.name for one in chosen if one.camera is None),
         recordings={one.name: _recording(one, mapped, default, settings) for one in chosen},
         visible_nodes=(TARGET,) if target else mapped.posed if mapped.unposed else None,
-        target=target,
+        target=target, mapped=mapped.mapped,
+        lenses={one.name: one.lens for one in chosen if one.lens is not None},
     )  # fmt: skip
     if not isinstance(settings, RegistrationSettings):
         return inputs

@@ -15,7 +15,7 @@ from drake_pose.body import TARGET_POSITIONS, PoseTree, reshaped
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError
-from drake_pose.files.folder import writes_folder
+from drake_pose.files.folder import write_file, writes_folder
 from drake_pose.fit.parameters import carried_joints
 from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.registration.diagnosis import (
@@ -36,6 +36,7 @@ from drake_pose.jobs.registration.inputs import (
     make_registration_tree,
     read_inputs,
 )
+from drake_pose.jobs.registration.lerobot_files import lerobot_files, require_data_set
 from drake_pose.jobs.registration.result import (
     check_exports,
     compared_frames,
@@ -132,6 +133,8 @@ def register_scene(
         inputs = read_inputs(Path(scene), Path(model), table, own, settings)
         work = _Registration(inputs, settings, on_camera)
         check_exports(settings.exports, [*inputs.known_cameras, *inputs.searched_cameras])
+        if "lerobot" in settings.exports:
+            require_data_set(inputs)
         work.find()
         start = time.perf_counter()
         if work.inputs.positions.is_estimate:
@@ -145,6 +148,12 @@ def register_scene(
         for name, camera in work.inputs.scene.cameras.items()
         if name not in work.inputs.left_out
     }
+    files: Mapping[str, bytes | str] = {}
+    if "lerobot" in settings.exports:
+        files, texts = lerobot_files(
+            work.inputs, placed.values(), settings.on, work.parameters["zeros"]
+        )
+        work.warnings += texts
     seconds = sum(one["seconds"] for one in described.values())
     summary = {
         # A single camera's part is also at the top level.
@@ -153,6 +162,8 @@ def register_scene(
         "cameras": described,
     }
     if folder is not None:
+        for name, content in files.items():
+            write_file(folder, name, content)
         write_result(
             folder, work.inputs, placed, work.registered, summary, overlay, urdf, work.shown
         )

@@ -20,8 +20,8 @@ from drake_pose.files.settings import (
 ALL = "all"
 """Stands for the names of all joints, or of all links."""
 
-Export = Literal["ros", "mujoco", "drake", "rerun"]
-"""Programs for which cameras are exported."""
+Export = Literal["ros", "mujoco", "drake", "rerun", "lerobot"]
+"""Programs for which cameras are exported; LeRobot gets the joints, too."""
 
 
 @readable
@@ -69,7 +69,8 @@ class RegistrationSettings(AuditSettings):
     exports: Annotated[tuple[Export, ...], Parameter("--export")] = ()
     """Export the cameras for this program, too; repeat for several. ros: camera_info and static
     transforms; mujoco: <camera> elements; drake: CameraConfigs; rerun: a recording with robot,
-    pictures and masks."""
+    pictures and masks; lerobot: of a LeRobot data set a joint map, the motors' calibration file,
+    both with the offsets of --zeros, and a copy of meta with the cameras."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,0 +1,159 @@
+"""Write what a registration found in the forms of LeRobot: `register --export lerobot`."""
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from drake_pose.camera.joint_map import MappedJoints, motors_of
+from drake_pose.camera.lerobot import INFO, camera_key
+from drake_pose.camera.lerobot_cameras import camera_fields
+from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.camera.servo_readings import HomingCorrection, correct_homing, dump_column
+from drake_pose.errors import SettingsError
+from drake_pose.jobs.registration.inputs import RegistrationInputs
+
+FOLDER = "lerobot"
+"""Folder of these files in a result folder."""
+
+
+def require_data_set(inputs: RegistrationInputs) -> MappedJoints:
+    """Return the joint log of the LeRobot data set that is registered.
+
+    Raises:
+        SettingsError: another recording is registered, or one with a joint table of its own.
+    """
+    path = inputs.scene.path
+    if inputs.mapped is None or not (path / INFO).is_file() or inputs.joints is not None:
+        raise SettingsError(
+            f"{path}: --export lerobot corrects a LeRobot data set with its own joint log, and "
+            f"this is none ({INFO}); leave it, or --joints, out"
+        )
+    return inputs.mapped
+
+
+def lerobot_files(
+    inputs: RegistrationInputs,
+    cameras: Iterable[Camera],
+    link: str | None,
+    zeros: Mapping[str, Mapping[str, Any]],
+) -> tuple[dict[str, bytes | str], list[str]]:
+    """Return a joint map, a corrected calibration of the motors, and a copy of `meta`.
+
+    Args:
+        inputs: the registration's inputs.
+        cameras: the cameras, with poses in the world, or in the frame of the link.
+        link: the link that carries the cameras; None: none.
+        zeros: the summary's entries on joint offsets, by joint.
+
+    Returns:
+        The files' contents by path in the result folder, and what is left out and why.
+    """
+    units = {"value_deg": math.radians(1.0), "value_mm": 1e-3}
+    offsets = {
+        joint: units[key] * one[key]
+        for joint, one in zeros.items()
+        for key in units
+        if one["significant"] and one.get(key) is not None
+    }
+    mapped, path = require_data_set(inputs), inputs.scene.path
+    columns = mapped.columns.items()
+    lines = [dump_column(joint, one, offsets.get(joint, 0.0)) for joint, one in columns]
+    files: dict[str, bytes | str] = {f"{FOLDER}/joint_map.yaml": "".join(lines)}
+    corrections, notes = _corrections(mapped, offsets)
+    source = mapped.log.servos.path if mapped.log.servos else None
+    if corrections and source is not None:
+        content = json.loads(source.read_bytes())
+        for one in corrections:
+            if "motor_names" in content:
+                content["homing_offset"][content["motor_names"].index(one.motor)] = one.after
+            else:
+                content[one.motor]["homing_offset"] = one.after
+        files[f"{FOLDER}/{source.name}"] = json.dumps(content, indent=4) + "\n"
+    for file in sorted(one for one in (path / INFO).parent.rglob("*") if one.is_file()):
+        files[f"{FOLDER}/{file.relative_to(path)}"] = file.read_bytes()
+    info = json.loads((path / INFO).read_bytes())
+    for camera in cameras:
+        key = camera_key(info["features"], camera.name)
+        lens = inputs.lenses.get(camera.name)
+        if not isinstance(camera, PinholeCamera) or lens is not None:
+            notes.append(
+                f"--export lerobot: camera '{camera.name}' is left out of {FOLDER}/{INFO}, as its "
+                "pictures are distorted: use cameras.yaml"
+            )
+            continue
+        own = info["features"][key]
+        own["info"] = (own.get("info") or {}) | camera_fields(camera, link)
+    files[f"{FOLDER}/{INFO}"] = json.dumps(info, indent=4) + "\n"
+    name = source.name if corrections and source is not None else None
+    files[f"{FOLDER}/README.md"] = _readme(path, name, corrections, offsets)
+    return files, notes
+
+
+def _corrections(
+    mapped: MappedJoints, offsets: Mapping[str, float]
+) -> tuple[list[HomingCorrection], list[str]]:
+    """Return the corrections of the motors that joint offsets demand, and why there are none."""
+    servos, none = mapped.log.servos, "--export lerobot: no calibration of the motors is written: "
+    if servos is None or servos.path is None:
+        return [], [
+            f"{none}the robot's own is not in or beside the data set; name it (--joint-map FILE)"
+        ]
+    if mapped.encoding is None:
+        return [], [f"{none}the joint log holds angles or is mapped, not readings of motors"]
+    if not (servos.is_so or servos.is_dynamixel):
+        return [], [
+            f"{none}robot_type '{servos.robot}' does not tell whose motors they are, and with it "
+            "the sign of homing_offset; correct it by joint_map.yaml"
+        ]
+    if not offsets:
+        return [], [f"{none}no joint offset is significant (--zeros all estimates them)"]
+    found = [
+        correct_homing(joint, motor, mapped.columns[joint.name],
+                       offsets.get(joint.name, 0.0), servos, mapped.encoding)
+        for joint, motor in motors_of(mapped)
+    ]  # fmt: skip
+    left = [f"{one.motor} ({one.reason})" for one in found if one.reason and one.motor]
+    texts = [f"--export lerobot: motors whose calibration is left as it was: {'; '.join(left)}"]
+    return [one for one in found if not one.reason], texts if left else []
+
+
+def _readme(
+    path: Path,
+    calibration: str | None,
+    corrections: Iterable[HomingCorrection],
+    offsets: Mapping[str, float],
+) -> str:
+    """Return a page that says what the files are, and how they are used.
+
+    Args:
+        path: the data set.
+        calibration: name of the corrected calibration file; None: there is none.
+        corrections: of its motors.
+        offsets: significant joint offsets [rad or m].
+    """
+    text = f"""Found by `drake-pose register` in {path}, which is left as it was.
+
+- `joint_map.yaml`: from the data set's columns to the model's joints [rad or m], {len(offsets)}
+  joint offsets included: `--joint-map joint_map.yaml`. For the episodes of this calibration.
+- `meta/`: a copy of the data set's, whose `info.json` has `camera_intrinsics` (matrix [pixel]) and
+  `camera_extrinsics` (4 x 4, camera in the robot's base [m]; x right, y down, z forward) in the
+  `info` of each camera: put it in the place of the data set's own.
+"""
+    if calibration is None:
+        return text
+    text += f"""- `{calibration}`: the robot's calibration, with corrected `homing_offset`:
+  LeRobot then reads the model's angles. Put it in the place of the robot's own, connect, and let
+  LeRobot write it to the motors. Episodes recorded before belong to the old one.
+
+| motor | homing_offset | corrected | its positions change by [steps] |
+| --- | --- | --- | --- |
+"""
+    for one in corrections:
+        text += f"| {one.motor} | {one.before} | {one.after} | {one.shift:+d} |\n"
+    return (
+        text + "\n`range_min` and `range_max` are as they were, now about the model's zero: the "
+        "range is moved by as many steps as the positions, and at one end it may lie beyond where "
+        "the joint was moved. Approach its ends slowly, or record the ranges again.\n"
+    )

@@ -1,0 +1,161 @@
+"""What `register --export lerobot` writes is read by this program, and by LeRobot's formulas."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pyarrow
+import pyarrow.parquet
+import pytest
+
+from drake_pose.errors import CameraError, SettingsError
+from drake_pose.jobs.registration.inputs import read_inputs
+from drake_pose.jobs.registration.lerobot_files import lerobot_files, require_data_set
+from drake_pose.jobs.registration.settings import AuditSettings, RegistrationSettings
+from tests.registration.episodes import painted_episode
+from tests.registration.recordings import NAMES, write_episode
+
+OFFSETS = {"joint1": 0.12, "joint2": -0.07}
+"""Errors of the calibration, to be added to the recorded positions [rad]."""
+STEP = 2.0 * np.pi / 4096
+KEY = "observation.images.camera"
+
+
+def write_data_set(folder, painted, robot="so101_follower"):
+    """Write a LeRobot data set of normalised readings, with the robot's calibration file."""
+    rng = np.random.default_rng(8)
+    columns, motors = [], {}
+    for k, name in enumerate(NAMES):
+        homing = int(rng.integers(-2000, 2000))
+        # All joints of the arm reach 2 rad to both sides.
+        low, high = 2047 - round(2.0 / STEP), 2047 + round(2.0 / STEP)
+        read = painted.values[:, k] - OFFSETS.get(name, 0.0)
+        steps = np.round(read / STEP) + 2047
+        columns.append(200 * (steps - low) / (high - low) - 100)
+        motors[name] = {"id": k + 1, "drive_mode": 0, "homing_offset": homing,
+                        "range_min": low, "range_max": high}  # fmt: skip
+    coded = [cv2.imencode(".png", one[..., ::-1])[1].tobytes() for one in painted.pictures]
+    count = len(painted.times)
+    table = {
+        "observation.state": np.column_stack(columns).astype(np.float32).tolist(),
+        KEY: [{"bytes": data, "path": None} for data in coded],
+        "timestamp": painted.times.astype(np.float32),
+        "episode_index": [0] * count,
+    }
+    info = {
+        "codebase_version": "v2.1", "robot_type": robot, "total_episodes": 1, "fps": 2.5,
+        "data_path": "data/episode_{episode_index:06d}.parquet", "video_path": None,
+        "features": {
+            "observation.state": {"dtype": "float32", "shape": [5],
+                                  "names": [f"{name}.pos" for name in NAMES]},
+            KEY: {"dtype": "image", "shape": [*painted.pictures.shape[1:]]},
+            "timestamp": {"dtype": "float32", "shape": [1]},
+        },
+    }  # fmt: skip
+    for name in ("meta", "data"):
+        (folder / name).mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
+    (folder / "meta" / "tasks.jsonl").write_text('{"task": "swing"}\n')
+    (folder / "arm.json").write_text(json.dumps(motors))
+    pyarrow.parquet.write_table(pyarrow.table(table), folder / "data" / "episode_000000.parquet")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("lerobot")
+    painted = painted_episode(folder)
+    return write_data_set(folder / "set", painted), painted
+
+
+def read(folder, painted, **settings):
+    return read_inputs(folder, painted.path, None, None, RegistrationSettings(**settings))
+
+
+def export(folder, painted, **settings):
+    """Return inputs, files and notes of an export of the true camera and offsets."""
+    inputs = read(folder, painted, **settings)
+    zeros = {
+        name: {"significant": name in OFFSETS, "value_deg": np.rad2deg(OFFSETS.get(name, 0.01))}
+        for name in NAMES
+    }
+    return inputs, *lerobot_files(inputs, [painted.camera], None, zeros)
+
+
+def test_the_joint_map_and_meta_are_read_with_the_data_set(recorded, tmp_path):
+    folder, painted = recorded
+    before = {one: one.read_bytes() for one in folder.rglob("*") if one.is_file()}
+    _, files, notes = export(folder, painted)
+    assert notes == []
+    (tmp_path / "data").symlink_to(folder / "data")
+    for name, content in files.items():
+        path = tmp_path / name.removeprefix("lerobot/")
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    assert (tmp_path / "meta" / "tasks.jsonl").read_bytes() == b'{"task": "swing"}\n'
+    # The corrected calibration does not belong to the readings; the map does.
+    inputs = read(tmp_path, painted, joint_map=tmp_path / "joint_map.yaml")
+    (recording,) = inputs.recordings.values()
+    np.testing.assert_allclose(recording.values_at(0.0), painted.values, atol=2 * STEP)
+    (camera,) = inputs.given_cameras
+    np.testing.assert_allclose(camera.X_WC, painted.camera.X_WC, atol=1e-12)
+    np.testing.assert_allclose(camera.kernel_parameters(), painted.camera.kernel_parameters())
+    audited = read_inputs(tmp_path, painted.path, None, None, AuditSettings())
+    assert [one.name for one in audited.given_cameras] == ["camera"]
+    assert before == {one: one.read_bytes() for one in folder.rglob("*") if one.is_file()}
+
+
+def test_the_corrected_calibration_homes_the_encoder_at_the_models_zero(recorded):
+    folder, painted = recorded
+    _, files, _ = export(folder, painted)
+    old, new = json.loads((folder / "arm.json").read_text()), json.loads(files["lerobot/arm.json"])
+    for k, name in enumerate(NAMES):
+        before, after = old[name], new[name]
+        assert {**after, "homing_offset": before["homing_offset"]} == before
+        read = painted.values[:, k] - OFFSETS.get(name, 0.0)
+        counted = np.round(read / STEP) + 2047 + before["homing_offset"]
+        homed = counted - after["homing_offset"]
+        middle = 0.5 * (after["range_min"] + after["range_max"])
+        degrees = (homed - middle) * 360 / 4095
+        np.testing.assert_allclose(np.deg2rad(degrees), painted.values[:, k], atol=2 * STEP)
+    text = files["lerobot/README.md"]
+    shift = round(OFFSETS["joint1"] / STEP)
+    homing = old["joint1"]["homing_offset"]
+    assert f"| joint1 | {homing} | {homing - shift} | +{shift} |" in text
+
+
+def test_what_is_left_out_is_said(recorded, tmp_path):
+    folder, painted = recorded
+    other = write_data_set(tmp_path / "other", painted, robot="my_arm")
+    _, files, notes = export(other, painted)
+    assert "lerobot/arm.json" not in files
+    assert "robot_type 'my_arm' does not tell whose motors" in notes[0]
+    (other / "arm.json").unlink()
+    _, _, notes = export(other, painted, units="normalised")
+    assert "not in or beside the data set; name it (--joint-map FILE)" in notes[0]
+    inputs = read(folder, painted)
+    _, notes = lerobot_files(inputs, [painted.camera], None, {})
+    assert "no joint offset is significant" in notes[0]
+    named = read(folder, painted, joint_map=folder / "arm.json")
+    assert named.mapped.log.servos.path == folder / "arm.json"
+    with pytest.raises(SettingsError, match="its own joint log"):
+        require_data_set(replace(inputs, joints=tmp_path / "joints.csv"))
+    write_episode(tmp_path / "plain", painted)
+    with pytest.raises(SettingsError, match=r"corrects a LeRobot data set"):
+        require_data_set(read(tmp_path / "plain", painted))
+
+
+def test_damaged_fields_of_cameras_are_named(recorded, tmp_path):
+    folder, painted = recorded
+    _, files, _ = export(folder, painted)
+    info = json.loads(files["lerobot/meta/info.json"])
+    (tmp_path / "data").symlink_to(folder / "data")
+    (tmp_path / "meta").mkdir()
+    for field, value in (("camera_intrinsics", None), ("camera_intrinsics", [[1, 2], [3, 4]]),
+                         ("camera_extrinsics", [[1.0]])):  # fmt: skip
+        changed = json.loads(json.dumps(info))
+        changed["features"][KEY]["info"][field] = value
+        (tmp_path / "meta" / "info.json").write_text(json.dumps(changed))
+        with pytest.raises(CameraError, match=rf"info.json: camera 'camera': {field} must be"):
+            read(tmp_path, painted, units="normalised")

@@ -15,7 +15,7 @@ from drake_pose.arrays import Array, Picture
 from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending_indices
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.camera.picture_files import TimedVideo, import_reader
-from drake_pose.errors import SceneError
+from drake_pose.errors import SceneError, listed
 from drake_pose.regular_files import read_regular, require_regular
 
 TRAJECTORY = "trajectory.h5"
@@ -50,6 +50,13 @@ def open_droid(path: Path, joints: JointLog | None) -> Episode:
                     *(f"{stamps}/read_start", f"{stamps}/read_end"),
                 )
             )
+            shapes = [one.shape for one in (arm, gripper, start, end)]
+            if arm.ndim != 2 or len({shape[:1] for shape in shapes}) > 1:
+                raise SceneError(
+                    f"{where}: truncated or damaged: joint_positions, gripper_position, read_start "
+                    f"and read_end have the shapes {', '.join(map(str, shapes))}, but n x 7 and "
+                    "three times n are expected"
+                )
             times = 1e-3 * 0.5 * (start + end)
             kept, warnings = ascending_indices(times, f"{where}: rows")
             names = (*(f"joint{k + 1}" for k in range(arm.shape[1])), "gripper_position")
@@ -59,9 +66,11 @@ def open_droid(path: Path, joints: JointLog | None) -> Episode:
     except (OSError, ValueError, LookupError, RuntimeError) as error:
         raise SceneError(f"{where}: truncated or damaged: {error}") from error
     if not cameras:
+        files = sorted(one for one in (path / "recordings").rglob("*") if one.is_file())
+        found = listed([str(one.relative_to(path)) for one in files]) or "no recordings"
         raise SceneError(
             f"{folder}: has no <serial>.mp4; export files of recordings/SVO as MP4 first "
-            "(svo_to_mp4.py of DROID)"
+            f"(svo_to_mp4.py of DROID); the folder has {found}"
         )
     return Episode.checked(path, cameras, joints or own, warnings)
 
@@ -114,9 +123,15 @@ def _zed_cameras(
         # A video of one camera is that of the left one.
         given = f"{serial}{side or '_left'}"
         matrix = file.get(f"observation/camera_intrinsics/{given}")
+        rows = file.get(f"observation/camera_extrinsics/{given}")
+        if rows is not None and matrix is None:
+            warnings.append(
+                f"camera '{name}': its recorded extrinsics are not used, as {file.filename} has no "
+                f"camera_intrinsics/{given}: give both in a camera file (--cameras), or estimate "
+                "the pose: drake-pose register"
+            )
         if matrix is not None:
             fx, _, cx, _, fy, cy = np.ravel(matrix[()])[:6].tolist()
-            rows = file.get(f"observation/camera_extrinsics/{given}")
             if rows is not None and not is_on_hand:
                 pose = recorded_pose(rows[()], name, warnings)
             X_WC = np.eye(4) if pose is None else pose

@@ -206,6 +206,8 @@ def test_missing_and_damaged_files_are_named(tmp_path):
         (none | {"111_frame_received": None}, r"111\.mp4: has no .*cameras/111_est.* has: 222_est"),
         ({"gripper_position": None}, r"has no .*/gripper_position; /obs.*state has: joint_pos"),
         ({"joint_positions": np.zeros((COUNT - 1, 7))}, "h5: truncated or damaged"),
+        ({"joint_positions": np.zeros(COUNT)}, r"have the shapes \(10,\), .* but n x 7 and"),
+        ({"read_end": START + EACH[1:]}, r"have the shapes .*\(9,\), but"),
         ({"read_end": START + 4 - EACH, "read_start": START - 4 - EACH}, "rows: .* backwards"),
     ):
         write_episode(tmp_path, **changed)
@@ -218,5 +220,21 @@ def test_missing_and_damaged_files_are_named(tmp_path):
     write_episode(tmp_path)
     for video in (tmp_path / "recordings" / "MP4").iterdir():
         video.unlink()
-    with pytest.raises(SceneError, match=r"MP4: has no <serial>\.mp4"):
+    with pytest.raises(SceneError, match=r"MP4: has no <serial>\.mp4.* the folder has no record"):
         open_episode(tmp_path)
+    (tmp_path / "recordings" / "SVO").mkdir()
+    (tmp_path / "recordings" / "SVO" / "111.svo").touch()
+    with pytest.raises(SceneError, match=r"MP4: has no .*folder has recordings/SVO/111\.svo"):
+        open_episode(tmp_path)
+
+
+def test_extrinsics_without_intrinsics_are_named(tmp_path):
+    import h5py
+
+    write_episode(tmp_path)
+    with h5py.File(tmp_path / "trajectory.h5", "a") as file:
+        file["observation/camera_extrinsics/222_right"] = np.zeros((COUNT, 6))
+    texts = [text for text in open_episode(tmp_path).warnings if "extrinsics" in text]
+    assert len(texts) == 1
+    assert texts[0].startswith("camera '222_right': its recorded extrinsics are not used, as ")
+    assert "trajectory.h5 has no camera_intrinsics/222_right" in texts[0]

@@ -3,13 +3,14 @@
 import math
 import os
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from drake_pose.arrays import Picture
+from drake_pose.arrays import Array, Picture
 from drake_pose.camera.bags import BAGS, open_bag
 from drake_pose.camera.camera_files import CameraFile, load_camera_file
 from drake_pose.camera.droid import TRAJECTORY, open_droid
@@ -103,9 +104,12 @@ def open_folder(path: Path, joints: JointLog | None) -> Episode:
         elif files is not None:
             # Frames are named as in a scene.
             video = TimedVideo(files)
-            frames = tuple(f"{k:06d}" for k in range(len(video.times)))
+            frames, times = tuple(f"{k:06d}" for k in range(len(video.times))), video.times
+            if joints is not None and joints.times is not None and joints.frames:
+                times = _times_of_rows(joints, frames)
+                times = video.times if np.isnan(times).all() else times
             size, camera_warnings = (video.width, video.height), video.warnings
-            camera = EpisodeCamera(name, *size, video.times, None, None, video.read, frames)
+            camera = EpisodeCamera(name, *size, times, None, None, video.read, frames)
         else:
             warnings.append(f"camera '{name}' of {CAMERAS} has no pictures; it is left out")
             continue
@@ -115,7 +119,34 @@ def open_folder(path: Path, joints: JointLog | None) -> Episode:
                 f"camera '{name}' has no entry in {CAMERAS}: its lens is unknown; calibrate it"
             )
         cameras.append(add_calibration(camera, calibration, path / CAMERAS))
+    if joints is not None and joints.times is not None and not joints.frames:
+        is_video = [isinstance(find_recorded_files(path, one.name), Path) for one in cameras]
+        if all(is_video) and not any(_shares_time(joints.times, one.times) for one in cameras):
+            spans = ", ".join(f"'{one.name}' {_span(one.times)}" for one in cameras)
+            warnings.append(
+                f"no picture is within the joint log, {_span(joints.times)}; pictures: {spans}: "
+                "both are counted from their starts"
+            )
+            cameras = [replace(one, times=one.times - one.times[0]) for one in cameras]
+            joints = replace(joints, times=joints.times - joints.times[0])
     return Episode.checked(path, cameras, joints, warnings)
+
+
+def _shares_time(first: Array, second: Array) -> bool:
+    """Return whether two series of ascending times overlap."""
+    return bool(first[0] <= second[-1] and second[0] <= first[-1])
+
+
+def _span(times: Array) -> str:
+    """Return the first and last of times [s], for messages."""
+    return f"{times[0]:.3f} to {times[-1]:.3f} s"
+
+
+def _times_of_rows(joints: JointLog, frames: Sequence[str]) -> Array:
+    """Return the times (n,) [s] of the joint log's rows of n frames; nan where there is no row."""
+    assert joints.times is not None
+    clock = JointLog(("time",), None, joints.times[:, None], joints.frames)
+    return clock.of_frames(frames)[:, 0]
 
 
 def _image_camera(
@@ -150,11 +181,9 @@ def _image_camera(
         frames = tuple(common[k] for k in kept)
         times, warnings = np.array([stamped[frame] for frame in frames]), warnings + late
     elif joints is not None and joints.times is not None and joints.frames:
-        clock = JointLog(("time",), None, joints.times[:, None], joints.frames)
-        times = clock.of_frames(frames)[:, 0]
-    elif scene.is_file():
-        _, rate = read_sequence(scene)
-        times = times if rate is None else np.arange(len(frames)) / rate
+        times = _times_of_rows(joints, frames)
+    else:
+        times = np.array([*picture_times(files, scene).values()])
     pictures = [files[frame] for frame in frames]
     height, width = read_picture(pictures[0], SceneError).shape[:2]
 
@@ -162,6 +191,30 @@ def _image_camera(
         return read_picture(pictures[k], SceneError)
 
     return EpisodeCamera(name, width, height, times, None, None, recorded, frames), warnings
+
+
+def picture_times(files: Mapping[str, Path] | Path, scene: Path) -> dict[str, float]:
+    """Return the times [s] of a camera's frames by name; nan where unknown.
+
+    They are a video's own, or those in `timestamps.csv` beside picture files, or follow from the
+    frame rate.
+
+    Args:
+        files: picture files by frame, or a video, whose frames are named 000000 and so on.
+        scene: path of the scene.yaml with the rate, which may be missing.
+
+    Raises:
+        SceneError: a file is unreadable.
+    """
+    if isinstance(files, Path):
+        return {f"{k:06d}": float(time) for k, time in enumerate(TimedVideo(files).times)}
+    frames = in_order(files)
+    stamps = next(iter(files.values())).parent / TIME_STAMPS
+    if stamps.is_file():
+        known = read_time_stamps(stamps)
+        return {frame: known.get(frame, math.nan) for frame in frames}
+    rate = read_sequence(scene)[1] or math.nan
+    return {frame: k / rate for k, frame in enumerate(frames)}
 
 
 def read_sequence(path: Path, sequence: bool = False) -> tuple[bool, float | None]:

@@ -300,8 +300,8 @@ class CaptureSettings(SceneSettings):
     """Track the body through a sequence, and search only in the first frame and after a loss;
     --no-track: search in every frame."""
     start: Path | None = None
-    """Joint positions in the first frame of a sequence [rad or m]: CSV file with the column frame
-    and one for each joint. Rows of other frames are used after a loss."""
+    """Joint positions in the first frame of a sequence [rad or m]: CSV file with the column frame,
+    or time [s], and one for each joint. Rows of other frames are used after a loss."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -420,8 +420,8 @@ class MaskSettings:
     """Model file of the object (URDF, SDFormat, MJCF or .dmd.yaml): its pose and mask are estimated
     alternately."""
     start: Path | None = None
-    """Rough joint positions in every frame [rad or m]: CSV file with the column frame and one for
-    each joint."""
+    """Rough joint positions in every frame [rad or m]: CSV file with the column frame, or time [s],
+    and one for each joint."""
     start_error: Annotated[float, Parameter(metavar="DEG")] = 5.0
     """Standard deviation of the errors of the angles in --start [deg]."""
     hold: Positions = field(default_factory=dict)

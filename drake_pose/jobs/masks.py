@@ -538,7 +538,7 @@ def _find_by_model(source: Source, settings: MaskSettings) -> Iterator[FoundMask
     cameras = [file.cameras[name] for name in source.names]
     body = load_model(settings.model, package_paths=settings.packages)
     kinematics = TreeKinematics(make_tree(body, EstimateSettings(hold=settings.hold)))
-    table = read_known_positions(settings.start, kinematics)
+    table = read_known_positions(settings.start, kinematics, times=source.times)
     recorded = {
         name: {frame: (where, picture) for frame, where, picture in source.read(name)}
         for name in source.names

@@ -54,6 +54,27 @@ def test_videos_with_a_faster_joint_log(tmp_path):
         open_episode(tmp_path / "joint_angles.csv")
 
 
+def test_a_late_video_and_clocks_that_do_not_overlap(tmp_path):
+    write_video(tmp_path / "videos" / "a.mp4", range(9), 0.2 + 0.1 * np.arange(9))
+    table = tmp_path / "joint_angles.csv"
+    write_table(table, "time", [round(0.1 * k, 3) for k in range(12)])
+    found = open_episode(tmp_path)
+    assert not any("clock" in text or "starts" in text for text in found.warnings)
+    positions = found.joints.at(found.camera("a").times)[:, 1]
+    np.testing.assert_allclose(positions, 2.0 + np.arange(9), rtol=0, atol=1e-6)
+    # Seconds since 1970 beside a video's own.
+    write_table(table, "time", [f"{1.7e9 + 0.1 * k:.3f}" for k in range(12)])
+    found = open_episode(tmp_path)
+    assert any("both are counted from their starts" in text for text in found.warnings)
+    positions = found.joints.at(found.camera("a").times)[:, 1]
+    np.testing.assert_allclose(positions, np.arange(9), rtol=0, atol=1e-5)
+    # A table's times of frames precede those of the video.
+    rows = [f"{k},{5 + 0.2 * k},{k}" for k in range(8)]
+    table.write_text("\n".join(["frame,time,grip", *rows]))
+    times = open_episode(tmp_path).camera("a").times
+    np.testing.assert_allclose(times, [*(5 + 0.2 * np.arange(8)), np.nan])
+
+
 def test_images_are_matched_by_frame_or_by_time(tmp_path):
     stamps, table = write_images(tmp_path, [2, 9, 10]) / "timestamps.csv", tmp_path / "other.csv"
     write_table(tmp_path / "joint_angles.csv", "frame", ["010", "2", "9"])

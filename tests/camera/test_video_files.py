@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from drake_pose.camera.picture_files import TimedVideo, VideoPictures
+from drake_pose.camera.picture_files import TimedVideo, VideoPictures, read_picture
 from drake_pose.errors import SceneError
 from tests.camera.recordings import number_of, write_video
 
@@ -33,6 +33,39 @@ def test_times_follow_a_variable_frame_rate(tmp_path):
     video = TimedVideo(write_video(tmp_path / "a.mkv", range(6), times))
     np.testing.assert_allclose(video.times, times, atol=1e-3)
     assert [number_of(video.read(k)) for k in (5, 0, 3)] == [5, 0, 3]
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mov", "mkv", "avi"])
+def test_a_video_may_begin_late(tmp_path, suffix):
+    """Its times are those in the file; AVI has none. OpenCV counts pictures from 0 on in MKV."""
+    times = 0.2 + 0.1 * np.arange(9)
+    codec = "mpeg4" if suffix == "avi" else "libx264"
+    path = write_video(tmp_path / f"a.{suffix}", range(9), times, codec=codec)
+    video = TimedVideo(path)
+    late = 0.2 * (suffix != "avi")
+    # AVI has no order of B-frames, so that its last time may be wrong.
+    np.testing.assert_allclose(video.times[:8], 0.1 * np.arange(8) + late, atol=1e-3)
+    assert [number_of(video.read(k)) for k in (0, 7, 3)] == [0, 7, 3]
+    if suffix != "avi":
+        plain = VideoPictures(path)
+        assert ([number_of(plain.read(k)) for k in range(plain.count)]) == [*range(9)]
+        assert plain.time == pytest.approx(0.8)
+
+
+def test_deep_pictures_are_decoded_once(tmp_path, monkeypatch):
+    calls, decode = [], cv2.imdecode
+    monkeypatch.setattr(cv2, "imdecode", lambda *how: calls.append(how) or decode(*how))
+    rng, path = np.random.default_rng(0), tmp_path / "a.png"
+    for shape in ((9, 11), (9, 11, 3), (9, 11, 4)):
+        values = rng.integers(0, 1 << 16, shape, dtype=np.uint16)
+        cv2.imwrite(str(path), values)
+        found = read_picture(path, SceneError)
+        upper = np.dstack([values >> 8] * 3) if len(shape) == 2 else values[:, :, 2::-1] >> 8
+        np.testing.assert_array_equal(found, upper)
+    assert len(calls) == 3
+    cv2.imwrite(str(path), values >> 4)
+    with pytest.raises(SceneError, match=r"a\.png: has 16 bits per pixel, but no value above 40"):
+        read_picture(path, SceneError)
 
 
 def test_rotation_metadata_is_applied(tmp_path):

@@ -31,11 +31,14 @@ from drake_pose.filtering.contour_tracker import TrackingSettings
 from drake_pose.jobs.estimate.measurements import (
     MeasuredPositions,
     check_units,
+    frame_times,
+    has_times,
     is_episode,
     logged_positions,
     read_episode_scene,
     read_joint_centres,
     read_measured_positions,
+    timed_positions,
 )
 from drake_pose.person.search import PERSON_LANDMARKS
 from drake_pose.search import (
@@ -345,7 +348,7 @@ def read_inputs(
             model, settings = leave_out_links(model, settings)
         truth, of_truth = _read_truth(scene_path, truth_path, model, frames)
         starts = {}
-    starts = _read_starts(settings.start, frames, model) or starts
+    starts = _read_starts(settings, scene, frames, model) or starts
     tracked = scene.sequence and settings.track
     _check_start(scene, frames, starts, settings.track)
     if (scene.images or not starts) and follows_person(scene, model, settings):
@@ -419,26 +422,33 @@ def _read_truth(
 
 
 def _read_starts(
-    file: Path | None, frames: Sequence[str], model: ArticulatedModel
+    settings: EstimateSettings, scene: Scene, frames: Sequence[str], model: ArticulatedModel
 ) -> dict[str, np.ndarray]:
     """Return the positions (nq,) by frame of the table ``settings.start`` [rad or m]; {} for None.
 
-    Of ``frames`` those without a row are left out; columns that are missing get the defaults.
+    Of ``frames`` those without a row are left out; columns that are missing get the defaults. A
+    table with a column `time` is read at the times of the scene's frames.
 
     Raises:
         SceneError: the table cannot be read, or has no row of the first frame.
     """
+    file = settings.start
     if file is None:
         return {}
-    known = read_measured_positions(file, model.position_names)
-    check_units(file, model, known.names, known.values)
-    places = [model.position_index(name) for name in known.names]
-    starts = {}
-    for frame in frames:
-        values = known.of(frame)
-        if values is not None:
-            starts[frame] = model.default_positions.copy()
-            starts[frame][places] = values
+    if has_times(file):
+        times = frame_times(scene)
+        starts = timed_positions(file, times, make_tree(model, settings), settings)[1]
+        starts = {frame: q for frame, q in starts.items() if frame in frames}
+    else:
+        known = read_measured_positions(file, model.position_names)
+        check_units(file, model, known.names, known.values)
+        places = [model.position_index(name) for name in known.names]
+        starts = {}
+        for frame in frames:
+            values = known.of(frame)
+            if values is not None:
+                starts[frame] = model.default_positions.copy()
+                starts[frame][places] = values
     if frames[0] not in starts:
         raise SceneError(
             f"{file}: has no row of the first frame, '{frames[0]}', at which the track starts"

@@ -14,15 +14,22 @@ from drake_pose.body import ParsedModel, PoseTree
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import load_camera_file
 from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog
-from drake_pose.camera.episode_files import add_calibration, open_episode, recording_format
+from drake_pose.camera.episode_files import (
+    add_calibration,
+    open_episode,
+    picture_times,
+    read_joint_table,
+    recording_format,
+)
 from drake_pose.camera.joint_map import MappedJoints, map_joints, read_joint_map
 from drake_pose.camera.motor_calibration import Servos, read_motors
-from drake_pose.camera.picture_files import frame_key
+from drake_pose.camera.picture_files import VIDEOS, frame_key
+from drake_pose.camera.sources import TIME_STAMPS
 from drake_pose.csv_files import read_csv, read_number
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 from drake_pose.files.records import BASE_COLUMNS, FIT_COLUMNS
 from drake_pose.files.settings import EpisodeSettings
-from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, Scene, select_frames
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, SCENE_FILE, Scene, select_frames
 
 
 @dataclass(frozen=True)
@@ -116,6 +123,66 @@ def read_measured_positions(path: Path, position_names: Sequence[str]) -> Measur
         if with_base:
             bases[frame] = _numbers(row[end:last], path, line)
     return MeasuredPositions(path, tuple(header[1:end]), values, bases, is_estimate)
+
+
+def has_times(path: Path) -> bool:
+    """Return whether a CSV table has a column `time`; SceneError: it is unreadable."""
+    return "time" in read_csv(path, SceneError)[0]
+
+
+def frame_times(scene: Scene) -> dict[str, float]:
+    """Return the time [s] of each frame of a scene, by name; nan where unknown.
+
+    They are the scene's own, or those of the first camera's pictures.
+
+    Raises:
+        SceneError: a file is unreadable.
+    """
+    if len(scene.times) or not scene.images:
+        times = scene.times if len(scene.times) else np.full(len(scene.frames), np.nan)
+        return dict(zip(scene.frames, times.tolist(), strict=True))
+    camera = next(iter(scene.images))[0]
+    files = {frame: path for (name, frame), path in scene.images.items() if name == camera}
+    first = next(iter(files.values()))
+    is_video = first.suffix.lower() in VIDEOS
+    found = picture_times(first if is_video else files, scene.path / SCENE_FILE)
+    of_key = {frame_key(frame): time for frame, time in found.items()}
+    return {frame: of_key.get(frame_key(frame), math.nan) for frame in scene.frames}
+
+
+def timed_positions(
+    path: Path, times: Mapping[str, float], tree: PoseTree, settings: EpisodeSettings
+) -> tuple[MeasuredPositions, dict[str, Array], tuple[str, ...]]:
+    """Return the positions of a table with a column `time` at the times [s] of frames.
+
+    With a column `frame`, too, they are those of the frames' rows.
+
+    Args:
+        path: the table, see `read_joint_table`.
+        times: time [s] of each frame, by name; nan: unknown.
+        tree: the pose tree, with its held values.
+        settings: joint map and units.
+
+    Returns:
+        As `logged_positions`.
+
+    Raises:
+        DrakePoseError: the message names the table, and columns, joints or units at fault; or the
+            times are needed and none is known.
+    """
+    log, warnings = read_joint_table(path)
+    own = np.array([*times.values()], dtype=np.float64)
+    if log.frames:
+        log = replace(log, times=None)
+    elif np.isnan(own).all():
+        raise SceneError(
+            f"{path}: has times, but those of the pictures are not known: give a column 'frame', "
+            f"or the pictures' times ({TIME_STAMPS}, or frame_rate_hz in scene.yaml)"
+        )
+    scene = Scene(path, {}, tuple(times), {}, times=own, joints=log)
+    found, starts, more = logged_positions(scene, tree, settings)
+    assert found is not None
+    return found, starts, (*warnings, *more)
 
 
 def check_units(

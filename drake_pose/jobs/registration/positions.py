@@ -1,7 +1,7 @@
 """Joint positions of every frame: from a table, or estimated from cameras with known poses."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,12 +16,14 @@ from drake_pose.camera.models import Camera
 from drake_pose.camera.picture_files import frame_key
 from drake_pose.errors import SceneError
 from drake_pose.files.records import base_pose
-from drake_pose.files.settings import EstimateSettings
+from drake_pose.files.settings import EpisodeSettings, EstimateSettings
 from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.estimate.measurements import (
     MeasuredPositions,
     check_units,
+    has_times,
     read_measured_positions,
+    timed_positions,
 )
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.person.shape import shape_parts
@@ -100,6 +102,7 @@ def read_known_positions(
     kinematics: TreeKinematics,
     unobserved: bool = False,
     table: MeasuredPositions | None = None,
+    times: Callable[[], Mapping[str, float]] | None = None,
 ) -> KnownPositions:
     """Return the positions in a table with columns for the frame and each joint that is not held.
 
@@ -108,6 +111,8 @@ def read_known_positions(
         kinematics: of the pose tree; its held values are added.
         unobserved: whether columns of joints that move no visible part are allowed.
         table: the table's contents, if it has been read before; None: it is read.
+        times: returns the time [s] of each frame, by name, for a table with a column `time`, whose
+            joints may have other names and units; None: such a table is refused.
 
     Raises:
         SceneError: the table cannot be read, lacks a joint, has an unusable column, or is not in
@@ -115,6 +120,9 @@ def read_known_positions(
         UnknownNameError: the model has no joint of a column's name.
     """
     model = kinematics.tree.model
+    warnings: tuple[str, ...] = ()
+    if table is None and times is not None and has_times(path):
+        table, _, warnings = timed_positions(path, times(), kinematics.tree, EpisodeSettings())
     table = table or read_measured_positions(path, model.position_names)
     held = {model.position_names[index] for index in kinematics.tree.held}
     needed = [name for name in kinematics.names if name not in held]
@@ -146,7 +154,7 @@ def read_known_positions(
     is_held = np.array(columns) < 0
     rows = table.values.items()
     values = {k: np.where(is_held, kinematics.lower, row[columns]) for k, row in rows}
-    warnings = check_units(path, model, kinematics.names, values)
+    warnings += check_units(path, model, kinematics.names, values)
     return KnownPositions(path, kinematics, values, table.is_estimate, warnings)
 
 

@@ -2,14 +2,24 @@
 
 import csv
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from drake_pose import MaskSettings, load_scene, make_masks
+from drake_pose.body import load_model
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.errors import CameraError, SceneError, SettingsError
+from drake_pose.files.settings import EstimateSettings
+from drake_pose.jobs.estimate.inputs import make_tree
+from drake_pose.jobs.estimate.measurements import frame_times
+from drake_pose.jobs.mask_sources import open_source
+from drake_pose.jobs.registration.positions import read_known_positions
+from drake_pose.silhouette.pictures.scenes import find_images
+from tests.camera.recordings import write_video
 from tests.jobs.masks.rooms import iou, moving, write_pictures
 from tests.jobs.scenes import NAMES, edit_camera, write_joints
 
@@ -95,6 +105,45 @@ def test_missing_cameras_and_starts_are_named(filmed, tmp_path):
     start.write_text("\n".join([lines[0], *("0,90,-90" for _ in lines[1:])]))
     with pytest.raises(SceneError, match=r"start\.csv"):
         make_masks(filmed.folder, tmp_path / "a", settings)
+
+
+def test_a_table_with_times_is_read_at_the_times_of_the_pictures(filmed, tmp_path):
+    """In degrees and by similar names, as a registration reads it; for masks and estimates."""
+    start, sources = tmp_path / "start.csv", dict[str, Path]()
+    rows = [f"{0.05 * k},{k},{-2 * k}" for k in range(40)]
+    start.write_text("\n".join([f"time,{NAMES[0]}_joint,{NAMES[1].upper()}", *rows]))
+    (filmed.folder / "scene.yaml").write_text("sequence: true\nframe_rate_hz: 10\n")
+    sources["rate"] = sources["stamps"] = filmed.folder
+    sources["video"] = tmp_path / "film"
+    write_video(tmp_path / "film/videos/front.mp4", range(8), 0.2 + 0.1 * np.arange(8))
+    sources["file"] = tmp_path / "film/videos/front.mp4"
+    (tmp_path / "film" / "scene.yaml").write_text("sequence: true")
+    cameras = load_cameras(filmed.folder / "cameras.yaml")
+    for name, path in sources.items():
+        late = 0.0 if name == "rate" else 0.2
+        if name == "stamps":
+            stamped = [f"{k:04d},{late + 0.1 * k}" for k in range(8)]
+            for camera in ("front", "side"):
+                table = filmed.folder / "images" / camera / "timestamps.csv"
+                table.write_text("\n".join(["frame,time", *stamped]))
+        kinematics = TreeKinematics(make_tree(load_model(filmed.model), EstimateSettings()))
+        found = read_known_positions(start, kinematics, times=open_source(path).times)
+        expected = np.radians(20.0 * (late + 0.1 * np.arange(8))[:, None] * [1.0, -2.0])
+        np.testing.assert_allclose([found.values[k] for k in range(8)], expected, atol=1e-6)
+        assert any("assumed to be in deg" in text for text in found.warnings)
+        if name == "file":
+            continue
+        scene = load_scene(path, {"front": cameras["front"]}) if path.is_dir() else None
+        times = frame_times(replace(scene, images=find_images(path, ["front"])))
+        np.testing.assert_allclose([*times.values()], late + 0.1 * np.arange(8), atol=1e-6)
+    with pytest.raises(SceneError, match="has times, but those of the pictures are not known"):
+        read_known_positions(start, kinematics, times=lambda: {"0": np.nan})
+    frames = [f"{k},{9 - k},{0.1 * k},0" for k in range(8)]
+    start.write_text("\n".join([f"frame,time,{NAMES[0]},{NAMES[1]}", *frames[::-1]]))
+    found = read_known_positions(
+        start, kinematics, times=lambda: {f"{k:04d}": 0.0 for k in range(8)}
+    )
+    np.testing.assert_allclose([found.values[k][0] for k in range(8)], 0.1 * np.arange(8))
 
 
 @pytest.mark.slow

@@ -61,19 +61,22 @@ class PictureStart(NamedTuple):
 
     camera: at its approximate pose. rows: indices of the recording's pictures to fit. clock: the
     time offset. alternatives: other poses X_CW (4, 4) that explain the pictures about as well.
+    joint_offsets: (m,) approximate ones [rad or m]; None: 0.
     """
 
     camera: PinholeCamera
     rows: Sequence[int]
     clock: TimeOffset
     alternatives: Sequence[Array]
+    joint_offsets: Array | None = None
 
     @classmethod
     def of(cls, one: PictureRegistration) -> "PictureStart":
         """Return a start from an earlier registration."""
         rows = [one.recording.names.index(frame.name) for frame in one.frames]
         others = [np.linalg.inv(X) for X in one.found.alternatives]
-        return cls(one.found.camera, rows, one.time_offset or NO_CLOCK, others)
+        clock = one.time_offset or NO_CLOCK
+        return cls(one.found.camera, rows, clock, others, one.joint_offsets)
 
 
 def accept_fit(

@@ -94,26 +94,43 @@ def _register(
     """
     chosen, moving = frames
     search = PictureSearch(body, camera, posed_pictures(recording, chosen, 0.0))
-    fitted = map_ordered(search.coarse_fit, search.search()[:most])
-    near = sorted((one for one in fitted if one is not None), key=lambda one: -evidence(*one[1]))
+    poses = search.search()[:most]
+    searches = [search] * len(poses)
+    if offset_joints:
+        both = map_ordered(partial(search.fit_offsets, offset_joints), poses)
+        searches, poses = [one for one, _ in both], [X_CW for _, X_CW in both]
+    near = _coarse_fits(searches, poses)
     if not near:
         raise unexplained_error(camera, "no pose shows the body in two pictures")
-    level, start = search.compared, near[0][0]
-    gains = level.tile_gains(start.X_CW)
+    search, start = near[0]
+    gains = search.compared.tile_gains(start.X_CW)
     # Hypotheses that explain about as much are fitted again: they may converge to the best one.
     close = [
-        one.X_CW
-        for one, _ in near[1:]
-        if vuong_statistic(gains, level.tile_gains(one.X_CW)) <= 1.96
+        (each, one.X_CW)
+        for each, one in near[1:]
+        if vuong_statistic(gains, each.compared.tile_gains(one.X_CW)) <= 1.96
     ]
-    again = map_ordered(search.coarse_fit, close)
-    alike = [one[0].X_CW for one in again if one is not None]
-    alternatives = level.distinct([start.X_CW, *alike])[1:]
-    both, clock = [*chosen, *moving], NO_CLOCK
+    again = _coarse_fits([each for each, _ in close], [X_CW for _, X_CW in close])
+    alike = [one.X_CW for _, one in again]
+    alternatives = search.compared.distinct([start.X_CW, *alike])[1:]
+    rows, clock, offsets = [*chosen, *moving], NO_CLOCK, search.joint_offsets
     if recording.times is not None:
-        clock = scan_time_offsets(body, start, recording, both)
-    found = PictureStart(start, both, clock, alternatives)
+        clock = scan_time_offsets(body, start, recording.with_offsets(offsets), rows)
+    found = PictureStart(start, rows, clock, alternatives, offsets)
     return fit_pictures(body, found, recording, focal, offset_joints)
+
+
+def _coarse_fits(
+    searches: Sequence[PictureSearch], X_CW: Sequence[Array]
+) -> list[tuple[PictureSearch, PinholeCamera]]:
+    """Return searches with their cameras roughly fitted from poses (4, 4), best first.
+
+    Poses at which the body leaves the pictures are left out.
+    """
+    fitted = map_ordered(lambda one: one[0].coarse_fit(one[1]), zip(searches, X_CW, strict=True))
+    both = zip(searches, fitted, strict=True)
+    near = sorted(((a, b) for a, b in both if b is not None), key=lambda one: -evidence(*one[1][1]))
+    return [(search, camera) for search, (camera, _) in near]
 
 
 def fit_pictures(
@@ -188,11 +205,13 @@ def _fit_until_stable(
     camera, offset, names = start.camera, start.clock.value, body.kinematics.names
     constants = ((TIME_OFFSET,) if recording.times is not None else ()) + tuple(offset_joints)
     joint_offsets, left = np.zeros(len(names)), 4 if offset_joints else 2
+    if offset_joints and start.joint_offsets is not None:
+        joint_offsets = start.joint_offsets
     as_now = recording.with_drift(start.clock.drift, mean_time(recording, start.rows))
     while True:
         left -= 1
-        frames = posed_pictures(as_now.with_offsets(joint_offsets), start.rows, offset)
-        best = PictureSearch(body, camera, frames).fit(camera, constants, focal)
+        search = PictureSearch(body, camera, posed_pictures(as_now, start.rows, offset))
+        best = search.with_offsets(joint_offsets).fit(camera, constants, focal)
         if best is None:
             raise unexplained_error(camera, "the body leaves the pictures")
         found = dict(zip(best.fit.names, best.found.shared.tolist(), strict=True))
@@ -201,7 +220,8 @@ def _fit_until_stable(
         most = SHARED.max_constant
         offset, joint_offsets = offset + by, np.clip(joint_offsets + turn, -most, most)
         if not left or (abs(by) < 0.02 and np.abs(turn).max() < np.radians(0.3)):
-            done = start._replace(camera=camera, clock=replace(start.clock, value=offset))
+            clock = replace(start.clock, value=offset)
+            done = start._replace(camera=camera, clock=clock, joint_offsets=joint_offsets)
             return best, as_now, done, assumed
 
 

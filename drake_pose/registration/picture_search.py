@@ -7,6 +7,7 @@ body where pictures change. The best are improved coarse-to-fine on an image pyr
 fitted on search lines across the contour in the pixels' foreground log-odds.
 """
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -24,8 +25,9 @@ from drake_pose.fit.background import (
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.fit.surfaces import simplify_or_hull
+from drake_pose.registration.offset_search import joints_like_cameras, search_offsets
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
-from drake_pose.registration.pyramid_level import PICTURES, PyramidLevel
+from drake_pose.registration.pyramid_level import PICTURES, PyramidLevel, evidence
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.registration.shared_fit import SharedFit, SharedValues
 from drake_pose.silhouette.outline import EMPTY_OUTLINE, Outline
@@ -123,6 +125,9 @@ def choose_frames(places: Array, count: int) -> list[int]:
 class PictureSearch:
     """Searches a camera's pose in some of its pictures.
 
+    Attributes:
+        joint_offsets: (m,) offsets that the frames' values include [rad or m], see `with_offsets`.
+
     Args:
         body: the robot's surfaces.
         camera: the camera; its pose is not used.
@@ -140,6 +145,7 @@ class PictureSearch:
         self._outlines = (coarse, *finer)
         self._X_WN = np.array([body.kinematics.poses(one.values) for one in frames])
         self._levels = dict[int, PyramidLevel]()
+        self.joint_offsets = np.zeros(len(body.kinematics.names))
 
     @property
     def compared(self) -> PyramidLevel:
@@ -176,6 +182,88 @@ class PictureSearch:
             improved.sort(key=lambda one: -one[0])
             found = level.distinct([X for _, X in improved], most)
         return found
+
+    def with_offsets(self, joint_offsets: Array) -> "PictureSearch":
+        """Return the same search with offsets (m,) [rad or m] added to all frames' values."""
+        other = copy.copy(self)
+        other.__dict__.pop("_small", None)
+        other.frames = tuple(replace(one, values=one.values + joint_offsets) for one in self.frames)
+        other.joint_offsets = self.joint_offsets + joint_offsets
+        other._X_WN = np.array([self._body.kinematics.poses(one.values) for one in other.frames])
+        other._levels = {
+            width: level.with_poses(other._X_WN[: len(level.backgrounds.pictures)])
+            for width, level in self._levels.items()
+        }
+        return other
+
+    def fit_offsets(
+        self,
+        joints: Sequence[str],
+        X_CW: Array,
+        *,
+        widths: Sequence[int] = (80, 160),
+        scales: Sequence[Sequence[float]] = (
+            (*(12.0,) * 3, *(8.0,) * 4, *(5.0,) * 4),
+            (*(8.0,) * 3, *(5.0,) * 4, *(3.0,) * 3),
+        ),
+    ) -> tuple["PictureSearch", Array]:
+        """Find joint offsets together with a camera's pose, roughly.
+
+        The offsets are searched by their scores (``search_offsets``), then fitted to contours.
+
+        Args:
+            joints: names of the joints with an offset. Those whose offset looks like a rotation of
+                the camera, and those that slide, keep 0.
+            X_CW: (4, 4) pose from which the search starts.
+            widths: of the pictures in which scores are compared [pixel], one search after another.
+            scales: of the fit's stages [pixel of a picture 320 wide]. Frames are segmented again
+                before each sequence.
+
+        Returns:
+            the same search with the offsets added to its frames' values, and the pose (4, 4).
+        """
+        kinematics = self._body.kinematics
+        values = np.array([one.values for one in self.frames])
+        shown = np.array([len(one.vertices) > 0 for one in self._body.coarse])
+        held = joints_like_cameras(kinematics, values, shown)
+        rows = [
+            k
+            for k, name in enumerate(kinematics.names)
+            if name in joints and name not in held and kinematics.is_angle[k]
+        ]
+        sought = [kinematics.names[k] for k in rows]
+        offsets = np.zeros(len(kinematics.names))
+
+        def poses(count: int, by: Array) -> Array:
+            return np.array([kinematics.poses(one + by) for one in values[:count]])
+
+        for k, width in enumerate(widths):
+            level = self._level(width)
+            some = partial(poses, len(level.backgrounds.pictures))
+            X_CW, offsets = search_offsets(
+                level, some, X_CW, offsets, rows, sweeps=2 if k == 0 else 0
+            )
+        best = self.with_offsets(offsets), X_CW
+        for sequence in scales:
+            search, X = best[0], best[1]
+            frames, small = search._small
+            camera = small.with_pose(np.linalg.inv(X))
+            posed = search._segment(
+                camera, frames, *search._learn(camera, frames), self._outlines[-1]
+            )
+            if posed is None:
+                break
+            fit = SharedFit([posed], [X], sought, fit_biases=False, expected=search._expected)
+            found = fit.fit(_stages(sequence, posed))
+            offsets = offsets.copy()
+            offsets[rows] += found.shared[fit.per_camera :]
+            tried = self.with_offsets(offsets), fit.cameras(found)[0].X_CW
+            if evidence(*tried[0].compared.explained(tried[1])) <= evidence(
+                *best[0].compared.explained(best[1])
+            ):
+                break
+            best = tried
+        return best
 
     def coarse_fit(self, X_CW: Array) -> tuple[PinholeCamera, tuple[float, float]] | None:
         """Fit a camera roughly from a pose X_CW (4, 4).
@@ -221,14 +309,18 @@ class PictureSearch:
             if posed is None:
                 return None
             fit = SharedFit(
-                [posed], [camera.X_CW], constants, camera_unknowns=camera_unknowns, fit_biases=False
-            )
+                [posed], [camera.X_CW], constants, camera_unknowns=camera_unknowns,
+                fit_biases=False, expected=self._expected,
+            )  # fmt: skip
             included = fit.inliers(fit.inlier_ratios(fit.start))
             found = fit.fit(_stages(scales, posed), included=included)
             camera = fit.cameras(found)[0]
         assert posed is not None
         full = PosedFrames(self._body.kinematics, self._body.full, camera, posed.frames)
-        fit = SharedFit([full], [camera.X_CW], constants, camera_unknowns=camera_unknowns)
+        fit = SharedFit(
+            [full], [camera.X_CW], constants,
+            camera_unknowns=camera_unknowns, expected=self._expected,
+        )  # fmt: skip
         # The new fit starts at the camera's fitted pose; only the constants keep their values.
         constant = np.arange(len(fit.names)) >= fit.per_camera
         found = fit.start._replace(shared=np.where(constant, found.shared, 0.0))
@@ -236,6 +328,11 @@ class PictureSearch:
         found = fit.fit(_stages((0.75,) * 7, full), found, included)
         camera = fit.cameras(found)[0]
         return PictureFit(fit, found, known, *self.compared.explained(camera.X_CW))
+
+    @property
+    def _expected(self) -> dict[str, float]:
+        """Prior means of offsets that are added to the frames' values, by name [rad or m]."""
+        return dict(zip(self._body.kinematics.names, -self.joint_offsets, strict=True))
 
     @cached_property
     def _small(self) -> tuple[list[PosedPicture], PinholeCamera]:

@@ -3,6 +3,7 @@
 A search goes from small pictures to larger ones, and each size is a level of an image pyramid.
 """
 
+import copy
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -96,6 +97,12 @@ class PyramidLevel:
         self._middle = self._points.mean(axis=0)
         off = self._points - self._middle
         self._size = float(np.sqrt((off**2).sum(axis=1).mean()))
+
+    def with_poses(self, X_WN: Array) -> "PyramidLevel":
+        """Return the same pictures with other poses of the nodes (f, nodes, 4, 4)."""
+        other = copy.copy(self)
+        other._X_WN = X_WN
+        return other
 
     def statistics(self, X_CW: Array, X_WN: Array | None = None) -> Array:
         """Return the sums (4,), see ``Explained``, over the pictures for a pose (4, 4).
@@ -212,10 +219,10 @@ class PyramidLevel:
         options = {"maxfev": evaluations, "initial_simplex": simplex, "xatol": 0.0, "fatol": 0.0}
 
         def cost(x: Array) -> float:
-            return -self.score(self._moved(X_CW, x))
+            return -self.score(self.moved(X_CW, x))
 
         found = minimize(cost, np.zeros(6), method="Nelder-Mead", options=options)
-        return -float(found.fun), self._moved(X_CW, found.x)
+        return -float(found.fun), self.moved(X_CW, found.x)
 
     def distinct(self, X_CW: Sequence[Array], most: int | None = None) -> list[Array]:
         """Return the poses (4, 4) that place the body apart from every pose kept before.
@@ -234,7 +241,7 @@ class PyramidLevel:
                 break
         return kept
 
-    def _moved(self, X_CW: Array, x: Array) -> Array:
+    def moved(self, X_CW: Array, x: Array) -> Array:
         """Return a pose (4, 4) moved by x (6,) in the camera's frame.
 
         x: rotation vector about the body's middle [rad], shift of the middle in the picture along u

@@ -10,7 +10,7 @@ offsets, link scales and lens errors that are not fitted are nuisance parameters
 sizes enlarge the covariance.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -131,6 +131,8 @@ class SharedFit:
             links cannot be scaled.
         camera_unknowns: number of unknowns of each camera, the first ones of CAMERA_NAMES.
         fit_biases: whether the masks' boundary biases are unknown.
+        expected: prior means of constants by name, about which they are bounded; None, and for
+            other names: 0.
     """
 
     def __init__(
@@ -142,10 +144,12 @@ class SharedFit:
         offsets: Sequence[LinkVector] = (),
         camera_unknowns: int = len(POSE_NAMES),
         fit_biases: bool = True,
+        expected: Mapping[str, float] | None = None,
     ) -> None:
         self.views, self.constants, self._X_CW = tuple(views), tuple(constants), tuple(X_CW)
         self._options: dict[str, Any] = {
             "offsets": offsets, "camera_unknowns": camera_unknowns, "fit_biases": fit_biases,
+            "expected": expected,
         }  # fmt: skip
         first, body = views[0], views[0].body
         if offsets:
@@ -167,7 +171,9 @@ class SharedFit:
         known = np.array([deviations.get(name, np.inf) for name in self.names])
         bounded = set(constants) - {*TARGET_POSITIONS, TIME_OFFSET}
         most = np.array([SHARED.max_constant if k in bounded else np.inf for k in self.names])
-        unknowns = [Unknowns(self.names, True, -most, most, known)]
+        self._expected = np.array([(expected or {}).get(name, 0.0) for name in self.names])
+        lower, upper = self._expected - most, self._expected + most
+        unknowns = [Unknowns(self.names, True, lower, upper, known)]
         if fit_biases:
             # Boundary biases are at most six pixels.
             every = parameter_names(body, cameras)
@@ -401,7 +407,7 @@ class SharedFit:
 
         Returns:
             the n included observations; their own unknowns (n, cameras) and the shared ones (u,) at
-            the values; the prior means of both, 0; and which masks (rows,) are included.
+            the values; the prior means of both; and which masks (rows,) are included.
         """
         included = np.ones(len(self.rows), bool) if included is None else included
         own = self._own(at)[included]
@@ -409,7 +415,7 @@ class SharedFit:
         return (
             observations,
             (own, at.shared),
-            (np.zeros_like(own), np.zeros(len(self.names))),
+            (np.zeros_like(own), self._expected),
             included,
         )
 

@@ -87,7 +87,7 @@ def test_upright_rotations_have_small_roll_and_all_headings() -> None:
 
 def test_moved_poses_separate_rotation_shift_and_depth(level: PyramidLevel, episode) -> None:
     X_CW, x = episode.camera.X_CW, np.array([0.3, -0.2, 0.5, 0.04, -0.07, 0.2])
-    moved = level._moved(X_CW, x)
+    moved = level.moved(X_CW, x)
     before, after = (X[:3, :3] @ level._middle + X[:3, 3] for X in (X_CW, moved))
     np.testing.assert_allclose(after[:2] / after[2], before[:2] / before[2] + x[3:5])
     assert after[2] == pytest.approx(before[2] * np.exp(x[5]))
@@ -97,7 +97,7 @@ def test_moved_poses_separate_rotation_shift_and_depth(level: PyramidLevel, epis
 
 def test_score_increases_towards_the_true_pose(level: PyramidLevel, episode) -> None:
     true = episode.camera.X_CW
-    aside = level._moved(true, np.array([0.06, -0.05, 0.04, 0.02, -0.02, 0.03]))
+    aside = level.moved(true, np.array([0.06, -0.05, 0.04, 0.02, -0.02, 0.03]))
     poses = [aside, true, *level.starts()[::1200]]
     scores = [level.score(X) for X in poses]
     assert np.argmax(scores) == 1
@@ -132,7 +132,7 @@ def test_tile_gains_sum_to_the_gain(level: PyramidLevel, episode) -> None:
 def test_distinct_poses_are_apart(level: PyramidLevel, episode) -> None:
     rng = np.random.default_rng(5)
     true = episode.camera.X_CW
-    poses = [level._moved(true, rng.normal(0.0, 0.03, 6)) for _ in range(30)]
+    poses = [level.moved(true, rng.normal(0.0, 0.03, 6)) for _ in range(30)]
     points = level._points[:: max(1, len(level._points) // 50)]
 
     def apart(one: np.ndarray, other: np.ndarray) -> float:

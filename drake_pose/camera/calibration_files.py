@@ -4,9 +4,10 @@ The format is recognised by the content, not by the file's name. In all of them 
 integers, and poses map points of the world to the camera, p_C = R p_W + T [m].
 """
 
+import json
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import numpy as np
 
 from drake_pose.arrays import Array
 from drake_pose.camera.models import Lens, check_number, check_pose, check_side, inverse_pose
+from drake_pose.camera.pose_files import episode_entry, read_launch, read_lines, recorded_poses
 from drake_pose.errors import CameraError
 from drake_pose.regular_files import read_regular
 from drake_pose.yaml_files import read_yaml
@@ -22,25 +24,47 @@ from drake_pose.yaml_files import read_yaml
 FORMATS = (
     "this program's cameras.yaml, Drake's CameraConfig or Scenario, ROS camera_info, Kalibr's "
     "camchain, OpenCV's FileStorage (camera_matrix, distortion_coefficients, image_width, "
-    "image_height, R, T), and the TOML of anipose, Pose2Sim or Caliscope"
+    "image_height, R, T), and the TOML of anipose, Pose2Sim or Caliscope; and, beside a file with "
+    "intrinsics, the poses of easy_handeye (.yaml, .calib), MoveIt's and other launch files of "
+    "static transforms, TransformStamped, DROID's cam2base_extrinsics.json, DROID-3D's "
+    "extrinsics.jsonl, and NAME: POSE, where POSE is a 4 x 4 matrix, [x, y, z, roll, pitch, yaw], "
+    "[x, y, z, qx, qy, qz, qw], or translation and rotation"
 )
 """Supported formats of camera files, for messages."""
 
 
-def read_camera_content(path: Path, largest: int = 1 << 20) -> Any:
-    """Return the content of a YAML, JSON, TOML or FileStorage file as plain values and arrays.
+def read_camera_content(
+    path: Path,
+    largest: int = 1 << 20,
+    largest_json: int = 1 << 29,
+    episode_ids: Collection[str] = (),
+) -> Any:
+    """Return the content of a YAML, JSON, TOML, FileStorage or launch file as plain values.
+
+    Matrices of a FileStorage are arrays. A launch file is a list of its static transforms.
 
     Args:
         largest: maximum size of the file [byte].
+        largest_json: the same for `.json` and `.jsonl` [byte].
+        episode_ids: of a `.jsonl`, only the lines that hold one of these names are read, if any do.
 
     Raises:
         CameraError: the file cannot be read.
     """
+    is_json = path.suffix in (".json", ".jsonl")
     try:
-        data = read_regular(path, largest + 1)
+        data = read_regular(path, (largest_json if is_json else largest) + 1)
     except OSError as error:
         raise CameraError(f"{path}: cannot read it: {error.strerror}") from error
     text = data.decode("utf-8", errors="replace")
+    if path.suffix == ".jsonl" or (is_json and len(data) > largest):
+        try:
+            of_lines = path.suffix == ".jsonl"
+            return read_lines(text, episode_ids) if of_lines else json.loads(text)
+        except ValueError as error:
+            raise CameraError(f"{path}: not a JSON file: {error}") from error
+    if len(data) <= largest and (launched := read_launch(text)) is not None:
+        return launched
     if len(data) <= largest and text.startswith(("<?xml", "<opencv_storage", "%YAML:1.0")):
         try:
             storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
@@ -59,7 +83,7 @@ def read_camera_content(path: Path, largest: int = 1 << 20) -> Any:
 
 
 def calibrated_cameras(
-    content: Mapping[Any, Any], path: Path
+    content: Any, path: Path, episode_ids: Collection[str] = ()
 ) -> dict[str, tuple[Lens, Array | None]]:
     """Return the cameras in a calibration tool's file, by name; empty if it is not such a file.
 
@@ -69,6 +93,7 @@ def calibrated_cameras(
     Args:
         content: content of the file, as from ``read_camera_content``.
         path: the file, for messages and a camera without a name.
+        episode_ids: names by which the recording may be known in DROID's files of many episodes.
 
     Returns:
         By name, the lens and the pose X_WC (4, 4) [m] of each camera; None: the file has no pose.
@@ -77,6 +102,8 @@ def calibrated_cameras(
         CameraError: a field is missing or invalid, OpenCV does not have the lens model, or a camera
             is so far away that lengths cannot be in metres.
     """
+    if isinstance(content, list):
+        return _droid_3d(content, path)
     if "camera_matrix" in content:
         name = str(content.get("camera_name", path.stem))
         where = f"{path}: camera '{name}'"
@@ -100,6 +127,81 @@ def calibrated_cameras(
         numbers = table.get("matrix"), table.get("distortions", ())
         lens = _lens(table.get("size"), *numbers, bool(table.get("fisheye", False)), where)
         found[name] = lens, _pose(table, "rotation", "translation", where)
+    if not found and (single := _camera_info(content, f"{path}: camera '{path.stem}'")):
+        return {str(content.get("camera_name", path.stem)): (single, None)}
+    for key, entry in () if found else entries.items():
+        if (own := _camera_info(entry, f"{path}: camera '{key}'")) is not None:
+            poses = recorded_poses({key: entry}, path)
+            found[key] = own, poses[key].X if key in poses else None
+    return found or _droid_intrinsics(entries, path, episode_ids)
+
+
+def _camera_info(entry: Mapping[Any, Any], where: str) -> Lens | None:
+    """Return the lens of a ROS CameraInfo message, or of width, height and fx, fy, cx, cy.
+
+    A CameraInfo has K or k; librealsense says ppx and ppy for cx and cy. None: it is neither.
+    """
+    one = {str(key).lower(): value for key, value in entry.items()}
+    if isinstance(one.get("intrinsics"), dict):
+        one |= {str(key).lower(): value for key, value in one["intrinsics"].items()}
+    numbers = [one.get(key, one.get(other)) for key, other in
+               (("fx", "fx"), ("fy", "fy"), ("cx", "ppx"), ("cy", "ppy"))]  # fmt: skip
+    matrix = next((one[key] for key in ("k", "intrinsic_matrix", "intrinsics") if key in one), None)
+    if None not in numbers:
+        matrix = [numbers[0], 0.0, numbers[2], 0.0, numbers[1], numbers[3], 0.0, 0.0, 1.0]
+    found = _numbers(matrix)
+    if found is None or found.size != 9 or not {"width", "height"} <= {*one}:
+        return None
+    distortion = next((one[key] for key in ("d", "coeffs", "distortion") if key in one), ())
+    model = str(one.get("distortion_model", "plumb_bob")) or "plumb_bob"
+    return lens_of([one["width"], one["height"]], matrix, distortion or (), model, where)
+
+
+def _droid_intrinsics(
+    entries: Mapping[str, Mapping[Any, Any]],
+    path: Path,
+    episode_ids: Collection[str],
+    size: tuple[int, int] = (1280, 720),
+) -> dict[str, tuple[Lens, Array | None]]:
+    """Return the lenses of DROID's intrinsics.json, by serial number; empty if it is none.
+
+    Its entries are [fx, cx, fy, cy] by serial number, by episode.
+
+    size: width and height of the pictures to which they apply: HD720 [pixel].
+    """
+    rows = [_numbers(value) for one in entries.values() for value in one.values()]
+    if not rows or any(one is None or one.shape != (4,) or one.min() < 1.0 for one in rows):
+        return {}
+    found = dict[str, tuple[Lens, Array | None]]()
+    for serial, (fx, cx, fy, cy) in (episode_entry(entries, path, episode_ids) or {}).items():
+        matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+        found[str(serial)] = _lens(size, matrix, (), False, f"{path}: camera '{serial}'"), None
+    return found
+
+
+def _droid_3d(records: Sequence[Any], path: Path) -> dict[str, tuple[Lens, Array | None]]:
+    """Return the lenses of DROID-3D's camera_intrinsics.jsonl, by serial number, of one episode.
+
+    Empty if it is not such a file. Raises CameraError: it holds several episodes.
+    """
+    held = [
+        one for one in records if isinstance(one, dict) and isinstance(one.get("cameras"), dict)
+    ]
+    if not held:
+        return {}
+    if len(held) > 1:
+        raise CameraError(
+            f"{path}: has {len(held)} episodes, and this recording does not say which is its own: "
+            "keep only its line"
+        )
+    found = dict[str, tuple[Lens, Array | None]]()
+    for role, one in held[0]["cameras"].items():
+        where = f"{path}: camera '{role}'"
+        left = one.get("left") if isinstance(one, dict) else None
+        # The recorded pictures are rectified: their distortion is removed.
+        lens = None if not isinstance(left, dict) else _camera_info(left | {"disto": ()}, where)
+        if lens is not None:
+            found[str(one.get("serial") or role)] = lens, None
     return found
 
 

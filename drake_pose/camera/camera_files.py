@@ -1,6 +1,6 @@
 """Read and write this program's camera files; read those of Drake and of calibration tools."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,13 @@ from drake_pose.camera.models import (
     check_pose,
     write_file,
 )
-from drake_pose.errors import CameraError
+from drake_pose.camera.pose_files import (
+    RecordedPose,
+    recorded_poses,
+    recording_names,
+    same_camera,
+)
+from drake_pose.errors import CameraError, listed
 
 _COMMON = ("width", "height", "center_x", "center_y")
 _REQUIRED = {
@@ -45,7 +51,12 @@ _OPTIONAL = {
 }
 
 
-def load_cameras(path: str | Path) -> dict[str, Camera]:
+def load_cameras(
+    path: str | Path,
+    known: "Known | None" = None,
+    recording: Path | None = None,
+    warnings: list[str] | None = None,
+) -> dict[str, Camera]:
     """Return the cameras of a file by name, in the file's order.
 
     A pinhole camera has `width height focal_x focal_y center_x center_y` [pixel, pixel centres at
@@ -57,11 +68,17 @@ def load_cameras(path: str | Path) -> dict[str, Camera]:
     name), a mapping of CameraConfigs, or a single one; their principal points are converted. Files
     of ROS, Kalibr, OpenCV, anipose, Pose2Sim and Caliscope are recognised likewise.
 
+    Args:
+        known, recording: as in ``load_camera_file``.
+        warnings: list to which warnings are appended; None: they are dropped.
+
     Raises:
         CameraError: names the file, the camera and the field at fault. Cameras without a pose, on
             moving links, or with distortion are refused.
     """
-    found = load_camera_file(path)
+    found = load_camera_file(path, known=known, recording=recording)
+    if warnings is not None:
+        warnings += found.warnings
     for name, link in found.links.items():
         raise CameraError(
             f"{path}: camera '{name}' rides on link '{link}' of a robot (link, X_LC), so its pose "
@@ -89,29 +106,73 @@ class CameraFile:
         links: link of each camera that is mounted on one, by the camera's name; its X_WC holds
             X_LC, the pose in the link.
         lenses: lens of each camera with distortion, for the images as taken.
+        warnings: how the file was read where it does not say so itself.
     """
 
     cameras: dict[str, Camera]
     unplaced: tuple[str, ...]
     links: Mapping[str, str] = field(default_factory=dict)
     lenses: Mapping[str, Lens] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
 
 
-def load_camera_file(path: str | Path, *, distorted: bool = False) -> CameraFile:
+Known = Callable[[], CameraFile | None]
+"""Returns cameras with intrinsics, by the recording's names; None: they are unknown."""
+
+
+def intrinsics_of(
+    own: Path, intrinsics: Path | None, wanted: Collection[str] = (), *, distorted: bool = False
+) -> Known:
+    """Return a function that reads the intrinsics of a recording's cameras.
+
+    Args:
+        own: the recording's camera file, which may be missing.
+        intrinsics: a camera file to read instead; None: the recording's.
+        wanted: names of the cameras that are used; empty: all.
+        distorted: as in ``load_camera_file``.
+    """
+
+    def read() -> CameraFile | None:
+        file = intrinsics or own
+        if not (intrinsics or file.is_file()):
+            return None
+        found = load_camera_file(file, distorted=distorted, recording=own.parent)
+        kept = {name: one for name, one in found.cameras.items() if not wanted or name in wanted}
+        return CameraFile(kept, tuple(kept), {}, found.lenses)
+
+    return read
+
+
+def load_camera_file(
+    path: str | Path,
+    *,
+    distorted: bool = False,
+    known: Known | None = None,
+    recording: Path | None = None,
+) -> CameraFile:
     """Read a camera file as load_cameras does, but allow cameras without X_WC.
 
     Args:
         distorted: allow cameras with `distortion`, which the caller removes from images; else they
             are refused.
+        known: called for a file of poses alone, see ``Known``; None: such a file is refused.
+        recording: the recording, which says what episode it is in DROID's files of many; None:
+            unknown.
 
     Raises:
         CameraError: names the file, the camera and the field at fault.
     """
     path = Path(path)
-    content = read_camera_content(path)
-    if not isinstance(content, dict) or not content:
+    episode_ids, serials = recording_names(recording)
+    content = read_camera_content(path, episode_ids=episode_ids)
+    if not isinstance(content, dict | list) or not content:
         raise CameraError(f"{path}: expected a mapping from camera names to their parameters")
-    calibrated = calibrated_cameras(content, path)
+    calibrated = calibrated_cameras(content, path, episode_ids)
+    poses = {} if calibrated else recorded_poses(content, path, episode_ids)
+    if poses:
+        named = {serials.get(name, name): one for name, one in poses.items()}
+        return _placed(path, named, None if known is None else known())
+    content = {} if isinstance(content, list) else content
     configs = None if calibrated else _find_configs(content, path)
     if configs is not None:
         # Import Drake only if needed, because it loads slowly.
@@ -153,6 +214,42 @@ def load_camera_file(path: str | Path, *, distorted: bool = False) -> CameraFile
             f"distortion (drake-pose undistort RECORDING --cameras {path} --out SCENE)"
         )
     return CameraFile(cameras, tuple(unplaced), links, lenses)
+
+
+def _placed(path: Path, poses: Mapping[str, RecordedPose], known: CameraFile | None) -> CameraFile:
+    """Return the known cameras at the poses of a file that has no intrinsics.
+
+    Args:
+        path: the file, for messages.
+        poses: its poses, by the file's names.
+        known: cameras with intrinsics, by the recording's names; None: there are none.
+
+    Raises:
+        CameraError: there are no intrinsics, or no pose is one of a known camera.
+    """
+    names = listed(sorted(poses))
+    if known is None or not known.cameras:
+        raise CameraError(
+            f"{path}: has poses ({names}) but no intrinsics: give a file with the pictures' width "
+            "and height, focal lengths and principal point, too (--intrinsics FILE, such as ROS' "
+            "camera_info or this program's cameras.yaml)"
+        )
+    own = [*known.cameras]
+    meant = {name: same_camera(name, own) for name in poses}
+    if len(poses) == len(own) == 1:
+        meant = {next(iter(poses)): own[0]}
+    found = {camera: poses[name] for name, camera in meant.items() if camera is not None}
+    if not found:
+        raise CameraError(
+            f"{path}: has poses of {names}, but the recording's cameras are {listed(own)}: name "
+            "them alike in the file, or name the one camera that it is for (--camera NAME)"
+        )
+    cameras = {name: known.cameras[name].with_pose(one.X) for name, one in found.items()}
+    links = {name: one.link for name, one in found.items() if one.link}
+    lenses = {name: lens for name, lens in known.lenses.items() if name in found}
+    assumed = dict.fromkeys(one.assumed for one in found.values() if one.assumed)
+    warnings = tuple(f"{path}: {text}; audit tests other readings" for text in assumed)
+    return CameraFile(cameras, (), links, lenses, warnings)
 
 
 def save_cameras(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Camera]) -> None:

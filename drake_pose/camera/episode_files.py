@@ -12,11 +12,11 @@ import numpy as np
 
 from drake_pose.arrays import Array, Picture
 from drake_pose.camera.bags import BAGS, open_bag
-from drake_pose.camera.camera_files import CameraFile, load_camera_file
+from drake_pose.camera.camera_files import CameraFile, intrinsics_of, load_camera_file
 from drake_pose.camera.droid import TRAJECTORY, open_droid
 from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending_indices
 from drake_pose.camera.lerobot import INFO, open_lerobot
-from drake_pose.camera.models import PinholeCamera
+from drake_pose.camera.models import Camera, Lens, PinholeCamera
 from drake_pose.camera.picture_files import (
     VIDEOS,
     TimedVideo,
@@ -26,6 +26,7 @@ from drake_pose.camera.picture_files import (
     in_order,
     read_picture,
 )
+from drake_pose.camera.pose_files import same_camera
 from drake_pose.camera.sources import CAMERAS, TIME_STAMPS, read_time_stamps
 from drake_pose.csv_files import read_csv, read_number
 from drake_pose.errors import CameraError, SceneError, SettingsError, listed
@@ -273,6 +274,40 @@ def add_calibration(camera: EpisodeCamera, calibration: CameraFile, path: Path) 
         )
     link, lens = calibration.links.get(camera.name), calibration.lenses.get(camera.name)
     return replace(camera, camera=found, link=link, lens=lens)
+
+
+def recorded_intrinsics(
+    cameras: Sequence[EpisodeCamera], path: Path, intrinsics: Path | None
+) -> CameraFile:
+    """Return an episode's cameras with intrinsics, by their names in the episode.
+
+    Those of a file for pictures of another size but the same shape are scaled.
+
+    Args:
+        cameras: the cameras that are used.
+        path: the episode's folder or file.
+        intrinsics: a camera file; None: the episode's cameras.yaml, or else its recorded ones.
+    """
+    read = intrinsics_of(path / CAMERAS, intrinsics, distorted=True)()
+    if read is None:
+        own = {one.name: one.camera for one in cameras if one.camera is not None}
+        lenses = {one.name: one.lens for one in cameras if one.lens is not None}
+        return CameraFile(dict(own), tuple(own), lenses=lenses)
+    found, lenses = dict[str, Camera](), dict[str, Lens]()
+    for name, given in read.cameras.items():
+        meant = same_camera(name, [one.name for one in cameras])
+        if len(read.cameras) == len(cameras) == 1:
+            meant = cameras[0].name
+        if meant is None or not isinstance(given, PinholeCamera):
+            continue
+        size = next((one.width, one.height) for one in cameras if one.name == meant)
+        alike = abs(size[0] * given.height - size[1] * given.width) <= max(size)
+        if name in read.lenses:
+            lenses[meant] = read.lenses[name]
+        elif alike:
+            given = given.resized(*size)
+        found[meant] = replace(given, name=meant)
+    return CameraFile(found, tuple(found), lenses=lenses)
 
 
 def recording_format(path: Path) -> Literal["lerobot", "droid", "bag", "folder", ""]:

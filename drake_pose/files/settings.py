@@ -313,6 +313,9 @@ class EpisodeSettings(SceneSettings):
     joint_map: Path | None = None
     """YAML file that assigns columns of an episode's joint log to joints, with their units; or the
     calibration file of a LeRobot robot (JSON)."""
+    intrinsics: Path | None = None
+    """Camera file with intrinsics, if the camera file has poses alone, as those of easy_handeye
+    and DROID. Default: the recording's own."""
     units: Literal["rad", "deg", "normalised", "steps"] | None = None
     """Unit of the angles in an episode's joint log; normalised: LeRobot's -100 to 100 of a motor's
     range; steps: of its encoder. Default: inferred from the readings and the joints' limits."""

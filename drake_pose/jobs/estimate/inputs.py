@@ -20,7 +20,7 @@ from drake_pose.body import (
     load_model,
     model_warnings,
 )
-from drake_pose.camera.camera_files import load_cameras
+from drake_pose.camera.camera_files import intrinsics_of, load_cameras
 from drake_pose.camera.episode_files import JOINT_TABLE, read_sequence
 from drake_pose.camera.models import Camera
 from drake_pose.errors import ModelError, SceneError, SettingsError, UnknownNameError
@@ -59,7 +59,7 @@ from drake_pose.silhouette.pictures.scene_checks import (
     leave_out_unreadable,
     read_scene,
 )
-from drake_pose.silhouette.pictures.scenes import SCENE_FILE, Scene
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, SCENE_FILE, Scene
 from drake_pose.silhouette.scoring import draw_labels, require_visible
 
 
@@ -339,9 +339,10 @@ def read_inputs(
     else:
         # Frames of a captured person are a sequence.
         is_person = settings.method == "person"
+        known = intrinsics_of(scene_path / CAMERA_FILE, settings.intrinsics, settings.cameras)
         scene, frames = read_scene(
             scene_path, settings.cameras, settings.frames,
-            cameras=None if camera_path is None else load_cameras(camera_path),
+            cameras=None if camera_path is None else load_cameras(camera_path, known, scene_path),
             sequence=is_person, every=settings.every,
         )  # fmt: skip
         if settings.unseen:

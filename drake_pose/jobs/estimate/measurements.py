@@ -19,6 +19,7 @@ from drake_pose.camera.episode_files import (
     open_episode,
     picture_times,
     read_joint_table,
+    recorded_intrinsics,
     recording_format,
 )
 from drake_pose.camera.joint_map import MappedJoints, map_joints, read_joint_map
@@ -282,10 +283,12 @@ class PlacedCameras(NamedTuple):
     Args:
         cameras: the cameras, in the episode's order.
         placed: names of all cameras of the camera file with a known, static pose X_WC.
+        warnings: how the camera file was read where it does not say so itself.
     """
 
     cameras: list[EpisodeCamera]
     placed: frozenset[str]
+    warnings: tuple[str, ...] = ()
 
 
 class TreeLog(NamedTuple):
@@ -345,9 +348,15 @@ def cameras_of(
     file = camera_path or episode.path / CAMERA_FILE
     if camera_path is None and not file.is_file():
         return PlacedCameras(chosen, frozenset(one.name for one in chosen if one.is_posed))
-    given = load_camera_file(file, distorted=True)
+    given = load_camera_file(
+        file,
+        distorted=True,
+        known=partial(recorded_intrinsics, chosen, episode.path, settings.intrinsics),
+        recording=episode.path,
+    )
     chosen = [add_calibration(one, given, file) for one in chosen]
-    return PlacedCameras(chosen, frozenset(given.cameras) - {*given.unplaced, *given.links})
+    placed = frozenset(given.cameras) - {*given.unplaced, *given.links}
+    return PlacedCameras(chosen, placed, given.warnings)
 
 
 def left_out_warnings(names: Iterable[str], placed: Collection[str]) -> list[str]:
@@ -474,7 +483,7 @@ def read_episode_scene(
             known.
     """
     episode = open_episode(path, joints=joints, episode=settings.episode)
-    chosen, placed = cameras_of(episode, cameras, settings)
+    chosen, placed, read = cameras_of(episode, cameras, settings)
     if not placed.intersection(one.name for one in chosen):
         raise SceneError(
             f"{path}: no camera has a pose X_WC; find the poses (drake-pose register), and give "
@@ -495,7 +504,9 @@ def read_episode_scene(
     return Scene(
         path, {name: one.camera for name, one in known.items() if one.camera is not None}, frames,
         {}, True, rate, images=images, readers=readers, times=times, joints=episode.joints,
-        warnings=(*episode.warnings, *left_out_warnings([one.name for one in chosen], placed)),
+        warnings=(
+            *episode.warnings, *read, *left_out_warnings([one.name for one in chosen], placed)
+        ),
     )  # fmt: skip
 
 

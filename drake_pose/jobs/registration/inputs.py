@@ -11,7 +11,12 @@ import numpy as np
 from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body import TARGET, ArticulatedModel, PoseTree, RootRotation, load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.camera.camera_files import CameraFile, load_camera_file, load_cameras
+from drake_pose.camera.camera_files import (
+    CameraFile,
+    intrinsics_of,
+    load_camera_file,
+    load_cameras,
+)
 from drake_pose.camera.episode import EpisodeCamera
 from drake_pose.camera.episode_files import JOINT_TABLE, open_episode, require_recording
 from drake_pose.camera.joint_map import MappedJoints
@@ -194,7 +199,9 @@ def read_inputs(
             f"{scene}: an audit of masks needs the positions of all joints of {model.name} that "
             f"are not held: {JOINT_TABLE} in the folder, or --joints FILE"
         )
-    given = None if cameras is None else load_cameras(cameras)
+    own = intrinsics_of(scene / CAMERA_FILE, settings.intrinsics, settings.cameras)
+    read = list[str]()
+    given = None if cameras is None else load_cameras(cameras, own, scene, read)
     found, frames = read_scene(
         scene, settings.cameras, settings.frames, given, every=settings.every
     )
@@ -206,7 +213,7 @@ def read_inputs(
     held = tuple(found.cameras.values())
     tree = make_tree(robot, EstimateSettings(hold=settings.hold))
     positions = read_known_positions(joints, TreeKinematics(tree))
-    warnings = [*found.warnings, *robot.warnings, *positions.warnings]
+    warnings = [*read, *found.warnings, *robot.warnings, *positions.warnings]
     if positions.are_one_pose(positions.of(frame, held[0].name) for frame in frames):
         warnings.append(
             "all frames show the robot in one pose, to a degree: common errors of joints and of "
@@ -255,13 +262,13 @@ def _read_episode(
             f"{', '.join(mapped.unposed)}; hold joints that do not move (--hold NAME=VALUE, [deg "
             "or m])"
         )
-    chosen, placed = cameras_of(episode, cameras, settings)
-    known = {one.name: _known_camera(one) for one in chosen}
+    chosen, placed, read = cameras_of(episode, cameras, settings)
+    known = {one.name: one.pinhole() for one in chosen}
     kinematics = TreeKinematics(tree)
     default = kinematics.flatten(tree.default_values())
     inputs = RegistrationInputs(
         Scene(path, known, (), {}), robot, tree, KnownPositions(path, kinematics, {}),
-        joints, cameras, tuple(warnings), searched_cameras=tuple(known.values()),
+        joints, cameras, (*warnings, *read), searched_cameras=tuple(known.values()),
         given_cameras=tuple(one for name, one in known.items() if name in placed),
         assumed_focal=frozenset(one.name for one in chosen if one.camera is None),
         recordings={one.name: _recording(one, mapped, default, settings) for one in chosen},
@@ -280,14 +287,6 @@ def _read_episode(
             )
     joint_names, link_names = _select_parameters(robot, kinematics, settings)
     return replace(inputs, offset_joints=joint_names, scaled_links=link_names)
-
-
-def _known_camera(one: EpisodeCamera) -> PinholeCamera:
-    """Return an episode's camera; an unknown focal length is 0.95 of the pictures' width."""
-    if one.camera is not None:
-        return replace(one.camera, name=one.name)
-    focal, centre = 0.95 * one.width, (0.5 * (one.width - 1), 0.5 * (one.height - 1))
-    return PinholeCamera(one.name, one.width, one.height, focal, focal, *centre, np.eye(4))
 
 
 def _recording(
@@ -353,7 +352,8 @@ def _read_masks(
             f"{path}: has no {CAMERA_FILE}; a registration needs a camera file with picture size "
             "and focal length (--cameras FILE)"
         )
-    file = load_camera_file(cameras or path / CAMERA_FILE)
+    known = intrinsics_of(path / CAMERA_FILE, settings.intrinsics, settings.cameras)
+    file = load_camera_file(cameras or path / CAMERA_FILE, known=known, recording=path)
     scene = check_scene(load_scene(path, file.cameras))
     scene, frames = scene.every(settings.every, settings.frames)
     searched, held = _select_cameras(scene, file, settings)
@@ -383,7 +383,7 @@ def _read_masks(
         positions = read_known_positions(joints, kinematics, on_link, table)
     found, unplaced = [camera.name for camera in searched], (*file.unplaced, *file.links)
     left_out = tuple(name for name in unplaced if name not in found)
-    warnings = [*scene.warnings, *robot.warnings, *positions.warnings]
+    warnings = [*file.warnings, *scene.warnings, *robot.warnings, *positions.warnings]
     warnings += [
         f"camera '{name}' has no X_WC and is not to be registered, or has no masks in "
         f"masks/{name}: it is left out of the written camera file; add its masks, or name it "

@@ -223,18 +223,20 @@ def _without_openings(
     is_mapped: bool,
     slack: float = 0.1,
 ) -> tuple[dict[str, str], list[str]]:
-    """Return the matched columns, without those that only their place gives to a gripper's joint.
+    """Return the matched columns, without openings of a gripper that are not its joint's position.
 
-    Such a column is kept if it leaves 0 ... 1, an opening's range, but not the joint's limits.
+    A column that only its place gives to a gripper's joint is kept if it leaves 0 ... 1, the range
+    of an opening, but not the joint's limits. One that has a gripper's name is left out if it is in
+    0 ... 1, and beyond these limits.
 
     Args:
         matched: joint by column.
         readings: (n,) readings by column.
         limits: by joint [rad or m].
         unit: unit of the readings [rad].
-        is_mapped: whether a joint map has the other joints; then a column that has a gripper's name
-            is kept only within the joint's limits, too.
-        slack: tolerance of the limits [rad or m].
+        is_mapped: whether a joint map has the other joints; then every column beyond the limits is
+            left out.
+        slack: tolerance of the limits [rad or m, and fraction of them].
 
     Returns:
         The columns that are kept, and warnings about the others.
@@ -242,19 +244,20 @@ def _without_openings(
     kept, warnings = dict(matched), list[str]()
     for column, joint in matched.items():
         is_named = column == joint or is_gripper_name(_words(column))
-        if not is_gripper_name(_words(joint)) or (is_named and not is_mapped):
-            continue
-        low, high = limits[joint][0] - slack, limits[joint][1] + slack
         own = readings[column][np.isfinite(readings[column])]
         least, most = own.min(initial=0.0), own.max(initial=0.0)
-        is_within = low <= unit * least <= unit * most <= high
-        if not is_within or (_is_opening(own) and not is_named):
+        low, high = limits[joint]
+        room = min(slack, slack * (high - low))
+        is_within = low - room <= unit * least <= unit * most <= high + room
+        is_wrong = not is_within and (_is_opening(own) or is_mapped or not is_named)
+        is_guess = _is_opening(own) and not is_named
+        if is_gripper_name(_words(joint)) and (is_wrong or is_guess):
             del kept[column]
             warnings.append(
-                f"column '{column}' of the joint log, {least:.3g} to {most:.3g}, "
-                f"is not taken for joint '{joint}': it seems to be a "
-                f"gripper's opening; map it if it is known ({joint}: {{column: {column}, from: [0, "
-                "1], to: [OPEN, CLOSED]})"
+                f"column '{column}' of the joint log, {least:.3g} to {most:.3g}, is not taken for "
+                f"joint '{joint}' ({low:.3g} to {high:.3g}): it seems to be a gripper's opening; "
+                f"map it if it is known ({joint}: {{column: {column}, from: [0, 1], to: [OPEN, "
+                "CLOSED]})"
             )
     return kept, warnings
 
@@ -371,7 +374,8 @@ def _find_unit(
     column = list(readings)[k]
     reason = (
         f"are not all within the joints' limits as radians ('{column}' is {minima[k]:.4g} to "
-        f"{maxima[k]:.4g}), and not clearly degrees"
+        f"{maxima[k]:.4g}, its joint's limits are {lower[k]:.4g} to {upper[k]:.4g}), and not "
+        "clearly degrees"
     )
     is_named = any(name.endswith(".pos") for name in readings)
     if is_named or normalised[0] <= largest <= normalised[1]:

@@ -137,18 +137,25 @@ def find_motors(folder: Path, robot: str, columns: Iterable[str]) -> tuple[Servo
     Args:
         folder: the data set.
         robot: type of the robot.
-        columns: names of the recorded columns; a file must have a motor of one of them.
+        columns: names of the recorded columns. A file must have a motor of one of them, or as many
+            motors as there are columns if these are only numbered.
 
     Raises:
         SceneError: there are several files, and none is clearly the robot's.
     """
+    columns, warnings = [*columns], list[str]()
     names = {name.removesuffix(".pos").removeprefix("main_") for name in columns} | {*columns}
-    warnings = list[str]()
+    # Without names in the data set its reader numbers the columns.
+    is_numbered = {*columns} == {f"joint_{k}" for k in range(len(columns))}
     inside = ("*.json", "meta/*.json", "calibration/**/*.json")
     for place, patterns in ((folder, inside), (folder.resolve().parent, (inside[0], inside[2]))):
         files = sorted({one for pattern in patterns for one in place.glob(pattern)})
         found = [one for file in files if (one := read_motors(file, robot)) is not None]
-        own = [one for one in found if names & {*one.motors}]
+        own = [
+            one
+            for one in found
+            if names & {*one.motors} or (is_numbered and len(one.motors) == len(columns))
+        ]
         warnings += [
             f"{one.path}: its motors are not those of the data set: {', '.join(one.motors)}"
             for one in found

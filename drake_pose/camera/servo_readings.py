@@ -60,6 +60,10 @@ class ServoJoint:
     is_gripper: bool
     motor: Motor | None
 
+    def is_called(self, names: tuple[str, ...]) -> bool:
+        """Return whether the column or the joint has one of LeRobot's names, after any prefix."""
+        return self.column.removesuffix(".pos").endswith(names) or self.name.endswith(names)
+
     @property
     def middle(self) -> float:
         """Middle of the joint's limits [rad or m]; 0 without limits."""
@@ -249,7 +253,7 @@ def servo_columns(
             found = _step_column(one, servos)
         else:
             length = range_in_steps(one, servos.turn)
-            if length is None and one.column.removesuffix(".pos").endswith(servos.full_turns):
+            if length is None and one.is_called(servos.full_turns):
                 length = servos.turn - 1
             if length is None:
                 assumed.append(one.name)
@@ -340,7 +344,7 @@ def _so_degrees(joints: Sequence[ServoJoint], servos: Servos) -> dict[str, Colum
     found, excess = dict[str, Column](), np.zeros(2)
     for one in joints if servos.is_so else ():
         for name, (sign, offset) in changed.items():
-            if one.column.removesuffix(".pos").endswith(name):
+            if one.is_called((name,)):
                 old = Column(one.column, math.radians(sign), math.radians(offset))
                 found[one.name] = old
                 for k, way in enumerate((Column("", math.radians(1.0)), old)):

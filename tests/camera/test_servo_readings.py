@@ -215,6 +215,12 @@ def test_an_opening_is_not_an_angle():
     )
     np.testing.assert_array_equal(found.log.positions[:, :2], arm)
     assert mapped(np.linspace(-0.3, 0.7, 20)).not_logged == ()
+    # A name does not help if the joint's limits do not hold.
+    log = JointLog((*names[:2], "gripper"), np.arange(20.0), np.column_stack([arm, arm[:, 0] > 0]))
+    small = (*model[:2], "gripper")
+    narrow = np.array([2.0, 2.0, 0.04])
+    found = map_joints(log, small, -2 * np.array([1, 1, 0]), narrow, limits[2])
+    assert found.not_logged == ("gripper",)
     # A model without gripper has the same arm.
     np.testing.assert_array_equal(mapped(np.linspace(0.0, 1.0, 20), 2).log.positions, arm)
 
@@ -224,13 +230,15 @@ WRONG = (0.11, -0.16, 0.05, -0.3, 0.2, 0.0)
 
 
 @pytest.mark.parametrize("mode", ["normalised", "deg", "steps"])
-@pytest.mark.parametrize("inverted", [False, True])
-@pytest.mark.parametrize("robot", ["so101_follower", "so100", "koch_follower"])
+@pytest.mark.parametrize(
+    ("robot", "inverted"),
+    [("so101_follower", False), ("so100", True), ("koch_follower", False), ("koch", True)],
+)
 def test_a_corrected_file_reads_the_models_angles(tmp_path, mode, robot, inverted):
     """An encoder that is homed by the corrected file reads degrees of the model in LeRobot."""
-    if mode == "deg" and inverted and not robot.startswith("koch"):
-        pytest.skip("in degrees LeRobot ignores the drive mode, and such a joint is mirrored")
     dynamixel = robot.startswith("koch")
+    # In degrees LeRobot ignores the drive mode of Feetech's motors: such a joint is mirrored.
+    inverted &= dynamixel or mode != "deg"
     arm, angles = arm_of(11, WRONG, dynamixel=dynamixel, inverted=inverted)
     angles = 0.5 * angles
     servos = read_motors(write_file(tmp_path / "arm.json", arm), robot)
@@ -287,6 +295,18 @@ def test_lists_are_corrected_in_their_own_sense(tmp_path):
         homing = correct_homing(joint, motor, column, off[k], servos, "deg").after
         read = np.deg2rad((counted[:, k] + homing) * 180 / 2048)
         np.testing.assert_allclose(read, found.log.positions[:, k] + off[k], atol=STEP)
+
+
+def test_columns_without_names_have_the_files_motors_in_order(tmp_path):
+    arm, angles = arm_of(12)
+    folder = tmp_path / "set"
+    write_file(folder / "arm.json", arm)
+    names = tuple(f"joint_{k}" for k in range(6))
+    servos, warnings = find_motors(folder, "so101", names)
+    assert warnings == []
+    log = log_of(arm, angles, "steps", servos=servos)
+    found = map_arm(JointLog(names, log.times, log.positions, servos=servos))
+    np.testing.assert_allclose(found.log.positions, angles, atol=2.1 * STEP)
 
 
 def test_files_are_found_beside_the_data_set(tmp_path):

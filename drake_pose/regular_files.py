@@ -39,6 +39,15 @@ def digest(path: Path) -> str:
     return found.hexdigest()
 
 
+def pointer_hint(path: Path) -> str:
+    """Return how to fetch a file of which there is only Git LFS's pointer; "" for other files."""
+    try:
+        is_pointer = read_regular(path, 40).startswith(b"version https://git-lfs")
+    except OSError:
+        return ""
+    return "; it is a pointer of Git LFS: git lfs pull fetches the file" if is_pointer else ""
+
+
 def require_regular(path: Path) -> int:
     """Return a file's size [byte] without opening the file, since opening a pipe blocks.
 

@@ -17,6 +17,7 @@ from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascendin
 from drake_pose.camera.models import Lens
 from drake_pose.camera.picture_files import decode_colours, import_reader, upper_bits
 from drake_pose.errors import CameraError, DrakePoseError, SceneError
+from drake_pose.regular_files import pointer_hint
 
 BAGS = (".bag", ".mcap", ".db3")
 """Suffixes of bags."""
@@ -149,7 +150,7 @@ def _scan(path: Path) -> tuple[Any, Any, Any, Any, Any, Any]:
                     ignored[topic] = "depths"
                 elif kind == "Image" and _encoding(coding) is None:
                     known = ", ".join((*_ENCODINGS, *_ALIASES))
-                    ignored[topic] = f"{coding} is not one of {known}, or of these with 16 bits"
+                    ignored[topic] = f"'{coding}' is not one of {known}, or of these with 16 bits"
                 else:
                     pictures[topic].append((*stamps, message.header.frame_id.strip("/")))
                 continue
@@ -286,7 +287,7 @@ def _translate_errors(path: Path) -> Iterator[None]:
     except Exception as error:  # The decompressors' errors have no common base class.
         raise SceneError(
             f"{path}: not a whole bag of ROS 1 or 2 ({type(error).__name__}: {error}); a truncated "
-            "bag can be repaired by 'rosbag reindex' or 'ros2 bag reindex'"
+            f"bag can be repaired by 'rosbag reindex' or 'ros2 bag reindex'{pointer_hint(path)}"
         ) from error
 
 

@@ -15,8 +15,8 @@ from drake_pose.arrays import Array, Picture
 from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending_indices
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.camera.picture_files import TimedVideo, import_reader
-from drake_pose.errors import SceneError, listed
-from drake_pose.regular_files import read_regular, require_regular
+from drake_pose.errors import CameraError, SceneError, listed
+from drake_pose.regular_files import pointer_hint, read_regular, require_regular
 
 TRAJECTORY = "trajectory.h5"
 """File by which DROID episodes are recognised."""
@@ -63,8 +63,9 @@ def open_droid(path: Path, joints: JointLog | None) -> Episode:
             own = JointLog(names, times[kept], np.column_stack([arm, gripper])[kept])
             for video in sorted(folder.glob("*.mp4")):
                 cameras += _zed_cameras(file, video, warnings)
-    except (OSError, ValueError, LookupError, RuntimeError) as error:
-        raise SceneError(f"{where}: truncated or damaged: {error}") from error
+    except (OSError, ValueError, LookupError, TypeError, RuntimeError) as error:
+        hint = pointer_hint(where)
+        raise SceneError(f"{where}: truncated or damaged: {error}{hint}") from error
     if not cameras:
         files = sorted(one for one in (path / "recordings").rglob("*") if one.is_file())
         found = listed([str(one.relative_to(path)) for one in files]) or "no recordings"
@@ -85,8 +86,9 @@ def _dataset(file: Any, name: str, where: Path) -> Array:
     """
     found = file
     for part in name.split("/"):
-        if part not in found:
-            raise SceneError(f"{where}: has no {name}; {found.name} has: {', '.join(found)}")
+        inside = [*found] if hasattr(found, "keys") else ["a table"]
+        if part not in inside:
+            raise SceneError(f"{where}: has no {name}; {found.name} has: {', '.join(inside)}")
         found = found[part]
     return np.asarray(found[()], dtype=np.float64)
 
@@ -131,12 +133,20 @@ def _zed_cameras(
                 "the pose: drake-pose register"
             )
         if matrix is not None:
-            fx, _, cx, _, fy, cy = np.ravel(matrix[()])[:6].tolist()
             if rows is not None and not is_on_hand:
                 pose = recorded_pose(rows[()], name, warnings)
             X_WC = np.eye(4) if pose is None else pose
-            camera = PinholeCamera(name, *calibrated, fx, fy, cx, cy, X_WC)
-            camera = camera.resized(width, video.height)
+            try:
+                fx, _, cx, _, fy, cy = np.ravel(matrix[()])[:6].tolist()
+                camera = PinholeCamera(name, *calibrated, fx, fy, cx, cy, X_WC)
+                camera = camera.resized(width, video.height)
+            except (ValueError, TypeError, CameraError) as error:
+                pose = None
+                warnings.append(
+                    f"camera '{name}': {file.filename}: camera_intrinsics/{given} is no camera "
+                    f"matrix and is ignored ({error}); give its intrinsics in a camera file "
+                    "(--cameras)"
+                )
 
         def recorded(number: int, begin: int = k * width) -> Picture:
             picture = video.read(int(kept[number]))
@@ -211,7 +221,11 @@ def _picture_times(file: Any, path: Path, serial: str, count: int, warnings: lis
     if beside.exists():
         # These are reception times: subtract the camera's delay, known from the rows.
         delay = np.median(read[1] - times) if available[:2] == [*kinds[:2]] else 0.0
-        times, source = np.array(json.loads(read_regular(beside))) - delay, beside.name
+        try:
+            stamped = np.array(json.loads(read_regular(beside)), dtype=np.float64)
+        except (OSError, ValueError, TypeError) as error:
+            raise SceneError(f"{beside}: is no list of times [ms]: {error}") from error
+        times, source = np.ravel(stamped) - delay, beside.name
     if len(times) != count:
         warnings.append(
             f"{path}: has {count} pictures, but {source} has {len(times)} times: they are paired "

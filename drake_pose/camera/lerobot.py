@@ -19,11 +19,12 @@ from drake_pose.camera.lerobot_tables import (
     is_picture,
     read_numbers,
     row_times,
+    shape_of,
 )
 from drake_pose.camera.motor_calibration import find_motors
 from drake_pose.camera.picture_files import TimedVideo, import_reader
 from drake_pose.errors import SceneError, UnknownNameError, listed
-from drake_pose.regular_files import read_regular
+from drake_pose.regular_files import pointer_hint, read_regular
 
 INFO = Path("meta", "info.json")
 """File by which LeRobot data sets are recognised."""
@@ -104,7 +105,8 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
 
 def camera_name(key: str) -> str:
     """Return the usual name of the camera with a key in the features of `meta/info.json`."""
-    return key.removeprefix("observation.").removeprefix("images.")
+    name = key.replace("/", ".").removeprefix("observation.").removeprefix("images.")
+    return name if "/" not in key else name.replace(".", "_")
 
 
 def camera_key(features: Iterable[str], name: str) -> str:
@@ -146,9 +148,11 @@ def _read_info(path: Path) -> Mapping[str, Any]:
 
 def _rate(info: Mapping[str, Any]) -> float | None:
     """Return the rows per second of `meta/info.json`; None: it has none that is positive."""
-    rate = info.get("fps")
-    is_rate = isinstance(rate, int | float) and np.isfinite(rate) and rate > 0
-    return float(rate) if rate is not None and is_rate else None
+    try:
+        rate = float(info.get("fps") or 0.0)
+    except (TypeError, ValueError):
+        return None
+    return rate if np.isfinite(rate) and rate > 0.0 else None
 
 
 def _episode_rows(path: Path, info: Mapping[str, Any], parquet: Any) -> _Rows:
@@ -168,10 +172,14 @@ def _episode_rows(path: Path, info: Mapping[str, Any], parquet: Any) -> _Rows:
     rows: dict[int, Mapping[str, Any]] = {}
     for file in sorted(path.glob("meta/episodes/*/*.parquet")):
         # Skip the statistics, which are most of the columns.
-        columns = parquet.read_schema(file).names
-        used = [name for name in columns if name.startswith(("episode_index", "data/", "videos/"))]
-        found = parquet.read_table(file, columns=used).to_pylist()
-        rows |= {row["episode_index"]: row for row in found}
+        try:
+            columns = parquet.read_schema(file).names
+            used = [one for one in columns if one.startswith(("episode_index", "data/", "videos/"))]
+            found = parquet.read_table(file, columns=used).to_pylist()
+            rows |= {int(row["episode_index"]): row for row in found}
+        except (ValueError, LookupError, TypeError) as error:
+            what = f"not a whole table with episode_index: {error}{pointer_hint(file)}"
+            raise SceneError(f"{file}: a file of it is damaged: {what}") from error
     lines = path / "meta" / "episodes.jsonl"
     if not rows and lines.is_file():
         for k, line in enumerate(read_regular(lines).decode("utf-8", "replace").splitlines(), 1):
@@ -181,10 +189,23 @@ def _episode_rows(path: Path, info: Mapping[str, Any], parquet: Any) -> _Rows:
                 raise SceneError(
                     f"{lines}: a file of it is damaged: line {k} is no JSON with episode_index"
                 ) from error
-    count = info.get("total_episodes")
-    if not rows and count is None:
+    if not rows:
         count = len([*path.glob("data/**/*.parquet")])
-    return rows or {k: {} for k in range(int(count or 0))}
+        rows = {k: {} for k in range(_count(path, info, "total_episodes", count))}
+    return rows
+
+
+def _count(path: Path, info: Mapping[str, Any], field: str, default: int) -> int:
+    """Return a number of `meta/info.json`; ``default`` if there is none.
+
+    Raises:
+        SceneError: it is no whole number.
+    """
+    found = info.get(field)
+    try:
+        return default if found is None else int(found)
+    except (ValueError, TypeError) as error:
+        raise SceneError(f"{path / INFO}: {field} must be a number, not {found!r}") from error
 
 
 def _file(path: Path, info: Mapping[str, Any], rows: _Rows, number: int, key: str = "") -> Path:
@@ -204,34 +225,46 @@ def _file(path: Path, info: Mapping[str, Any], rows: _Rows, number: int, key: st
         SceneError: the template has an unknown word, or one whose value is not known.
     """
     is_v3, which = info["codebase_version"].startswith("3."), "video_path" if key else "data_path"
-    folder, suffix = ("videos", "mp4") if key else ("data", "parquet")
-    own = f"{folder}/" + ("{video_key}/" if key and is_v3 else "") + "chunk-{chunk_index:03d}/"
-    own += ("{video_key}/" if key and not is_v3 else "") + (
-        "file-{file_index:03d}." if is_v3 else "episode_{episode_index:06d}."
-    )
-    template = str(info.get(which) or own + suffix)
-    size = info.get("chunks_size") or 1000
-    chunk, row, where = number // int(size), rows[number], f"videos/{key}" if key else "data"
+    # The templates of versions 2 and 3.
+    own = [
+        "data/chunk-{chunk_index:03d}/episode_{episode_index:06d}.parquet",
+        "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+    ]
+    if key:
+        own = [
+            "videos/chunk-{chunk_index:03d}/{video_key}/episode_{episode_index:06d}.mp4",
+            "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
+        ]
+    given = info.get(which)
+    templates = [str(given).replace("\\", "/")] if given else own[::-1] if is_v3 else own
+    size = _count(path, info, "chunks_size", 1000) or 1000
+    chunk, row, where = number // size, rows[number], f"videos/{key}" if key else "data"
     values: dict[str, Any] = dict.fromkeys(("video_key", "image_key", "camera_key", "key"), key)
     values |= dict.fromkeys(("episode_index", "episode_id", "episode"), number)
     values |= dict.fromkeys(("episode_chunk", "chunk"), chunk)
     values["chunk_index"] = row.get(f"{where}/chunk_index", chunk)
-    if is_v3 and "{file_index" in template and f"{where}/file_index" not in row:
-        raise SceneError(
-            f"{path}: the file of episode {number} is not known: {path / INFO} has the {which} "
-            f"'{template}', and the column {where}/file_index of meta/episodes/*/*.parquet is "
-            "missing: copy the whole folder meta"
-        )
     # In version 2 each episode has its own file, numbered on or from 0 in each chunk.
-    indices = [row.get(f"{where}/file_index", number), number % int(size)]
-    try:
-        files = [path / template.format(**values, file_index=index) for index in indices]
-    except (LookupError, ValueError, AttributeError) as error:
-        raise SceneError(
-            f"{path / INFO}: the {which} '{template}' cannot be filled in ({error}); known words "
-            f"are {', '.join(values)}, file_index"
-        ) from error
-    return next((file for file in files if file.is_file()), files[0])
+    indices = [row.get(f"{where}/file_index", number), number % size]
+    files, lacking = list[Path](), ""
+    for template in templates:
+        if is_v3 and "{file_index" in template and f"{where}/file_index" not in row:
+            lacking = (
+                f"{path}: the file of episode {number} is not known: its {which} is '{template}', "
+                f"and the column {where}/file_index of meta/episodes/*/*.parquet is missing: copy "
+                "the whole folder meta"
+            )
+            continue
+        try:
+            files += [path / template.format(**values, file_index=index) for index in indices]
+        except (LookupError, ValueError, AttributeError) as error:
+            raise SceneError(
+                f"{path / INFO}: the {which} '{template}' cannot be filled in ({error}); known "
+                f"words are {', '.join(values)}, file_index"
+            ) from error
+    found = next((file for file in files if file.is_file()), None)
+    if found is None and lacking:
+        raise SceneError(lacking)
+    return found or files[0]
 
 
 def _choose_episode(path: Path, info: Mapping[str, Any], rows: _Rows, wanted: int | None) -> int:
@@ -286,26 +319,39 @@ def _read_table(
     """
     file, features = _file(path, info, rows, number), info["features"]
     try:
-        available = parquet.read_schema(file).names
+        schema = parquet.read_schema(file)
+        available = schema.names
         used = [key for key in available if key in {*features, "timestamp", "frame_index"}]
-        filters = [("episode_index", "=", number)] if "episode_index" in available else None
-        table = parquet.read_table(file, columns=used, filters=filters)
-        if table.num_rows or filters is None:
+        if "episode_index" not in available:
+            table, others = parquet.read_table(file, columns=used), np.empty(0)
+        elif str(schema.field("episode_index").type).startswith(("list", "fixed", "large")):
+            # Rows of lists of one number cannot be filtered while reading.
+            # The column is usually a feature, too.
+            table = parquet.read_table(file, columns=list(dict.fromkeys([*used, "episode_index"])))
+            others = read_numbers(table, "episode_index", str(file))[:, 0]
+            table = table.filter((others == number).tolist())
+        else:
+            filters = [("episode_index", "=", number)]
+            table = parquet.read_table(file, columns=used, filters=filters)
             if not table.num_rows:
-                raise SceneError(f"{file}: is empty: it has no row")
+                found = parquet.read_table(file, columns=["episode_index"])
+                others = read_numbers(found, "episode_index", str(file))[:, 0]
+        if table.num_rows:
             return table, file
-        others = set(parquet.read_table(file, columns=["episode_index"])[0].to_pylist())
+        others = np.unique(others)
         if len(others) == 1 and "episode" in str(info.get("data_path") or "episode"):
             warnings.append(
-                f"{file}: its column episode_index is {others.pop()}, not {number}; all its rows "
+                f"{file}: its column episode_index is {others[0]:g}, not {number}; all its rows "
                 "are used"
             )
             return parquet.read_table(file, columns=used), file
     except (ValueError, TypeError, NotImplementedError) as error:
-        raise SceneError(f"{file}: a file of it is damaged: not a whole table: {error}") from error
+        what = f"not a whole table: {error}{pointer_hint(file)}"
+        raise SceneError(f"{file}: a file of it is damaged: {what}") from error
+    found = listed([f"{one:g}" for one in others], 20)
     raise SceneError(
-        f"{file}: has no row of episode {number}: its column episode_index has "
-        f"{listed([*map(str, sorted(others, key=str))], 20) or 'no row'}"
+        f"{file}: is empty: it has no row of episode {number}"
+        + (f"; its column episode_index has {found}" if found else "")
     )
 
 
@@ -336,7 +382,8 @@ def _read_joints(
         lacking = (
             f"{path}: has no joint positions; give a table of them (--joints). Wanted is a feature "
             "observation.state, state, or one named after joints, with rows of numbers in "
-            f"{file.name}; the data set has: {describe(features)}"
+            f"{file.name}; the data set has: {describe(features)}; the table has: "
+            f"{listed(table.column_names, 20)}"
         )
         if actions:
             lacking += (
@@ -383,7 +430,7 @@ def _read_camera(
         if key not in table.column_names:
             raise SceneError(f"{video} is missing")
     column = table[key] if key in table.column_names else None
-    stored = StoredPictures(path, file, key, column, feature.get("shape") or (), number)
+    stored = StoredPictures(path, file, key, column, shape_of(feature), number)
     height, width = stored.read(0).shape[:2]
     return EpisodeCamera(key, width, height, np.empty(0), None, None, stored.read)
 

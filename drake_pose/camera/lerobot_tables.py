@@ -49,14 +49,16 @@ def read_numbers(table: Any, key: str, where: str) -> Array:
                 f"{where}: column '{key}' has {sizes[k]} numbers in row {k} (counted from 0), but "
                 f"{width} in the rows before"
             )
-    return np.array([np.full(width, np.nan) if row is None else row for row in rows])
+    found = [np.full(width, np.nan) if row is None else row for row in rows]
+    return np.array(found).reshape(len(rows), width)
 
 
 def row_times(table: Any, rate_hz: float | None, where: str, warnings: list[str]) -> Array:
     """Return the times (n,) [s] of a table's rows.
 
-    They are those of the column `timestamp`, whose unit follows from the rate: s, ms, us or ns. If
-    the column is missing or stands still, they are `frame_index` divided by the rate.
+    They are those of the column `timestamp`, whose unit follows from the rate: s, ms, us or ns, or
+    rows, if it counts them. If the column is missing or stands still, they are `frame_index`
+    divided by the rate.
 
     Args:
         table: the table (pyarrow.Table).
@@ -89,6 +91,9 @@ def row_times(table: Any, rate_hz: float | None, where: str, warnings: list[str]
         return np.asarray(frames, np.float64) / rate_hz
     if rate_hz is None or step <= 0.0:
         return times
+    if rate_hz > 1.25 and np.array_equal(times, times[0] + np.arange(count)):
+        warnings.append(f"{where}: 'timestamp' counts rows and is divided by {rate_hz:g} Hz (fps)")
+        return times / rate_hz
     ratio = step * rate_hz
     power = 3 * round(math.log10(ratio) / 3)
     units = {3: "ms", 6: "microseconds", 9: "ns"}
@@ -114,18 +119,21 @@ def find_states(features: Features) -> list[str]:
     grippers. Features named after joints come first if the state is Cartesian or has no names.
     Actions, velocities, efforts and commands are never positions.
     """
-    others = "action|velocit|vel$|effort|torque|current|acc|command|target|desired|goal|leader"
+    others = (
+        r"action|velocit|q?vel$|efforts?$|torque|acc|currents?$|command|cmd|target|desired|goal|"
+        r"leader|next|index|task|timestamp|env|reward|done|success|force|error"
+    )
     numeric = [
         key
         for key, one in features.items()
-        if len(one.get("shape") or ()) < 3
+        if len(shape_of(one)) < 3
         and re.match(r"float|double|u?int", str(one.get("dtype", "")))
-        and not re.search(rf"(?:^|[._/])(?:{others}|next|index|task|timestamp|env)", key.lower())
-        and not re.search(r"(?:index|velocit(?:y|ies)|vel|effort|torque|current)s?$", key.lower())
+        and not any(re.match(others, word) for word in re.split(r"[._/\s]", key.lower()))
     ]
     states = ("observation.state", "state", "observation.states", "states", "observations.state")
-    plain = [key for key in states if key in numeric][:1]
-    grouped = [key for key in numeric if key.startswith(tuple(f"{one}." for one in states))]
+    dotted = {key: key.replace("/", ".") for key in numeric}
+    plain = [key for one in states for key in numeric if dotted[key] == one][:1]
+    grouped = [k for k in numeric if dotted[k].startswith(tuple(f"{one}." for one in states))]
     joints = [key for key in numeric if re.search(r"joint|qpos|servo|motor", key.lower())]
     if joints:
         hand = [key for key in numeric if re.search(r"gripper|finger", key.lower())]
@@ -138,7 +146,7 @@ def find_states(features: Features) -> list[str]:
 def _is_cartesian(key: str, feature: Mapping[str, Any]) -> bool:
     """Return whether a feature's names are coordinates of a pose, or it has no names of its own."""
     words = "|".join(("[xyzw]", "[rq][xyzw]", "roll", "pitch", "yaw", "gripper", "pad", "state"))
-    names = feature_names(key, {**feature, "shape": feature.get("shape") or [1]})
+    names = feature_names(key, {**feature, "shape": shape_of(feature) or [1]})
     found = [re.fullmatch(rf"(?:.*[_. ])?(?:{words})(?:_?\d+)?", one.lower()) for one in names]
     return all(found) or names[0] == "joint_0"
 
@@ -147,6 +155,12 @@ def describe(features: Features) -> str:
     """Return the names of features with their types and shapes, for messages."""
     texts = [f"{k} ({one.get('dtype')} {one.get('shape', '')})" for k, one in features.items()]
     return listed(texts, 20) or "none"
+
+
+def shape_of(feature: Mapping[str, Any]) -> list[int]:
+    """Return a feature's shape in `meta/info.json`; [] if it has none."""
+    shape = feature.get("shape")
+    return [int(one) for one in shape] if isinstance(shape, list) else [int(shape)] if shape else []
 
 
 def feature_names(key: str, feature: Mapping[str, Any]) -> list[str]:
@@ -167,7 +181,7 @@ def feature_names(key: str, feature: Mapping[str, Any]) -> list[str]:
         names = [name for part in names for name in part]
     if names and len(names) == size:
         return [str(name) for name in names]
-    last = key.rpartition(".")[2]
+    last = key.replace("/", ".").rpartition(".")[2]
     last = "joint" if last in ("state", "states") else last
     return [f"{last}_{k}" for k in range(size)] if size > 1 else [last]
 
@@ -197,7 +211,7 @@ def column_names(keys: Sequence[str], widths: Iterable[int], features: Features)
 
 def is_picture(key: str, feature: Mapping[str, Any]) -> bool:
     """Return whether a feature holds colour images: of type image or video, or arrays (H, W, 3)."""
-    shape = [*(feature.get("shape") or ())]
+    shape = shape_of(feature)
     metadata = {**feature, **(feature.get("info") or {})}
     if any("is_depth" in field and value is True for field, value in metadata.items()):
         return False

@@ -15,7 +15,7 @@ from PIL import Image, UnidentifiedImageError
 from drake_pose.arrays import Mask, Picture
 from drake_pose.camera.models import LARGEST_SIDE
 from drake_pose.errors import DrakePoseError, SceneError
-from drake_pose.regular_files import read_regular, require_regular
+from drake_pose.regular_files import pointer_hint, read_regular, require_regular
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg")
@@ -52,7 +52,12 @@ def read_picture(path: Path, error_type: type[DrakePoseError]) -> Picture:
     Raises:
         error_type: the file is unreadable; the message names it.
     """
-    return decode_colours(_read(path, error_type), path, error_type)
+    try:
+        return decode_colours(_read(path, error_type), path, error_type)
+    except error_type as error:
+        if hint := pointer_hint(path):
+            raise error_type(f"{error}{hint}") from None
+        raise
 
 
 def decode_colours(data: bytes, path: Path, error_type: type[DrakePoseError]) -> Picture:
@@ -399,7 +404,7 @@ class TimedVideo:
         except (*self._errors, IndexError) as error:
             raise SceneError(
                 f"{path}: not a video that PyAV can read, or its index is missing ({error}); copy "
-                "or record it again"
+                f"or record it again{pointer_hint(path)}"
             ) from error
         self._packets = list(self._scan())
         if not self._packets:

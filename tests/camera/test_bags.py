@@ -180,7 +180,7 @@ def test_images_of_all_encodings_are_decoded(tmp_path):
         assert np.abs(found - red)[2 : SIDE // 4 - 2, 2:-2].max() < 3, pattern
     assert not {"depth", "strange", "dark"} & set(episode.cameras)
     warnings = "\n".join(episode.warnings)
-    assert "/strange is left out: yuv444 is not one of rgb8, bgr8" in warnings
+    assert "/strange is left out: 'yuv444' is not one of rgb8, bgr8" in warnings
     assert "/dark, picture 0: has 16 bits per pixel, but no value above 1932 of 65535" in warnings
     assert "/depth" not in warnings
 

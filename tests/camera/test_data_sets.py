@@ -228,6 +228,17 @@ def test_missing_and_damaged_files_are_named(tmp_path):
         open_episode(tmp_path)
 
 
+def test_useless_intrinsics_and_stamps_are_named(tmp_path):
+    video = write_episode(tmp_path, **{"222_left": np.zeros((COUNT, 3, 3))})
+    episode = open_episode(tmp_path)
+    assert episode.camera("222_left").camera is None
+    assert "camera_intrinsics/222_left is no camera matrix and is ignored" in episode.warnings[-1]
+    for text in ('{"a": [1]}', "{", '["now"]'):
+        video.with_name("111_timestamps.json").write_text(text)
+        with pytest.raises(SceneError, match=r"111_timestamps\.json: is no list of times \[ms\]"):
+            open_episode(tmp_path)
+
+
 def test_extrinsics_without_intrinsics_are_named(tmp_path):
     import h5py
 

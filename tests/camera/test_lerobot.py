@@ -238,6 +238,7 @@ def entries(*names):
             {"observation.left.joint_pos": ["c", "d"], "observation.right.joint_pos": ["c", "d"]},
             ("left.joint_pos.c", "left.joint_pos.d", "right.joint_pos.c", "right.joint_pos.d"),
         ),
+        ({"observation/joint_position": ["a", "b"], "observation/joint_torque": None}, ("a", "b")),
         ({"action": ["a", "b"], "observation.velocity": ["a", "b"]}, None),
     ],
 )
@@ -267,7 +268,10 @@ def cut(path):
     ("change", "message"),
     [
         ({"columns": {"episode_index": [4] * COUNT}}, "episode_index is 4, not 0; all its rows"),
-        ({"columns": {"episode_index": [4] * 5 + [5] * 5}}, "no row of episode 0.* has 4, 5"),
+        (
+            {"columns": {"episode_index": [4] * 5 + [5] * 5}},
+            "is empty: it has no row of episode 0.* has 4, 5",
+        ),
         ({"columns": {"timestamp": ["now"] * COUNT}}, "'timestamp' holds string, but numbers"),
         ({"columns": {"observation.state": [[1.0, 2.0]] * 9 + [[1.0]]}}, "has 1 numbers in row 9"),
         ({"columns": {"observation.state": [None, *STATES[1:]]}}, "'pan' is not a number in 1 of"),
@@ -285,7 +289,20 @@ def cut(path):
         ({"info": {"features": None}}, r"info\.json: has no 'features'.* it has: codebase_version"),
         ({"info": {"codebase_version": None}}, ""),
         ({"info": {"fps": "fast"}}, ""),
+        ({"version": "v3.0"}, ""),
+        (
+            {
+                "paths": {"data_path": r"data\chunk-{chunk}\file.parquet"},
+                "data": "data/chunk-0/file.parquet",
+            },
+            "",
+        ),
+        ({"features": {"observation.state": {**STATE, "shape": 2}, TOP: MEDIA["video"]}}, ""),
+        ({"columns": {"episode_index": [[0]] * COUNT}}, ""),
+        ({"columns": {"episode_index": [[3]] * COUNT}}, "episode_index is 3, not 0"),
         ({"info": {"total_episodes": None}}, ""),
+        ({"info": {"total_episodes": "many"}}, r"info\.json: total_episodes must be a number, not"),
+        ({"columns": {"timestamp": range(COUNT)}}, "'timestamp' counts rows and is divided by 10"),
         ({"info": {"codebase_version": "v1.6"}}, r"version v1\.6, but only 2\.0, 2\.1 and 3\.0"),
         ({"data": "data/elsewhere.parquet"}, r"present: none; expected, for one, .*e_000000.parq"),
         ({"video": None}, "camera 'top' is left out: .*mp4 is missing"),
@@ -318,6 +335,11 @@ def test_truncated_files_are_named(tmp_path, name):
     path = tmp_path / (f"videos/chunk-000/{TOP}/episode_000000.mp4" if name == "video" else name)
     path.write_bytes(path.read_bytes()[:60])
     with pytest.raises(SceneError, match=f"{path.name}: "):
+        open_episode(tmp_path)
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
+    with pytest.raises(
+        SceneError, match=r"no JSON|it is a pointer of Git LFS: git lfs pull fetches"
+    ):
         open_episode(tmp_path)
     path.unlink()
     path.mkdir()

@@ -60,7 +60,8 @@ def register(
     An episode needs no masks: pictures or videos with joint positions by time or frame, a LeRobot
     data set, a raw folder of DROID, or a ROS bag. The robot must move in view of a static camera,
     or carry the camera (--on) with a --target in view. For a static camera the time offset between
-    pictures and joints is estimated as well, and the focal length if it is unknown.
+    pictures and joints is estimated as well, and the focal length if it is unknown. A camera that
+    was nudged meanwhile is registered as two, which have one clock.
 
     Files in the output folder: report.html (start here); cameras.yaml, which estimate reads;
     registration.yaml (6 x 6 covariance, other poses); summary.json; overlay/; overlay_as_given/;

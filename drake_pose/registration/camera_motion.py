@@ -40,6 +40,7 @@ class MotionSettings:
         noises: the same, in standard deviations of the shifts about their median.
         abrupt: minimum fraction of a nudge's shift that happens between the pictures next to it.
         most_during: maximum number of compared pictures that are taken during a nudge.
+        most_nudges: a camera that was nudged more often shakes.
         around: number of compared pictures before and after a nudge whose medians differ.
     """
 
@@ -55,6 +56,7 @@ class MotionSettings:
     noises: float = 5.0
     abrupt: float = 0.75
     most_during: int = 3
+    most_nudges: int = 4
     around: int = 8
 
 
@@ -90,6 +92,28 @@ class CameraMotion(NamedTuple):
     shake: float = 0.0
 
 
+class CameraPart(NamedTuple):
+    """A part of a recording in which its camera was not moved; it may be the whole recording.
+
+    Args:
+        of: the recorded camera's name.
+        pictures: the part's pictures in the recording.
+        rotation: (3, 3) approximate rotation of the camera in its frame in the first part.
+        since, until: times of the part's first and last picture [s]; None: they have none.
+        is_whole: whether it is the whole recording.
+        drift, shake: of ``CameraMotion`` [pixel].
+    """
+
+    of: str
+    pictures: slice
+    rotation: Array
+    since: float | None
+    until: float | None
+    is_whole: bool
+    drift: float
+    shake: float
+
+
 def find_camera_motion(
     read: Callable[[int], Picture], count: int, camera: PinholeCamera
 ) -> CameraMotion:
@@ -112,6 +136,7 @@ def find_camera_motion(
         return CameraMotion(())
     rows, shifts = rows[known], shifts[known]
     steps = find_steps(shifts, tracker.least)
+    steps = steps if len(steps) <= MOTION.most_nudges else []
     begins, ends = [0, *(k for _, k in steps)], [*(k for k, _ in steps), len(rows) - 1]
     parts = [shifts[a : b + 1] for a, b in zip(begins, ends, strict=True)]
     levels = [np.median(part, axis=0) for part in parts]

@@ -27,7 +27,8 @@ class Finding:
         alternatives: names of other causes that explain it equally well.
         joints: significant corrections by joint, where several are wrong [rad or m].
         at_body: how far a camera's error shifts the body [m]; 0 for other kinds.
-        link: of a "link" finding the misplaced link; of a "moved" finding "camera" or "base".
+        link: of a "link" finding the misplaced link; of a "moved" finding "camera" or "base", and
+            "" for one in pictures.
         text: details in words; "" for none.
     """
 

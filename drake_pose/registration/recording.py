@@ -55,6 +55,22 @@ class Recording:
         """Return the same recording with offsets (m,) [rad or m] added to all values."""
         return replace(self, values_at=lambda offset: self.values_at(offset) + joint_offsets)
 
+    def part(self, pictures: slice) -> "Recording":
+        """Return the recording of some successive pictures."""
+
+        def values_at(offset: float | Array) -> Array:
+            later = np.zeros(len(self.names))
+            later[pictures] = offset
+            return self.values_at(later)[pictures]
+
+        times = None if self.times is None else self.times[pictures]
+        first = pictures.start
+        return Recording(self.names[pictures], values_at, lambda k: self.read(first + k), times)
+
+    def at_offset(self, offset: float) -> "Recording":
+        """Return the recording without times, with the values at a known offset [s]."""
+        return replace(self, values_at=lambda _: self.values_at(offset), times=None)
+
     def with_drift(self, drift: float, since: float) -> "Recording":
         """Return the recording with a log clock faster by a drift [s/s], right at `since` [s]."""
         if not drift or self.times is None:

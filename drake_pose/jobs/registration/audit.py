@@ -29,6 +29,11 @@ from drake_pose.jobs.registration.diagnosis import (
 )
 from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs
 from drake_pose.jobs.registration.large_errors import SceneComparison
+from drake_pose.jobs.registration.moved_cameras import (
+    motion_findings,
+    register_recordings,
+    split_moved_cameras,
+)
 from drake_pose.jobs.registration.result import (
     describe_pictures,
     describe_pose,
@@ -46,10 +51,8 @@ from drake_pose.registration.diagnosis import DIAGNOSIS
 from drake_pose.registration.findings import Diagnosis, Finding
 from drake_pose.registration.picture_acceptance import (
     PictureRegistration,
-    PictureStart,
     evaluate_pictures,
 )
-from drake_pose.registration.picture_registration import fit_pictures, register_pictures
 from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
@@ -108,7 +111,7 @@ def audit_scene(
     settings, begin = settings or AuditSettings(), time.perf_counter()
     table, own, folder = (None if one is None else Path(one) for one in (joints, cameras, out))
     with use_workers(settings.workers):
-        inputs = read_inputs(Path(scene), Path(model), table, own, settings)
+        inputs = split_moved_cameras(read_inputs(Path(scene), Path(model), table, own, settings))
         pictures = _Pictures()
         if inputs.recordings:
             given, (inputs, pictures) = inputs, _find_cameras(inputs)
@@ -218,22 +221,30 @@ def _find_cameras(
     body = RegistrationBody(inputs.tree, inputs.visible_nodes)
     warnings = left_out_warnings(inputs.recordings, [one.name for one in inputs.given_cameras])
     compared, findings = list[Camera](), list[Finding]()
-    pictures = dict[str, PictureRegistration]()
     names, frames = dict[str, tuple[str, str]](), list[MultiViewFrame]()
-    for given in inputs.given_cameras:
-        name, recording = given.name, inputs.recordings[given.name]
-        if before is None:
-            one = register_pictures(body, given, recording, offset_joints=offset_joints)
-        else:
-            start = PictureStart.of(before.found[name])
-            one = fit_pictures(body, start, recording, offset_joints=offset_joints)
-        pictures[name] = one
+    placed = {one.name for one in inputs.given_cameras}
+    searched = [one for one in inputs.searched_cameras if one.name in placed]
+    pictures = {
+        one.found.camera.name: one
+        for one in register_recordings(
+            body,
+            inputs,
+            searched,
+            warnings,
+            offset_joints=offset_joints,
+            before=None if before is None else before.found,
+        )
+    }
+    findings += motion_findings(body, inputs, pictures)
+    for given in (one for one in inputs.given_cameras if one.name in pictures):
+        name, recording, one = given.name, inputs.recordings[given.name], pictures[given.name]
         values = np.array([frame.values + one.joint_offsets for frame in one.frames])
         off = compare_camera(body, given, one.found, values, alone)
         is_near = off.pixels < near * one.fit.fit.views[0].size
         compared.append(given if is_near else one.found.camera)
         findings += [] if is_near or off.p_value > DIAGNOSIS.significance else [off]
-        findings += compare_clock(body, one, recording)
+        # The parts of a recording have one clock.
+        findings += compare_clock(body, one, recording) if inputs.parts[name].of == name else []
         segmented, _, lost = evaluate_pictures(body, one, one.found)
         for frame in segmented:
             known = frame.name if alone else f"{name}-{frame.name}"

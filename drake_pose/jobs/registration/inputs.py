@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_pose.arrays import Array, Mask, Picture
+from drake_pose.arrays import Array, Picture
 from drake_pose.body import TARGET, ArticulatedModel, PoseTree, RootRotation, load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import (
@@ -42,6 +42,7 @@ from drake_pose.jobs.registration.positions import (
     read_known_positions,
 )
 from drake_pose.jobs.registration.settings import ALL, AuditSettings, RegistrationSettings
+from drake_pose.registration.camera_motion import CameraPart
 from drake_pose.registration.joint_offsets import (
     require_frame_count,
     require_parameters,
@@ -54,7 +55,7 @@ from drake_pose.registration.standing_object import (
     fixed_link_error,
     require_rotation,
 )
-from drake_pose.silhouette.pictures.scene_checks import check_scene, read_scene
+from drake_pose.silhouette.pictures.scene_checks import check_scene, read_mask_of, read_scene
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, Scene, load_scene, select_frames
 
 
@@ -76,6 +77,7 @@ class RegistrationInputs:
         assumed_focal: names of cameras with an unknown focal length, which have a usual one.
         left_out: names of cameras without X_WC that are not to be registered.
         recordings: an episode's pictures with the joint log, by camera; empty for masks.
+        parts: of an episode's recordings, by the name of the camera in each part.
         audited_frames: names of the frames to be audited.
         frames: frames that have been read, with the masks of searched and known cameras.
         visible_nodes: names of the tree's nodes that masks show; None: all.
@@ -98,6 +100,7 @@ class RegistrationInputs:
     assumed_focal: frozenset[str] = frozenset()
     left_out: tuple[str, ...] = ()
     recordings: Mapping[str, Recording] = field(default_factory=dict)
+    parts: Mapping[str, CameraPart] = field(default_factory=dict)
     audited_frames: tuple[str, ...] = ()
     frames: tuple[MultiViewFrame, ...] = ()
     visible_nodes: tuple[str, ...] | None = None
@@ -134,35 +137,6 @@ class RegistrationInputs:
         """Return `frames` at other values (m,) of the tree, one array for each frame."""
         frames = zip(self.frames, values, strict=True)
         return tuple(replace(one, values=own) for one, own in frames)
-
-
-def read_mask_of(
-    scene: Scene,
-    camera: str,
-    frame: str,
-    *,
-    may_be_empty: bool,
-    most: float = 0.5,
-    most_of_edge: float = 0.75,
-) -> Mask:
-    """Return a camera's mask (H, W) of a frame.
-
-    Args:
-        camera, frame: their names.
-        may_be_empty: whether a mask without the body is accepted.
-        most, most_of_edge: a mask is inverted if the body fills more than these fractions of both
-            the picture and its edge.
-
-    Raises MaskError: the mask cannot be read, is empty and must not be, or is inverted.
-    """
-    mask = scene.read(camera, frame, may_be_empty=may_be_empty)
-    edge = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
-    if edge.mean() > most_of_edge and (fraction := float(mask.mean())) > most:
-        raise MaskError(
-            f"{scene.masks[camera, frame]}: white fills {100.0 * fraction:.0f} % of the picture "
-            "and its edge: the mask seems to be inverted; the body must be white, all else black"
-        )
-    return mask
 
 
 def uses_pictures(path: Path, settings: AuditSettings) -> bool:

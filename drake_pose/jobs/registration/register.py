@@ -37,11 +37,13 @@ from drake_pose.jobs.registration.inputs import (
     read_inputs,
 )
 from drake_pose.jobs.registration.lerobot_files import lerobot_files, require_data_set
+from drake_pose.jobs.registration.moved_cameras import register_recordings, split_moved_cameras
 from drake_pose.jobs.registration.result import (
     check_exports,
     compared_frames,
     describe_camera,
     describe_parameters,
+    describe_part,
     describe_pictures,
     describe_run,
     picture_warnings,
@@ -52,7 +54,6 @@ from drake_pose.person.shape import shape_parts, shape_values
 from drake_pose.registration.bundle import adjust_bundle
 from drake_pose.registration.joint_offsets import KinematicParameter, calibrate_joints
 from drake_pose.registration.picture_acceptance import PictureRegistration, evaluate_pictures
-from drake_pose.registration.picture_registration import register_pictures
 from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrames
 from drake_pose.registration.recording import choose_pictures, posed_pictures
 from drake_pose.registration.register import (
@@ -130,7 +131,7 @@ def register_scene(
     settings = settings or RegistrationSettings()
     table, own, folder = (None if one is None else Path(one) for one in (joints, cameras, out))
     with use_workers(settings.workers):
-        inputs = read_inputs(Path(scene), Path(model), table, own, settings)
+        inputs = split_moved_cameras(read_inputs(Path(scene), Path(model), table, own, settings))
         work = _Registration(inputs, settings, on_camera)
         check_exports(settings.exports, [*inputs.known_cameras, *inputs.searched_cameras])
         if "lerobot" in settings.exports:
@@ -231,13 +232,17 @@ class _Registration:
         elif inputs.target is not None:
             self._find_target(inputs.target)
         else:
-            frames = list[MultiViewFrame]()
-            for camera in inputs.searched_cameras:
-                name, start = camera.name, time.perf_counter()
-                focal = self._settings.focal or name in inputs.assumed_focal
-                one = register_pictures(
-                    self.body, camera, inputs.recordings[name], focal, inputs.offset_joints
-                )
+            frames, start = list[MultiViewFrame](), time.perf_counter()
+            focal = [*inputs.recordings] if self._settings.focal else inputs.assumed_focal
+            for one in register_recordings(
+                self.body,
+                inputs,
+                inputs.searched_cameras,
+                self.warnings,
+                focal,
+                inputs.offset_joints,
+            ):
+                name = one.found.camera.name
                 frames += [
                     MultiViewFrame(
                         frame.name, frame.values, {name: frame.mask},
@@ -248,7 +253,11 @@ class _Registration:
                 self.pictures[name] = one
                 self.warnings += picture_warnings(one, name in inputs.assumed_focal)
                 self._note(one.found, start)
-            self.inputs = replace(inputs, frames=tuple(frames))
+                start = time.perf_counter()
+            unexplained = [name for name in inputs.recordings if name not in self.pictures]
+            self.inputs = replace(
+                inputs, frames=tuple(frames), left_out=(*inputs.left_out, *unexplained)
+            )
 
     def _find_each(self) -> None:
         """Register each camera from its masks.
@@ -406,6 +415,7 @@ class _Registration:
             name: self.parameters
             | describe_camera(one, self.seconds[name] + more, suggestions[name], on)
             | describe_pictures(self.pictures.get(name), name in self.target_pictures)
+            | describe_part(self.inputs.parts.get(name))
             for name, one in self.registered.items()
         }
 

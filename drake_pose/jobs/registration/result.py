@@ -28,6 +28,7 @@ from drake_pose.files.settings import percent
 from drake_pose.jobs.registration.inputs import RegistrationInputs
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.jobs.registration.words import describe_drift, describe_reading
+from drake_pose.registration.camera_motion import CameraPart
 from drake_pose.registration.joint_offsets import JointCalibration, KinematicParameter
 from drake_pose.registration.picture_acceptance import PictureRegistration
 from drake_pose.registration.posed_frames import PosedFrame
@@ -119,6 +120,20 @@ def describe_pictures(one: PictureRegistration | None, found: bool = False) -> d
         "explained": one.fit.explained,
         "contour": one.fit.contour,
     }
+
+
+def describe_part(part: CameraPart | None) -> dict[str, Any]:
+    """Return a camera's part of summary.json on its motion; None, and a static one: no entries."""
+    if part is None or (part.is_whole and not (part.drift or part.shake)):
+        return {}
+    moving = {"drift_px": part.drift, "shake_px": part.shake}
+    return _describe_span(part) | moving
+
+
+def _describe_span(part: CameraPart) -> dict[str, Any]:
+    """Return the recorded camera of a part, and its times [s] if they are known."""
+    times = {"from": part.since, "until": part.until}
+    return {"part_of": part.of} | {name: one for name, one in times.items() if one is not None}
 
 
 def picture_warnings(one: PictureRegistration, assumed: bool) -> list[str]:
@@ -265,7 +280,8 @@ def write_result(
     links = {name: one["link"] for name, one in parts.items() if "link" in one}
     formats = summary["settings"]["exports"]
     write_exports(path, formats, inputs, cameras.values(), links, pictures or {})
-    write_file(path, CAMERA_FILE, dump_cameras(cameras, links))
+    spans = {k: _describe_span(one) for k, one in inputs.parts.items() if not one.is_whole}
+    write_file(path, CAMERA_FILE, dump_cameras(cameras, links, spans=spans))
 
 
 def write_overlays(

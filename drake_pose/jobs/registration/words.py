@@ -73,6 +73,11 @@ def describe_common_finding(one: Finding) -> str:
         return f"{link}: {one.text}"
     if one.kind == "reading":
         return f"{one.name}{pixels}"
+    if one.kind == "moved" and not one.link:
+        if one.shift_sd:
+            return f"{describe_error(replace(one, kind='camera'), f'moved {one.text}')}{pixels}"
+        angle = f"{math.degrees(one.angle):.2f} degrees"
+        return f"camera '{one.name}' {one.text}, as by turns of {angle}{pixels}"
     if one.kind == "moved":
         off = describe_error(replace(one, kind=one.link), "is off")
         what = "the base" if one.link == "base" else f"camera '{one.name}'"

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from drake_pose.arrays import Mask
 from drake_pose.camera.models import Camera
 from drake_pose.camera.picture_files import natural_key
 from drake_pose.errors import MaskError, SceneError
@@ -235,3 +236,32 @@ def _check_gaps(frames: Sequence[str], max_gaps: int = 6) -> list[str]:
         f"{missing} frames dropped by all cameras {', '.join(texts)}{rest}; the times of all later "
         "frames do not include them"
     ]
+
+
+def read_mask_of(
+    scene: Scene,
+    camera: str,
+    frame: str,
+    *,
+    may_be_empty: bool,
+    most: float = 0.5,
+    most_of_edge: float = 0.75,
+) -> Mask:
+    """Return a camera's mask (H, W) of a frame.
+
+    Args:
+        camera, frame: their names.
+        may_be_empty: whether a mask without the body is accepted.
+        most, most_of_edge: a mask is inverted if the body fills more than these fractions of both
+            the picture and its edge.
+
+    Raises MaskError: the mask cannot be read, is empty and must not be, or is inverted.
+    """
+    mask = scene.read(camera, frame, may_be_empty=may_be_empty)
+    edge = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+    if edge.mean() > most_of_edge and (fraction := float(mask.mean())) > most:
+        raise MaskError(
+            f"{scene.masks[camera, frame]}: white fills {100.0 * fraction:.0f} % of the picture "
+            "and its edge: the mask seems to be inverted; the body must be white, all else black"
+        )
+    return mask

@@ -1,0 +1,232 @@
+"""Split recordings where their camera was moved, and register the parts with one body and clock."""
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import count, pairwise
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from drake_pose.camera.models import PinholeCamera
+from drake_pose.errors import RegistrationError
+from drake_pose.jobs.registration.diagnosis import compare_camera
+from drake_pose.jobs.registration.inputs import RegistrationInputs
+from drake_pose.registration.camera_motion import (
+    CameraMotion,
+    CameraPart,
+    find_camera_motion,
+)
+from drake_pose.registration.findings import Finding
+from drake_pose.registration.picture_acceptance import PictureRegistration, PictureStart
+from drake_pose.registration.picture_registration import fit_pictures, register_pictures
+from drake_pose.registration.recording import (
+    NO_CLOCK,
+    Recording,
+    choose_pictures,
+    mean_time,
+)
+from drake_pose.registration.register import RegistrationBody
+
+
+def split_moved_cameras(inputs: RegistrationInputs) -> RegistrationInputs:
+    """Return the inputs of an episode with a camera for each part in which it was not moved.
+
+    The first part keeps the camera's name; the others have the name and a number, such as `left_2`.
+    Drift and shake only give warnings. Masks, and cameras on a link, are left as they are.
+    """
+    if inputs.target is not None or not inputs.recordings:
+        return inputs
+    searched, parts = list[PinholeCamera](), dict[str, CameraPart]()
+    warnings, scene = list[str](), dict(inputs.scene.cameras)
+    for camera in inputs.searched_cameras:
+        recording = inputs.recordings[camera.name]
+        motion = find_camera_motion(recording.read, len(recording.names), camera)
+        warnings += motion_warnings(camera, recording, motion)
+        own = _parts(camera.name, recording, motion, {*inputs.recordings, *parts})
+        parts |= own
+        scene |= {name: replace(camera, name=name) for name in own}
+        # The longest part is registered first; the others start from it.
+        lengths = {name: one.pictures.stop - one.pictures.start for name, one in own.items()}
+        searched += [replace(camera, name=k) for k in sorted(own, key=lambda k: -lengths[k])]
+    given = [
+        replace(camera, name=name)
+        for camera in inputs.given_cameras
+        for name, one in parts.items()
+        if one.of == camera.name
+    ]
+    assumed = {name for name, one in parts.items() if one.of in inputs.assumed_focal}
+    recordings = {k: inputs.recordings[one.of].part(one.pictures) for k, one in parts.items()}
+    return replace(
+        inputs, scene=replace(inputs.scene, cameras=scene), searched_cameras=tuple(searched),
+        given_cameras=tuple(given), assumed_focal=frozenset(assumed), recordings=recordings,
+        parts=parts, warnings=(*inputs.warnings, *warnings),
+    )  # fmt: skip
+
+
+def _parts(
+    name: str, recording: Recording, motion: CameraMotion, taken: Collection[str]
+) -> dict[str, CameraPart]:
+    """Return the parts of a camera's recording by name, in order.
+
+    taken: names that other cameras have.
+    """
+    free = (f"{name}_{k}" for k in count(2) if f"{name}_{k}" not in taken)
+    begins = [0, *(one.after for one in motion.nudges)]
+    ends = [*(one.before + 1 for one in motion.nudges), len(recording.names)]
+    R, parts = np.eye(3), dict[str, CameraPart]()
+    for k, (begin, end) in enumerate(zip(begins, ends, strict=True)):
+        since, until = None, None
+        if recording.times is not None:
+            since, until = recording.times[[begin, end - 1]].tolist()
+        if k:
+            R = R @ Rotation.from_rotvec(-motion.nudges[k - 1].rotation).as_matrix()
+        parts[next(free) if k else name] = CameraPart(
+            name, slice(begin, end), R, since, until, not motion.nudges, motion.drift, motion.shake
+        )
+    return parts
+
+
+def motion_warnings(camera: PinholeCamera, recording: Recording, motion: CameraMotion) -> list[str]:
+    """Return warnings of a camera's nudges, drift and shake; empty: it stands still."""
+
+    def as_turn(pixels: float) -> str:
+        degrees = np.degrees(pixels / np.mean(camera.kernel_parameters()[1:3]))
+        return f"{pixels:.1f} pixels, a turn by {degrees:.2f} degrees or the like"
+
+    texts, who = [], f"camera '{camera.name}'"
+    for one in motion.nudges:
+        names = f"between pictures {recording.names[one.before]} and {recording.names[one.after]}"
+        when = (
+            names if recording.times is None else f"at {recording.times[one.after]:.2f} s, {names}"
+        )
+        degrees = np.degrees(np.linalg.norm(one.rotation))
+        texts.append(
+            f"{who} moved {when}: its background shifted by {one.pixels:.1f} pixels, as by a turn "
+            f"of {degrees:.2f} degrees; the pictures before and after are used as two cameras"
+        )
+    if motion.drift:
+        texts.append(
+            f"{who} drifts: its background shifts slowly by {as_turn(motion.drift)}; the pose "
+            "found is a mean; fix the camera, or give fewer pictures (--frame)"
+        )
+    if motion.shake:
+        texts.append(
+            f"{who} shakes: from picture to picture its background shifts by "
+            f"{as_turn(motion.shake)}; the pose found is a mean; fix the camera"
+        )
+    return texts
+
+
+def register_recordings(
+    body: RegistrationBody,
+    inputs: RegistrationInputs,
+    cameras: Sequence[PinholeCamera],
+    warnings: list[str],
+    focal: Collection[str] = (),
+    offset_joints: Sequence[str] = (),
+    before: Mapping[str, PictureRegistration] | None = None,
+) -> Iterator[PictureRegistration]:
+    """Register cameras of an episode, one after another.
+
+    Args:
+        body: the robot's surfaces.
+        inputs: the episode, with the recordings' parts.
+        cameras: some of its searched cameras.
+        warnings: gets a warning of each part that no pose explains, if another part is registered.
+        focal: names of cameras whose focal length is fitted.
+        offset_joints: joints whose offsets are fitted.
+        before: earlier registrations by camera, from which fits start; None: poses are searched.
+
+    Raises RegistrationError: no pose explains a camera's pictures, in any part of its recording.
+    """
+    done, errors = dict[str, PictureRegistration](), dict[str, RegistrationError]()
+    of = {name: one.of for name, one in inputs.parts.items()}
+    for camera in cameras:
+        name, recording = camera.name, inputs.recordings[camera.name]
+        others = [other for other in done if of[other] == of[name]]
+        try:
+            if others:
+                R = inputs.parts[others[0]].rotation.T @ inputs.parts[name].rotation
+                one = _register_part(body, name, recording, done[others[0]], R)
+            elif before is not None:
+                start = PictureStart.of(before[name])
+                one = fit_pictures(body, start, recording, name in focal, offset_joints)
+            else:
+                one = register_pictures(body, camera, recording, name in focal, offset_joints)
+        except RegistrationError as error:
+            if inputs.parts[name].is_whole:
+                raise
+            errors[name] = error
+            continue
+        done[name] = one
+        yield one
+    for name, why in errors.items():
+        if of[name] not in {of[other] for other in done}:
+            raise why
+        text = str(why).replace(" Nothing was written", "")
+        warnings.append(f"{text}: this part of the recording is left out")
+
+
+def motion_findings(
+    body: RegistrationBody, inputs: RegistrationInputs, found: Mapping[str, PictureRegistration]
+) -> list[Finding]:
+    """Return the motions of an episode's cameras as findings of kind "moved".
+
+    found: the registered cameras by name.
+    """
+    findings = list[Finding]()
+    for name, part in inputs.parts.items():
+        camera = inputs.scene.cameras[name]
+        for pixels, what in ((part.drift, "drifts"), (part.shake, "shakes")):
+            if pixels and part.of == name:
+                angle = pixels / float(np.mean(camera.kernel_parameters()[1:3]))
+                findings.append(
+                    Finding(
+                        "moved", name, angle, 0.0, 0.0, 0.0, pixels, 0.0, link="camera", text=what
+                    )
+                )
+    for (name, part), (other, later) in pairwise(inputs.parts.items()):
+        if part.of == later.of and name in found and other in found:
+            before, one = found[name].found, found[other]
+            after = replace(one.found, covariance=before.covariance + one.found.covariance)
+            values = np.array([frame.values + one.joint_offsets for frame in one.frames])
+            off = compare_camera(body, before.camera, after, values, False)
+            when = f"after picture {inputs.recordings[name].names[-1]}"
+            when = when if later.since is None else f"at {later.since:.2f} s"
+            findings.append(replace(off, kind="moved", name=part.of, text=when))
+    return findings
+
+
+def _register_part(
+    body: RegistrationBody,
+    name: str,
+    recording: Recording,
+    first: PictureRegistration,
+    R: np.ndarray,
+) -> PictureRegistration:
+    """Register a camera from its pose in another part of its recording.
+
+    Clock, focal length and joint offsets are those of the other part.
+
+    Args:
+        name, recording: of the camera in this part.
+        first: the other part.
+        R: (3, 3) approximate rotation of the camera in its frame in the other part.
+
+    Raises RegistrationError: no pose near that one explains the pictures.
+    """
+    before, offsets = first.recording, first.joint_offsets
+    clock = first.time_offset or NO_CLOCK
+    since = mean_time(before, [before.names.index(one.name) for one in first.frames])
+    X = first.found.camera.X_WC.copy()
+    X[:3, :3] @= R
+    camera = replace(first.found.camera, name=name, X_WC=X)
+    rows = [row for some in choose_pictures(body, camera, recording) for row in some]
+    as_now = recording.with_drift(clock.drift, since)
+    known = as_now.at_offset(clock.value).with_offsets(offsets)
+    one = fit_pictures(body, PictureStart(camera, rows, NO_CLOCK, ()), known)
+    return replace(
+        one, frames=tuple(replace(k, values=k.values - offsets) for k in one.frames),
+        time_offset=first.time_offset and replace(clock, scores=clock.scores[:0]),
+        focal_deviation=first.focal_deviation, recording=as_now, joint_offsets=offsets,
+    )  # fmt: skip

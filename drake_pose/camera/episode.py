@@ -94,10 +94,10 @@ class EpisodeCamera:
     is_posed: bool = False
 
     def pinhole(self) -> PinholeCamera:
-        """Return the camera; without one, its focal length is 0.95 of the pictures' width."""
+        """Return the camera; without one, its focal length is 0.65 of the pictures' width."""
         if self.camera is not None:
             return replace(self.camera, name=self.name)
-        focal, centre = 0.95 * self.width, (0.5 * (self.width - 1), 0.5 * (self.height - 1))
+        focal, centre = 0.65 * self.width, (0.5 * (self.width - 1), 0.5 * (self.height - 1))
         return PinholeCamera(self.name, self.width, self.height, focal, focal, *centre, np.eye(4))
 
     def read(self, k: int) -> Picture:

@@ -214,7 +214,10 @@ def _say_clock(one: Mapping[str, Any]) -> str:
 
     ``one`` is the camera's entry of summary.json.
     """
-    texts = []
+    texts = [
+        f"its pose explains {percent(one['explained'])} of the changes in its pictures, and chance "
+        f"{percent(one['explained_by_chance'])} (p-value {one['p_value']:.1g})"
+    ]
     if one["time_offset_s"] is not None:
         value, deviation = 1e3 * one["time_offset_s"], 1e3 * one["time_offset_sd_s"]
         word = "later" if value > 0.0 else "earlier"
@@ -222,9 +225,11 @@ def _say_clock(one: Mapping[str, Any]) -> str:
             f"its pictures show the joints {abs(value):.0f} ms {word} than their time stamps say "
             f"(sd {deviation:.0f} ms)"
         )
+    else:
+        texts.append("its time offset is not determined")
     if one["focal_sd_px"] is not None:
         texts.append(f"focal length {one['focal_px']:.1f} pixels (sd {one['focal_sd_px']:.1f})")
-    return "; ".join(texts) or "its time offset is not determined"
+    return "; ".join(texts)
 
 
 def _say_target(target: Mapping[str, Any]) -> str:

@@ -5,11 +5,13 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import ndtr
 
 from drake_pose.arrays import Array, Picture
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.fit.background import estimate_gain
+from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.fit.problem import TIME_OFFSET
 from drake_pose.fit.surfaces import simplify_or_hull
 from drake_pose.registration.picture_search import (
@@ -18,7 +20,7 @@ from drake_pose.registration.picture_search import (
     segment_picture,
 )
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
-from drake_pose.registration.pyramid_level import PICTURES, evidence
+from drake_pose.registration.pyramid_level import PICTURES
 from drake_pose.registration.recording import NO_CLOCK, Recording, TimeOffset, posed_pictures
 from drake_pose.registration.register import (
     FrameMisfit,
@@ -26,7 +28,7 @@ from drake_pose.registration.register import (
     RegistrationBody,
     frame_misfits,
 )
-from drake_pose.registration.shared_fit import SharedFit, inlier_threshold
+from drake_pose.registration.shared_fit import SHARED, SharedFit, inlier_threshold
 from drake_pose.silhouette.scoring import draw_mask
 from drake_pose.workers import map_ordered
 
@@ -44,6 +46,7 @@ class PictureRegistration:
         focal_deviation: relative standard deviation of the focal length; 0: it was not fitted.
         recording: the recording, with the drift of its clock removed.
         joint_offsets: (m,) added to the frames' values for their masks and log-odds.
+        by_chance: fraction that a search explained with the joint positions of other pictures.
     """
 
     found: RegisteredCamera
@@ -54,6 +57,12 @@ class PictureRegistration:
     focal_deviation: float
     recording: Recording
     joint_offsets: Array
+    by_chance: float
+
+    @property
+    def p_value(self) -> float:
+        """Probability that as much is explained by chance, see ``p_value_of``."""
+        return p_value_of(self.fit.explained, self.by_chance)
 
 
 class PictureStart(NamedTuple):
@@ -61,6 +70,7 @@ class PictureStart(NamedTuple):
 
     camera: at its approximate pose. rows: indices of the recording's pictures to fit. clock: the
     time offset. alternatives: other poses X_CW (4, 4) that explain the pictures about as well.
+    by_chance: fraction that a search explained with the joint positions of other pictures.
     joint_offsets: (m,) approximate ones [rad or m]; None: 0.
     """
 
@@ -68,6 +78,7 @@ class PictureStart(NamedTuple):
     rows: Sequence[int]
     clock: TimeOffset
     alternatives: Sequence[Array]
+    by_chance: float
     joint_offsets: Array | None = None
 
     @classmethod
@@ -76,7 +87,26 @@ class PictureStart(NamedTuple):
         rows = [one.recording.names.index(frame.name) for frame in one.frames]
         others = [np.linalg.inv(X) for X in one.found.alternatives]
         clock = one.time_offset or NO_CLOCK
-        return cls(one.found.camera, rows, clock, others, one.joint_offsets)
+        return cls(one.found.camera, rows, clock, others, one.by_chance, one.joint_offsets)
+
+
+def p_value_of(
+    explained: float, by_chance: float, *, floor: float = 0.05, deviation: float = 0.3
+) -> float:
+    """Return the probability that a pose explains a fraction of the pictures by chance.
+
+    The logarithm of the ratio of both fractions is normally distributed around 0, if the joint
+    positions do not belong to the pictures.
+
+    Args:
+        explained: fraction of the possible log-likelihood gain that the pose explains.
+        by_chance: that of the best pose for joint positions of other pictures.
+        floor: added to both fractions; small ones are uncertain.
+        deviation: standard deviation of the logarithm, chosen on searches with the joint positions
+            of other episodes and of other robots.
+    """
+    ratio = (max(explained, 0.0) + floor) / (max(by_chance, 0.0) + floor)
+    return float(ndtr(-np.log(ratio) / deviation))
 
 
 def accept_fit(
@@ -84,45 +114,47 @@ def accept_fit(
     recording: Recording,
     start: PictureStart,
     joint_offsets: Array,
-    focal: bool,
+    focal: float,
     *,
-    min_explained: float = 0.12,
-    min_ratio: float = 0.42,
-    min_contour: float = 0.16,
-    min_evidence: float = 1.05,
+    max_p_value: float = 0.01,
+    min_ratio: float = 0.39,
     max_sd: float = 0.04,
     max_clock_sd: float = 0.1,
+    guessed_lens_error: float = 0.1,
 ) -> PictureRegistration:
     """Return the registration of a fit, if it explains the pictures.
 
     The first four arguments are what `_fit_until_stable` returns.
 
     Args:
-        min_explained: minimum explained fraction; correct poses have 0.2 or more, a wrong one that
-            few frames supported 0.09.
-        min_ratio: minimum mean inlier ratio; correct poses have 0.5 or more, the best wrong ones
-            0.3, one with a fitted focal length 0.6.
-        min_contour: minimum strength of edges along contours beyond chance; correct poses have 0.17
-            or more, the best wrong ones 0.13, one with a fitted focal length 0.17.
-        min_evidence: minimum of both together; correct poses have 1.2 or more, wrong ones 0.9.
+        focal: prior standard deviation of the focal length's logarithm; 0: it was not fitted.
+        max_p_value: maximum of `p_value_of`.
+        min_ratio: minimum mean inlier ratio. Correct poses have 0.42 or more; a similar robot's
+            model, which explains much beyond chance, has 0.35.
         max_sd: maximum standard deviation of the pose [distance from the body; rad]. Correct poses
-            have 0.01; mirrored pictures fit a pose from behind, with 0.05.
+            have 0.01.
         max_clock_sd: a time offset with a larger standard deviation is not determined [s].
+        guessed_lens_error: relative error of focal lengths that pictures alone determine, which
+            enlarges the covariance. Simulated ones err by 1 %, one of two real ones by 20 %.
 
     Raises RegistrationError: a criterion is not met.
     """
     fit, (posed,) = best.fit, best.fit.views
-    ratio = float(best.ratios[best.inliers].mean())
-    score = evidence(best.explained, best.contour)
-    least = (min_explained, min_ratio, min_contour, min_evidence)
-    if (np.array([best.explained, ratio, best.contour, score]) < least).any():
+    p_value = p_value_of(best.explained, start.by_chance)
+    if p_value > max_p_value:
         raise unexplained_error(
             start.camera,
-            f"the best one explains {max(best.explained, 0.0):.0%} of all changes (minimum "
-            f"{min_explained:.0%}), {ratio:.0%} of the contours fit (minimum {min_ratio:.0%}), and "
-            f"edges along them are stronger than elsewhere by {best.contour:.2f} (minimum "
-            f"{min_contour}); the first plus {PICTURES.contour_weight:g} times the last is "
-            f"{score:.2f} (minimum {min_evidence})",
+            f"the best one explains {max(best.explained, 0.0):.0%} of all changes, and one fitted "
+            f"with the joint positions of other pictures {max(start.by_chance, 0.0):.0%} (p-value "
+            f"{p_value:.2g}, at most {max_p_value:g})",
+        )
+    ratio = float(best.ratios[best.inliers].mean())
+    if ratio < min_ratio:
+        raise unexplained_error(
+            start.camera,
+            f"{ratio:.0%} of the best one's contours fit (minimum {min_ratio:.0%}), although it "
+            f"explains {best.explained:.0%} of all changes and chance {start.by_chance:.0%} "
+            f"(p-value {p_value:.2g}): is it another model of this robot",
         )
     deviations = np.sqrt(np.diag(best.covariance))
     pose = fit.camera_covariances(best.found, best.covariance)[0]
@@ -137,6 +169,12 @@ def accept_fit(
             f"the best, {distance:.1f} m away, has a standard deviation of "
             f"{1e3 * found.translation_sd:.0f} mm and {np.degrees(found.rotation_sd):.1f} degrees",
         )
+    focal_index = len(POSE_NAMES)
+    if focal > SHARED.focal_deviation:
+        by = best.covariance[:, focal_index] / best.covariance[focal_index, focal_index]
+        covariance = best.covariance + guessed_lens_error**2 * np.outer(by, by)
+        pose = fit.camera_covariances(best.found, covariance)[0]
+        found, deviations = replace(found, covariance=pose), np.sqrt(np.diag(covariance))
     clock = None
     if TIME_OFFSET in fit.names:
         deviation = float(deviations[fit.names.index(TIME_OFFSET)])
@@ -147,9 +185,10 @@ def accept_fit(
         {one.name: recording.picture(one.name) for one in posed.frames},
         best,
         clock,
-        float(deviations[fit.per_camera - 1]) if focal else 0.0,
+        float(deviations[focal_index]) if focal else 0.0,
         recording,
         joint_offsets,
+        start.by_chance,
     )
 
 

@@ -27,6 +27,7 @@ from drake_pose.registration.picture_acceptance import (
 from drake_pose.registration.picture_search import (
     PictureFit,
     PictureSearch,
+    PosedPicture,
 )
 from drake_pose.registration.pyramid_level import evidence
 from drake_pose.registration.recording import (
@@ -48,8 +49,9 @@ def register_pictures(
     body: RegistrationBody,
     camera: PinholeCamera,
     recording: Recording,
-    focal: bool = False,
+    focal: float = 0.0,
     offset_joints: Sequence[str] = (),
+    guessed_lens: bool = False,
 ) -> PictureRegistration:
     """Estimate a camera's pose and time offset from pictures of a moving robot.
 
@@ -57,20 +59,22 @@ def register_pictures(
         body: the robot's surfaces and pose tree.
         camera: the camera; its pose is not used.
         recording: the camera's pictures and the joint log.
-        focal: whether the focal length is fitted.
+        focal: prior standard deviation of the focal length's logarithm; 0: it is not fitted.
         offset_joints: joints whose offsets are fitted. Their significance is not tested here
             (``calibrate_joints`` does), but masks follow them.
+        guessed_lens: whether the camera's focal length is a guess: others are tried, and ratios of
+            the pixels' sides in pictures of unusual proportions.
 
     Raises RegistrationError: there are too few pictures with joint positions, the robot does not
         move, or no pose explains the pictures; the message says so if mirrored pictures fit.
     """
     chosen = choose_pictures(body, camera, recording)
     try:
-        return _register(body, camera, recording, chosen, focal, offset_joints)
+        return _register(body, camera, recording, chosen, focal, offset_joints, guessed_lens)
     except RegistrationError as error:
         mirrored = camera.mirrored(), recording.mirrored()
         try:
-            _register(body, *mirrored, chosen, focal, offset_joints)
+            _register(body, *mirrored, chosen, focal, offset_joints, guessed_lens)
         except RegistrationError:
             raise error from None
         raise RegistrationError(
@@ -84,8 +88,9 @@ def _register(
     camera: PinholeCamera,
     recording: Recording,
     frames: tuple[list[int], list[int]],
-    focal: bool,
+    focal: float,
     offset_joints: Sequence[str],
+    guessed_lens: bool = False,
     most: int = 3,
 ) -> PictureRegistration:
     """As register_pictures, without a test for mirrored pictures.
@@ -93,16 +98,13 @@ def _register(
     frames: indices as of choose_pictures. most: maximum number of pose hypotheses that are fitted.
     """
     chosen, moving = frames
-    search = PictureSearch(body, camera, posed_pictures(recording, chosen, 0.0))
-    poses = search.search()[:most]
-    searches = [search] * len(poses)
-    if offset_joints:
-        both = map_ordered(partial(search.fit_offsets, offset_joints), poses)
-        searches, poses = [one for one, _ in both], [X_CW for _, X_CW in both]
-    near = _coarse_fits(searches, poses)
+    pictures = posed_pictures(recording, chosen, 0.0)
+    near = _search(body, camera, pictures, offset_joints, most, guessed_lens)
     if not near:
         raise unexplained_error(camera, "no pose shows the body in two pictures")
     search, start = near[0]
+    if explained_as_mirrored(body, search, start):
+        raise unexplained_error(camera, "the mirrored pictures are explained better")
     gains = search.compared.tile_gains(start.X_CW)
     # Hypotheses that explain about as much are fitted again: they may converge to the best one.
     close = [
@@ -116,8 +118,34 @@ def _register(
     rows, clock, offsets = [*chosen, *moving], NO_CLOCK, search.joint_offsets
     if recording.times is not None:
         clock = scan_time_offsets(body, start, recording.with_offsets(offsets), rows)
-    found = PictureStart(start, rows, clock, alternatives, offsets)
+    # The same search with joint positions of other pictures tells what chance explains.
+    chance = _search(body, start, exchange_values(pictures), offset_joints, most)
+    by_chance = max((one.compared.explained(k.X_CW)[0] for one, k in chance[:1]), default=0.0)
+    found = PictureStart(start, rows, clock, alternatives, by_chance, offsets)
     return fit_pictures(body, found, recording, focal, offset_joints)
+
+
+def _search(
+    body: RegistrationBody,
+    camera: PinholeCamera,
+    pictures: Sequence[PosedPicture],
+    offset_joints: Sequence[str],
+    most: int,
+    guessed_lens: bool = False,
+) -> list[tuple[PictureSearch, PinholeCamera]]:
+    """Return searches in pictures with their cameras roughly fitted, best first.
+
+    The arguments are those of `_register`.
+    """
+    search = PictureSearch(body, camera, pictures)
+    poses = search.search()[:most]
+    if guessed_lens:
+        search, poses = _scan_lenses(body, search, poses)
+    searches = [search] * len(poses)
+    if offset_joints:
+        both = map_ordered(partial(search.fit_offsets, offset_joints), poses)
+        searches, poses = [one for one, _ in both], [X_CW for _, X_CW in both]
+    return _coarse_fits(searches, poses)
 
 
 def _coarse_fits(
@@ -133,11 +161,105 @@ def _coarse_fits(
     return [(search, camera) for search, (camera, _) in near]
 
 
+def exchange_values(pictures: Sequence[PosedPicture], shift: int = 5) -> list[PosedPicture]:
+    """Return pictures with the values of others: each gets those `shift` places ahead."""
+    count = len(pictures)
+    return [
+        replace(one, values=pictures[(k + min(shift, count // 2)) % count].values, rates=None)
+        for k, one in enumerate(pictures)
+    ]
+
+
+def explained_as_mirrored(
+    body: RegistrationBody,
+    search: PictureSearch,
+    camera: PinholeCamera,
+    *,
+    evaluations: int = 150,
+    turn: float = 0.08,
+    starts: int = 3,
+    threshold: float = 1.96,
+) -> bool:
+    """Return whether a search's pictures are explained significantly better if mirrored.
+
+    From behind, a distant body has the mirror image of its silhouette. So mirrored pictures are
+    explained by a camera on the opposite side of the body, though less well, as near parts are
+    shown larger. That of the mirrored pictures is compared with the given one.
+
+    Args:
+        body: the robot's surfaces.
+        search: a search in the pictures.
+        camera: at its pose in the pictures as they are.
+        evaluations, turn: of each local search, see ``PyramidLevel.improve``.
+        starts: number of local searches.
+        threshold: minimum Vuong statistic of the mirrored pictures' advantage.
+    """
+    frames = [
+        replace(one, picture=np.ascontiguousarray(one.picture[:, ::-1])) for one in search.frames
+    ]
+    mirrored, level = PictureSearch(body, camera.mirrored(), frames), search.compared
+    X_CW = level.opposite(camera.X_CW)
+    improve = partial(mirrored.compared.improve, evaluations=evaluations, turn=turn)
+    _, X_CW = max(map_ordered(improve, [(k, X_CW) for k in range(starts)]), key=lambda one: one[0])
+    opposite = mirrored.coarse_fit(X_CW)
+    if opposite is None:
+        return False
+    gains = mirrored.compared.tile_gains(opposite[0].X_CW)[:, ::-1]
+    return vuong_statistic(gains, level.tile_gains(camera.X_CW)) > threshold
+
+
+def _scan_lenses(
+    body: RegistrationBody,
+    search: PictureSearch,
+    found: Sequence[Array],
+    factors: Sequence[float] = (0.5, 0.63, 0.8, 1.0, 1.25, 1.6, 2.0),
+) -> tuple[PictureSearch, list[Array]]:
+    """Improve poses with other focal lengths and aspect ratios of the pixels.
+
+    Args:
+        body: the robot's surfaces.
+        search: a search with a camera whose focal length is a guess.
+        found: poses X_CW (4, 4) that it found.
+        factors: of the focal length.
+
+    Returns:
+        a search with the camera that scores best, and the poses improved with it, best first.
+    """
+    results = []
+    for squeezed in squeezed_cameras(search.camera):
+        for factor in factors:
+            focal_x, focal_y = factor * squeezed.focal_x, factor * squeezed.focal_y
+            camera = replace(squeezed, focal_x=focal_x, focal_y=focal_y)
+            own = PictureSearch(body, camera, search.frames)
+            # A longer focal length shows a body that is as much farther away at the same size.
+            starts = [np.vstack([X[:2], X[2] * [1, 1, 1, factor], X[3]]) for X in found]
+            improve = partial(own.compared.improve, evaluations=150, turn=0.06)
+            improved = sorted(map_ordered(improve, enumerate(starts)), key=lambda one: -one[0])
+            results.append((improved[0][0], own, [X for _, X in improved]))
+    return max(results, key=lambda one: one[0])[1:]
+
+
+def squeezed_cameras(camera: PinholeCamera, tolerance: float = 0.01) -> tuple[PinholeCamera, ...]:
+    """Return a camera with square pixels, and with those of pictures squeezed to its size.
+
+    Pictures of unusual proportions are often made of ones of 4:3 or 16:9. A camera whose pictures
+    have the proportions of a sensor is returned alone.
+
+    tolerance: relative difference of proportions that count as the same.
+    """
+    shape = camera.width / camera.height
+    sensors = np.array([4 / 3, 16 / 9, 16 / 10, 3 / 2, 5 / 4])
+    if (np.abs(sensors / shape - 1.0) < tolerance).any():
+        return (camera,)
+    squeezed = (replace(camera, focal_y=one / shape * camera.focal_x) for one in (4 / 3, 16 / 9))
+    return (camera, *squeezed)
+
+
 def fit_pictures(
     body: RegistrationBody,
     start: PictureStart,
     recording: Recording,
-    focal: bool = False,
+    focal: float = 0.0,
     offset_joints: Sequence[str] = (),
     *,
     most_fits: int = 5,
@@ -149,7 +271,7 @@ def fit_pictures(
     Args:
         start: the search result.
         recording: the recording as it is, with any drift of its clock.
-        focal: whether the focal length is fitted.
+        focal: prior standard deviation of the focal length's logarithm; 0: it is not fitted.
         offset_joints: joints whose offsets are fitted.
         most_fits: maximum number of fits of the drift. A fit is repeated if the estimated drift
             changed by more than its standard deviation and more than `min_drift`.
@@ -187,7 +309,7 @@ def fit_pictures(
 def _fit_until_stable(
     body: RegistrationBody,
     recording: Recording,
-    focal: bool,
+    focal: float,
     offset_joints: Sequence[str],
     start: PictureStart,
 ) -> tuple[PictureFit, Recording, PictureStart, Array]:

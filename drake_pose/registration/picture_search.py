@@ -11,6 +11,7 @@ import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import Any
 
 import cv2
 import numpy as np
@@ -137,7 +138,7 @@ class PictureSearch:
     def __init__(
         self, body: RegistrationBody, camera: PinholeCamera, frames: Sequence[PosedPicture]
     ) -> None:
-        self._body, self._camera, self.frames = body, camera, tuple(frames)
+        self._body, self.camera, self.frames = body, camera, tuple(frames)
         coarse, *finer = (simplify_or_hull(body.coarse, count) for count in PICTURES.triangles)
         # Small parts are invisible at the coarsest level.
         least = 0.25 * max(one.ball[3] for one in coarse)
@@ -282,10 +283,10 @@ class PictureSearch:
                 return None
             fit = SharedFit([posed], [X_CW], fit_biases=False)
             X_CW = fit.cameras(fit.fit(_stages(scales, posed)))[0].X_CW
-        return self._camera.with_pose(np.linalg.inv(X_CW)), self.compared.explained(X_CW)
+        return self.camera.with_pose(np.linalg.inv(X_CW)), self.compared.explained(X_CW)
 
     def fit(
-        self, camera: PinholeCamera, constants: Sequence[str] = (), focal: bool = False
+        self, camera: PinholeCamera, constants: Sequence[str] = (), focal: float = 0.0
     ) -> PictureFit | None:
         """Fit a camera from near its pose, on search lines across the contours.
 
@@ -293,12 +294,15 @@ class PictureSearch:
             camera: at the start's pose, with the pictures' original size.
             constants: names of further unknowns shared by all frames, such as joints with an
                 offset, or TIME_OFFSET; see ``SharedFit``.
-            focal: whether the focal length is fitted.
+            focal: prior standard deviation of the focal length's logarithm; 0: it is not fitted.
 
         Returns:
             the fit; None if the body leaves the pictures.
         """
-        camera_unknowns, posed = len(POSE_NAMES) + focal, None
+        lens: dict[str, Any] = {}
+        if focal:
+            lens = {"camera_unknowns": len(POSE_NAMES) + 1, "focal_deviation": focal}
+        posed = None
         # The background is estimated again before each sequence of stages.
         for scales, outlines in (
             ((*(5.0,) * 4, *(3.0,) * 4), self._outlines[-1]),
@@ -309,18 +313,14 @@ class PictureSearch:
             if posed is None:
                 return None
             fit = SharedFit(
-                [posed], [camera.X_CW], constants, camera_unknowns=camera_unknowns,
-                fit_biases=False, expected=self._expected,
-            )  # fmt: skip
+                [posed], [camera.X_CW], constants, fit_biases=False, expected=self._expected, **lens
+            )
             included = fit.inliers(fit.inlier_ratios(fit.start))
             found = fit.fit(_stages(scales, posed), included=included)
             camera = fit.cameras(found)[0]
         assert posed is not None
         full = PosedFrames(self._body.kinematics, self._body.full, camera, posed.frames)
-        fit = SharedFit(
-            [full], [camera.X_CW], constants,
-            camera_unknowns=camera_unknowns, expected=self._expected,
-        )  # fmt: skip
+        fit = SharedFit([full], [camera.X_CW], constants, expected=self._expected, **lens)
         # The new fit starts at the camera's fitted pose; only the constants keep their values.
         constant = np.arange(len(fit.names)) >= fit.per_camera
         found = fit.start._replace(shared=np.where(constant, found.shared, 0.0))
@@ -403,7 +403,7 @@ class PictureSearch:
             count = PICTURES.search_frames if width < PICTURES.compare_width else len(self.frames)
             pictures = [one.picture for one in self.frames[:count]]
             self._levels[width] = PyramidLevel(
-                self._outlines[k], self._camera, pictures, self._X_WN[:count], width
+                self._outlines[k], self.camera, pictures, self._X_WN[:count], width
             )
         return self._levels[width]
 

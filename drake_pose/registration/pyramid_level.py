@@ -224,6 +224,15 @@ class PyramidLevel:
         found = minimize(cost, np.zeros(6), method="Nelder-Mead", options=options)
         return -float(found.fun), self.moved(X_CW, found.x)
 
+    def opposite(self, X_CW: Array) -> Array:
+        """Return the pose (4, 4) of a camera on the other side of the body, as far away.
+
+        It sees about the mirror image of the silhouettes from X_CW (4, 4), at the mirrored place.
+        """
+        X = np.diag([-1.0, 1.0, -1.0, 1.0]) @ X_CW
+        X[2, 3] += 2.0 * float(X_CW[2, :3] @ self._middle + X_CW[2, 3])
+        return X
+
     def distinct(self, X_CW: Sequence[Array], most: int | None = None) -> list[Array]:
         """Return the poses (4, 4) that place the body apart from every pose kept before.
 

@@ -60,7 +60,8 @@ class SharedFitSettings(NamedTuple):
             logarithms of link scales.
         max_constant: largest joint offset [rad or m] or logarithm of a link scale; without it, the
             offset of a hardly visible gripper became 130 degrees.
-        focal_deviation: prior standard deviation of the logarithms of focal lengths.
+        focal_deviation, guessed_focal_deviation: prior standard deviation of the logarithms of
+            given focal lengths, and of guessed ones.
         prior_freedom: degrees of freedom of the prior of the frames' variance factor.
         prior_deviation: prior standard deviation of the logarithms of error sizes: a factor of 20.
         min_inlier_ratio: a mask is an inlier if its inlier ratio is at least this fraction of the
@@ -85,6 +86,7 @@ class SharedFitSettings(NamedTuple):
     constant_deviation: float = 0.2
     max_constant: float = 0.6
     focal_deviation: float = 0.1
+    guessed_focal_deviation: float = 0.5
     prior_freedom: int = 20
     prior_deviation: float = 3.0
     min_inlier_ratio: float = 0.7
@@ -133,6 +135,7 @@ class SharedFit:
         fit_biases: whether the masks' boundary biases are unknown.
         expected: prior means of constants by name, about which they are bounded; None, and for
             other names: 0.
+        focal_deviation: prior standard deviation of the logarithms of focal lengths, if fitted.
     """
 
     def __init__(
@@ -145,11 +148,13 @@ class SharedFit:
         camera_unknowns: int = len(POSE_NAMES),
         fit_biases: bool = True,
         expected: Mapping[str, float] | None = None,
+        focal_deviation: float = SHARED.focal_deviation,
     ) -> None:
         self.views, self.constants, self._X_CW = tuple(views), tuple(constants), tuple(X_CW)
         self._options: dict[str, Any] = {
             "offsets": offsets, "camera_unknowns": camera_unknowns, "fit_biases": fit_biases,
             "expected": expected,
+            "focal_deviation": focal_deviation,
         }  # fmt: skip
         first, body = views[0], views[0].body
         if offsets:
@@ -167,7 +172,7 @@ class SharedFit:
         deviations = dict.fromkeys(constants, SHARED.constant_deviation)
         # The calibration target's pose is found before and hardly constrained here [m, rad].
         deviations |= dict.fromkeys(TARGET_POSITIONS, 1.0)
-        deviations |= {f"{one.name}.{CAMERA_NAMES[6]}": SHARED.focal_deviation for one in cameras}
+        deviations |= {f"{one.name}.{CAMERA_NAMES[6]}": focal_deviation for one in cameras}
         known = np.array([deviations.get(name, np.inf) for name in self.names])
         bounded = set(constants) - {*TARGET_POSITIONS, TIME_OFFSET}
         most = np.array([SHARED.max_constant if k in bounded else np.inf for k in self.names])

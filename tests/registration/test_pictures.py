@@ -15,11 +15,15 @@ from drake_pose.registration.picture_acceptance import (
     PictureRegistration,
     PictureStart,
     evaluate_pictures,
+    p_value_of,
 )
 from drake_pose.registration.picture_registration import (
+    exchange_values,
+    explained_as_mirrored,
     fit_pictures,
     register_pictures,
     scan_time_offsets,
+    squeezed_cameras,
 )
 from drake_pose.registration.picture_search import (
     PictureSearch,
@@ -281,7 +285,9 @@ def registered(episode, recording) -> PictureRegistration:
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_rotvec(np.radians([0.5, -0.6, 0.6])).as_matrix()
     near = episode.camera.with_pose(turn @ episode.camera.X_WC)
-    start = PictureStart(near, range(0, 16, 3), TimeOffset(LATE - 0.01, np.inf, NO_SCORES), ())
+    start = PictureStart(
+        near, range(0, 16, 3), TimeOffset(LATE - 0.01, np.inf, NO_SCORES), (), 0.05
+    )
     return fit_pictures(episode.body, start, recording())
 
 
@@ -433,3 +439,69 @@ def test_joints_of_another_episode_are_refused(episode, recording):
     other = recording(values_at=lambda offset: -0.7 * episode.values_at(2.0 * episode.times))
     with pytest.raises(RegistrationError, match="no pose explains its pictures"):
         register_pictures(episode.body, episode.camera, other)
+
+
+def test_p_value_is_even_at_chance_and_falls_with_what_is_explained():
+    assert p_value_of(0.1, 0.1) == pytest.approx(0.5)
+    values = [p_value_of(explained, 0.1) for explained in (0.05, 0.15, 0.3, 0.6)]
+    assert values == sorted(values, reverse=True)
+    assert values[1] > 0.01 > values[2]
+    # Without anything explained by chance, a trifle is no evidence.
+    assert p_value_of(0.05, 0.0) > 0.01
+    assert p_value_of(-0.2, -0.1) == pytest.approx(0.5)
+
+
+def test_each_picture_gets_the_joint_positions_of_another(episode, recording):
+    pictures = posed_pictures(recording(), range(0, 16, 3), 0.0)
+    exchanged = exchange_values(pictures)
+    assert [one.name for one in exchanged] == [one.name for one in pictures]
+    before, after = (np.array([k.values for k in own]) for own in (pictures, exchanged))
+    assert (np.abs(before - after).max(axis=1) > 0.1).all()
+    np.testing.assert_allclose(np.sort(before, axis=0), np.sort(after, axis=0))
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_mirrored_pictures_are_distinguished_at_the_opposite_pose(episode, recording, mirrored):
+    """In mirrored pictures the search finds the camera on the body's other side."""
+    own, camera = recording(), episode.camera
+    search = PictureSearch(episode.body, camera, posed_pictures(own, range(0, 16, 2), LATE))
+    if mirrored:
+        X_CW = search.compared.opposite(camera.X_CW)
+        pictures = posed_pictures(own.mirrored(), range(0, 16, 2), LATE)
+        camera = camera.mirrored().with_pose(np.linalg.inv(X_CW))
+        search = PictureSearch(episode.body, camera, pictures)
+        _, X_CW = search.compared.improve((0, X_CW), evaluations=150, turn=0.08)
+        camera = camera.with_pose(np.linalg.inv(X_CW))
+    assert explained_as_mirrored(episode.body, search, camera) == mirrored
+
+
+@pytest.mark.parametrize(
+    ("size", "ratios"),
+    [((640, 480), [1.0]), ((1280, 720), [1.0]), ((224, 224), [1.0, 4 / 3, 16 / 9])],
+)
+def test_pictures_of_unusual_proportions_may_be_squeezed(episode, size, ratios):
+    given = replace(episode.camera, width=size[0], height=size[1])
+    cameras = squeezed_cameras(given)
+    assert [one.focal_y / one.focal_x for one in cameras] == pytest.approx(ratios)
+
+
+@pytest.mark.slow
+def test_unknown_lens_of_squeezed_pictures_is_found(episode, recording):
+    """Pictures of 4:3 are squeezed to squares, and no focal length is known."""
+    camera, side = episode.camera, 120
+
+    def read(k: int) -> np.ndarray:
+        return cv2.resize(episode.pictures[k], (side, side), interpolation=cv2.INTER_AREA)
+
+    guess = replace(
+        camera, width=side, height=side, focal_x=0.65 * side, focal_y=0.65 * side,
+        center_x=0.5 * (side - 1), center_y=0.5 * (side - 1),
+    )  # fmt: skip
+    found = register_pictures(
+        episode.body, guess, recording(read=read), focal=0.5, guessed_lens=True
+    ).found
+    true = camera.focal_x * side / camera.width
+    assert found.camera.focal_x == pytest.approx(true, rel=0.05)
+    assert found.camera.focal_y == pytest.approx(camera.focal_y * side / camera.height, rel=0.05)
+    error = pose_error(found.camera.X_WC, camera.X_WC)
+    assert np.linalg.norm(error[3:]) < 3.0 * found.translation_sd

@@ -26,6 +26,7 @@ from drake_pose.registration.recording import (
     mean_time,
 )
 from drake_pose.registration.register import RegistrationBody
+from drake_pose.registration.shared_fit import SHARED
 
 
 def split_moved_cameras(inputs: RegistrationInputs) -> RegistrationInputs:
@@ -133,7 +134,7 @@ def register_recordings(
         inputs: the episode, with the recordings' parts.
         cameras: some of its searched cameras.
         warnings: gets a warning of each part that no pose explains, if another part is registered.
-        focal: names of cameras whose focal length is fitted.
+        focal: names of cameras whose focal length is fitted; unknown ones always are.
         offset_joints: joints whose offsets are fitted.
         before: earlier registrations by camera, from which fits start; None: poses are searched.
 
@@ -144,15 +145,18 @@ def register_recordings(
     for camera in cameras:
         name, recording = camera.name, inputs.recordings[camera.name]
         others = [other for other in done if of[other] == of[name]]
+        prior, guessed = SHARED.focal_deviation if name in focal else 0.0, False
+        if name in inputs.assumed_focal:
+            prior, guessed = SHARED.guessed_focal_deviation, True
         try:
             if others:
                 R = inputs.parts[others[0]].rotation.T @ inputs.parts[name].rotation
                 one = _register_part(body, name, recording, done[others[0]], R)
             elif before is not None:
                 start = PictureStart.of(before[name])
-                one = fit_pictures(body, start, recording, name in focal, offset_joints)
+                one = fit_pictures(body, start, recording, prior, offset_joints)
             else:
-                one = register_pictures(body, camera, recording, name in focal, offset_joints)
+                one = register_pictures(body, camera, recording, prior, offset_joints, guessed)
         except RegistrationError as error:
             if inputs.parts[name].is_whole:
                 raise
@@ -224,7 +228,7 @@ def _register_part(
     rows = [row for some in choose_pictures(body, camera, recording) for row in some]
     as_now = recording.with_drift(clock.drift, since)
     known = as_now.at_offset(clock.value).with_offsets(offsets)
-    one = fit_pictures(body, PictureStart(camera, rows, NO_CLOCK, ()), known)
+    one = fit_pictures(body, PictureStart(camera, rows, NO_CLOCK, (), first.by_chance), known)
     return replace(
         one, frames=tuple(replace(k, values=k.values - offsets) for k in one.frames),
         time_offset=first.time_offset and replace(clock, scores=clock.scores[:0]),

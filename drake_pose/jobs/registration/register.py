@@ -233,7 +233,7 @@ class _Registration:
             self._find_target(inputs.target)
         else:
             frames, start = list[MultiViewFrame](), time.perf_counter()
-            focal = [*inputs.recordings] if self._settings.focal else inputs.assumed_focal
+            focal = [*inputs.recordings] if self._settings.focal else []
             for one in register_recordings(
                 self.body,
                 inputs,

@@ -118,6 +118,8 @@ def describe_pictures(one: PictureRegistration | None, found: bool = False) -> d
         "focal_px": focal,
         "focal_sd_px": one.focal_deviation * focal if one.focal_deviation else None,
         "explained": one.fit.explained,
+        "explained_by_chance": one.by_chance,
+        "p_value": one.p_value,
         "contour": one.fit.contour,
     }
 

@@ -1,5 +1,6 @@
 """The report of a registration from pictures: time offsets, focal lengths, parameters."""
 
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,6 +21,7 @@ def summary(**camera):
         "modes": [{}], "mean_iou": 0.9, "seconds": 1.0, "outliers": [], "zeros": {},
         "lengths": {}, "masks": "found", "focal_px": 500.0, "focal_sd_px": None,
         "time_offset_s": None, "time_offset_sd_s": None, "time_offset_scores": [],
+        "explained": 0.42, "explained_by_chance": 0.06, "p_value": 2e-6,
         "frames": {"0000": {"agrees": True, "E_total": 0.1, "iou": 0.9, "inlier_ratio": 0.8}},
     }  # fmt: skip
     return {
@@ -42,6 +44,9 @@ def test_time_offset_is_drawn_at_the_peak_of_the_scores(tmp_path, late):
     )
     assert f"joints {abs(1e3 * late):.0f} ms {'later' if late > 0 else 'earlier'}" in page
     assert "Focal length 500.0 pixels (490.2 to 509.8)" in page
+    assert re.search(
+        r"explains 42\S*.% of the changes in its pictures, chance 6\S*.% \(p-value 2e-06\)", page
+    )
     assert page.count('<img class="plot" src="data:image/') == 1
     (axes,) = plot_offset({"time_offset_scores": scores.tolist(), **told}).axes
     curve, line = (one.get_xydata() for one in axes.lines)
@@ -96,7 +101,7 @@ def test_summary_of_time_offset_and_focal_length():
     clock = TimeOffset(0.1, 0.02, scores, drift=1e-3, drift_deviation=1e-4)
     one = SimpleNamespace(
         found=SimpleNamespace(camera=camera), time_offset=clock, focal_deviation=0.01,
-        fit=SimpleNamespace(explained=0.3, contour=0.2),
+        fit=SimpleNamespace(explained=0.3, contour=0.2), by_chance=0.1, p_value=1e-3,
     )  # fmt: skip
     told = describe_pictures(one)
     assert (told["time_offset_s"], told["time_offset_sd_s"]) == (0.1, 0.02)

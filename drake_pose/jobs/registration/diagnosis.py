@@ -14,6 +14,7 @@ from drake_pose.errors import CameraError, RegistrationError
 from drake_pose.files.records import BADLY_EXPLAINED
 from drake_pose.files.settings import percent
 from drake_pose.fit.parameters import POSE_NAMES
+from drake_pose.jobs.registration.readings import likeliest_reading
 from drake_pose.jobs.registration.words import describe_reading
 from drake_pose.registration.diagnosis import DIAGNOSIS
 from drake_pose.registration.findings import Finding
@@ -283,11 +284,20 @@ def compare_camera(
     """
     off = pose_difference(found.camera.X_WC, given.X_WC)
     p_value = float(chdtrc(len(off), squared_distance(off, found.covariance)))
+    middle = placed_points(body.coarse, body.kinematics.poses(values[0])).mean(axis=0)
+    distance = float(np.linalg.norm(found.camera.X_WC[:3, 3] - middle))
+    text, reading = "", likeliest_reading(given.X_WC, found.camera.X_WC, distance)
+    if reading is not None:
+        words, angle, shift = reading
+        text = (
+            f"; its X_WC seems to be {words}: read so, it is off by {np.degrees(angle):.2f} "
+            f"degrees and {1e3 * shift:.1f} mm"
+        )
     return Finding(
         "camera", given.name, float(np.linalg.norm(off[:3])), float(np.linalg.norm(off[3:])),
         found.rotation_sd, found.translation_sd,
         _picture_shift(body, (given, values), (found.camera, values)), p_value,
-        ("base",) if alone else (),
+        ("base",) if alone and not text else (), text=text,
     )  # fmt: skip
 
 

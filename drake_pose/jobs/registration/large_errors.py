@@ -12,10 +12,10 @@ from drake_pose.files.settings import percent
 from drake_pose.jobs.registration.diagnosis import (
     compare_camera,
     explain_misfit,
-    last_before_change,
     require_seen_by,
 )
 from drake_pose.jobs.registration.inputs import RegistrationInputs
+from drake_pose.jobs.registration.moves import base_motion, changed_after
 from drake_pose.jobs.registration.readings import focal_correction, scene_corrections
 from drake_pose.registration.diagnosis import DIAGNOSIS, diagnose_frames
 from drake_pose.registration.findings import Diagnosis, Finding
@@ -28,7 +28,6 @@ from drake_pose.registration.large_errors import (
     mask_excess_and_lack,
     mismatched_links,
 )
-from drake_pose.registration.online_registration import pose_difference
 from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit
 from drake_pose.registration.posed_frames import MultiViewFrame, placed_points
 from drake_pose.registration.register import (
@@ -134,14 +133,10 @@ class SceneComparison:
         try:
             require_seen_by(self.body, inputs.known_cameras, self._sample)
         except CameraError as error:
-            if (
-                not inputs.recordings
-                and (one := self._search(inputs.known_cameras, [])) is not None
-            ):
-                raise CameraError(
-                    f"{error}; {one.name}: then the robot is where the masks show it"
-                ) from None
-            raise
+            unseen = None if inputs.recordings else self._search_unseen(str(error))
+            if unseen is None:
+                raise
+            return self._finish(self._correct(unseen, most - 1))
         given = self._compare(inputs.known_cameras, ())
         now = self._correct(given, most)
         if now.is_doubtful:
@@ -149,6 +144,27 @@ class SceneComparison:
             placed = self._search_cameras(given)
             now = given if placed is None else self._correct(placed, most)
         return self._finish(given if now.is_doubtful else now)
+
+    def _search_unseen(self, why: str) -> SceneFit | None:
+        """Return the fit of a scene in which a given camera cannot show the robot.
+
+        Another reading of the cameras' poses is tried, then cameras are registered.
+
+        why: the reason in words. None: neither explains most frames.
+        """
+        given = self._inputs.known_cameras
+        if (one := self._search(given, [])) is not None:
+            found = Finding("reading", one.name, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+            reread = self._compare(one.cameras, (one,))
+            if not reread.is_doubtful:
+                return replace(reread, findings=(found,), warnings=(f"as given, {why}",))
+        placed = self._register(self._sample, given)
+        cameras = [placed[one.name][0].camera if one.name in placed else one for one in given]
+        findings = tuple(off for _, off in placed.values())
+        now = self._compare(cameras, ()) if placed else None
+        if now is None or now.is_doubtful:
+            return None
+        return replace(now, findings=findings, warnings=(f"as given, {why}",))
 
     def _correct(self, now: SceneFit, most: int) -> SceneFit:
         """Return the fit with up to `most` further corrections, recorded in its findings."""
@@ -541,51 +557,6 @@ def _add_remaining(one: Finding, rest: Finding | None) -> Finding:
     angle = one.angle + rest.angle
     total = replace(rest, angle=angle, shift=shift, pixels=one.pixels)
     return replace(total, p_value=one.p_value, alternatives=one.alternatives)
-
-
-def changed_after(found: Diagnosis, cameras: Collection[str], least: int) -> tuple[list[int], str]:
-    """Return the outlier frames before or after a change, and the last frame before the change.
-
-    Args:
-        found: the diagnosis.
-        cameras: names; only frames with masks of exactly these cameras are used.
-        least: minimum number of frames before and after; with fewer there is no change.
-
-    Returns:
-        the outliers' indices in ``found.frames``, and a frame's name. ([], ""): no change.
-    """
-    own = [k for k, one in enumerate(found.frames) if {*one.given_ratios} == {*cameras}]
-    wrong = [found.frames[k].finding is not None for k in own]
-    last = last_before_change(wrong, least)
-    if last is None:
-        return [], ""
-    return [own[k] for k in np.flatnonzero(wrong)], found.frames[own[last]].frame
-
-
-def base_motion(
-    given: Mapping[str, Camera], placed: Mapping[str, RegisteredCamera], sds: float = 4.0
-) -> Finding | None:
-    """Return the motion of the base that cameras agree on; None: they differ, or there is one.
-
-    The motion is in the world, its shift that of the world's origin; pixels and p-value are 0.
-
-    Args:
-        given: by name the cameras at their given poses.
-        placed: by name the registered cameras, some of these.
-        sds: maximum difference of motions in standard deviations, plus 0.25 degrees and 3 mm.
-    """
-    motions = [given[name].X_WC @ one.camera.X_CW for name, one in placed.items()]
-    rotation_sd = max((one.rotation_sd for one in placed.values()), default=0.0)
-    shift_sd = max((one.translation_sd for one in placed.values()), default=0.0)
-    off = [pose_difference(one, motions[0]) for one in motions[1:]]
-    most = sds * rotation_sd + np.radians(0.25), sds * shift_sd + 0.003
-    if not off or any(
-        np.linalg.norm(one[:3]) > most[0] or np.linalg.norm(one[3:]) > most[1] for one in off
-    ):
-        return None
-    by = pose_difference(motions[0], np.eye(4))
-    size = float(np.linalg.norm(by[:3])), float(np.linalg.norm(by[3:]))
-    return Finding("base", "base", *size, rotation_sd, shift_sd, 0.0, 0.0)
 
 
 _KINDS = {"offset": "joint", "focal": "focal"}

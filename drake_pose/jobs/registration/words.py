@@ -82,7 +82,8 @@ def describe_common_finding(one: Finding) -> str:
         off = describe_error(replace(one, kind=one.link), "is off")
         what = "the base" if one.link == "base" else f"camera '{one.name}'"
         return f"{what} was moved {one.text}, {off}{pixels}"
-    return f"{describe_error(one)} in all frames that agree{pixels}"
+    # Of a camera the text names another reading of its pose.
+    return f"{describe_error(one)} in all frames that agree{pixels}{one.text}"
 
 
 def describe_frame_finding(one: FrameDiagnosis, found: Finding) -> str:

@@ -1,0 +1,56 @@
+"""Motions of cameras or of the base between two frames of a scene."""
+
+from collections.abc import Collection, Mapping
+
+import numpy as np
+
+from drake_pose.camera.models import Camera
+from drake_pose.jobs.registration.diagnosis import last_before_change
+from drake_pose.registration.findings import Diagnosis, Finding
+from drake_pose.registration.online_registration import pose_difference
+from drake_pose.registration.register import RegisteredCamera
+
+
+def changed_after(found: Diagnosis, cameras: Collection[str], least: int) -> tuple[list[int], str]:
+    """Return the outlier frames before or after a change, and the last frame before the change.
+
+    Args:
+        found: the diagnosis.
+        cameras: names; only frames with masks of exactly these cameras are used.
+        least: minimum number of frames before and after; with fewer there is no change.
+
+    Returns:
+        the outliers' indices in ``found.frames``, and a frame's name. ([], ""): no change.
+    """
+    own = [k for k, one in enumerate(found.frames) if {*one.given_ratios} == {*cameras}]
+    wrong = [found.frames[k].finding is not None for k in own]
+    last = last_before_change(wrong, least)
+    if last is None:
+        return [], ""
+    return [own[k] for k in np.flatnonzero(wrong)], found.frames[own[last]].frame
+
+
+def base_motion(
+    given: Mapping[str, Camera], placed: Mapping[str, RegisteredCamera], sds: float = 4.0
+) -> Finding | None:
+    """Return the motion of the base that cameras agree on; None: they differ, or there is one.
+
+    The motion is in the world, its shift that of the world's origin; pixels and p-value are 0.
+
+    Args:
+        given: by name the cameras at their given poses.
+        placed: by name the registered cameras, some of these.
+        sds: maximum difference of motions in standard deviations, plus 0.25 degrees and 3 mm.
+    """
+    motions = [given[name].X_WC @ one.camera.X_CW for name, one in placed.items()]
+    rotation_sd = max((one.rotation_sd for one in placed.values()), default=0.0)
+    shift_sd = max((one.translation_sd for one in placed.values()), default=0.0)
+    off = [pose_difference(one, motions[0]) for one in motions[1:]]
+    most = sds * rotation_sd + np.radians(0.25), sds * shift_sd + 0.003
+    if not off or any(
+        np.linalg.norm(one[:3]) > most[0] or np.linalg.norm(one[3:]) > most[1] for one in off
+    ):
+        return None
+    by = pose_difference(motions[0], np.eye(4))
+    size = float(np.linalg.norm(by[:3])), float(np.linalg.norm(by[3:]))
+    return Finding("base", "base", *size, rotation_sd, shift_sd, 0.0, 0.0)

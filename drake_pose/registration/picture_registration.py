@@ -83,6 +83,31 @@ def register_pictures(
         ) from error
 
 
+def register_near(
+    body: RegistrationBody,
+    camera: PinholeCamera,
+    recording: Recording,
+    by_chance: float,
+    focal: float = 0.0,
+    offset_joints: Sequence[str] = (),
+) -> PictureRegistration:
+    """As register_pictures, but begin at the camera's pose, and search only if it does not fit.
+
+    by_chance: what a search explained by chance in other pictures of this camera.
+    """
+    try:
+        chosen, moving = choose_pictures(body, camera, recording)
+        rows, clock = [*chosen, *moving], NO_CLOCK
+        if recording.times is not None:
+            clock = scan_time_offsets(body, camera, recording, rows)
+        exchanged = exchange_values(posed_pictures(recording, chosen, 0.0))
+        here = PictureSearch(body, camera, exchanged).compared.explained(camera.X_CW)[0]
+        start = PictureStart(camera, rows, clock, (), max(by_chance, here))
+        return fit_pictures(body, start, recording, focal, offset_joints)
+    except RegistrationError:
+        return register_pictures(body, camera, recording, focal, offset_joints)
+
+
 def _register(
     body: RegistrationBody,
     camera: PinholeCamera,

@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from drake_pose.arrays import Array
 from drake_pose.camera.camera_files import describe_camera
 from drake_pose.camera.models import Camera
-from drake_pose.errors import SceneError
-from drake_pose.files.folder import write_summary, writes_folder
+from drake_pose.errors import DrakePoseError, SceneError
+from drake_pose.files.folder import read_summary, write_summary, writes_folder
 from drake_pose.files.records import mask_digests, user_units
 from drake_pose.files.settings import percent
 from drake_pose.jobs.estimate.measurements import left_out_warnings
@@ -90,6 +91,7 @@ def audit_scene(
     cameras: Path | str | None = None,
     overlay: bool = True,
     on_frame: OnFrame | None = None,
+    near: Path | None = None,
 ) -> SceneAudit:
     """Return errors common to all frames, and outlier frames, in time linear in their number.
 
@@ -104,6 +106,8 @@ def audit_scene(
         cameras: a camera file in place of the scene's or episode's own.
         overlay: whether overlays are drawn.
         on_frame: called after each frame.
+        near: result folder of the audit of another episode, near whose poses the cameras are
+            expected; those that are not there are searched. None: all are searched.
 
     Raises:
         DrakePoseError: names the wrong file, camera, frame or joint.
@@ -114,7 +118,7 @@ def audit_scene(
         inputs = split_moved_cameras(read_inputs(Path(scene), Path(model), table, own, settings))
         pictures = _Pictures()
         if inputs.recordings:
-            given, (inputs, pictures) = inputs, _find_cameras(inputs)
+            given, (inputs, pictures) = inputs, _find_cameras(inputs, others=near)
             compared = SceneComparison(inputs, on_frame).run()
             offset_joints = [one.name for one in compared.found.common if one.kind == "joint"]
             if offset_joints:
@@ -193,6 +197,7 @@ def _find_cameras(
     before: _Pictures | None = None,
     offset_joints: Sequence[str] = (),
     near: float = 0.08,
+    others: Path | None = None,
 ) -> tuple[RegistrationInputs, _Pictures]:
     """Register each camera of an episode from its pictures, and segment all of them.
 
@@ -202,6 +207,7 @@ def _find_cameras(
         offset_joints: names of the joints whose offsets are fitted.
         near: a given camera is used for comparisons if it shows the body at less than this distance
             from the registered one [square root of the silhouettes' area].
+        others: as `near` of ``audit_scene``.
 
     Returns:
         the inputs as a scene of masks: each picture is a frame of its camera only, compared with
@@ -233,6 +239,7 @@ def _find_cameras(
             warnings,
             offset_joints=offset_joints,
             before=None if before is None else before.found,
+            near=None if others is None else _found_poses(others),
         )
     }
     findings += motion_findings(body, inputs, pictures)
@@ -263,6 +270,21 @@ def _find_cameras(
         frames=tuple(frames),
     )
     return updated, _Pictures(pictures, tuple(findings), names)
+
+
+def _found_poses(folder: Path) -> dict[str, tuple[Array, float]]:
+    """Return the pose X_WC (4, 4) found by an audit and what chance explained, by camera.
+
+    The result is empty if the folder has no result.
+    """
+    try:
+        found = read_summary(folder)["found_cameras"]
+        return {
+            name: (np.array(one["X_WC"]), float(one["explained_by_chance"]))
+            for name, one in found.items()
+        }
+    except (DrakePoseError, KeyError):
+        return {}
 
 
 def _audit_warnings(

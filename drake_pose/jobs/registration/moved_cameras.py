@@ -7,6 +7,7 @@ from itertools import count, pairwise
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from drake_pose.arrays import Array
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.jobs.registration.diagnosis import compare_camera
@@ -18,7 +19,11 @@ from drake_pose.registration.camera_motion import (
 )
 from drake_pose.registration.findings import Finding
 from drake_pose.registration.picture_acceptance import PictureRegistration, PictureStart
-from drake_pose.registration.picture_registration import fit_pictures, register_pictures
+from drake_pose.registration.picture_registration import (
+    fit_pictures,
+    register_near,
+    register_pictures,
+)
 from drake_pose.registration.recording import (
     NO_CLOCK,
     Recording,
@@ -126,6 +131,7 @@ def register_recordings(
     focal: Collection[str] = (),
     offset_joints: Sequence[str] = (),
     before: Mapping[str, PictureRegistration] | None = None,
+    near: Mapping[str, tuple[Array, float]] | None = None,
 ) -> Iterator[PictureRegistration]:
     """Register cameras of an episode, one after another.
 
@@ -137,6 +143,8 @@ def register_recordings(
         focal: names of cameras whose focal length is fitted; unknown ones always are.
         offset_joints: joints whose offsets are fitted.
         before: earlier registrations by camera, from which fits start; None: poses are searched.
+        near: by camera the pose X_WC (4, 4) found in another episode, at which fits start, and what
+            chance explained there; a camera that does not fit is searched. None: there are none.
 
     Raises RegistrationError: no pose explains a camera's pictures, in any part of its recording.
     """
@@ -155,6 +163,10 @@ def register_recordings(
             elif before is not None:
                 start = PictureStart.of(before[name])
                 one = fit_pictures(body, start, recording, prior, offset_joints)
+            elif near is not None and name in near:
+                X_WC, by_chance = near[name]
+                begun = replace(camera, X_WC=X_WC)
+                one = register_near(body, begun, recording, by_chance, prior, offset_joints)
             else:
                 one = register_pictures(body, camera, recording, prior, offset_joints, guessed)
         except RegistrationError as error:

@@ -64,7 +64,11 @@ def open_bag(path: Path, joints: JointLog | None) -> Episode:
         SceneError: the bag is unreadable, truncated, or has no images.
     """
     pictures, states, infos, parents, ignored, kinds = _scan(path)
-    warnings = [f"{topic} is left out: {why}" for topic, why in ignored.items() if why != "depths"]
+    warnings = [
+        f"{f'pictures of {topic} are' if topic in pictures else f'{topic} is'} left out: {why}"
+        for topic, why in ignored.items()
+        if why != "depths"
+    ]
     warnings += _name_joints(states)
     shifts, texts = _clock_shifts(pictures, states)
     warnings += texts
@@ -227,17 +231,20 @@ def _clock_shifts(
     states: Mapping[Any, Sequence[_Row]],
     *,
     differs: float = 1.0,
+    max_fraction: float = 0.1,
 ) -> tuple[dict[Any, int | None], list[str]]:
     """Return what is added to the stamps in the headers of each stream [ns], and warnings.
 
-    The result is 0 where the headers have the clock of the joints, and None where most headers have
-    no stamp, so that the times in the bag are used. Headers of another clock are moved by the
+    The result is 0 where the headers have the clock of the joints, and None where too many headers
+    have no stamp, so that the times in the bag are used. Headers of another clock are moved by the
     median difference of the times in the bag.
 
     Args:
         pictures, states: rows by topic, and by (topic, names).
         differs: clocks differ if headers lag behind the times in the bag by so much more or less
             than those of the joints [s]: more than recorders delay messages.
+        max_fraction: maximum fraction of a stream's messages whose headers may have no stamp; they
+            are left out.
     """
     streams: dict[Any, Sequence[_Row]] = {**states, **pictures}
     lags: dict[Any, float | None] = {}
@@ -245,7 +252,8 @@ def _clock_shifts(
         stamps = np.array([row[:2] for row in rows])
         stamped = stamps[stamps[:, 0] > 0]
         lag = 1e-9 * (stamped[:, 1] - stamped[:, 0])
-        lags[key] = float(np.median(lag)) if 2 * len(stamped) > len(stamps) else None
+        is_stamped = len(stamps) - len(stamped) <= max_fraction * len(stamps)
+        lags[key] = float(np.median(lag)) if is_stamped else None
         # Times in the bag that do not follow the headers tell nothing.
         if len(lag) and np.median(np.abs(lag - np.median(lag))) > differs:
             lags[key] = np.nan
@@ -306,7 +314,9 @@ def _ordered_times(
         SceneError: too many rows are out of order, see ``ascending_indices``.
     """
     stamps = np.array([row[:2] for row in rows])
-    times = 1e-9 * (stamps[:, 1] if shift is None else stamps[:, 0] + shift)
+    times = 1e-9 * stamps[:, 1]
+    if shift is not None:
+        times = np.where(stamps[:, 0] > 0, 1e-9 * (stamps[:, 0] + shift), np.nan)
     kept, late = ascending_indices(times, what)
     warnings += late
     return times[kept], kept

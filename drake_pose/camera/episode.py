@@ -160,7 +160,8 @@ class Episode:
         """
         found, warnings = {camera.name: camera for camera in cameras}, list(reader_warnings)
         if not found:
-            raise SceneError(f"{path}: has no camera's pictures: {'; '.join(warnings) or 'none'}")
+            why = f": {'; '.join(warnings)}" if warnings else ""
+            raise SceneError(f"{path}: has no camera's pictures{why}")
         for name, camera in found.items():
             warnings += _gap_warnings(camera.times, f"camera '{name}'", "picture")
         if joints is None:
@@ -169,6 +170,11 @@ class Episode:
         if not joints.positions.size:
             raise SceneError(f"{path}: the joint log has no row, or no joint")
         is_number = np.isfinite(joints.positions)
+        if not is_number.any():
+            raise SceneError(
+                f"{path}: the joint log has {len(joints.positions)} rows, but no number: "
+                f"{', '.join(joints.names)} are all missing or infinite"
+            )
         joints = replace(joints, positions=np.where(is_number, joints.positions, np.nan))
         warnings += [
             f"the joint log: '{name}' is not a number in {(~column).sum()} of {len(column)} rows, "
@@ -280,7 +286,8 @@ def _comparison_warnings(path: Path, camera: EpisodeCamera, joints: JointLog) ->
             "and pictures both need times [s] (for a folder of images: timestamps.csv, or "
             "frame_rate_hz in scene.yaml), or the log needs a column 'frame'"
         )
-    outside = int(np.isnan(joints.at(camera.times)).all(axis=1).sum())
+    clock = JointLog(("time",), joints.times, joints.times[:, None])
+    outside = int(np.isnan(clock.at(camera.times)).sum())
     (first, last), (begin, end) = camera.times[[0, -1]], joints.times[[0, -1]]
     span = f"({first:.3f} to {last:.3f} s; the log's are {begin:.3f} to {end:.3f} s)"
     if outside == count:
@@ -288,4 +295,7 @@ def _comparison_warnings(path: Path, camera: EpisodeCamera, joints: JointLog) ->
     is_short = last - first < 0.75 * (end - begin)
     text = f"{where}: {outside} of {count} pictures are before or after the log {span}"
     short = f"{where}: its pictures cover only a part of the log {span}"
+    ratio = (end - begin) / (last - first) if last > first else 1.0
+    for unit, scale in (("ms", 1e3), ("microseconds", 1e6), ("ns", 1e9)):
+        short += f": are its times in {unit}?" if 0.7 * scale < ratio < 1.4 * scale else ""
     return [text] if outside else [short] if is_short else []

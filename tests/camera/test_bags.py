@@ -328,6 +328,24 @@ def test_clocks_of_headers_that_differ_are_moved_by_the_times_of_recording(
     assert [number_of(one.read(k)) for k in (3, 1)] == [3, 1]
 
 
+@pytest.mark.parametrize("lacking", [1, 3])
+def test_few_headers_without_stamps_are_left_out(tmp_path, lacking):
+    bag = Bag(tmp_path, "mcap")
+    with bag.writer:
+        for k in range(COUNT):
+            time = np.nan if k < lacking else 0.1 * k
+            bag.image("/a", time, numbered(k), "rgb8", logged=0.1 * k + 0.02)
+            bag.joints("/joint_states", 0.1 * k, x=0.1 * k)
+        bag.image("/a", 0.1 * COUNT, numbered(9), "odd", logged=0.1 * COUNT)
+    one, texts = (episode := open_episode(bag.path)).camera("a"), "\n".join(episode.warnings)
+    numbers = [*range(lacking if lacking == 1 else 0, COUNT)]
+    assert [number_of(one.read(k)) for k in range(len(one.times))] == numbers
+    late = 0.0 if lacking == 1 else 0.02
+    np.testing.assert_allclose(one.times - 1.7e9, 0.1 * np.array(numbers) + late, atol=1e-6)
+    assert ("without time stamps" in texts) == (lacking == 3)
+    assert "pictures of /a are left out: 'odd' is not one of rgb8" in texts
+
+
 def test_messages_of_equal_times_in_the_bag_are_told_apart(tmp_path):
     bag = Bag(tmp_path, "sqlite3")
     with bag.writer:

@@ -75,6 +75,19 @@ def test_a_late_video_and_clocks_that_do_not_overlap(tmp_path):
     np.testing.assert_allclose(times, [*(5 + 0.2 * np.arange(8)), np.nan])
 
 
+def test_logs_in_other_units_or_without_numbers_are_named(tmp_path):
+    write_video(tmp_path / "videos" / "a.mp4", range(9))
+    table = tmp_path / "joint_angles.csv"
+    write_table(table, "time", [100 * k for k in range(9)])
+    assert open_episode(tmp_path).warnings[-1].endswith("are its times in ms?")
+    table.write_text("\n".join(["time,joint1", *(f"{0.1 * k:.1f},nan" for k in range(9))]))
+    with pytest.raises(SceneError, match="has 9 rows, but no number: joint1 are all missing"):
+        open_episode(tmp_path)
+    table.write_text("\n".join(["time,joint1", "0,nan", *(f"0.{k},1" for k in range(1, 9))]))
+    texts = open_episode(tmp_path).warnings
+    assert not any("before or after the log" in text for text in texts)
+
+
 def test_images_are_matched_by_frame_or_by_time(tmp_path):
     stamps, table = write_images(tmp_path, [2, 9, 10]) / "timestamps.csv", tmp_path / "other.csv"
     write_table(tmp_path / "joint_angles.csv", "frame", ["010", "2", "9"])

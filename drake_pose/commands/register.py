@@ -59,9 +59,9 @@ def register(
 
     An episode needs no masks: pictures or videos with joint positions by time or frame, a LeRobot
     data set, a raw folder of DROID, or a ROS bag. The robot must move in view of a static camera,
-    or carry the camera (--on) with a --target in view. For a static camera the time offset between
-    pictures and joints is estimated as well, and the focal length if it is unknown. A camera that
-    was nudged meanwhile is registered as two, which have one clock.
+    or carry the camera (--on) over a scene that stands still. Without a --target the time offset
+    between pictures and joints is estimated as well, and the focal length if it is unknown. A
+    static camera that was nudged meanwhile is registered as two, which have one clock.
 
     Files in the output folder: report.html (start here); cameras.yaml, which estimate reads;
     registration.yaml (6 x 6 covariance, other poses); summary.json; overlay/; overlay_as_given/;
@@ -156,16 +156,23 @@ def _print_registration(result: SceneRegistration) -> None:
     """Print the worst frames, the camera poses with standard deviations, and other estimates."""
     from drake_pose.files.folder import REPORT
     from drake_pose.jobs.registration.result import PARAMETERS, parameter_rows
+    from drake_pose.jobs.registration.tracks import SCENE
     from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 
     console = output_console()
     misfits = [(name, one) for name, own in result.registered.items() for one in own.frames]
-    shown, which = worst_frames([misfit.E_total for _, misfit in misfits])
-    frames = Table("camera", "frame", "E_total", "IoU", "", title=f"Masks and robot{which}")
-    for name, misfit in (misfits[k] for k in shown):
+    if next(iter(result.summary["cameras"].values())).get("evidence") == SCENE:
+        shown, which = worst_frames([-misfit.inlier_ratio for _, misfit in misfits])
+        frames = Table("camera", "frame", "points that fit", "", title=f"Standing scene{which}")
+        shares: list[tuple[str, ...]] = [(percent(misfit.inlier_ratio),) for _, misfit in misfits]
+    else:
+        shown, which = worst_frames([misfit.E_total for _, misfit in misfits])
+        frames = Table("camera", "frame", "E_total", "IoU", "", title=f"Masks and robot{which}")
+        shares = [(percent(misfit.E_total), percent(misfit.iou)) for _, misfit in misfits]
+    for k in shown:
+        name, misfit = misfits[k]
         word = "" if misfit.is_inlier else "outlier"
-        shares = percent(misfit.E_total), percent(misfit.iou)
-        frames.add_row(escape(name), escape(misfit.frame), *shares, word)
+        frames.add_row(escape(name), escape(misfit.frame), *shares[k], word)
     table = Table(
         "camera", "position [m]", "sd [mm]", "sd [deg]", "poses", "inliers", "mean IoU", "seconds",
         title="Cameras in the robot's world",
@@ -186,7 +193,7 @@ def _print_registration(result: SceneRegistration) -> None:
     console.print(frames)
     console.print(table)
     for name, one in result.summary["cameras"].items():
-        if "time_offset_scores" in one:
+        if "time_offset_scores" in one or one.get("evidence") == SCENE:
             console.print(escape(f"camera '{name}': {_say_clock(one)}"), soft_wrap=True)
     first = next(iter(result.summary["cameras"].values()))
     for key, title, of, what in PARAMETERS:
@@ -210,14 +217,21 @@ def _print_registration(result: SceneRegistration) -> None:
 
 
 def _say_clock(one: Mapping[str, Any]) -> str:
-    """Return a text of a camera's time offset and focal length, as far as they were estimated.
+    """Return a text of a camera's evidence, time offset and focal length, as far as estimated.
 
     ``one`` is the camera's entry of summary.json.
     """
-    texts = [
-        f"its pose explains {percent(one['explained'])} of the changes in its pictures, and chance "
-        f"{percent(one['explained_by_chance'])} (p-value {one['p_value']:.1g})"
-    ]
+    if "points" in one:
+        texts = [
+            f"from {one['points']} points of the scene: {percent(one['sightings_that_fit'])} of "
+            f"{one['sightings']} sightings fit; the pose explains {percent(one['explained'])} of "
+            f"the matches, and chance {percent(one['explained_by_chance'])}"
+        ]
+    else:
+        texts = [
+            f"its pose explains {percent(one['explained'])} of the changes in its pictures, and "
+            f"chance {percent(one['explained_by_chance'])} (p-value {one['p_value']:.1g})"
+        ]
     if one["time_offset_s"] is not None:
         value, deviation = 1e3 * one["time_offset_s"], 1e3 * one["time_offset_sd_s"]
         word = "later" if value > 0.0 else "earlier"

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from drake_pose.arrays import Array, Picture
-from drake_pose.body import TARGET, ArticulatedModel, PoseTree, RootRotation, load_model
+from drake_pose.body import ArticulatedModel, PoseTree, load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import (
     CameraFile,
@@ -42,6 +42,7 @@ from drake_pose.jobs.registration.positions import (
     read_known_positions,
 )
 from drake_pose.jobs.registration.settings import ALL, AuditSettings, RegistrationSettings
+from drake_pose.jobs.registration.trees import make_registration_tree, read_target
 from drake_pose.registration.camera_motion import CameraPart
 from drake_pose.registration.joint_offsets import (
     require_frame_count,
@@ -50,11 +51,7 @@ from drake_pose.registration.joint_offsets import (
 )
 from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrame
 from drake_pose.registration.recording import Recording
-from drake_pose.registration.standing_object import (
-    CalibrationTarget,
-    fixed_link_error,
-    require_rotation,
-)
+from drake_pose.registration.standing_object import CalibrationTarget, require_rotation
 from drake_pose.silhouette.pictures.scene_checks import check_scene, read_mask_of, read_scene
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, Scene, load_scene, select_frames
 
@@ -222,12 +219,12 @@ def _read_episode(
             f"{path}: holds no joint positions, and none are given (--joints FILE): pictures alone "
             f"do not determine a robot's pose. {episode.warnings[-1]}"
         )
-    robot, target = load_model(model, package_paths=settings.packages), None
+    robot, target, standing = load_model(model, package_paths=settings.packages), None, None
     if isinstance(settings, RegistrationSettings):
-        target = _read_target(robot, settings)
-    tree = make_tree(robot, EstimateSettings(hold=settings.hold))
-    if target is not None:
-        tree = target.tree(np.eye(4))
+        target = read_target(robot, settings)
+        tree, standing = make_registration_tree(robot, settings, target)
+    else:
+        tree = make_tree(robot, EstimateSettings(hold=settings.hold))
     mapped = map_log(path, episode.joints, tree, settings)
     warnings = [*episode.warnings, *robot.warnings, *mapped.warnings]
     if mapped.unposed:
@@ -246,19 +243,25 @@ def _read_episode(
         given_cameras=tuple(one for name, one in known.items() if name in placed),
         assumed_focal=frozenset(one.name for one in chosen if one.camera is None),
         recordings={one.name: _recording(one, mapped, default, settings) for one in chosen},
-        visible_nodes=(TARGET,) if target else mapped.posed if mapped.unposed else None,
+        visible_nodes=standing or (mapped.posed if mapped.unposed else None),
         target=target, mapped=mapped.mapped,
         lenses={one.name: one.lens for one in chosen if one.lens is not None},
     )  # fmt: skip
     if not isinstance(settings, RegistrationSettings):
         return inputs
-    for name in ("suggest",) if settings.target else ("on", "suggest"):
+    scene_alone = settings.on is not None and target is None
+    for name in ("suggest", *(("lengths",) if scene_alone else ())):
         if getattr(settings, name):
             raise SettingsError(
                 f"--{name} needs masks, but {path} has pictures: make masks of them "
                 "(drake-pose masks), or leave it out"
-                + ("; with --target FILE pictures are enough" if name == "on" else "")
             )
+    if scene_alone and standing is not None and not {*standing} <= {*mapped.posed}:
+        raise SceneError(
+            f"{path}: joints between the base and link '{settings.on}' are not logged, so its pose "
+            "is not known: give a joint map (--joint-map FILE), or hold those that do not move "
+            "(--hold NAME=VALUE)"
+        )
     joint_names, link_names = _select_parameters(robot, kinematics, settings)
     return replace(inputs, offset_joints=joint_names, scaled_links=link_names)
 
@@ -291,28 +294,6 @@ def _recording(
     return Recording(names, values_at, read, times)
 
 
-def _read_target(
-    model: ArticulatedModel, settings: RegistrationSettings
-) -> CalibrationTarget | None:
-    """Return the calibration target that a camera on the robot's link sees.
-
-    None: no target is set, so the cameras see the robot `model`.
-
-    Raises SettingsError: the target is unusable, or no link carries the cameras.
-    """
-    if settings.target is None:
-        return None
-    if settings.on is None:
-        raise SettingsError(
-            f"{settings.target} and a camera that rides on no link both stand still, so masks of "
-            "the target do not relate the camera to the robot: name the camera's link (--on LINK)"
-        )
-    other = load_model(settings.target, package_paths=settings.packages)
-    held = make_tree(model, EstimateSettings(hold=settings.hold)).held
-    named = {model.position_names[index]: value for index, value in held.items()}
-    return CalibrationTarget(model, settings.on, named, make_tree(other, EstimateSettings()))
-
-
 def _read_masks(
     path: Path,
     robot: ArticulatedModel,
@@ -331,7 +312,7 @@ def _read_masks(
     scene = check_scene(load_scene(path, file.cameras))
     scene, frames = scene.every(settings.every, settings.frames)
     searched, held = _select_cameras(scene, file, settings)
-    table, target = None, _read_target(robot, settings)
+    table, target = None, read_target(robot, settings)
     if joints is not None and target is None:
         table = read_measured_positions(joints, robot.position_names)
     if joints is None or (table is not None and table.is_estimate):
@@ -424,39 +405,6 @@ def _select_cameras(
         elif name not in unplaced and settings.on is None:
             held.append(camera)
     return tuple(searched), tuple(held)
-
-
-def make_registration_tree(
-    model: ArticulatedModel, settings: RegistrationSettings, target: CalibrationTarget | None = None
-) -> tuple[PoseTree, tuple[str, ...] | None]:
-    """Return the pose tree, and the names of its nodes that masks show; None: all.
-
-    The tree of a camera on a link starts at this link; the masks show the robot's static base, or
-    the target. Without a link, the tree starts in the world.
-
-    target: None: the masks show the robot.
-
-    Raises SettingsError: no part that masks show stands still, or no joint moves the link.
-    """
-    if target is not None:
-        return target.tree(np.eye(4)), (TARGET,)
-    tree = make_tree(model, EstimateSettings(hold=settings.hold))
-    link = settings.on
-    if link is None:
-        return tree, None
-    base = [node.name for node in tree.nodes if node.parent < 0 and not node.value_names]
-    if not base:
-        raise SettingsError(
-            f"{model.path}: no visible link stands still, so the pose of a camera on link '{link}' "
-            "is not observable; the robot's base needs visual geometry"
-        )
-    held = {model.position_names[index]: value for index, value in tree.held.items()}
-    moved = model.pose_tree(
-        link, root_position=np.zeros(3), root_rotation=RootRotation.fixed(), held=held
-    )
-    if not {node.name for node in moved.nodes[1:]} & set(base):
-        raise fixed_link_error(model, link)
-    return moved, tuple(base)
 
 
 def _select_parameters(

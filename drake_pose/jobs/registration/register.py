@@ -31,11 +31,7 @@ from drake_pose.jobs.registration.diagnosis import (
     require_explained,
     target_warnings,
 )
-from drake_pose.jobs.registration.inputs import (
-    RegistrationInputs,
-    make_registration_tree,
-    read_inputs,
-)
+from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs
 from drake_pose.jobs.registration.lerobot_files import lerobot_files, require_data_set
 from drake_pose.jobs.registration.moved_cameras import register_recordings, split_moved_cameras
 from drake_pose.jobs.registration.result import (
@@ -50,6 +46,8 @@ from drake_pose.jobs.registration.result import (
     write_result,
 )
 from drake_pose.jobs.registration.settings import RegistrationSettings
+from drake_pose.jobs.registration.tracks import describe_tracks, draw_tracks, track_warnings
+from drake_pose.jobs.registration.trees import make_registration_tree
 from drake_pose.person.shape import shape_parts, shape_values
 from drake_pose.registration.bundle import adjust_bundle
 from drake_pose.registration.joint_offsets import KinematicParameter, calibrate_joints
@@ -71,6 +69,10 @@ from drake_pose.registration.standing_object import (
     TargetSearch,
     find_target_frames,
     require_detections,
+)
+from drake_pose.registration.standing_scene.track_registration import (
+    TrackRegistration,
+    register_tracks,
 )
 from drake_pose.workers import use_workers
 
@@ -131,7 +133,9 @@ def register_scene(
     settings = settings or RegistrationSettings()
     table, own, folder = (None if one is None else Path(one) for one in (joints, cameras, out))
     with use_workers(settings.workers):
-        inputs = split_moved_cameras(read_inputs(Path(scene), Path(model), table, own, settings))
+        inputs = read_inputs(Path(scene), Path(model), table, own, settings)
+        if settings.on is None:
+            inputs = split_moved_cameras(inputs)
         work = _Registration(inputs, settings, on_camera)
         check_exports(settings.exports, [*inputs.known_cameras, *inputs.searched_cameras])
         if "lerobot" in settings.exports:
@@ -165,6 +169,9 @@ def register_scene(
     if folder is not None:
         for name, content in files.items():
             write_file(folder, name, content)
+        for one in work.tracks.values() if overlay else ():
+            draw_tracks(folder, one)
+        overlay = overlay and not work.tracks
         write_result(
             folder, work.inputs, placed, work.registered, summary, overlay, urdf, work.shown
         )
@@ -182,6 +189,7 @@ class _Registration:
         parameters: the summary's part on joint offsets and link scales.
         pictures: registrations from pictures, by camera; empty for masks, and for a target.
         target_pictures: by camera and frame, pictures in which the target was found.
+        tracks: registrations of cameras on a link from a standing scene, by camera.
     """
 
     def __init__(
@@ -201,6 +209,7 @@ class _Registration:
         self.parameters: dict[str, Any] = {"zeros": {}, "lengths": {}}
         self.pictures = dict[str, PictureRegistration]()
         self.target_pictures = dict[str, dict[str, Picture]]()
+        self.tracks = dict[str, TrackRegistration]()
         self._joint_offsets = np.zeros(len(self.body.kinematics.names))
 
     @property
@@ -215,7 +224,7 @@ class _Registration:
         # Cameras that see one target are first registered separately; it has one pose.
         several = self.inputs.target is not None and len(self.registered) > 1
         focal = settings.focal and not self.pictures
-        return bool(settings.zeros or settings.lengths or focal or several)
+        return not self.tracks and bool(settings.zeros or settings.lengths or focal or several)
 
     def find(self) -> None:
         """Register each camera by itself, from masks or from pictures.
@@ -231,6 +240,8 @@ class _Registration:
             self._find_each()
         elif inputs.target is not None:
             self._find_target(inputs.target)
+        elif self._settings.on is not None:
+            self._find_in_scene(self._settings.on)
         else:
             frames, start = list[MultiViewFrame](), time.perf_counter()
             focal = [*inputs.recordings] if self._settings.focal else []
@@ -258,6 +269,24 @@ class _Registration:
             self.inputs = replace(
                 inputs, frames=tuple(frames), left_out=(*inputs.left_out, *unexplained)
             )
+
+    def _find_in_scene(self, link: str) -> None:
+        """Register each camera on a link from whatever stands still in its pictures.
+
+        Raises RegistrationError: the pictures do not determine the camera's pose on the link.
+        """
+        inputs = self.inputs
+        base = inputs.tree.node_index((inputs.visible_nodes or ())[0])
+        for camera in inputs.searched_cameras:
+            name, start = camera.name, time.perf_counter()
+            assumed = name in inputs.assumed_focal
+            one = register_tracks(
+                self.body, link, base, camera, inputs.recordings[name],
+                self._settings.focal or assumed, inputs.offset_joints,
+            )  # fmt: skip
+            self.tracks[name] = one
+            self.warnings += track_warnings(one, assumed)
+            self._note(one.found, start)
 
     def _find_each(self) -> None:
         """Register each camera from its masks.
@@ -347,7 +376,7 @@ class _Registration:
         A camera whose focal length is clearly wrong gets the estimated one, and its pose.
         """
         inputs, body = self.inputs, self.body.with_tree(self.inputs.tree)
-        if inputs.positions.is_estimate:
+        if inputs.positions.is_estimate or self.tracks:
             return
         for name, found in self.registered.items():
             picture, own = self.pictures.get(name), inputs.of(name)
@@ -401,9 +430,8 @@ class _Registration:
             if inputs.target is not None:
                 require_determined(found)
             picture = self.pictures.get(name)
-            self.warnings += outlier_warnings(
-                found, picture is not None or name in self.target_pictures
-            )
+            from_pictures = picture is not None or name in {**self.target_pictures, **self.tracks}
+            self.warnings += outlier_warnings(found, from_pictures)
         self.warnings += common_outlier_warnings(
             self.registered.values(), from_pictures=bool(self.pictures)
         )
@@ -414,7 +442,11 @@ class _Registration:
         return {
             name: self.parameters
             | describe_camera(one, self.seconds[name] + more, suggestions[name], on)
-            | describe_pictures(self.pictures.get(name), name in self.target_pictures)
+            | (
+                describe_tracks(self.tracks[name], self.body.kinematics)
+                if name in self.tracks
+                else describe_pictures(self.pictures.get(name), name in self.target_pictures)
+            )
             | describe_part(self.inputs.parts.get(name))
             for name, one in self.registered.items()
         }
@@ -466,7 +498,9 @@ class _Registration:
             inputs.offset_joints, self._settings.focal, links=inputs.scaled_links,
             start=self._offsets_in_pictures(), still_factor=2.5 if self.pictures else 1.0,
         )  # fmt: skip
-        self.parameters = describe_parameters(found, self.body.kinematics)
+        self.parameters = describe_parameters(
+            found.offsets, found.link_scales, self.body.kinematics
+        )
         self.warnings += parameter_warnings(found)
         offsets = {one.name: one.value for one in found.offsets}
         self._joint_offsets = np.array([offsets.get(name, 0.0) for name in names])

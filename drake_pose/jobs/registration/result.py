@@ -29,7 +29,7 @@ from drake_pose.jobs.registration.inputs import RegistrationInputs
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.jobs.registration.words import describe_drift, describe_reading
 from drake_pose.registration.camera_motion import CameraPart
-from drake_pose.registration.joint_offsets import JointCalibration, KinematicParameter
+from drake_pose.registration.joint_offsets import KinematicParameter
 from drake_pose.registration.picture_acceptance import PictureRegistration
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import RegisteredCamera, TargetPose
@@ -77,8 +77,8 @@ def describe_camera(
         "frames": {
             frame.frame: {
                 "agrees": frame.is_inlier,
-                "E_total": frame.E_total,
-                "iou": frame.iou,
+                "E_total": None if math.isnan(frame.E_total) else frame.E_total,
+                "iou": None if math.isnan(frame.iou) else frame.iou,
                 "inlier_ratio": frame.inlier_ratio,
             }
             for frame in found.frames
@@ -162,7 +162,9 @@ def picture_warnings(one: PictureRegistration, assumed: bool) -> list[str]:
 
 
 def describe_parameters(
-    found: JointCalibration, kinematics: TreeKinematics
+    offsets: Sequence[KinematicParameter],
+    link_scales: Sequence[KinematicParameter],
+    kinematics: TreeKinematics,
 ) -> dict[str, dict[str, Any]]:
     """Return the summary's parts "zeros" on joint offsets and "lengths" on link scales.
 
@@ -185,8 +187,8 @@ def describe_parameters(
     turns = dict(zip(kinematics.names, kinematics.is_angle, strict=True))
     units = {True: ("deg", math.degrees(1.0)), False: ("mm", 1e3)}
     return {
-        "zeros": {one.name: describe(one, *units[bool(turns[one.name])]) for one in found.offsets},
-        "lengths": {one.name: describe(one, "percent", 1e2) for one in found.link_scales},
+        "zeros": {one.name: describe(one, *units[bool(turns[one.name])]) for one in offsets},
+        "lengths": {one.name: describe(one, "percent", 1e2) for one in link_scales},
     }
 
 
@@ -412,7 +414,11 @@ def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
     pictures, pairs = [], []
     for camera, one in summary["cameras"].items():
         # Written overlays from the worst to the best.
-        errors = {frame: float(part["E_total"]) for frame, part in one["frames"].items()}
+        # Frames without a silhouette are ordered by the points that do not fit.
+        errors = {
+            frame: 1.0 - part["inlier_ratio"] if part["E_total"] is None else part["E_total"]
+            for frame, part in one["frames"].items()
+        }
         shown = (
             frame for frame in errors if (folder / OVERLAY / camera / f"{frame}.png").is_file()
         )
@@ -437,6 +443,7 @@ def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
             if first[key]
         ],
         by_pictures=first["masks"] == "found",
+        by_points=first["masks"] == "none",
         # Cameras that see a target have no time offset.
         clocks=first["masks"] == "found" and "time_offset_scores" in first,
         offsets={name: figure and plot_uri(figure) for name, figure in figures},

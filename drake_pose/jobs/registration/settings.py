@@ -45,7 +45,8 @@ class RegistrationSettings(AuditSettings):
     cameras without X_WC."""
     on: Annotated[str | None, Parameter(metavar="LINK")] = None
     """The cameras ride on this link (eye in hand). Their pose X_LC in the link's frame is estimated
-    from masks of the robot's static base, or from masks or pictures of a --target."""
+    from pictures of whatever stands still, from masks of the robot's static base, or from masks or
+    pictures of a --target."""
     target: Path | None = None
     """With --on: model file (URDF, SDFormat, MJCF) of a rigid calibration target anywhere in the
     world, which the masks or pictures show; its pose is estimated, too."""

@@ -1,0 +1,86 @@
+"""Cameras on a link, registered from scenes that stand still: summary, warnings and overlays."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from drake_pose.body.tree_kinematics import TreeKinematics
+from drake_pose.errors import listed
+from drake_pose.files.folder import OVERLAY, write_file
+from drake_pose.files.overlay import EXCESS_RGB, encode_png
+from drake_pose.jobs.registration.result import describe_parameters
+from drake_pose.registration.register import evenly_spaced
+from drake_pose.registration.standing_scene.track_registration import TrackRegistration
+
+SCENE = "scene"
+"""The summary's `evidence` of a camera that was registered from a standing scene."""
+
+
+def describe_tracks(one: TrackRegistration, kinematics: TreeKinematics) -> dict[str, Any]:
+    """Return a camera's part of summary.json on its points, clock, focal length and offsets."""
+    clock, focal = one.time_offset, one.found.camera.focal_x
+    known = clock if clock is not None and clock.determined else None
+    return {
+        "evidence": SCENE,
+        "masks": "none",
+        "mean_iou": None,
+        "points": int(one.seen.points.max()) + 1,
+        "sightings": len(one.seen.uv),
+        "sightings_that_fit": float(one.inliers.mean()),
+        "explained": one.explained,
+        "explained_by_chance": one.chance,
+        "time_offset_s": known and known.value,
+        "time_offset_sd_s": known and known.deviation,
+        "focal_px": focal,
+        "focal_sd_px": one.focal_deviation * focal if one.focal_deviation else None,
+        **describe_parameters(one.offsets, (), kinematics),
+    }
+
+
+def track_warnings(one: TrackRegistration, assumed: bool) -> list[str]:
+    """Return warnings of likely joint offsets, and of what was estimated or is not determined.
+
+    assumed: whether the focal length was not given.
+    """
+    found, texts = one.found, list[str]()
+    name = found.camera.name
+    if assumed:
+        focal, deviation = found.camera.focal_x, one.focal_deviation * found.camera.focal_x
+        texts.append(
+            f"camera '{name}': no focal length is given: it was estimated as {focal:.0f} pixels "
+            f"(standard deviation {deviation:.0f}); give it in the camera file if it is known"
+        )
+    if one.likely:
+        texts.append(
+            f"camera '{name}': offsets of {listed(one.likely)} explain the pictures much better: "
+            "estimate them, too (--zeros all). The standard deviations include what they would "
+            "change"
+        )
+    loose = [offset.name for offset in one.offsets if not offset.determined]
+    if loose:
+        texts.append(
+            f"the offsets of {listed(loose)} are not determined by what camera '{name}' sees, and "
+            "were not changed: they move the whole scene, or the camera, as another pose would"
+        )
+    if one.time_offset is not None and not one.time_offset.determined:
+        texts.append(
+            f"camera '{name}': its pictures do not determine its time offset to the joint log, "
+            "because the robot moves too little or too slowly; add a faster motion"
+        )
+    return texts
+
+
+def draw_tracks(folder: Path, one: TrackRegistration, most: int = 6) -> None:
+    """Draw the points of up to `most` pictures: blue where they fit, orange where they do not."""
+    camera, frames = one.found.camera.name, one.found.frames
+    worst = sorted(range(len(frames)), key=lambda k: frames[k].inlier_ratio)
+    for k in evenly_spaced(worst, most):
+        name = frames[k].frame
+        picture = one.pictures[name].copy()
+        own = one.seen.frames == k
+        for (u, v), fits in zip(one.seen.uv[own], one.inliers[own], strict=True):
+            colour = (0, 114, 178) if fits else EXCESS_RGB
+            place = round(float(u)), round(float(v))
+            cv2.circle(picture, place, 4, colour, 2, cv2.LINE_AA)
+        write_file(folder, f"{OVERLAY}/{camera}/{name}.png", encode_png(picture))

@@ -1,0 +1,65 @@
+"""The pose trees of a registration: from the world, or from the link that carries the cameras."""
+
+import numpy as np
+
+from drake_pose.body import TARGET, ArticulatedModel, PoseTree, RootRotation, load_model
+from drake_pose.errors import SettingsError
+from drake_pose.files.settings import EstimateSettings
+from drake_pose.jobs.estimate.inputs import make_tree
+from drake_pose.jobs.registration.settings import RegistrationSettings
+from drake_pose.registration.standing_object import CalibrationTarget, fixed_link_error
+
+
+def read_target(
+    model: ArticulatedModel, settings: RegistrationSettings
+) -> CalibrationTarget | None:
+    """Return the calibration target that a camera on the robot's link sees.
+
+    None: no target is set, so the cameras see the robot `model`.
+
+    Raises SettingsError: the target is unusable, or no link carries the cameras.
+    """
+    if settings.target is None:
+        return None
+    if settings.on is None:
+        raise SettingsError(
+            f"{settings.target} and a camera that rides on no link both stand still, so masks of "
+            "the target do not relate the camera to the robot: name the camera's link (--on LINK)"
+        )
+    other = load_model(settings.target, package_paths=settings.packages)
+    held = make_tree(model, EstimateSettings(hold=settings.hold)).held
+    named = {model.position_names[index]: value for index, value in held.items()}
+    return CalibrationTarget(model, settings.on, named, make_tree(other, EstimateSettings()))
+
+
+def make_registration_tree(
+    model: ArticulatedModel, settings: RegistrationSettings, target: CalibrationTarget | None = None
+) -> tuple[PoseTree, tuple[str, ...] | None]:
+    """Return the pose tree, and the names of its nodes that masks show; None: all.
+
+    The tree of a camera on a link starts at this link; the masks show the robot's static base, or
+    the target. Without a link, the tree starts in the world.
+
+    target: None: the masks show the robot.
+
+    Raises SettingsError: no part that masks show stands still, or no joint moves the link.
+    """
+    if target is not None:
+        return target.tree(np.eye(4)), (TARGET,)
+    tree = make_tree(model, EstimateSettings(hold=settings.hold))
+    link = settings.on
+    if link is None:
+        return tree, None
+    base = [node.name for node in tree.nodes if node.parent < 0 and not node.value_names]
+    if not base:
+        raise SettingsError(
+            f"{model.path}: no visible link stands still, so the pose of a camera on link '{link}' "
+            "is not observable; the robot's base needs visual geometry"
+        )
+    held = {model.position_names[index]: value for index, value in tree.held.items()}
+    moved = model.pose_tree(
+        link, root_position=np.zeros(3), root_rotation=RootRotation.fixed(), held=held
+    )
+    if not {node.name for node in moved.nodes[1:]} & set(base):
+        raise fixed_link_error(model, link)
+    return moved, tuple(base)

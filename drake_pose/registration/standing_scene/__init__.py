@@ -1,0 +1,1 @@
+"""Cameras on a link, registered from whatever stands still in their pictures."""

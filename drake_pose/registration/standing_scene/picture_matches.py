@@ -1,0 +1,138 @@
+"""Points of a scene matched between pictures that one camera took from several places."""
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from drake_pose.arrays import Array, Indices, Picture
+from drake_pose.camera.models import PinholeCamera
+
+
+class MatchSettings(NamedTuple):
+    """Settings of the matching; chosen on pictures of 320 to 1280 pixels' width.
+
+    Args:
+        features: maximum number of features of a picture.
+        contrast: minimum contrast of a feature, as of OpenCV's SIFT.
+        ratio: a match counts if its descriptor is nearer than the second one by this factor.
+        still: matches that move less ride along with the camera, or tell nothing [pixel].
+        epipolar: tolerance of the epipolar geometry of a pair of pictures [pixel].
+        least: minimum number of matches of a pair of pictures.
+    """
+
+    features: int = 1200
+    contrast: float = 0.02
+    ratio: float = 0.8
+    still: float = 3.0
+    epipolar: float = 2.0
+    least: int = 12
+
+
+MATCHING = MatchSettings()
+
+
+class Matches(NamedTuple):
+    """Points matched between two pictures.
+
+    frames: (n, 2) indices of the pictures. uv: (n, 2, 2) where the point is in each [pixel].
+    """
+
+    frames: Indices
+    uv: Array
+
+
+class Sightings(NamedTuple):
+    """Points of the scene seen in several pictures.
+
+    frames, points: (n,) index of the picture and of the point. uv: (n, 2) [pixel].
+    """
+
+    frames: Indices
+    points: Indices
+    uv: Array
+
+
+def match_pictures(pictures: Sequence[Picture]) -> tuple[Matches, Sightings]:
+    """Match points between all pairs of pictures (H, W, 3), and join them into tracks."""
+    sift = cv2.SIFT.create(MATCHING.features, contrastThreshold=MATCHING.contrast)
+    found = [sift.detectAndCompute(cv2.cvtColor(p, cv2.COLOR_RGB2GRAY), None) for p in pictures]
+    uv = [np.array([k.pt for k in keys], np.float64).reshape(-1, 2) for keys, _ in found]
+    # RootSIFT: Hellinger's distance of the histograms.
+    descriptors = [
+        None if d is None else np.sqrt(d / np.maximum(d.sum(axis=1, keepdims=True), 1e-9))
+        for _, d in found
+    ]
+    first = np.cumsum([0, *map(len, uv)])
+    pairs, kept = [], []
+    for i, j in combinations(range(len(pictures)), 2):
+        rows = _mutual(descriptors[i], descriptors[j])
+        both = np.stack([uv[i][rows[:, 0]], uv[j][rows[:, 1]]], axis=1)
+        moves = np.linalg.norm(both[:, 1] - both[:, 0], axis=1) > MATCHING.still
+        rows, both = rows[moves], both[moves]
+        rows = rows[_on_epipolar_lines(both)]
+        pairs.append(rows + first[[i, j]])
+        kept.append(np.tile([i, j], (len(rows), 1)))
+    edges, frames = np.concatenate(pairs), np.concatenate(kept)
+    everything, picture = np.concatenate(uv), np.repeat(np.arange(len(uv)), np.diff(first))
+    return Matches(frames, everything[edges]), _tracks(edges, picture, everything)
+
+
+def _mutual(a: Array | None, b: Array | None) -> Indices:
+    """Return (n, 2) rows of unit descriptors a and b that are each other's clearly nearest."""
+    if a is None or b is None or min(len(a), len(b)) < 2:
+        return np.zeros((0, 2), np.intp)
+    alike = a @ b.T
+    best = alike.argmax(axis=1)
+    rows = np.arange(len(a))
+    first = alike[rows, best]
+    mutual = alike.argmax(axis=0)[best] == rows
+    alike[rows, best] = -1.0
+    # Distances of unit vectors.
+    near, second = (np.sqrt(np.maximum(2.0 - 2.0 * one, 0.0)) for one in (first, alike.max(axis=1)))
+    rows = rows[mutual & (near < MATCHING.ratio * second)]
+    return np.stack([rows, best[rows]], axis=1)
+
+
+def _on_epipolar_lines(uv: Array) -> NDArray[np.bool_]:
+    """Return which of a pair's matches (n, 2, 2) agree with one epipolar geometry."""
+    none = np.zeros(len(uv), np.bool_)
+    if len(uv) < MATCHING.least:
+        return none
+    cv2.setRNGSeed(0)
+    F, mask = cv2.findFundamentalMat(
+        np.ascontiguousarray(uv[:, 0]), np.ascontiguousarray(uv[:, 1]),
+        cv2.FM_RANSAC, MATCHING.epipolar, 0.99, 1000,
+    )  # fmt: skip
+    if F is None or mask is None:
+        return none
+    inside = mask.ravel() > 0
+    return inside if np.count_nonzero(inside) >= MATCHING.least else none
+
+
+def _tracks(edges: Indices, picture: Indices, uv: Array) -> Sightings:
+    """Return the tracks of features, joined by edges (n, 2); at most one feature of a picture."""
+    count = len(picture)
+    graph = coo_array((np.ones(len(edges)), edges.T), shape=(count, count))
+    _, label = connected_components(graph, directed=False)
+    size = np.bincount(label)
+    used = np.flatnonzero(size[label] > 1)
+    key = label[used] * (picture.max() + 1) + picture[used]
+    _, inverse, times = np.unique(key, return_inverse=True, return_counts=True)
+    # Two features of one picture on a track: which is right is not known.
+    bad = np.unique(label[used][times[inverse] > 1])
+    used = used[~np.isin(label[used], bad)]
+    _, points = np.unique(label[used], return_inverse=True)
+    return Sightings(picture[used], points, uv[used])
+
+
+def rays(camera: PinholeCamera, uv: Array) -> Array:
+    """Return rays (..., 3) with z = 1 in the camera through points uv (..., 2) [pixel]."""
+    f, c = (camera.focal_x, camera.focal_y), (camera.center_x, camera.center_y)
+    xy = (uv - c) / f
+    return np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)

@@ -1,0 +1,221 @@
+"""Laws of the registration of a camera on a link from points of a standing scene."""
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drake_pose.arrays import Array
+from drake_pose.camera.models import PinholeCamera
+from drake_pose.registration.standing_scene.hand_eye_tracks import (
+    EpipolarSearch,
+    TrackProblem,
+    fit_tracks,
+    gauge_constants,
+    jackknife,
+)
+from drake_pose.registration.standing_scene.picture_matches import (
+    Matches,
+    Sightings,
+    match_pictures,
+)
+
+CAMERA = PinholeCamera("wrist", 640, 480, 500.0, 510.0, 310.0, 250.0, np.eye(4))
+X_LC = np.eye(4)
+X_LC[:3, :3] = Rotation.from_euler("zyx", [2.1, 0.3, -0.4]).as_matrix()
+X_LC[:3, 3] = 0.05, -0.03, 0.06
+TIMES = np.linspace(0.0, 4.0, 14)
+
+
+def hand(times: Array, turn: tuple[float, float, float] = (0.35, 0.3, 0.5)) -> Array:
+    """Return the poses X_WL (n, 4, 4) of a hand that looks down and swings about three axes."""
+    X = np.tile(np.eye(4), (len(times), 1, 1))
+    phases = times[:, None] * (1.3, 1.7, 0.9) + (0.0, 1.0, 2.0)
+    down = Rotation.from_euler("x", 180.0, degrees=True)
+    X[:, :3, :3] = (down * Rotation.from_rotvec(turn * np.sin(phases))).as_matrix()
+    X[:, :3, 3] = 0.1 * np.sin(phases[:, ::-1] + 0.5) + (0.4, 0.0, 0.5)
+    return X
+
+
+def see(X_WL: Array, points: Array, noise: float, rng: np.random.Generator) -> Sightings:
+    """Return sightings in the pictures by OpenCV's projection, with normal errors [pixel]."""
+    K = np.array([[500.0, 0.0, 310.0], [0.0, 510.0, 250.0], [0.0, 0.0, 1.0]])
+    rows = []
+    for k, X in enumerate(X_WL):
+        X_CW = np.linalg.inv(X @ X_LC)
+        turn, _ = cv2.Rodrigues(X_CW[:3, :3])
+        uv = cv2.projectPoints(points, turn, X_CW[:3, 3], K, None)[0].reshape(-1, 2)
+        ahead = (points @ X_CW[2, :3] + X_CW[2, 3]) > 0.05
+        inside = ahead & np.all((uv > 0) & (uv < (640, 480)), axis=1)
+        shown = np.flatnonzero(inside & (rng.uniform(size=len(uv)) < 0.7))
+        rows.append(np.column_stack([np.full(len(shown), k), shown, uv[shown]]))
+    table = np.concatenate(rows)
+    often = np.bincount(table[:, 1].astype(int), minlength=len(points)) > 1
+    table = table[often[table[:, 1].astype(int)]]
+    _, point = np.unique(table[:, 1], return_inverse=True)
+    uv = table[:, 2:] + rng.normal(0.0, noise, (len(table), 2))
+    return Sightings(table[:, 0].astype(int), point, uv)
+
+
+def table_points(rng: np.random.Generator, count: int = 120) -> Array:
+    """Return points (count, 3) on a table, and on things up to 5 cm high."""
+    xy = rng.uniform((0.05, -0.35), (0.75, 0.35), (count, 2))
+    return np.column_stack([xy, rng.uniform(0.0, 0.05, count) * (rng.uniform(size=count) < 0.3)])
+
+
+def all_matches(seen: Sightings) -> Matches:
+    """Return the matches of all pairs of sightings of a point."""
+    pairs = [
+        (i, j)
+        for point in range(seen.points.max() + 1)
+        for own in [np.flatnonzero(seen.points == point)]
+        for i, j in pairwise(own)
+    ]
+    rows = np.array(pairs)
+    rows = rows[seen.frames[rows[:, 0]] < seen.frames[rows[:, 1]]]
+    return Matches(seen.frames[rows], seen.uv[rows])
+
+
+def error(found: Array) -> Array:
+    """Return rotation vector [rad] and translation [m] (6,) of the error, in the camera's axes."""
+    by = np.linalg.inv(found) @ X_LC
+    return np.concatenate([Rotation.from_matrix(by[:3, :3]).as_rotvec(), by[:3, 3]])
+
+
+def problem_of(
+    seen: Sightings, poses: Callable[[Array], Array], *constant_sds: float, focal_sd: float = 0.0
+) -> TrackProblem:
+    return TrackProblem(CAMERA, poses, seen, np.array([focal_sd, *constant_sds]))
+
+
+def test_all_rotations_are_searched_amid_wrong_matches() -> None:
+    rng, X_WL = np.random.default_rng(3), hand(TIMES)
+    matches = all_matches(see(X_WL, table_points(rng), 1.0, rng))
+    wrong = rng.uniform(size=len(matches.uv)) < 0.3
+    matches.uv[wrong, 1] = rng.uniform((0, 0), (640, 480), (np.count_nonzero(wrong), 2))
+    search = EpipolarSearch(CAMERA, matches)
+    (explained, found), *_ = search.search(X_WL)
+    chance = search.search(np.roll(X_WL, 5, axis=0), 1000)[0][0]
+    assert np.linalg.norm(error(found)[:3]) < 0.02
+    assert np.linalg.norm(error(found)[3:]) < 0.02
+    assert explained > 0.5 > 2.0 * chance
+
+
+def test_a_scene_gives_the_pose_the_clock_and_the_focal_length() -> None:
+    rng = np.random.default_rng(5)
+    seen = see(hand(TIMES + 0.06), table_points(rng), 0.3, rng)
+    camera = PinholeCamera("wrist", 640, 480, 450.0, 459.0, 310.0, 250.0, np.eye(4))
+
+    def poses(constants: Array) -> Array:
+        return hand(TIMES + constants[0])
+
+    problem = problem_of(seen, poses, 0.2, focal_sd=0.2)._replace(camera=camera)
+    start = X_LC.copy()
+    start[:3, 3] += 0.02
+    fit = fit_tracks(problem, start)
+    deviations = np.sqrt(np.diag(fit.covariance))
+    assert np.all(np.abs(error(fit.X_LC)) < 4.0 * deviations[:6])
+    assert fit.constants[1] == pytest.approx(0.06, abs=4.0 * deviations[7])
+    assert np.exp(fit.constants[0]) == pytest.approx(500.0 / 450.0, abs=4.0 * deviations[6])
+    assert deviations[6] < 0.01
+    assert deviations[7] < 0.005
+
+
+def test_points_that_ride_along_do_not_count() -> None:
+    rng, X_WL = np.random.default_rng(6), hand(TIMES)
+    seen = see(X_WL, table_points(rng), 0.3, rng)
+    fixed = rng.uniform((200, 350), (450, 470), (30, 2))
+    frames = np.repeat(np.arange(len(X_WL)), len(fixed))
+    points = np.tile(np.arange(len(fixed)), len(X_WL)) + seen.points.max() + 1
+    both = Sightings(
+        np.concatenate([seen.frames, frames]),
+        np.concatenate([seen.points, points]),
+        np.concatenate([seen.uv, np.tile(fixed, (len(X_WL), 1))]),
+    )
+    fit = fit_tracks(problem_of(both, lambda _: X_WL), X_LC)
+    assert np.linalg.norm(error(fit.X_LC)[3:]) < 0.001
+    assert fit.inliers[: len(seen.uv)].mean() > 0.98
+    assert fit.inliers[len(seen.uv) :].mean() < 0.2
+
+
+def test_covariances_are_those_of_many_noisy_scenes() -> None:
+    X_WL, rows = hand(TIMES), []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        seen = see(X_WL, table_points(rng, 60), 0.5, rng)
+        problem = problem_of(seen, lambda _: X_WL)
+        fit = fit_tracks(problem, X_LC)
+        sigmas = [np.sqrt(np.diag(C))[:6] for C in (fit.covariance, jackknife(problem, fit))]
+        rows.append([error(fit.X_LC) / one for one in sigmas])
+    spread = np.sqrt(np.mean(np.square(rows), axis=(0, 2)))
+    # The robust loss costs some information; the jackknife has eleven degrees of freedom.
+    assert 0.8 < spread[0] < 1.3
+    assert 0.7 < spread[1] < 1.3
+
+
+def test_noise_of_the_joints_widens_the_jackknife() -> None:
+    X_WL, rows = hand(TIMES), []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        off = np.tile(np.eye(4), (len(X_WL), 1, 1))
+        off[:, :3, :3] = Rotation.from_rotvec(rng.normal(0, 0.004, (len(X_WL), 3))).as_matrix()
+        seen = see(X_WL @ off, table_points(rng, 60), 0.3, rng)
+        problem = problem_of(seen, lambda _: X_WL)
+        fit = fit_tracks(problem, X_LC)
+        rows.append(error(fit.X_LC) / np.sqrt(np.diag(jackknife(problem, fit)))[:6])
+    assert 0.6 < np.sqrt(np.mean(np.square(rows))) < 1.5
+
+
+def test_one_axis_leaves_the_position_along_it_open() -> None:
+    rng, X_WL = np.random.default_rng(8), hand(TIMES, (0.0, 0.0, 0.6))
+    seen = see(X_WL, table_points(rng), 0.3, rng)
+    fit = fit_tracks(problem_of(seen, lambda _: X_WL), X_LC)
+    variances, axes = np.linalg.eigh(fit.covariance[3:6, 3:6])
+    along = X_LC[:3, :3] @ axes[:, 2]
+    assert np.sqrt(variances[2]) > 1.0
+    assert np.sqrt(variances[1]) < 0.005
+    assert np.abs(along[2]) > 0.999
+
+
+def test_first_and_last_joints_are_told_from_others() -> None:
+    rng, X_WL = np.random.default_rng(9), hand(TIMES)
+    seen = see(X_WL, table_points(rng), 0.3, rng)
+
+    def poses(constants: Array) -> Array:
+        first, last, between = np.eye(4), np.eye(4), np.tile(np.eye(4), (len(TIMES), 1, 1))
+        first[:3, :3] = Rotation.from_rotvec([0.0, 0.0, constants[0]]).as_matrix()
+        last[:3, :3] = Rotation.from_rotvec([0.0, 0.0, constants[1]]).as_matrix()
+        between[:, :3, :3] = Rotation.from_rotvec(
+            constants[2] * np.column_stack([np.cos(TIMES), np.sin(TIMES), 0.0 * TIMES])
+        ).as_matrix()
+        return np.asarray(first @ hand(TIMES) @ between @ last)
+
+    problem = problem_of(seen, poses, 0.1, 0.1, 0.1)
+    assert gauge_constants(problem, X_LC, np.zeros(4)).tolist() == [False, True, True, False]
+
+
+def test_pictures_of_a_textured_table_are_matched() -> None:
+    rng = np.random.default_rng(10)
+    texture = cv2.resize(rng.integers(0, 255, (60, 60, 3)).astype(np.uint8), (600, 600))
+    for _ in range(60):
+        at = rng.integers(0, 560, 2)
+        colour = rng.integers(0, 255, 3).tolist()
+        cv2.rectangle(texture, at.tolist(), (at + rng.integers(8, 40, 2)).tolist(), colour, -1)
+    H = np.array([[0.9, -0.2, 80.0], [0.15, 1.0, -20.0], [1e-4, 2e-4, 1.0]])
+    first = texture[60:540, 20:580].copy()
+    second = cv2.warpPerspective(texture, H, (560, 480))
+    # A gripper stands still in both.
+    for one in (first, second):
+        one[400:, 200:360] = cv2.resize(texture[:80, :160], (160, 80))
+    pictures = [np.ascontiguousarray(one) for one in (first, second)]
+    matches, seen = match_pictures(pictures)
+    from_texture = np.column_stack([matches.uv[:, 0] + (20.0, 60.0), np.ones(len(matches.uv))])
+    mapped = from_texture @ H.T
+    off = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - matches.uv[:, 1], axis=1)
+    assert len(off) > 50
+    assert np.mean(off < 2.0) > 0.9
+    assert np.all(np.linalg.norm(matches.uv[:, 1] - matches.uv[:, 0], axis=1) > 3.0)
+    assert np.all(np.bincount(seen.points) == 2)

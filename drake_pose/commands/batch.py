@@ -57,7 +57,9 @@ def batch(
           walker: {scene: recordings/walker}
           robot: {scene: recordings/robot, model: arm.urdf, audit: recordings/robot/joints.csv}
 
-    A scene with the key audit is audited; all errors are listed in findings.csv.
+    A scene with the key audit is audited; all errors are listed in findings.csv. Of episodes in one
+    data set or folder the first is searched, and the others start at its cameras; episodes.csv and
+    episodes.png tell which episodes share a camera's pose, and when a camera moved.
 
         drake-pose batch jobs.yaml --out results/all --workers 2
 
@@ -124,6 +126,8 @@ def _print_batch(result: Batch, most: int = 4) -> None:
     for table in (estimates, audits):
         if table.row_count:
             console.print(table)
+    for text in result.moves:
+        console.print(escape(text), soft_wrap=True)
     frames = sum(state.frames_done for state in result.scenes.values())
     console.print(f"frames         {frames} in {result.seconds:.1f} s")
     print_files(("results", result.out))

@@ -167,6 +167,7 @@ class Batch:
         seconds: wall time of this run until the last `write` [s].
         out: folder of the batch.
         waiting: tasks still to be run, first ones first.
+        moves: which episodes share a camera's pose, and since when it has moved, in words.
 
     Args:
         jobs, out, on_progress: as in `run_batch`.
@@ -178,6 +179,7 @@ class Batch:
         self.seconds, self._begin = 0.0, time.monotonic()
         self._next_summary = next_summary(self._begin)
         self.waiting: deque[Task] = deque()
+        self.moves: tuple[str, ...] = ()
         self._followers = dict[str, list[Task]]()
 
     @property
@@ -191,6 +193,7 @@ class Batch:
             "complete": all(one.state == "finished" for one in self.scenes.values()),
             "seconds": self.seconds,
             "version": VERSION,
+            "moves": list(self.moves),
             "scenes": {name: one.as_json() for name, one in self.scenes.items()},
         }
 
@@ -209,16 +212,21 @@ class Batch:
                 for name, state in self.scenes.items()
                 for one in state.totals.get("findings", ())
             ]
-            table = csv_text([("scene", "what", "name", "text"), *rows])
-            write_file(self.out, "findings.csv", table)
-        table, files = episodes_table({name: one.totals for name, one in self.scenes.items()})
-        if files:
-            write_file(self.out, "episodes.csv", table)
-            for name, text in files.items():
+            write_file(
+                self.out, "findings.csv", csv_text([("scene", "what", "name", "text"), *rows])
+            )
+        found = {name: one.totals for name, one in self.scenes.items()}
+        table = episodes_table(found, is_drawn=not self.waiting)
+        self.moves = table.moves
+        if table.files:
+            write_file(self.out, "episodes.csv", table.text)
+            for name, text in table.files.items():
                 write_file(self.out, name, text)
             for path in self.out.glob("cameras_*.yaml"):
-                if path.name not in files:
+                if path.name not in table.files:
                     path.unlink()
+        if table.picture:
+            write_file(self.out, "episodes.png", table.picture)
 
     def plan(self) -> None:
         """Queue all scenes' tasks that have no result yet; scenes that cannot be read fail.

@@ -254,7 +254,8 @@ def _totals(task: Task) -> Mapping[str, Any] | None:
 
     Estimate: ``frame_count``, ``found_count``, ``mean_E_total``. Audit: ``frame_count``,
     ``agreeing_count``, ``findings``, and ``cameras``: entries of the cameras found, by name, with
-    ``off_mm`` and ``off_deg``, the distance from the given pose (None if that is no error).
+    ``off_mm`` and ``off_deg``, the distance from the given pose (None if that is no error); and
+    ``joint_offsets``, unit, value and standard deviation of the joints with errors, by name.
     """
     if task.index is not None:
         return None
@@ -269,7 +270,14 @@ def _totals(task: Task) -> Mapping[str, Any] | None:
         | {"off_deg": off.get(name, {}).get("angle_deg")}
         for name, one in summary["found_cameras"].items()
     }
+    units = (("deg", "angle_deg", "angle_sd_deg"), ("mm", "shift_mm", "shift_sd_mm"))
+    offsets = {
+        one["name"]: next((unit, one[key], one[sd]) for unit, key, sd in units if one[sd])
+        for one in found
+        if one["what"] == "joint" and (one["angle_sd_deg"] or one["shift_sd_mm"])
+    }
     return {
+        "joint_offsets": offsets,
         "cameras": cameras,
         "frame_count": summary["frame_count"] + len(summary["unseen"]),
         "agreeing_count": summary["agreeing_count"],

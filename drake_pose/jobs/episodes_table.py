@@ -1,15 +1,19 @@
-"""Table of the cameras of all audited episodes, and camera files of cameras that did not move."""
+"""Table of the cameras of all audited episodes, the poses that they share, and their files."""
 
-from collections.abc import Mapping
+import io
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import yaml
+from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from drake_pose.arrays import Array
 from drake_pose.csv_files import csv_text
+from drake_pose.errors import listed
 from drake_pose.registration.diagnosis import DIAGNOSIS
 from drake_pose.registration.online_registration import pose_difference, squared_distance
 
@@ -20,41 +24,70 @@ estimated) and camera (its entry of a camera file)."""
 
 COLUMNS = (
     "scene", "camera", "frames", "agreeing", "x", "y", "z", "sd_mm", "sd_deg", "off_mm", "off_deg",
-    "time_offset_s", "time_offset_sd_s", "joints", "moved_mm", "moved_deg", "moved", "camera_file",
+    "time_offset_s", "time_offset_sd_s", "joints", "moved_mm", "moved_deg", "moved", "pose",
+    "p_value", "camera_file",
 )  # fmt: skip
 """Columns of episodes.csv. x, y, z: position of the camera in the world [m]; off: distance from its
-given pose, if that is an error; joints: joints with errors; moved: distance from the pose in
-earlier episodes, and whether that is significant; camera_file: file with the cameras' poses,
-combined from all episodes in which they did not move."""
+given pose, if that is an error; joints: joints with errors; moved: distance from the pose in the
+episode before, and whether that is significant; pose: number of the camera's pose, equal in all
+episodes that share it; p_value: probability of a distance as large from this pose by chance;
+camera_file: file with the cameras' poses, combined from all episodes that share them."""
 
 
-def episodes_table(episodes: Mapping[str, Mapping[str, Any]]) -> tuple[str, dict[str, str]]:
-    """Return the text of episodes.csv, and the texts of camera files (YAML) by name.
+@dataclass(frozen=True, eq=False)
+class EpisodesTable:
+    """The cameras of all audited episodes.
 
-    A camera has moved if its pose differs significantly from the combined pose of the episodes
-    since its last move. A new camera file begins at each episode in which a camera has moved. There
-    are no camera files ({}) without audited episodes.
+    Args:
+        text: of episodes.csv.
+        files: texts of camera files (YAML) by name; {} without audited episodes.
+        moves: sentences, for each camera which episodes share a pose and since when it has moved.
+        picture: of episodes.png, displacement and joint offsets over the episodes (PNG); b"": there
+            are fewer than two episodes.
+    """
+
+    text: str
+    files: Mapping[str, str]
+    moves: tuple[str, ...]
+    picture: bytes
+
+
+def episodes_table(
+    episodes: Mapping[str, Mapping[str, Any]], is_drawn: bool = False
+) -> EpisodesTable:
+    """Return the table of audited episodes, with the poses that they share.
+
+    An episode shares the pose of the episode before unless it differs significantly from all
+    episodes with that pose combined; else the most likely of the poses before; else it has a new
+    one. A new camera file begins at each episode in which a camera has moved.
 
     Args:
         episodes: totals of audits (`batch.Outcome`) by scene, in the order of the job; scenes
             without ``cameras`` are skipped.
+        is_drawn: whether the picture is drawn.
     """
     rows = list[list[Any]]()
-    files: list[dict[str, _CombinedPose]] = [{}]
+    poses, files = dict[str, list[_CombinedPose]](), list[dict[str, _CombinedPose]]([{}])
     for scene, totals in episodes.items():
         named = totals.get("findings", ())
         joints = " ".join(one["name"] for one in named if one["what"] == "joint")
-        stand, moves = files[-1], dict[str, tuple[Any, ...]]()
-        for name, one in totals.get("cameras", {}).items():
-            moves[name] = stand[name].moved(one) if name in stand else (None,) * 3
-        if any(moved == "yes" for *_, moved in moves.values()):
-            # Cameras that have not moved keep their combined pose.
-            files.append({k: v for k, v in stand.items() if moves.get(k, "-")[-1] != "yes"})
+        before, now, found = files[-1], dict(files[-1]), totals.get("cameras", {})
+        moves = dict[str, tuple[Any, ...]]()
+        for name, one in found.items():
+            own, last = poses.setdefault(name, []), before.get(name)
+            shared, p_value = _shared_pose(one, own, last)
+            if shared is None:
+                own.append(shared := _CombinedPose(one))
+            shift, turn = (None, None) if last is None else last.compare(one)[:2]
+            is_moved = "" if last is None else "no" if shared is last else "yes"
+            moves[name] = (shift, turn, is_moved, own.index(shared) + 1, p_value)
+            now[name] = shared
+        if any(move[2] == "yes" for move in moves.values()):
+            files.append(now)
+        files[-1] = now
         for name, move in moves.items():
-            one = totals["cameras"][name]
-            if name not in files[-1]:
-                files[-1][name] = _CombinedPose(one)
-            files[-1][name].add(one)
+            one = found[name]
+            now[name].add(one)
             place = [row[3] for row in one["X_WC"][:3]]
             rows.append(
                 [scene, name, totals["frame_count"], totals["agreeing_count"], *place,
@@ -67,7 +100,107 @@ def episodes_table(episodes: Mapping[str, Mapping[str, Any]]) -> tuple[str, dict
         for k, file in enumerate(files, 1)
         if rows
     }
-    return csv_text([COLUMNS, *rows]), texts
+    picture = b""
+    if is_drawn and len({row[0] for row in rows}) > 1:
+        moved = {row[0] for row in rows if row[COLUMNS.index("moved")] == "yes"}
+        picture = _draw(episodes, moved)
+    return EpisodesTable(csv_text([COLUMNS, *rows]), texts, _describe_moves(rows), picture)
+
+
+def _shared_pose(
+    one: FoundCamera, poses: Sequence["_CombinedPose"], last: "_CombinedPose | None"
+) -> tuple["_CombinedPose | None", float | None]:
+    """Return the pose that a camera shares, and the p-value of its distance; None: a new one.
+
+    Args:
+        poses: its poses in earlier episodes.
+        last: the pose in the episode before; None: this is the first.
+    """
+    if last is None:
+        return None, None
+    in_order = [last, *(k for k in poses if k is not last)]
+    p_values = [k.compare(one)[2] for k in in_order]
+    best = 0 if p_values[0] >= DIAGNOSIS.significance else int(np.argmax(p_values))
+    is_shared = p_values[best] >= DIAGNOSIS.significance
+    return (in_order[best] if is_shared else None), p_values[best]
+
+
+def _describe_moves(rows: Sequence[Sequence[Any]], most: int = 8) -> tuple[str, ...]:
+    """Return sentences about each camera's poses over the episodes.
+
+    Args:
+        rows: rows of the table.
+        most: maximum number of episodes that are named for each pose.
+    """
+    sentences, columns = list[str](), {name: k for k, name in enumerate(COLUMNS)}
+    for camera in dict.fromkeys(row[columns["camera"]] for row in rows):
+        own = [row for row in rows if row[columns["camera"]] == camera]
+        numbers = [row[columns["pose"]] for row in own]
+        if len(own) < 2:
+            continue
+        if len({*numbers}) == 1:
+            sentences.append(f"camera '{camera}' has one pose in all {len(own)} episodes")
+        for row in own:
+            if row[columns["moved"]] == "yes":
+                shift, turn = (row[columns[key]] for key in ("moved_mm", "moved_deg"))
+                sentences.append(
+                    f"camera '{camera}' moved by {turn:.2f} degrees and {shift:.1f} mm before "
+                    f"episode {row[0]} (p-value {row[columns['p_value']]:.1g})"
+                    if row[columns["pose"]] == max(numbers[: own.index(row) + 1])
+                    and row[columns["pose"]] not in numbers[: own.index(row)]
+                    else f"camera '{camera}' moved back to pose {row[columns['pose']]} by "
+                    f"{turn:.2f} degrees and {shift:.1f} mm before episode {row[0]}"
+                )
+        for number in sorted({*numbers}) if len({*numbers}) > 1 else ():
+            sharing = [str(row[0]) for row in own if row[columns["pose"]] == number]
+            sentences.append(f"camera '{camera}', pose {number}: {listed(sharing, most)}")
+    return tuple(sentences)
+
+
+def _draw(
+    episodes: Mapping[str, Mapping[str, Any]], moved: Collection[str], normal: float = 1.96
+) -> bytes:
+    """Return a picture (PNG) of the cameras' displacements and joint offsets over the episodes.
+
+    Displacements are those from the first episode; bars are 95 % intervals.
+
+    Args:
+        episodes: totals by scene.
+        moved: names of the scenes before which a camera has moved, which get a line.
+        normal: half the width of a 95 % interval in standard deviations.
+    """
+    scenes = [name for name, totals in episodes.items() if totals.get("cameras")]
+    curves = dict[tuple[str, str], list[tuple[int, float, float]]]()
+    first = dict[str, Array]()
+    for k, scene in enumerate(scenes):
+        for name, one in episodes[scene]["cameras"].items():
+            X_WC = np.array(one["X_WC"])
+            off = pose_difference(X_WC, first.setdefault(name, X_WC))
+            size = float(1e3 * np.linalg.norm(off[3:]))
+            turn = float(np.degrees(np.linalg.norm(off[:3])))
+            curves.setdefault(("shift [mm]", name), []).append((k, size, one["translation_sd_mm"]))
+            curves.setdefault(("turn [deg]", name), []).append((k, turn, one["rotation_sd_deg"]))
+        for name, (unit, value, sd) in episodes[scene].get("joint_offsets", {}).items():
+            curves.setdefault((f"joint offset [{unit}]", name), []).append((k, value, sd))
+    titles = list(dict.fromkeys(title for title, _ in curves))
+    figure = Figure(figsize=(8.0, 0.4 + 1.9 * len(titles)), dpi=120, layout="constrained")
+    figure.suptitle("Difference from the first episode; dashed: a camera moved", fontsize=9)
+    for axes, title in zip(np.atleast_1d(figure.subplots(len(titles), 1)), titles, strict=True):
+        for (kind, name), points in curves.items():
+            if kind == title:
+                x, y, sd = np.array(points).T
+                axes.errorbar(x, y, normal * sd, fmt="o-", markersize=3, linewidth=0.8, label=name)
+        for scene in moved:
+            axes.axvline(scenes.index(scene) - 0.5, color="#d55e00", linestyle="--", linewidth=1.0)
+        axes.set_ylabel(title, fontsize=8)
+        axes.tick_params(labelsize=7)
+        axes.legend(fontsize=7, loc="upper left")
+        step = max(1, len(scenes) // 12)
+        axes.set_xlim(-0.5, len(scenes) - 0.5)
+        axes.set_xticks(range(0, len(scenes), step), scenes[::step])
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png")
+    return stream.getvalue()
 
 
 class _CombinedPose:
@@ -104,17 +237,16 @@ class _CombinedPose:
         X_WC[:3, 3] += mean[3:]
         return X_WC, np.asarray(self._count * inverse)
 
-    def moved(self, one: FoundCamera) -> tuple[float, float, str]:
-        """Return distance [mm] and angle [deg] of a pose from the combined one, and "yes" or "no".
+    def compare(self, one: FoundCamera) -> tuple[float, float, float]:
+        """Return distance [mm] and angle [deg] of a pose from the combined one, and its p-value.
 
-        "yes": the camera has moved, since the difference is significant.
+        The p-value is the probability of a distance as large by chance.
         """
         X_WC, covariance = self.pose()
         off = pose_difference(np.array(one["X_WC"]), X_WC)
         distance = squared_distance(off, covariance + np.array(one["covariance"]))
         shift, turn = 1e3 * np.linalg.norm(off[3:]), np.degrees(np.linalg.norm(off[:3]))
-        is_moved = float(chdtrc(len(off), distance)) < DIAGNOSIS.significance
-        return float(shift), float(turn), "yes" if is_moved else "no"
+        return float(shift), float(turn), float(chdtrc(len(off), distance))
 
     def entry(self) -> dict[str, Any]:
         """Return the camera's entry of a camera file.

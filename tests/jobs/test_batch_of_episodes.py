@@ -4,6 +4,7 @@ import csv
 import io
 import json
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -12,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from drake_pose.camera.camera_files import describe_camera, load_cameras
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import SettingsError
+from drake_pose.jobs.batch import run_batch
 from drake_pose.jobs.batch_file import read_job
-from drake_pose.jobs.batch_tasks import plan_scene
+from drake_pose.jobs.batch_tasks import Outcome, plan_scene
 from drake_pose.jobs.episodes_table import COLUMNS, episodes_table
 from drake_pose.jobs.registration.settings import AuditSettings
 from tests.cli import run_to_end
@@ -48,7 +50,8 @@ def test_a_significant_difference_to_earlier_episodes_is_a_move(tmp_path):
         "failed": {},
         "again": totals([1.0, 0.02, 0.5], 1.0),
     }
-    text, cameras = episodes_table(episodes)
+    found = episodes_table(episodes, is_drawn=True)
+    text, cameras = found.text, found.files
     rows = list(csv.DictReader(io.StringIO(text)))
     assert tuple(rows[0]) == COLUMNS
     assert [row["moved"] for row in rows] == ["", "no", "yes", "no"]
@@ -60,13 +63,57 @@ def test_a_significant_difference_to_earlier_episodes_is_a_move(tmp_path):
     (tmp_path / "before.yaml").write_text(cameras["cameras_1.yaml"])
     before = load_cameras(tmp_path / "before.yaml")["left"]
     np.testing.assert_allclose(before.X_WC[:3, 3], [1.0005, -0.0005, 0.5])
-    assert episodes_table({"scene": {"frame_count": 3, "agreeing_count": 3}})[1] == {}
+    assert [row["pose"] for row in rows] == ["1", "1", "2", "2"]
+    assert found.moves[0].startswith(
+        "camera 'left' moved by 1.00 degrees and 20.5 mm before episode"
+    )
+    assert found.moves[1:] == (
+        "camera 'left', pose 1: first, same", "camera 'left', pose 2: bumped, again"
+    )  # fmt: skip
+    assert cv2.imdecode(np.frombuffer(found.picture, np.uint8), cv2.IMREAD_COLOR) is not None
+    none = episodes_table({"scene": {"frame_count": 3, "agreeing_count": 3}}, is_drawn=True)
+    assert (none.files, none.moves, none.picture) == ({}, (), b"")
+
+
+def test_a_camera_that_is_put_back_shares_its_earlier_pose():
+    """Poses are shared by many episodes although each differs from the next by chance."""
+    rng = np.random.default_rng(3)
+    places = np.array([[1.0, 0.0, 0.5]] * 8 + [[1.0, 0.02, 0.5]] * 8 + [[1.0, 0.0, 0.5]] * 8)
+    noisy = places + rng.normal(0.0, 0.001, places.shape)
+    found = episodes_table({f"e{k:02d}": totals(list(one)) for k, one in enumerate(noisy)})
+    rows = list(csv.DictReader(io.StringIO(found.text)))
+    assert [row["pose"] for row in rows] == ["1"] * 8 + ["2"] * 8 + ["1"] * 8
+    assert [row["scene"] for row in rows if row["moved"] == "yes"] == ["e08", "e16"]
+    assert any("moved back to pose 1" in one and "e16" in one for one in found.moves)
+    one = episodes_table({k: totals([1.0, 0.0, 0.5]) for k in ("a", "b")})
+    assert one.moves == ("camera 'left' has one pose in all 2 episodes",)
+
+
+def test_episodes_start_at_the_cameras_of_the_first(tmp_path, out):
+    """Also if the first fails; and in a resumed batch, whose first episode is done already."""
+    painted = painted_episode(tmp_path, frames=6)
+    for name in ("one", "two", "three"):
+        write_episode(tmp_path / "set" / name, painted)
+    entry = {"model": "boxes.urdf", "audit": True}
+    scenes = {name: {"scene": f"set/{name}"} for name in ("one", "two", "three")}
+    (tmp_path / "jobs.yaml").write_text(yaml.safe_dump({"defaults": entry, "scenes": scenes}))
+    done = []
+
+    def work(task):
+        done.append((task.job.name, task.near))
+        return Outcome("lost" if task.job.name == "one" else None, 0.0, {"frame_count": 6})
+
+    run_batch(read_job(tmp_path / "jobs.yaml"), out, work=work)
+    first = out / "one"
+    assert sorted(done[1:]) == [("three", first), ("two", first)]
+    assert done[0] == ("one", None)
 
 
 def test_combined_pose_is_the_information_weighted_mean():
     # A slow drift of insignificant steps is a move as well.
     far = 5.0 * 0.001
-    text, _ = episodes_table({str(k): totals([k * far, 0.0, 0.0], sd=0.002) for k in range(9)})
+    drifting = {str(k): totals([k * far, 0.0, 0.0], sd=0.002) for k in range(9)}
+    text = episodes_table(drifting).text
     moved = [row["moved"] for row in csv.DictReader(io.StringIO(text))]
     assert 0 < moved.count("yes") < 5
     # The second camera has not moved and has one pose in all files.
@@ -74,7 +121,7 @@ def test_combined_pose_is_the_information_weighted_mean():
     sds = (0.001, 0.002)
     for one, x, sd in zip(episodes.values(), (0.0, 0.005), sds, strict=True):
         one["cameras"]["right"] = totals([x, 0.0, 0.0], sd=sd)["cameras"]["left"]
-    files = [yaml.safe_load(text) for text in episodes_table(episodes)[1].values()]
+    files = [yaml.safe_load(text) for text in episodes_table(episodes).files.values()]
     assert [file["left"]["X_WC"][0][3] for file in files] == [0.0, 1.0]
     weighted = np.average([0.0, 0.005], weights=np.power(sds, -2.0))
     assert [file["right"]["X_WC"][0][3] for file in files] == pytest.approx([weighted] * 2)
@@ -106,16 +153,24 @@ def test_episodes_of_a_job_have_the_settings_of_audits(tmp_path, out):
 
 @pytest.mark.slow
 def test_episodes_are_audited_in_a_batch(tmp_path, out):
+    """The second episode starts at the camera of the first."""
     painted = painted_episode(tmp_path, late=0.04)
-    write_episode(tmp_path / "scene", painted)
-    entry = {"scene": "scene", "model": "boxes.urdf", "audit": True, "overlay": False}
-    (tmp_path / "jobs.yaml").write_text(yaml.safe_dump({"scenes": {"one": entry}}))
+    entry = {"model": "boxes.urdf", "audit": True, "overlay": False}
+    scenes = {name: {"scene": f"set/{name}"} for name in ("one", "two")}
+    for name in scenes:
+        write_episode(tmp_path / "set" / name, painted)
+    (tmp_path / "jobs.yaml").write_text(yaml.safe_dump({"defaults": entry, "scenes": scenes}))
     words = ["batch", tmp_path / "jobs.yaml", "--out", out]
     for more in ([], ["--resume"]):
         run_to_end(*words, *more)
-        (row,) = read_rows(out / "episodes.csv")
-        assert float(row["time_offset_s"]) == pytest.approx(0.04, abs=0.005)
-        assert row["off_mm"] == ""
-        place = [float(row[name]) for name in "xyz"]
-        np.testing.assert_allclose(place, painted.camera.X_WC[:3, 3], atol=0.01)
+        rows = read_rows(out / "episodes.csv")
+        assert [row["pose"] for row in rows] == ["1", "1"]
+        for row in rows:
+            assert float(row["time_offset_s"]) == pytest.approx(0.04, abs=0.005)
+            assert row["off_mm"] == ""
+            place = [float(row[name]) for name in "xyz"]
+            np.testing.assert_allclose(place, painted.camera.X_WC[:3, 3], atol=0.01)
+        assert (out / "episodes.png").is_file()
+    seconds = [json.loads((out / k / "summary.json").read_text())["seconds"] for k in scenes]
+    assert seconds[1] < seconds[0]
     assert json.loads((out / "batch.json").read_text())["scenes"]["one"]["state"] == "finished"

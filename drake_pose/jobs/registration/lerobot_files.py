@@ -75,16 +75,20 @@ def lerobot_files(
         files[f"{FOLDER}/{file.relative_to(path)}"] = file.read_bytes()
     info = json.loads((path / INFO).read_bytes())
     for camera in cameras:
-        key = camera_key(info["features"], camera.name)
-        lens = inputs.lenses.get(camera.name)
-        if not isinstance(camera, PinholeCamera) or lens is not None:
+        part = inputs.parts.get(camera.name)
+        reason = ""
+        if part is not None and not part.is_whole:
+            reason = "it was moved during the episode"
+        elif not isinstance(camera, PinholeCamera) or camera.name in inputs.lenses:
+            reason = "its pictures are distorted"
+        if reason:
             notes.append(
-                f"--export lerobot: camera '{camera.name}' is left out of {FOLDER}/{INFO}, as its "
-                "pictures are distorted: use cameras.yaml"
+                f"--export lerobot: camera '{camera.name}' is left out of {FOLDER}/{INFO}, as "
+                f"{reason}: use cameras.yaml"
             )
-            continue
-        own = info["features"][key]
-        own["info"] = (own.get("info") or {}) | camera_fields(camera, link)
+        elif isinstance(camera, PinholeCamera):
+            own = info["features"][camera_key(info["features"], camera.name)]
+            own["info"] = (own.get("info") or {}) | camera_fields(camera, link)
     files[f"{FOLDER}/{INFO}"] = json.dumps(info, indent=4) + "\n"
     name = source.name if corrections and source is not None else None
     files[f"{FOLDER}/README.md"] = _readme(path, name, corrections, offsets)

@@ -13,6 +13,7 @@ from drake_pose.errors import CameraError, SettingsError
 from drake_pose.jobs.registration.inputs import read_inputs
 from drake_pose.jobs.registration.lerobot_files import lerobot_files, require_data_set
 from drake_pose.jobs.registration.settings import AuditSettings, RegistrationSettings
+from drake_pose.registration.camera_motion import CameraPart
 from tests.registration.episodes import painted_episode
 from tests.registration.recordings import NAMES, write_episode
 
@@ -137,6 +138,12 @@ def test_what_is_left_out_is_said(recorded, tmp_path):
     inputs = read(folder, painted)
     _, notes = lerobot_files(inputs, [painted.camera], None, {})
     assert "no joint offset is significant" in notes[0]
+    halves = {k: CameraPart("camera", slice(0, 8), np.eye(3), 0.0, 1.0, False, 0.0, 0.0)
+              for k in ("camera", "camera_2")}  # fmt: skip
+    cameras = [replace(painted.camera, name=name) for name in halves]
+    files, notes = lerobot_files(replace(inputs, parts=halves), cameras, None, {})
+    assert all(f"'{k}' is left out" in one for k, one in zip(halves, notes[1:], strict=True))
+    assert "camera_extrinsics" not in files["lerobot/meta/info.json"]
     named = read(folder, painted, joint_map=folder / "arm.json")
     assert named.mapped.log.servos.path == folder / "arm.json"
     with pytest.raises(SettingsError, match="its own joint log"):

@@ -16,7 +16,13 @@ import numpy as np
 
 from drake_pose.arrays import Array
 from drake_pose.camera.models import Lens, check_number, check_pose, check_side, inverse_pose
-from drake_pose.camera.pose_files import episode_entry, read_launch, read_lines, recorded_poses
+from drake_pose.camera.pose_files import (
+    episode_entry,
+    finite_numbers,
+    read_launch,
+    read_lines,
+    recorded_poses,
+)
 from drake_pose.errors import CameraError
 from drake_pose.regular_files import read_regular
 from drake_pose.yaml_files import read_yaml
@@ -223,13 +229,7 @@ def _numbers(value: Any) -> Array | None:
     """
     if isinstance(value, dict):
         value = value.get("data")
-    if not isinstance(value, list | tuple | np.ndarray):
-        return None
-    try:
-        found = np.asarray(value, dtype=np.float64).ravel()
-    except (ValueError, TypeError):
-        return None
-    return found if np.isfinite(found).all() else None
+    return finite_numbers(value)
 
 
 def lens_of(size: Any, matrix: Any, distortion: Any, model: str, where: str) -> Lens:

@@ -175,7 +175,13 @@ def load_camera_file(
     if poses:
         named = {serials.get(name, name): one for name, one in poses.items()}
         return _placed(path, named, None if known is None else known())
-    content = {} if isinstance(content, list) else content
+    if isinstance(content, list):
+        if not calibrated:
+            raise CameraError(
+                f"{path}: expected a mapping from camera names to their parameters, but it has a "
+                "list that is no pose"
+            )
+        content = {}
     configs = None if calibrated else _find_configs(content, path)
     if configs is not None:
         # Import Drake only if needed, because it loads slowly.

@@ -300,13 +300,35 @@ def _numbers(value: Any, keys: Sequence[str] = ()) -> Array | None:
         value = [plain[key] for key in keys if key in plain]
         if not keys or len(value) != len(keys):
             return None
-    if not isinstance(value, list | tuple | np.ndarray) or not len(value):
+    found = finite_numbers(value)
+    return found if found is not None and len(found) else None
+
+
+def finite_numbers(value: Any) -> Array | None:
+    """Return the numbers (n,), by rows, of an array or of small nested lists.
+
+    The result is None for anything else, and if an entry is not a finite number.
+    """
+    if not isinstance(value, list | tuple | np.ndarray) or not _is_small(value):
         return None
     try:
         found = np.asarray(value, dtype=np.float64).ravel()
     except (ValueError, TypeError):
         return None
     return found if np.isfinite(found).all() else None
+
+
+def _is_small(value: Any, depth: int = 3, count: int = 100) -> bool:
+    """Return whether nested lists have few levels and entries; aliases of YAML may hold billions.
+
+    Args:
+        value: the lists; anything else is small.
+        depth: maximum number of levels.
+        count: maximum length of a list: several times a pose's 16 numbers.
+    """
+    if not isinstance(value, list | tuple):
+        return True
+    return depth > 0 and len(value) <= count and all(_is_small(k, depth - 1, count) for k in value)
 
 
 def _pose_of(value: Any, where: str) -> RecordedPose | None:

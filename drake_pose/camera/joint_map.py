@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -168,7 +168,9 @@ def motors_of(mapped: MappedJoints) -> list[tuple[ServoJoint, str]]:
 def _match(
     readings: Mapping[str, Array], wanted: Sequence[str]
 ) -> tuple[dict[str, str], list[str]]:
-    """Match columns to joints by `match_names`, if need be without a gripper's opening at the end.
+    """Match columns to joints by `match_names`, or by the order of LeRobot's arms.
+
+    If need be, an opening of a gripper is left out at the end.
 
     Args:
         readings: (n,) readings by column.
@@ -177,8 +179,29 @@ def _match(
     matched, warnings = match_names([*readings], wanted)
     *series, last = readings or ("",)
     if not matched and _is_opening(readings.get(last, np.zeros(0))):
-        return match_names(series, wanted)
+        matched, warnings = match_names(series, wanted)
+    ordered = _in_order(readings, wanted)
+    if len(ordered) > len(matched) and matched.items() <= ordered.items():
+        pairings = ", ".join(f"{a} for {b}" for a, b in ordered.items())
+        return ordered, [
+            "the columns have the names of LeRobot's arms, the joints others: they are matched in "
+            f"order ({pairings}); the model's zeros and signs must be LeRobot's"
+        ]
     return matched, warnings
+
+
+def _in_order(columns: Iterable[str], joints: Sequence[str]) -> dict[str, str]:
+    """Return the joint of each column of an SO-100, SO-101 or Koch, by their order.
+
+    The mapping is empty unless the columns are those of one such arm, and the joints are as many,
+    with or without its gripper.
+    """
+    names = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+    ends = [name.split("_") for name in names]
+    found = [[one for one in columns if _words(one)[-len(end) :] == end] for end in ends]
+    if len(joints) not in (5, 6) or any(len(own) != 1 for own in found):
+        return {}
+    return dict(zip((own[0] for own in found), joints, strict=False))
 
 
 def _servo_joints(

@@ -145,8 +145,7 @@ def find_motors(folder: Path, robot: str, columns: Iterable[str]) -> tuple[Servo
     """
     columns, warnings = [*columns], list[str]()
     names = {name.removesuffix(".pos").removeprefix("main_") for name in columns} | {*columns}
-    # Without names in the data set its reader numbers the columns.
-    is_numbered = {*columns} == {f"joint_{k}" for k in range(len(columns))}
+    is_numbered = all(name[-1:].isdigit() for name in columns)
     inside = ("*.json", "meta/*.json", "calibration/**/*.json")
     for place, patterns in ((folder, inside), (folder.resolve().parent, (inside[0], inside[2]))):
         files = sorted({one for pattern in patterns for one in place.glob(pattern)})

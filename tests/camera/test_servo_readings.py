@@ -309,6 +309,21 @@ def test_columns_without_names_have_the_files_motors_in_order(tmp_path):
     np.testing.assert_allclose(found.log.positions, angles, atol=2.1 * STEP)
 
 
+def test_a_model_with_other_names_has_the_arms_joints_in_order(tmp_path):
+    """Joints of other models of the SO-100, such as MuJoCo's."""
+    arm, angles = arm_of(13)
+    servos = read_motors(write_file(tmp_path / "arm.json", arm), "so100")
+    log = log_of(arm, angles, "normalised", servos=servos)
+    joints = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
+    for count in (6, 5):
+        limits = LOWER[:count], UPPER[:count], np.ones(count, bool)
+        found = map_joints(log, joints[:count], *limits)
+        np.testing.assert_allclose(found.log.positions, angles[:, :count], atol=2.1 * STEP)
+        assert "gripper.pos for Jaw" in found.warnings[0] or count == 5
+    with pytest.raises(SceneError, match="no column of the joint log is a joint"):
+        map_joints(log, ("a", "b"), LOWER[:2], UPPER[:2], np.ones(2, bool))
+
+
 def test_files_are_found_beside_the_data_set(tmp_path):
     arm, _ = arm_of(10)
     folder = tmp_path / "sets" / "pick"

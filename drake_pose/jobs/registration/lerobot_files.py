@@ -27,8 +27,8 @@ def require_data_set(inputs: RegistrationInputs) -> MappedJoints:
     path = inputs.scene.path
     if inputs.mapped is None or not (path / INFO).is_file() or inputs.joints is not None:
         raise SettingsError(
-            f"{path}: --export lerobot corrects a LeRobot data set with its own joint log, and "
-            f"this is none ({INFO}); leave it, or --joints, out"
+            f"{path}: --export lerobot needs a LeRobot data set ({INFO}), and its own joint log: "
+            + ("leave --joints out" if (path / INFO).is_file() else "leave it out")
         )
     return inputs.mapped
 

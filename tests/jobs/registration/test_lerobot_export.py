@@ -146,10 +146,12 @@ def test_what_is_left_out_is_said(recorded, tmp_path):
     assert "camera_extrinsics" not in files["lerobot/meta/info.json"]
     named = read(folder, painted, joint_map=folder / "arm.json")
     assert named.mapped.log.servos.path == folder / "arm.json"
-    with pytest.raises(SettingsError, match="its own joint log"):
+    with pytest.raises(SettingsError, match="leave --joints out"):
         require_data_set(replace(inputs, joints=tmp_path / "joints.csv"))
     write_episode(tmp_path / "plain", painted)
-    with pytest.raises(SettingsError, match=r"corrects a LeRobot data set"):
+    with pytest.raises(
+        SettingsError, match=r"needs a LeRobot data set \(meta/info.json\).*leave it out"
+    ):
         require_data_set(read(tmp_path / "plain", painted))
 
 

@@ -7,7 +7,7 @@ to any colour, the likelihoods of a pixel in one frame are
     background visible: 0.92 s + 0.08        body visible: 0.25 s + 0.75
 
 because a background changes now and then, and a body may resemble its background. Log-likelihoods
-are summed over the frames for the best background of each pixel (``PixelSums``, ``explain``).
+are summed over the frames for the best background of each pixel (``fit.explain_kernel``).
 
 Once the pose is approximately known, so are the background of each pixel and the log-odds that the
 pixel shows the body. Search lines across the contour then locate its edge (``fit.colours``).
@@ -15,19 +15,15 @@ pixel shows the body. Search lines across the contour then locate its edge (``fi
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 from functools import cached_property
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 from scipy.ndimage import convolve1d
 
 from drake_pose.arrays import Array, Floats, Mask, Picture
-from drake_pose.compiled import compiled
 from drake_pose.fit.colours import COLOURS, Colour, colour_numbers
-from drake_pose.silhouette.outline import PackedOutlines
-from drake_pose.silhouette.span_kernel import fill_rows, find_spans, make_rows
+from drake_pose.fit.explain_kernel import PixelSums
 
 
 @dataclass(frozen=True)
@@ -110,22 +106,6 @@ def apply_gain(picture: Picture | Floats, gain: Floats) -> Floats:
         gain: (3, 4) slopes and offsets, see ``estimate_gain``.
     """
     return np.asarray(cv2.transform(picture.astype(np.float32), gain))
-
-
-class PixelSums(NamedTuple):
-    """Log-likelihoods of each pixel, from which ``explain`` scores poses.
-
-    Attributes:
-        visible: (H, W, 3) log-likelihoods of the three backgrounds if no frame is covered.
-        covered: (H, W, f, 3) change of each log-likelihood if a frame is covered.
-        uncovered: (H, W) maximum of ``visible``.
-        edges: (2, f, H, W) strength of edges across u and v in each frame, minus its mean.
-    """
-
-    visible: Floats
-    covered: Floats
-    uncovered: Floats
-    edges: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -423,110 +403,3 @@ def _find_colours(pictures: Floats, deviations: Floats, rows: int = 8) -> Floats
             remaining &= ~shared
         strips.append(np.array(found))
     return np.concatenate(strips, axis=1)
-
-
-class Explained(IntEnum):
-    """Indices of the sums of ``explain``.
-
-    GAIN: log-likelihood minus that without a body. CONTOUR: edge strength along the outlines, minus
-    its expectation. OUTLINE: length of the outlines [pixel]. AREA: area of the bodies [pixel].
-    """
-
-    GAIN = 0
-    CONTOUR = 1
-    OUTLINE = 2
-    AREA = 3
-
-
-@compiled
-def explain(
-    packed: PackedOutlines,
-    X_CN: Array,
-    is_static: Mask,
-    camera: Array,
-    sums: PixelSums,
-    side: float,
-    tiles_per_side: int,
-    always_covered: float = 0.3,
-) -> tuple[Array, Array]:
-    """Score the poses of a body in all frames by sums over the pixels.
-
-    One 64-bit word per pixel has a bit for each frame in which the body covers the pixel, so at
-    most 32 frames are supported. Where neighbouring words differ lies the body's outline.
-
-    Args:
-        packed: surfaces of the nodes.
-        X_CN: (f, nodes, 3, 4) poses of the nodes in the frames.
-        is_static: (nodes,) whether a node is static in all frames. Static nodes belong to the
-            background; only their outline is scored.
-        camera: (8,) `Camera.kernel_parameters`.
-        sums: log-likelihoods and edges of the f frames' images.
-        side: side of a tile in which the gain is also summed [pixel].
-        tiles_per_side: t, number of tiles per row and column, to which their indices are taken
-            modulo; 0: there are no tiles.
-        always_covered: factor of the positive gain of pixels that the body covers in all frames,
-            whose background is unknown; a negative gain there counts 0.
-
-    Returns:
-        (4,) sums by ``Explained``, and (t, t) the gain of each tile (row, column).
-    """
-    height, width = sums.uncovered.shape
-    frames, one = X_CN.shape[0], np.uint64(1)
-    totals, tiles = np.zeros(4), np.zeros((tiles_per_side, tiles_per_side))
-    words = np.zeros((height, width), dtype=np.uint64)
-    rows, crossings = make_rows(packed, camera)
-    top, bottom = height, 0
-    for f in range(frames):
-        for node in range(X_CN.shape[1]):
-            crossings = fill_rows(packed, node, node + 1, X_CN[f], camera, crossings, rows)
-            top, bottom = min(top, rows.row_range[0]), max(bottom, rows.row_range[1])
-            # Static nodes use the upper bits.
-            bit = one << np.uint64(f + frames if is_static[node] else f)
-            for row in range(rows.row_range[0], rows.row_range[1]):
-                for k in range(find_spans(row, crossings, rows.counts, rows.changes, rows.spans)):
-                    for column in range(rows.spans[k, 0], rows.spans[k, 1]):
-                        words[row, column] |= bit
-    every = (one << np.uint64(frames)) - one
-    for row in range(top, bottom):
-        for column in range(width):
-            word = words[row, column]
-            if word == 0:
-                continue
-            covered = word & every
-            if covered != 0:
-                a, b, c = sums.visible[row, column]
-                remaining, f = covered, 0
-                while remaining != 0:
-                    if remaining & one:
-                        totals[Explained.AREA] += 1.0
-                        a += sums.covered[row, column, f, 0]
-                        b += sums.covered[row, column, f, 1]
-                        c += sums.covered[row, column, f, 2]
-                    remaining >>= one
-                    f += 1
-                gain = max(a, b, c) - sums.uncovered[row, column]
-                if covered == every:
-                    gain = always_covered * max(gain, 0.0)
-                totals[Explained.GAIN] += gain
-                if tiles_per_side > 0:
-                    tiles[
-                        int(row / side) % tiles_per_side, int(column / side) % tiles_per_side
-                    ] += gain
-            left_of = words[row, column - 1] if column > 0 else word
-            right_of = words[row, column + 1] if column < width - 1 else word
-            above = words[row - 1, column] if row > 0 else word
-            below = words[row + 1, column] if row < height - 1 else word
-            across_u, across_v = word & ~(left_of & right_of), word & ~(above & below)
-            remaining, f = across_u | across_v, 0
-            while remaining != 0:
-                if remaining & one:
-                    strength = -np.inf
-                    if across_u >> np.uint64(f) & one:
-                        strength = sums.edges[0, f % frames, row, column]
-                    if across_v >> np.uint64(f) & one:
-                        strength = max(strength, sums.edges[1, f % frames, row, column])
-                    totals[Explained.CONTOUR] += strength
-                    totals[Explained.OUTLINE] += 1.0
-                remaining >>= one
-                f += 1
-    return totals, tiles

@@ -15,8 +15,8 @@ import numpy as np
 from drake_pose.arrays import Array
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
-from drake_pose.fit.background import Explained
 from drake_pose.fit.covariance import vuong_statistic
+from drake_pose.fit.explain_kernel import Explained
 from drake_pose.fit.problem import TIME_OFFSET
 from drake_pose.registration.picture_acceptance import (
     PictureRegistration,

@@ -178,10 +178,7 @@ class PictureSearch:
         after = (*(kept for _, kept, _, _ in rounds[1:]), rounds[-1][1])
         for (width, kept, evaluations, turn), most in zip(rounds, after, strict=True):
             level = self._level(width)
-            improve = partial(level.improve, evaluations=evaluations, turn=turn)
-            improved = map_ordered(improve, enumerate(found[:kept]))
-            improved.sort(key=lambda one: -one[0])
-            found = level.distinct([X for _, X in improved], most)
+            found = level.distinct(level.improve(found[:kept], evaluations, turn)[1], most)
         return found
 
     def with_offsets(self, joint_offsets: Array) -> "PictureSearch":

@@ -10,11 +10,12 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from scipy.optimize import minimize
 
 from drake_pose.arrays import Array, Picture
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.fit.background import Backgrounds, Explained, explain
+from drake_pose.fit.background import Backgrounds
+from drake_pose.fit.explain_kernel import Explained, explain, explain_poses
+from drake_pose.registration.pose_simplex import ScoredPictures, move_pose, search_simplexes
 from drake_pose.registration.posed_frames import placed_points
 from drake_pose.registration.register import uniform_rotations
 from drake_pose.silhouette.outline import Outline, pack
@@ -123,33 +124,47 @@ class PyramidLevel:
         return fraction, float(sums[Explained.CONTOUR]) / max(float(sums[Explained.OUTLINE]), 1.0)
 
     def score(self, X_CW: Array, frames: int | None = None) -> float:
-        """Return the score, see `evidence`, of a pose (4, 4).
+        """Return the score of a pose (4, 4), see `scores`."""
+        return float(self.scores([X_CW], frames)[0])
+
+    def scores(self, X_CW: Sequence[Array] | Array, frames: int | None = None) -> Array:
+        """Return the scores (n,), see `evidence`, of n poses (4, 4).
 
         A constant is added to the outlines' length. It limits the score of short outlines, whose
         edges are strong by chance.
 
         frames: number of frames that are used, from the first on; None: all.
         """
-        X_WN = self._X_WN[:frames]
-        sums = self.statistics(X_CW, X_WN)
-        outline = sums[Explained.OUTLINE] + 0.3 * len(X_WN) * self.camera.width
-        possible = self.backgrounds.max_gain * len(X_WN) / len(self._X_WN)
-        return evidence(
-            float(sums[Explained.GAIN]) / max(possible, 1e-9),
-            float(sums[Explained.CONTOUR] / outline),
+        own, poses = self._scored(frames), np.asarray(X_CW)[:, :3]
+
+        def sums(some: Array) -> Array:
+            return np.asarray(
+                explain_poses(own.packed, some, own.X_WN, own.is_static, own.camera, own.sums)
+            )
+
+        found = np.concatenate(
+            map_ordered(sums, (poses[k : k + 100] for k in range(0, len(poses), 100)))
         )
+        outline = found[:, Explained.OUTLINE] + own.scales[1]
+        contour = own.scales[2] * found[:, Explained.CONTOUR] / outline
+        return np.asarray(found[:, Explained.GAIN] / own.scales[0] + contour)
+
+    def _scored(self, frames: int | None = None) -> ScoredPictures:
+        """Return the first pictures, prepared for scores; frames: their number; None: all."""
+        X_WN = np.ascontiguousarray(self._X_WN[:frames, :, :3])
+        possible = self.backgrounds.max_gain * len(X_WN) / len(self._X_WN)
+        outline = 0.3 * len(X_WN) * self.camera.width
+        return ScoredPictures(
+            self._packed, X_WN, self._static, self._parameters, self.backgrounds.sums,
+            self._middle, np.array([max(possible, 1e-9), outline, PICTURES.contour_weight]),
+        )  # fmt: skip
 
     def best(self, X_CW: Sequence[Array], frames: int, fraction: float) -> list[Array]:
         """Return the given fraction of the poses (4, 4), those with the best scores, best first.
 
         frames: number of frames that are used, from the first on.
         """
-
-        def scores(some: Sequence[Array]) -> list[float]:
-            return [self.score(X, frames) for X in some]
-
-        some = [X_CW[k : k + 200] for k in range(0, len(X_CW), 200)]
-        order = np.argsort(-np.concatenate(map_ordered(scores, some)), kind="stable")
+        order = np.argsort(-self.scores(X_CW, frames), kind="stable")
         return [X_CW[k] for k in order[: math.ceil(fraction * len(order))]]
 
     def tile_gains(self, X_CW: Array, squares: int = 16) -> Array:
@@ -198,31 +213,35 @@ class PyramidLevel:
         return found
 
     def improve(
-        self, numbered: tuple[int, Array], evaluations: int, turn: float
-    ) -> tuple[float, Array]:
-        """Improve a pose by Nelder and Mead's simplex search.
+        self, X_CW: Sequence[Array], evaluations: int, turn: float
+    ) -> tuple[Array, list[Array]]:
+        """Improve poses by Nelder and Mead's simplex search.
 
         Args:
-            numbered: a seed for the signs of the first simplex, and the pose (4, 4).
-            evaluations: maximum number of scores.
+            X_CW: n poses (4, 4).
+            evaluations: maximum number of scores for each pose, at least 7.
             turn: rotation of the first simplex [rad]; its shifts [focal lengths] are 0.4 times, the
                 step of the log depth 0.6 times as large.
 
         Returns:
-            the best score and its pose.
+            the scores (n,), highest first, and the improved poses.
         """
-        key, X_CW = numbered
-        signs = np.random.default_rng(key).choice([-1.0, 1.0], 6)
+        count = len(X_CW)
+        signs = [np.random.default_rng(k).choice([-1.0, 1.0], 6) for k in range(count)]
         # Rotation [rad], shift in the picture [focal lengths], logarithm of the depth.
-        steps = turn * signs * np.array([1.0, 1.0, 1.0, 0.4, 0.4, 0.6])
-        simplex = np.vstack([np.zeros(6), np.diag(steps)])
-        options = {"maxfev": evaluations, "initial_simplex": simplex, "xatol": 0.0, "fatol": 0.0}
+        steps = turn * np.array(signs) * np.array([1.0, 1.0, 1.0, 0.4, 0.4, 0.6])
+        corners = np.zeros((count, 7, 6))
+        corners[:, np.arange(1, 7), np.arange(6)] = steps
+        starts, costs = np.asarray(X_CW)[:, :3], np.zeros((count, 7))
+        own = self._scored()
 
-        def cost(x: Array) -> float:
-            return -self.score(self.moved(X_CW, x))
+        def search(k: int) -> None:
+            some = slice(k, k + 5)
+            search_simplexes(own, starts[some], corners[some], costs[some], evaluations)
 
-        found = minimize(cost, np.zeros(6), method="Nelder-Mead", options=options)
-        return -float(found.fun), self.moved(X_CW, found.x)
+        map_ordered(search, range(0, count, 5))
+        order = np.argsort(costs[:, 0], kind="stable")
+        return -costs[order, 0], [self.moved(X_CW[k], corners[k, 0]) for k in order]
 
     def opposite(self, X_CW: Array) -> Array:
         """Return the pose (4, 4) of a camera on the other side of the body, as far away.
@@ -251,17 +270,9 @@ class PyramidLevel:
         return kept
 
     def moved(self, X_CW: Array, x: Array) -> Array:
-        """Return a pose (4, 4) moved by x (6,) in the camera's frame.
-
-        x: rotation vector about the body's middle [rad], shift of the middle in the picture along u
-            and v [focal lengths], and change of the logarithm of the middle's depth.
-        """
-        p_CM = X_CW[:3, :3] @ self._middle + X_CW[:3, 3]
-        depth = p_CM[2] * np.exp(x[5])
-        place = np.array([p_CM[0] / p_CM[2] + x[3], p_CM[1] / p_CM[2] + x[4], 1.0])
-        moved = np.eye(4)
-        moved[:3, :3] = cv2.Rodrigues(x[:3])[0] @ X_CW[:3, :3]
-        moved[:3, 3] = depth * place - moved[:3, :3] @ self._middle
+        """Return a pose (4, 4) moved by x (6,) in the camera's frame, see ``move_pose``."""
+        moved = X_CW.copy()
+        move_pose(X_CW[:3], self._middle, x, moved[:3])
         return moved
 
 

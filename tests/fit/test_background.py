@@ -5,16 +5,15 @@ import pytest
 
 from drake_pose.fit.background import (
     Backgrounds,
-    Explained,
     KnownBackground,
     apply_gain,
     estimate_gain,
-    explain,
     foreground_of_colours,
     foreground_picture,
     mask_of_foreground,
 )
 from drake_pose.fit.colours import COLOURS, Colour
+from drake_pose.fit.explain_kernel import Explained, explain
 from drake_pose.silhouette.outline import pack
 from drake_pose.silhouette.scoring import draw_mask
 from tests.registration.episodes import painted_episode

@@ -6,10 +6,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from drake_pose.errors import RegistrationError
-from drake_pose.fit.background import Explained
+from drake_pose.fit.explain_kernel import Explained
 from drake_pose.fit.problem import TIME_OFFSET
 from drake_pose.registration.picture_acceptance import (
     PictureRegistration,
@@ -105,9 +106,10 @@ def test_score_increases_towards_the_true_pose(level: PyramidLevel, episode) -> 
     poses = [aside, true, *level.starts()[::1200]]
     scores = [level.score(X) for X in poses]
     assert np.argmax(scores) == 1
-    score, found = level.improve((3, aside), evaluations=60, turn=0.1)
-    assert score == pytest.approx(level.score(found))
-    assert scores[0] + 0.5 * (scores[1] - scores[0]) < score
+    improved, found = level.improve([poses[2], aside], evaluations=60, turn=0.1)
+    np.testing.assert_allclose(improved, level.scores(found))
+    assert scores[0] + 0.5 * (scores[1] - scores[0]) < improved[0]
+    assert improved[1] >= scores[2]
     best = level.best(poses, LEVEL_FRAMES, 0.4)
     assert len(best) == np.ceil(0.4 * len(poses))
     assert [level.score(X) for X in best] == sorted(scores, reverse=True)[: len(best)]
@@ -119,6 +121,25 @@ def test_score_increases_towards_the_true_pose(level: PyramidLevel, episode) -> 
     told = level.statistics(true)
     assert share == pytest.approx(told[Explained.GAIN] / level.backgrounds.max_gain)
     assert contour == pytest.approx(told[Explained.CONTOUR] / told[Explained.OUTLINE])
+
+
+@pytest.mark.parametrize("evaluations", [24, 61])
+def test_many_simplexes_are_searched_as_scipy_searches_one(level: PyramidLevel, evaluations):
+    poses = level.starts(50)[::60]
+    scores, found = level.improve(poses, evaluations, turn=0.2)
+    np.testing.assert_allclose(level.scores(found), scores)
+    expected = []
+    for k, X_CW in enumerate(poses):
+        signs = np.random.default_rng(k).choice([-1.0, 1.0], 6)
+        steps = 0.2 * signs * np.array([1.0, 1.0, 1.0, 0.4, 0.4, 0.6])
+        simplex = np.vstack([np.zeros(6), np.diag(steps)])
+        options = {"maxfev": evaluations, "initial_simplex": simplex, "xatol": 0.0, "fatol": 0.0}
+
+        def cost(x, X_CW=X_CW):
+            return -level.score(level.moved(X_CW, x))
+
+        expected.append(-minimize(cost, np.zeros(6), method="Nelder-Mead", options=options).fun)
+    np.testing.assert_allclose(scores, sorted(expected, reverse=True))
 
 
 def test_tile_gains_sum_to_the_gain(level: PyramidLevel, episode) -> None:

@@ -1,0 +1,296 @@
+"""Score poses of a body by sums over the pixels of a static camera's pictures.
+
+The model of the pixels is that of ``fit.background``. One 64-bit word per pixel has a bit for each
+frame in which the body covers the pixel, so at most 32 frames are supported. Where neighbouring
+words differ lies the body's outline.
+"""
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from drake_pose.arrays import Array, Floats, Mask
+from drake_pose.compiled import compiled
+from drake_pose.silhouette.outline import PackedOutlines
+from drake_pose.silhouette.span_kernel import Rows, fill_rows, find_spans, make_rows
+
+
+class PixelSums(NamedTuple):
+    """Log-likelihoods of each pixel, from which ``explain`` scores poses.
+
+    Attributes:
+        visible: (H, W, 3) log-likelihoods of the three backgrounds if no frame is covered.
+        covered: (H, W, f, 3) change of each log-likelihood if a frame is covered.
+        uncovered: (H, W) maximum of ``visible``.
+        edges: (2, f, H, W) strength of edges across u and v in each frame, minus its mean.
+    """
+
+    visible: Floats
+    covered: Floats
+    uncovered: Floats
+    edges: Floats
+
+
+class Explained(IntEnum):
+    """Indices of the sums of ``explain``.
+
+    GAIN: log-likelihood minus that without a body. CONTOUR: edge strength along the outlines, minus
+    its expectation. OUTLINE: length of the outlines [pixel]. AREA: area of the bodies [pixel].
+    """
+
+    GAIN = 0
+    CONTOUR = 1
+    OUTLINE = 2
+    AREA = 3
+
+
+class Words(NamedTuple):
+    """Scratch arrays for the words of one body's pixels.
+
+    Attributes:
+        words: (H, W) uint64 a bit for each frame that covers the pixel, and frames further up for
+            static nodes; zero between calls.
+        ends: (H, 2) int64 first column, and column after the last, of each row's words; (W, 0)
+            between calls.
+        rows: scratch of the span kernel.
+        positions: (64,) position of a word's only bit, by the upper six bits of its product with
+            a de Bruijn number.
+    """
+
+    words: np.ndarray
+    ends: np.ndarray
+    rows: Rows
+    positions: np.ndarray
+
+
+# Its 64 windows of six bits all differ (de Bruijn).
+_WINDOWS = np.uint64(0x03F79D71B4CB0A89)
+
+
+@compiled
+def make_words(packed: PackedOutlines, camera: Array) -> tuple[Words, np.ndarray]:
+    """Return scratch for packed surfaces, and crossings as of ``make_rows``.
+
+    camera: (8,) `Camera.kernel_parameters`.
+    """
+    width, height = int(camera[6]), int(camera[7])
+    rows, crossings = make_rows(packed, camera)
+    ends = np.zeros((height, 2), dtype=np.int64)
+    ends[:, 0] = width
+    positions = np.zeros(64, dtype=np.int64)
+    for k in range(64):
+        positions[((np.uint64(1) << np.uint64(k)) * _WINDOWS) >> np.uint64(58)] = k
+    return Words(np.zeros((height, width), dtype=np.uint64), ends, rows, positions), crossings
+
+
+@compiled
+def _cover(
+    packed: PackedOutlines,
+    X_CN: Array,
+    is_static: Mask,
+    camera: Array,
+    scratch: Words,
+    crossings: np.ndarray,
+) -> tuple[int, int, np.ndarray]:
+    """Set the bits of all covered pixels, and the ends of their rows.
+
+    The arguments are those of ``explain``, and scratch of ``make_words``.
+
+    Returns:
+        the first row with words, the row after the last, and the crossings, reallocated if need be.
+    """
+    words, ends, rows, one = scratch.words, scratch.ends, scratch.rows, np.uint64(1)
+    frames, top, bottom = X_CN.shape[0], words.shape[0], 0
+    for node in range(X_CN.shape[1]):
+        if packed.starts[node, 1] == packed.starts[node + 1, 1]:
+            continue
+        # A node that stands in all frames is drawn once.
+        stands = True
+        for f in range(1, frames):
+            for i in range(3):
+                for j in range(4):
+                    stands &= X_CN[f, node, i, j] == X_CN[0, node, i, j]
+        for f in range(1 if stands else frames):
+            crossings = fill_rows(packed, node, node + 1, X_CN[f], camera, crossings, rows)
+            top, bottom = min(top, rows.row_range[0]), max(bottom, rows.row_range[1])
+            bit = (one << np.uint64(frames)) - one if stands else one << np.uint64(f)
+            if is_static[node]:  # Static nodes use the upper bits.
+                bit <<= np.uint64(frames)
+            for row in range(rows.row_range[0], rows.row_range[1]):
+                count = find_spans(row, crossings, rows.counts, rows.changes, rows.spans)
+                if count == 0:
+                    continue
+                ends[row, 0] = min(ends[row, 0], rows.spans[0, 0])
+                ends[row, 1] = max(ends[row, 1], rows.spans[count - 1, 1])
+                for k in range(count):
+                    for column in range(rows.spans[k, 0], rows.spans[k, 1]):
+                        words[row, column] |= bit
+    return top, bottom, crossings
+
+
+@compiled
+def _sum_up(
+    frames: int,
+    sums: PixelSums,
+    top: int,
+    bottom: int,
+    scratch: Words,
+    side: float,
+    always_covered: float,
+    totals: Array,
+    tiles: Array,
+) -> None:
+    """Add a body's sums to ``totals`` (4,) and ``tiles`` (t, t), and clear its words.
+
+    The other arguments are those of ``explain``, and rows and scratch of ``_cover``.
+    """
+    words, ends, positions, one = scratch.words, scratch.ends, scratch.positions, np.uint64(1)
+    zero, last, lowest = np.uint64(0), words.shape[1] - 1, words.shape[0] - 1
+    every = (one << np.uint64(frames)) - one
+    for row in range(top, bottom):
+        for column in range(ends[row, 0], ends[row, 1]):
+            word = words[row, column]
+            if word == zero:
+                continue
+            covered = word & every
+            if covered != zero:
+                a, b, c = sums.visible[row, column]
+                remaining = covered
+                while remaining != zero:
+                    bit = remaining & (~remaining + one)
+                    f = positions[(bit * _WINDOWS) >> np.uint64(58)]
+                    totals[Explained.AREA] += 1.0
+                    a += sums.covered[row, column, f, 0]
+                    b += sums.covered[row, column, f, 1]
+                    c += sums.covered[row, column, f, 2]
+                    remaining ^= bit
+                gain = max(a, b, c) - sums.uncovered[row, column]
+                if covered == every:
+                    gain = always_covered * max(gain, 0.0)
+                totals[Explained.GAIN] += gain
+                count = tiles.shape[0]
+                if count > 0:
+                    tiles[int(row / side) % count, int(column / side) % count] += gain
+            left_of = words[row, column - 1] if column > 0 else word
+            right_of = words[row, column + 1] if column < last else word
+            above = words[row - 1, column] if row > 0 else word
+            below = words[row + 1, column] if row < lowest else word
+            across_u, across_v = word & ~(left_of & right_of), word & ~(above & below)
+            remaining = across_u | across_v
+            while remaining != zero:
+                bit = remaining & (~remaining + one)
+                f = positions[(bit * _WINDOWS) >> np.uint64(58)] % frames
+                strength = np.float32(-np.inf)
+                if across_u & bit != zero:
+                    strength = sums.edges[0, f, row, column]
+                if across_v & bit != zero:
+                    strength = max(strength, sums.edges[1, f, row, column])
+                totals[Explained.CONTOUR] += strength
+                totals[Explained.OUTLINE] += 1.0
+                remaining ^= bit
+    for row in range(top, bottom):
+        words[row, ends[row, 0] : ends[row, 1]] = zero
+        ends[row, 0], ends[row, 1] = words.shape[1], 0
+
+
+@compiled
+def explain(
+    packed: PackedOutlines,
+    X_CN: Array,
+    is_static: Mask,
+    camera: Array,
+    sums: PixelSums,
+    side: float,
+    tiles_per_side: int,
+    always_covered: float = 0.3,
+) -> tuple[Array, Array]:
+    """Score the poses of a body in all frames by sums over the pixels.
+
+    Args:
+        packed: surfaces of the nodes.
+        X_CN: (f, nodes, 3, 4) poses of the nodes in the frames.
+        is_static: (nodes,) whether a node is static in all frames. Static nodes belong to the
+            background; only their outline is scored.
+        camera: (8,) `Camera.kernel_parameters`.
+        sums: log-likelihoods and edges of the f frames' images.
+        side: side of a tile in which the gain is also summed [pixel].
+        tiles_per_side: t, number of tiles per row and column, to which their indices are taken
+            modulo; 0: there are no tiles.
+        always_covered: factor of the positive gain of pixels that the body covers in all frames,
+            whose background is unknown; a negative gain there counts 0.
+
+    Returns:
+        (4,) sums by ``Explained``, and (t, t) the gain of each tile (row, column).
+    """
+    totals, tiles = np.zeros(4), np.zeros((tiles_per_side, tiles_per_side))
+    scratch, crossings = make_words(packed, camera)
+    top, bottom, _ = _cover(packed, X_CN, is_static, camera, scratch, crossings)
+    _sum_up(X_CN.shape[0], sums, top, bottom, scratch, side, always_covered, totals, tiles)
+    return totals, tiles
+
+
+@compiled
+def explain_pose(
+    packed: PackedOutlines,
+    X_CW: Array,
+    X_WN: Array,
+    is_static: Mask,
+    camera: Array,
+    sums: PixelSums,
+    X_CN: Array,
+    totals: Array,
+    scratch: Words,
+    crossings: np.ndarray,
+    always_covered: float = 0.3,
+) -> np.ndarray:
+    """Write the sums (4,) of ``explain`` for one pose of the camera into ``totals``.
+
+    Args:
+        X_CW: (3, 4) pose of the world in the camera.
+        X_WN: (f, nodes, 3, 4) poses of the nodes in the world.
+        X_CN: (f, nodes, 3, 4) scratch.
+        scratch, crossings: of ``make_words``.
+
+    The other arguments are those of ``explain``.
+
+    Returns:
+        the crossings, reallocated if need be.
+    """
+    frames = X_WN.shape[0]
+    for f in range(frames):
+        for node in range(X_WN.shape[1]):
+            for i in range(3):
+                a, b, c = X_CW[i, 0], X_CW[i, 1], X_CW[i, 2]
+                for j in range(4):
+                    X_CN[f, node, i, j] = (
+                        a * X_WN[f, node, 0, j] + b * X_WN[f, node, 1, j] + c * X_WN[f, node, 2, j]
+                    )
+                X_CN[f, node, i, 3] += X_CW[i, 3]
+    totals[:] = 0.0
+    top, bottom, crossings = _cover(packed, X_CN, is_static, camera, scratch, crossings)
+    none = np.zeros((0, 0))
+    _sum_up(frames, sums, top, bottom, scratch, 1.0, always_covered, totals, none)
+    return crossings
+
+
+@compiled
+def explain_poses(
+    packed: PackedOutlines,
+    X_CW: Array,
+    X_WN: Array,
+    is_static: Mask,
+    camera: Array,
+    sums: PixelSums,
+) -> Array:
+    """Return the sums (n, 4) of ``explain`` for n poses X_CW (n, 3, 4) of the camera.
+
+    The other arguments are those of ``explain_pose``.
+    """
+    totals, X_CN = np.zeros((X_CW.shape[0], 4)), np.empty_like(X_WN)
+    scratch, crossings = make_words(packed, camera)
+    for n in range(X_CW.shape[0]):
+        crossings = explain_pose(
+            packed, X_CW[n], X_WN, is_static, camera, sums, X_CN, totals[n], scratch, crossings
+        )
+    return totals

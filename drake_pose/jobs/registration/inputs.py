@@ -256,6 +256,11 @@ def _read_episode(
                 f"--{name} needs masks, but {path} has pictures: make masks of them "
                 "(drake-pose masks), or leave it out"
             )
+    if scene_alone and settings.zeros and len(chosen) > 1:
+        raise SettingsError(
+            f"--zeros with --on takes one camera, but {path} has {', '.join(known)}: name the one "
+            f"on link '{settings.on}' (--camera NAME)"
+        )
     if scene_alone and standing is not None and not {*standing} <= {*mapped.posed}:
         raise SceneError(
             f"{path}: joints between the base and link '{settings.on}' are not logged, so its pose "

@@ -1,8 +1,6 @@
 """Register the cameras of a scene or an episode."""
 
-import os
 import time
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from drake_pose.arrays import Array, Picture
-from drake_pose.body import TARGET_POSITIONS, PoseTree, reshaped
+from drake_pose.body import TARGET_POSITIONS, PoseTree
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError
@@ -47,7 +45,7 @@ from drake_pose.jobs.registration.result import (
 )
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.jobs.registration.tracks import describe_tracks, draw_tracks, track_warnings
-from drake_pose.jobs.registration.trees import make_registration_tree
+from drake_pose.jobs.registration.trees import corrected_urdf, make_registration_tree
 from drake_pose.person.shape import shape_parts, shape_values
 from drake_pose.registration.bundle import adjust_bundle
 from drake_pose.registration.joint_offsets import KinematicParameter, calibrate_joints
@@ -224,7 +222,7 @@ class _Registration:
         # Cameras that see one target are first registered separately; it has one pose.
         several = self.inputs.target is not None and len(self.registered) > 1
         focal = settings.focal and not self.pictures
-        return not self.tracks and bool(settings.zeros or settings.lengths or focal or several)
+        return bool(settings.zeros or settings.lengths or focal or several)
 
     def find(self) -> None:
         """Register each camera by itself, from masks or from pictures.
@@ -493,6 +491,11 @@ class _Registration:
             RegistrationError: there are fewer frames than parameters, or the fit lost the robot.
         """
         inputs, names, cameras = self.inputs, self.body.kinematics.names, self.registered
+        if self.tracks:
+            (one, *_) = self.tracks.values()
+            self.parameters = describe_parameters(one.offsets, (), self.body.kinematics)
+            significant = {each.name: each.value for each in one.offsets if each.significant}
+            return corrected_urdf(inputs.model, folder, significant, {})
         found = calibrate_joints(
             self.body, list(cameras.values()), [inputs.of(name) for name in cameras],
             inputs.offset_joints, self._settings.focal, links=inputs.scaled_links,
@@ -530,23 +533,7 @@ class _Registration:
             again = [replace(one, inlier_ratio=ratio, is_inlier=own) for one, ratio, own in rows]
             self.registered[camera.name] = replace(before, frames=tuple(again))
             self._update(kinematics, camera, covariance, target_pose)
-        path = inputs.model.path
-        if (
-            folder is None
-            or not inputs.model.changes_shape
-            or not (offsets_in_file or shifts_in_file)
-        ):
-            return None
-        # Offsets and scales change the joints' origins; mesh paths become relative to the folder.
-        text = path.read_text(encoding="utf-8")
-        root = ElementTree.fromstring(
-            reshaped(text, joint_offsets=offsets_in_file, joint_shifts=shifts_in_file)
-        )
-        for mesh in root.iter("mesh"):
-            name = mesh.get("filename", "")
-            if "://" not in name:
-                mesh.set("filename", os.path.relpath(path.parent / name, folder))
-        return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
+        return corrected_urdf(inputs.model, folder, offsets_in_file, shifts_in_file)
 
     def _offsets_in_pictures(self) -> dict[str, float]:
         """Return the mean joint offsets from registrations in pictures, by name [rad or m].

@@ -1,8 +1,20 @@
-"""The pose trees of a registration: from the world, or from the link that carries the cameras."""
+"""Pose trees of a registration, from the world or the cameras' link, and corrected models."""
+
+import os
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
-from drake_pose.body import TARGET, ArticulatedModel, PoseTree, RootRotation, load_model
+from drake_pose.body import (
+    TARGET,
+    ArticulatedModel,
+    PoseTree,
+    RootRotation,
+    load_model,
+    reshaped,
+)
 from drake_pose.errors import SettingsError
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.inputs import make_tree
@@ -63,3 +75,32 @@ def make_registration_tree(
     if not {node.name for node in moved.nodes[1:]} & set(base):
         raise fixed_link_error(model, link)
     return moved, tuple(base)
+
+
+def corrected_urdf(
+    model: ArticulatedModel,
+    folder: Path | None,
+    offsets: Mapping[str, float],
+    shifts: Mapping[str, Sequence[float]],
+) -> bytes | None:
+    """Return the text of a model's URDF with corrected origins of joints.
+
+    Args:
+        model: the model.
+        folder: the result folder, which mesh paths will be relative to.
+        offsets: joint offsets by name [rad or m].
+        shifts: by joint the shift (3,) of its origin in its parent link's frame [m].
+
+    Returns:
+        the text; None if nothing is corrected, there is no folder, or the model is no URDF.
+    """
+    path = model.path
+    if folder is None or not model.changes_shape or not (offsets or shifts):
+        return None
+    text = path.read_text(encoding="utf-8")
+    root = ElementTree.fromstring(reshaped(text, joint_offsets=offsets, joint_shifts=shifts))
+    for mesh in root.iter("mesh"):
+        name = mesh.get("filename", "")
+        if "://" not in name:
+            mesh.set("filename", os.path.relpath(path.parent / name, folder))
+    return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)

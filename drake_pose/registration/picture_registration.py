@@ -224,9 +224,8 @@ def explained_as_mirrored(
     ]
     mirrored, level = PictureSearch(body, camera.mirrored(), frames), search.compared
     X_CW = level.opposite(camera.X_CW)
-    improve = partial(mirrored.compared.improve, evaluations=evaluations, turn=turn)
-    _, X_CW = max(map_ordered(improve, [(k, X_CW) for k in range(starts)]), key=lambda one: one[0])
-    opposite = mirrored.coarse_fit(X_CW)
+    _, improved = mirrored.compared.improve([X_CW] * starts, evaluations, turn)
+    opposite = mirrored.coarse_fit(improved[0])
     if opposite is None:
         return False
     gains = mirrored.compared.tile_gains(opposite[0].X_CW)[:, ::-1]
@@ -258,9 +257,8 @@ def _scan_lenses(
             own = PictureSearch(body, camera, search.frames)
             # A longer focal length shows a body that is as much farther away at the same size.
             starts = [np.vstack([X[:2], X[2] * [1, 1, 1, factor], X[3]]) for X in found]
-            improve = partial(own.compared.improve, evaluations=150, turn=0.06)
-            improved = sorted(map_ordered(improve, enumerate(starts)), key=lambda one: -one[0])
-            results.append((improved[0][0], own, [X for _, X in improved]))
+            scores, improved = own.compared.improve(starts, evaluations=150, turn=0.06)
+            results.append((scores[0], own, improved))
     return max(results, key=lambda one: one[0])[1:]
 
 

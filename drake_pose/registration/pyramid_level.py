@@ -233,13 +233,13 @@ class PyramidLevel:
         corners = np.zeros((count, 7, 6))
         corners[:, np.arange(1, 7), np.arange(6)] = steps
         starts, costs = np.asarray(X_CW)[:, :3], np.zeros((count, 7))
-        own = self._scored()
+        own, step = self._scored(), max(1, min(5, count // 8))
 
         def search(k: int) -> None:
-            some = slice(k, k + 5)
+            some = slice(k, k + step)
             search_simplexes(own, starts[some], corners[some], costs[some], evaluations)
 
-        map_ordered(search, range(0, count, 5))
+        map_ordered(search, range(0, count, step))
         order = np.argsort(costs[:, 0], kind="stable")
         return -costs[order, 0], [self.moved(X_CW[k], corners[k, 0]) for k in order]
 

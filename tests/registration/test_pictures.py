@@ -491,7 +491,7 @@ def test_mirrored_pictures_are_distinguished_at_the_opposite_pose(episode, recor
         pictures = posed_pictures(own.mirrored(), range(0, 16, 2), LATE)
         camera = camera.mirrored().with_pose(np.linalg.inv(X_CW))
         search = PictureSearch(episode.body, camera, pictures)
-        _, X_CW = search.compared.improve((0, X_CW), evaluations=150, turn=0.08)
+        X_CW = search.compared.improve([X_CW], evaluations=150, turn=0.08)[1][0]
         camera = camera.with_pose(np.linalg.inv(X_CW))
     assert explained_as_mirrored(episode.body, search, camera) == mirrored
 

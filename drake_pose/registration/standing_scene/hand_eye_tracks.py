@@ -8,6 +8,7 @@ gripper's, move otherwise than the scene and do not count.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -260,14 +261,37 @@ def jackknife(problem: TrackProblem, fit: TrackFit) -> Array:
     """
     frames = np.unique(problem.seen.frames)
     groups = np.array_split(frames, min(TRACKS.groups, len(frames)))
-    rows = []
-    for group in groups:
-        other = fit_tracks(problem.without(group), fit)
-        by = inverse_transforms(fit.X_LC) @ other.X_LC
-        turn = Rotation.from_matrix(by[:3, :3]).as_rotvec()
-        rows.append([*turn, *by[:3, 3], *(other.constants - fit.constants)])
+    rows = [_moved(fit, fit_tracks(problem.without(group), fit)) for group in groups]
     off = np.array(rows) - np.mean(rows, axis=0)
     return np.asarray((len(rows) - 1) / len(rows) * off.T @ off)
+
+
+def intrinsics_effect(
+    problem: TrackProblem, fit: TrackFit, focal: float = 0.003, centre: float = 1.0
+) -> Array:
+    """Return the covariance (7 + k, 7 + k), see `TrackFit`, from errors of the intrinsics.
+
+    Args:
+        focal: relative standard deviation of a given focal length, as of usual calibrations.
+        centre: standard deviation of the principal point's coordinates [pixel].
+    """
+    camera = problem.camera
+    wrong = [
+        replace(camera, center_x=camera.center_x + centre),
+        replace(camera, center_y=camera.center_y + centre),
+    ]
+    if not problem.prior_sds[0]:
+        by = 1.0 + focal
+        wrong.append(replace(camera, focal_x=by * camera.focal_x, focal_y=by * camera.focal_y))
+    off = np.array([_moved(fit, fit_tracks(problem._replace(camera=one), fit)) for one in wrong])
+    return np.asarray(off.T @ off)
+
+
+def _moved(fit: TrackFit, other: TrackFit) -> Array:
+    """Return by how much another fit's unknowns (7 + k,), see `TrackFit`, differ from a fit's."""
+    by = inverse_transforms(fit.X_LC) @ other.X_LC
+    turn = Rotation.from_matrix(by[:3, :3]).as_rotvec()
+    return np.concatenate([turn, by[:3, 3], other.constants - fit.constants])
 
 
 def gauge_constants(problem: TrackProblem, X_LC: Array, constants: Array) -> NDArray[np.bool_]:
@@ -402,10 +426,12 @@ def _sampson(t: Array, Rx: Array, R_B: Array, y: Array) -> tuple[Array, Array]:
         Rx: (n, m, 3) rays of the first pictures, rotated into the second ones by R_B (n, m, 3, 3).
         y: (m, 3) rays of the second pictures.
     """
+    # A camera that only turns satisfies every constraint: such a pose explains nothing.
+    still = (t**2).sum(-1) < 1e-6
     line = np.cross(t, Rx)
     back = (np.cross(y, t)[..., None, :] @ R_B)[..., 0, :]
     size = np.sqrt((line[..., :2] ** 2).sum(-1) + (back[..., :2] ** 2).sum(-1)) + 1e-9
-    return (line * y).sum(-1) / size, size
+    return np.where(still, 1.0, (line * y).sum(-1) / size), size
 
 
 def _weights(r: Array, scale: float) -> Array:

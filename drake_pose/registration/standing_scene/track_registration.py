@@ -13,7 +13,7 @@ from scipy.special import stdtr, stdtrit
 from drake_pose.arrays import Array, Picture
 from drake_pose.body import inverse_transforms
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.errors import RegistrationError
+from drake_pose.errors import RegistrationError, listed
 from drake_pose.registration.hand_eye import rotation_spread
 from drake_pose.registration.joint_offsets import KinematicParameter
 from drake_pose.registration.picture_registration import TimeOffset, choose_pictures
@@ -25,6 +25,7 @@ from drake_pose.registration.standing_scene.hand_eye_tracks import (
     TrackProblem,
     fit_tracks,
     gauge_constants,
+    intrinsics_effect,
     jackknife,
     poses_differ,
 )
@@ -47,6 +48,8 @@ class TrackRegistrationSettings(NamedTuple):
             time offset [s], and of the logarithm of an unknown focal length.
         focals: focal lengths from which the search for an unknown one starts [given one].
         times: time offsets from which it starts [s].
+        least_turn: minimum rotation of the link about a second axis [deg].
+        least_motion: minimum standard deviation of the link's position [mm].
         determined: maximum standard deviation of a determined constant, over the prior's.
         max_sd: maximum standard deviation of a determined pose along any axis [rad, m].
         better: joint offsets that lower the residuals by this factor are likely.
@@ -62,6 +65,8 @@ class TrackRegistrationSettings(NamedTuple):
     focal_sd: float = 0.2
     focals: tuple[float, ...] = (0.65, 0.8, 1.0, 1.25)
     times: tuple[float, ...] = (-0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3)
+    least_turn: float = 2.0
+    least_motion: float = 5.0
     determined: float = 0.2
     max_sd: float = 0.04
     better: float = 1.5
@@ -128,6 +133,7 @@ def register_tracks(
     slow, fast = choose_pictures(body, camera, recording, settings.pictures, moving=settings.moving)
     rows = sorted({*slow, *fast})
     link_poses = _link_poses(body, base, recording, rows)
+    _require_motion(camera, link, link_poses(np.zeros(1 + len(names))))
     pictures = [recording.read(k) for k in rows]
     matches, seen = match_pictures(pictures)
     _require_matches(camera, matches, len(rows))
@@ -144,7 +150,7 @@ def register_tracks(
     problem = TrackProblem(camera, link_poses, seen, sds)
     problem, fit = _fit_determined(problem, start.X_LC[0], start.constants)
     _require_determined(camera, link, link_poses(fit.constants[1:]), fit.X_LC, fit.covariance)
-    covariance = jackknife(problem, fit)
+    covariance = jackknife(problem, fit) + intrinsics_effect(problem, fit)
     others = [fit_tracks(problem, X, start.constants) for X in start.X_LC[1:]]
     alike = [
         one.X_LC
@@ -155,7 +161,7 @@ def register_tracks(
     if not asked.any():
         likely, effect = _likely_offsets(body, problem, fit)
         covariance[:6, :6] += np.outer(effect, effect)
-    _require_determined(camera, link, link_poses(fit.constants[1:]), fit.X_LC, covariance)
+    _require_determined(camera, link, link_poses(fit.constants[1:]), fit.X_LC, covariance, likely)
     scale = float(np.exp(fit.constants[0]))
     placed = replace(
         camera, focal_x=scale * camera.focal_x, focal_y=scale * camera.focal_y
@@ -277,12 +283,35 @@ def _require_explained(camera: PinholeCamera, link: str, start: _Start) -> None:
         )
 
 
+def _require_motion(camera: PinholeCamera, link: str, X_WL: Array) -> None:
+    """Refuse motions of the link that determine no camera's pose on it, before any work.
+
+    Raises RegistrationError: states how far the link turns and moves.
+    """
+    turns = np.degrees(rotation_spread(X_WL[:, :3, :3]))
+    moved = 1e3 * float(np.linalg.norm(X_WL[:, :3, 3].std(axis=0)))
+    if turns[1] < STANDING_SCENE.least_turn or moved < STANDING_SCENE.least_motion:
+        raise RegistrationError(
+            f"camera '{camera.name}': between its pictures link '{link}' turns by {turns[0]:.0f} "
+            f"degrees about one axis and by {turns[1]:.1f} about others, and moves by {moved:.0f} "
+            f"mm (standard deviations): its pictures do not determine "
+            + ("its position along that axis" if moved >= STANDING_SCENE.least_motion else "scale")
+            + ". Rotate the wrist by 20 degrees or more about at least two axes, and move it by "
+            "100 mm, while the camera sees the same objects. Nothing was written"
+        )
+
+
 def _require_determined(
-    camera: PinholeCamera, link: str, X_WL: Array, X_LC: Array, covariance: Array
+    camera: PinholeCamera,
+    link: str,
+    X_WL: Array,
+    X_LC: Array,
+    covariance: Array,
+    likely: Sequence[str] = (),
 ) -> None:
     """Refuse a pose with too large standard deviations, and name the direction.
 
-    covariance: as of ``TrackFit``.
+    covariance: as of ``TrackFit``. likely: joints whose offsets are likely.
 
     Raises RegistrationError: states direction, standard deviation, and how the link turned.
     """
@@ -300,6 +329,12 @@ def _require_determined(
             )
     if worst:
         turns = np.degrees(rotation_spread(X_WL[:, :3, :3]))
+        if likely:
+            raise RegistrationError(
+                f"camera '{camera.name}': with the joint positions as logged its pictures do not "
+                f"determine {' and '.join(worst)}: offsets of {listed(likely)} explain the "
+                "pictures much better: estimate them, too (--zeros all). Nothing was written"
+            )
         raise RegistrationError(
             f"camera '{camera.name}': its pictures do not determine {' and '.join(worst)}: between "
             f"them the link turns by {turns[0]:.0f} degrees about one axis, by {turns[1]:.1f} and "

@@ -1,0 +1,148 @@
+"""Episodes of a camera on a wrist over a table, without masks or target."""
+
+import csv
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+from drake_pose.errors import RegistrationError, SettingsError
+from drake_pose.jobs.registration.register import register_scene
+from drake_pose.jobs.registration.settings import RegistrationSettings
+
+NAMES = tuple(f"joint{k}" for k in range(6))
+JOINTS = (
+    ((0.0, 0.0, 0.3), (0, 0, 1)),
+    ((0.0, 0.0, 0.1), (0, 1, 0)),
+    ((0.0, 0.0, 0.3), (0, 1, 0)),
+    ((0.0, 0.0, 0.25), (0, 0, 1)),
+    ((0.0, 0.0, 0.1), (0, 1, 0)),
+    ((0.0, 0.0, 0.08), (0, 0, 1)),
+)
+"""Where each joint is in its parent link [m], and its axis."""
+SIZE, FOCAL, LATE = (320, 240), 260.0, 0.06
+K = np.array([[FOCAL, 0.0, 159.5], [0.0, FOCAL, 119.5], [0.0, 0.0, 1.0]])
+X_LC = np.eye(4)
+X_LC[:3, :3] = Rotation.from_euler("zyx", [100.0, 8.0, -12.0], degrees=True).as_matrix()
+X_LC[:3, 3] = 0.04, -0.05, 0.03
+
+
+def write_arm(path: Path) -> Path:
+    """Write an arm whose base stands still; its last link is `link5`."""
+    box = '<visual><geometry><box size="0.08 0.08 0.08"/></geometry></visual>'
+    parts, parent = [f'<robot name="arm"><link name="base">{box}</link>'], "base"
+    for k, (place, axis) in enumerate(JOINTS):
+        parts.append(
+            f'<link name="link{k}">{box}</link><joint name="joint{k}" type="revolute">'
+            f'<parent link="{parent}"/><child link="link{k}"/>'
+            f'<origin xyz="{" ".join(map(str, place))}"/><axis xyz="{" ".join(map(str, axis))}"/>'
+            '<limit lower="-3" upper="3" effort="1" velocity="1"/></joint>'
+        )
+        parent = f"link{k}"
+    path.write_text("".join(parts) + "</robot>")
+    return path
+
+
+def values_at(times: np.ndarray, swing: np.ndarray) -> np.ndarray:
+    """Return joint positions (n, 6): the hand looks down, and swings."""
+    middle = np.array([0.0, 0.5, 1.2, 0.0, np.pi - 1.7, 0.2])
+    return middle + swing * np.sin(times[:, None] * (0.7, 0.9, 1.1, 1.3, 0.8, 1.0) + np.arange(6))
+
+
+def link_pose(values: np.ndarray) -> np.ndarray:
+    """Return the pose (4, 4) of the last link, by products of the joints' motions."""
+    X = np.eye(4)
+    for (place, axis), value in zip(JOINTS, values, strict=True):
+        step = np.eye(4)
+        step[:3, 3] = place
+        step[:3, :3] = Rotation.from_rotvec(value * np.array(axis)).as_matrix()
+        X = X @ step
+    return X
+
+
+def write_episode(folder: Path, swing: tuple[float, ...], objects: int = 150) -> Path:
+    """Write 40 pictures of a table with things on it, taken LATE after their times, and a log."""
+    rng = np.random.default_rng(4)
+    table = np.full((1500, 1500, 3), 170, np.uint8)
+    for _ in range(objects):
+        at, colour = rng.integers(0, 1400, 2), rng.integers(0, 255, 3).tolist()
+        cv2.rectangle(table, at.tolist(), (at + rng.integers(15, 90, 2)).tolist(), colour, -1)
+        cv2.circle(
+            table, rng.integers(0, 1500, 2).tolist(), int(rng.integers(8, 30)), colour[::-1], -1
+        )
+    pixel = 1.0 / len(table)
+    to_world = np.array([[pixel, 0, 0.0], [0, pixel, -0.5], [0, 0, 0], [0, 0, 1]])
+    images = folder / "images" / "wrist"
+    images.mkdir(parents=True)
+    times, rows = np.arange(40) / 5.0, [("frame", "time")]
+    for k, values in enumerate(values_at(times + LATE, np.array(swing))):
+        X_CW = np.linalg.inv(link_pose(values) @ X_LC)
+        picture = cv2.warpPerspective(table, K @ X_CW[:3] @ to_world, SIZE, flags=cv2.INTER_AREA)
+        picture[200:, 130:190] = table[100:140, 100:160] // 2  # A gripper.
+        noisy = picture + rng.normal(0.0, 2.0, picture.shape)
+        cv2.imwrite(str(images / f"{k:04d}.png"), noisy.clip(0, 255).astype(np.uint8))
+        rows.append((f"{k:04d}", str(times[k])))
+    (images / "timestamps.csv").write_text("\n".join(",".join(row) for row in rows))
+    camera = {"width": SIZE[0], "height": SIZE[1], "focal_x": FOCAL, "focal_y": FOCAL}
+    camera |= {"center_x": 159.5, "center_y": 119.5}
+    (folder / "cameras.yaml").write_text(yaml.safe_dump({"wrist": camera}))
+    logged = np.arange(-0.5, 9.0, 1.0 / 15.0)
+    with (folder / "joint_angles.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["time", *NAMES])
+        writer.writerows(
+            [t, *row] for t, row in zip(logged, values_at(logged, np.array(swing)), strict=True)
+        )
+    return folder
+
+
+@pytest.mark.slow
+def test_a_wrist_camera_is_found_over_things_on_a_table(tmp_path):
+    scene = write_episode(tmp_path / "scene", (0.15, 0.1, 0.12, 0.3, 0.25, 0.4))
+    settings = RegistrationSettings(on="link5")
+    result = register_scene(
+        scene, write_arm(tmp_path / "arm.urdf"), out=tmp_path / "out", settings=settings
+    )
+    found = result.registered["wrist"]
+    off = np.concatenate(
+        [
+            Rotation.from_matrix(X_LC[:3, :3] @ found.camera.X_WC[:3, :3].T).as_rotvec(),
+            X_LC[:3, 3] - found.camera.X_WC[:3, 3],
+        ]
+    )
+    assert np.linalg.norm(off[:3]) < np.radians(0.5)
+    assert np.linalg.norm(off[3:]) < 0.004
+    assert np.all(np.abs(off) < 4.0 * np.sqrt(np.diag(found.covariance)))
+    one = result.summary["cameras"]["wrist"]
+    assert one["evidence"] == "scene"
+    assert one["time_offset_s"] == pytest.approx(LATE, abs=0.005)
+    assert one["explained"] > 2.0 * one["explained_by_chance"]
+    assert yaml.safe_load((tmp_path / "out/cameras.yaml").read_text())["wrist"]["link"] == "link5"
+    assert list((tmp_path / "out/overlay/wrist").glob("*.png"))
+    assert "points that fit" in (tmp_path / "out/report.html").read_text()
+
+
+def test_a_wrist_that_turns_about_one_axis_is_refused(tmp_path):
+    scene = write_episode(tmp_path / "scene", (0.0, 0.0, 0.0, 0.0, 0.3, 0.0))
+    with pytest.raises(RegistrationError, match=r"link 'link5' turns by.*by 0\.0 about.*two axes"):
+        register_scene(
+            scene, write_arm(tmp_path / "arm.urdf"), settings=RegistrationSettings(on="link5")
+        )
+
+
+def test_a_bare_table_is_refused(tmp_path):
+    scene = write_episode(tmp_path / "scene", (0.15, 0.1, 0.12, 0.3, 0.25, 0.4), objects=0)
+    with pytest.raises(RegistrationError, match=r"camera 'wrist': .* without texture"):
+        register_scene(
+            scene, write_arm(tmp_path / "arm.urdf"), settings=RegistrationSettings(on="link5")
+        )
+
+
+def test_link_scales_need_masks(tmp_path):
+    scene = write_episode(tmp_path / "scene", (0.15, 0.1, 0.12, 0.3, 0.25, 0.4), objects=0)
+    settings = RegistrationSettings(on="link5", lengths=("all",))
+    with pytest.raises(SettingsError, match="lengths needs masks"):
+        register_scene(scene, write_arm(tmp_path / "arm.urdf"), settings=settings)

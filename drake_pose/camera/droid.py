@@ -116,7 +116,10 @@ def _zed_cameras(
     hand = file.get(f"observation/camera_type/{serial}")
     is_on_hand = hand is not None and not np.any(hand[()])
     if is_on_hand:
-        late.append(f"camera '{serial}' is on the hand (camera_type 0): it moves with the arm")
+        late.append(
+            f"camera '{serial}' is on the hand (camera_type 0): it moves with the arm; register "
+            f"finds it on its link (--on LINK --camera {serial})"
+        )
     warnings += [*video.warnings, *late]
     sides = ("_left", "_right") if video.width > stereo * video.height else ("",)
     width, cameras = video.width // len(sides), []

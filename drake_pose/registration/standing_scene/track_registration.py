@@ -277,7 +277,8 @@ def _require_explained(camera: PinholeCamera, link: str, start: _Start) -> None:
             f"camera '{camera.name}': no pose on link '{link}' explains how its pictures move: the "
             f"best one explains {start.explained:.0%} of {start.matches} matched points, where "
             f"joint positions of other moments explain {start.chance:.0%}; twice as much is "
-            f"needed. Does the camera ride on link '{link}', does the scene stand still, are the "
+            f"needed. Does the camera ride on link '{link}' "
+            f"(name the one that does: --camera NAME), does the scene stand still, are the "
             "joint positions those of these pictures, are the pictures not mirrored, and is the "
             "focal length about right? Nothing was written"
         )

@@ -124,7 +124,7 @@ def _register(
     """
     chosen, moving = frames
     pictures = posed_pictures(recording, chosen, 0.0)
-    near = _search(body, camera, pictures, offset_joints, most, guessed_lens)
+    near = _search(body, PictureSearch(body, camera, pictures), offset_joints, most, guessed_lens)
     if not near:
         raise unexplained_error(camera, "no pose shows the body in two pictures")
     search, start = near[0]
@@ -144,7 +144,8 @@ def _register(
     if recording.times is not None:
         clock = scan_time_offsets(body, start, recording.with_offsets(offsets), rows)
     # The same search with joint positions of other pictures tells what chance explains.
-    chance = _search(body, start, exchange_values(pictures), offset_joints, most)
+    exchanged = search.with_frames(exchange_values(search.frames))
+    chance = _search(body, exchanged, offset_joints, most)
     by_chance = max((one.compared.explained(k.X_CW)[0] for one, k in chance[:1]), default=0.0)
     found = PictureStart(start, rows, clock, alternatives, by_chance, offsets)
     return fit_pictures(body, found, recording, focal, offset_joints)
@@ -152,17 +153,17 @@ def _register(
 
 def _search(
     body: RegistrationBody,
-    camera: PinholeCamera,
-    pictures: Sequence[PosedPicture],
+    search: PictureSearch,
     offset_joints: Sequence[str],
     most: int,
     guessed_lens: bool = False,
 ) -> list[tuple[PictureSearch, PinholeCamera]]:
-    """Return searches in pictures with their cameras roughly fitted, best first.
+    """Return searches with their cameras roughly fitted, best first.
 
-    The arguments are those of `_register`.
+    Args:
+        search: the search; those returned have joint offsets added, or another lens.
+        body, offset_joints, most, guessed_lens: as of `_register`.
     """
-    search = PictureSearch(body, camera, pictures)
     poses = search.search()[:most]
     if guessed_lens:
         search, poses = _scan_lenses(body, search, poses)

@@ -183,10 +183,19 @@ class PictureSearch:
 
     def with_offsets(self, joint_offsets: Array) -> "PictureSearch":
         """Return the same search with offsets (m,) [rad or m] added to all frames' values."""
+        frames = tuple(replace(one, values=one.values + joint_offsets) for one in self.frames)
+        other = self.with_frames(frames)
+        other.joint_offsets = self.joint_offsets + joint_offsets
+        return other
+
+    def with_frames(self, frames: Sequence[PosedPicture]) -> "PictureSearch":
+        """Return the same search with other values of its f frames; their pictures are the same.
+
+        frames: f pictures in the same order.
+        """
         other = copy.copy(self)
         other.__dict__.pop("_small", None)
-        other.frames = tuple(replace(one, values=one.values + joint_offsets) for one in self.frames)
-        other.joint_offsets = self.joint_offsets + joint_offsets
+        other.frames = tuple(frames)
         other._X_WN = np.array([self._body.kinematics.poses(one.values) for one in other.frames])
         other._levels = {
             width: level.with_poses(other._X_WN[: len(level.backgrounds.pictures)])

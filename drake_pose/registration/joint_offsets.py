@@ -7,7 +7,7 @@ together with the parameters that it is correlated with.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from drake_pose.body import TARGET_POSITIONS, PoseTree
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
 from drake_pose.fit.parameters import POSE_NAMES, carried_joints, link_scale_name
+from drake_pose.registration.offset_search import joints_like_cameras
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import RegisteredCamera, RegistrationBody
 from drake_pose.registration.shared_fit import SHARED, SharedFit, SharedValues
@@ -156,7 +157,8 @@ def calibrate_joints(
         focal: whether the cameras' focal lengths are fitted.
         links: the links whose scales are fitted.
         level: probability that anything is significant by chance.
-        start: initial offsets by name [rad or m]; None, and for other names: 0.
+        start: offsets by name [rad or m] that the cameras were fitted with, 0 for other names.
+            Only parameters that a camera hides are then dropped, and its covariance includes them.
         still_factor: factor of the standard deviation of parameters correlated with a camera, such
             as a first joint's offset: only static parts separate the two, and pictures show these
             badly. 2.5 for pictures (six rooms with an SO-101, whose first offset was off by 0.1 to
@@ -187,25 +189,22 @@ def calibrate_joints(
         begin.shared[:] = [(start or {}).get(name, 0.0) for name in fit.names]
         if sought == requested:
             before = float(fit.inlier_ratios(begin).mean())
-        # Wrong parameters make outliers of good frames, so the first fit includes all frames.
-        fit, found = fit.from_found(fit.fit(SHARED.stages_with_constants, begin))
-        included = fit.inliers(fit.inlier_ratios(found))
-        fit, found = fit.from_found(fit.fit(SHARED.stages_with_constants, found, included))
+        # One camera and its offsets may have been fitted together before.
+        known = bool(start) and sought == requested and not links and len(views) == 1
+        fit, found, included = _fit_to_inliers(fit, begin, known)
         # Each mask contributes six affine motions to the estimate of the error sizes.
         freedom = max(1, 6 * int(np.count_nonzero(included)) - len(fit.names))
         own, shared = fit.covariances(found, included)
         covariance, least = own + shared, level / max(1, len(requested))
         values = describe_constants(fit, found, freedom, least, covariance, sought)
-        if all(one.determined for one in values.values()):
+        kept = _kept(values, fit if start else None)
+        if kept == sought:
             covariance = widen_to_cost_curvature(fit, found, included, own) + shared
             values = describe_constants(fit, found, freedom, least, covariance, sought)
-            if all(one.determined for one in values.values()):
-                # Significance is tested jointly once all parameters are determined.
-                most = float(stdtrit(freedom, 1.0 - 0.5 * least))
-                beside = significant_constants(fit, found, covariance, sought, most)
-                values = {k: replace(one, significant=k in beside) for k, one in values.items()}
+            kept = _kept(values, fit if start else None)
+        if kept == sought:
+            values = _with_significance(fit, found, freedom, least, covariance, values)
         parameters |= values
-        kept = [name for name in sought if values[name].determined]
     found, covariance, gauges = shrink_widened(fit, found, covariance, sought, still_factor)
     again = describe_constants(
         fit, found, freedom, least, covariance, sought, determined=0.2 * still_factor
@@ -219,17 +218,99 @@ def calibrate_joints(
     deviations = np.sqrt(np.diag(covariance))[: len(views) * fit.per_camera]
     first = len(fit.names) - len(fit.constants)
     target_rows = slice(first, first + len(target_positions))
+    held = {*joints} - {*sought} if start else set[str]()
+    covariances = fit.camera_covariances(found, covariance)
+    covariances += _unknown_rotations(views, fit.cameras(found), held)
     return JointCalibration(
         tuple(parameters[name] for name in joints),
         tuple(replace(parameters[link_scale_name(link)], name=link) for link in links),
         tuple(fit.cameras(found)),
-        fit.camera_covariances(found, covariance),
+        covariances,
         deviations[fit.per_camera - 1 :: fit.per_camera] if focal else np.zeros(len(views)),
         found.shared[target_rows],
         covariance[target_rows, target_rows],
         tuple(ratios[fit.rows == c] for c in range(len(views))),
         tuple(fit.inliers(ratios)[fit.rows == c] for c in range(len(views))),
     )
+
+
+def _with_significance(
+    fit: SharedFit,
+    found: SharedValues,
+    freedom: int,
+    level: float,
+    covariance: Array,
+    values: Mapping[str, KinematicParameter],
+) -> dict[str, KinematicParameter]:
+    """Return descriptions by name, with the significance of the determined ones tested jointly.
+
+    The other arguments are those of `describe_constants`.
+    """
+    most = float(stdtrit(freedom, 1.0 - 0.5 * level))
+    tested = [name for name, one in values.items() if one.determined]
+    beside = significant_constants(fit, found, covariance, tested, most)
+    return {k: replace(one, significant=k in beside) for k, one in values.items()}
+
+
+def _kept(values: Mapping[str, KinematicParameter], fit: SharedFit | None) -> list[str]:
+    """Return the names of the parameters that stay in a fit, from their descriptions by name.
+
+    fit: one that began at known offsets. Parameters that are not determined then stay, too, near
+        their expected 0, unless they are correlated with a camera: held at exactly 0, they would
+        bias the others. None: they go.
+    """
+    cameras = set() if fit is None else set(fit.names) - set(fit.constants)
+    return [
+        name
+        for name, one in values.items()
+        if one.determined or (fit is not None and not set(one.gauge) & cameras)
+    ]
+
+
+def _fit_to_inliers(
+    fit: SharedFit, begin: SharedValues, known: bool
+) -> tuple[SharedFit, SharedValues, Mask]:
+    """Fit cameras and parameters to the inliers among the masks.
+
+    Args:
+        fit, begin: the fit, and where it begins.
+        known: whether it begins at fitted values, which large steps may lose.
+
+    Returns:
+        the fit about the found cameras, the values, and the masks (rows,) that entered it.
+    """
+    found, stages = begin, SHARED.stages_with_constants
+    if known:
+        stages = stages[-SHARED.last_stages :]
+    else:
+        # Wrong parameters make outliers of good frames, so this fit includes all frames.
+        fit, found = fit.from_found(fit.fit(stages, begin))
+    included = fit.inliers(fit.inlier_ratios(found))
+    return *fit.from_found(fit.fit(stages, found, included)), included
+
+
+def _unknown_rotations(
+    views: Sequence[PosedFrames], cameras: Sequence[PinholeCamera], held: Collection[str]
+) -> Array:
+    """Return what cameras' covariances (cameras, 6, 6) lack where unknown offsets are held at 0.
+
+    An offset that looks like a rotation of the camera has its prior's standard deviation.
+
+    Args:
+        views: for each camera its frames.
+        cameras: at their poses.
+        held: names of the joints whose offsets are held.
+    """
+    missing = np.zeros((len(views), 6, 6))
+    for k, (view, camera) in enumerate(zip(views, cameras, strict=True)):
+        kinematics = view.kinematics
+        values = np.array([one.values for one in view.frames])
+        shown = np.array([len(one.vertices) > 0 for one in view.outlines])
+        for name in {*joints_like_cameras(kinematics, values, shown)} & {*held}:
+            twist = kinematics.motions(values[0]).twists[kinematics.names.index(name), :6]
+            moved = np.append(twist[:3], np.cross(twist[:3], camera.X_WC[:3, 3]) + twist[3:])
+            missing[k] += SHARED.constant_deviation**2 * np.outer(moved, moved)
+    return missing
 
 
 def shrink_widened(

@@ -18,17 +18,19 @@ from drake_pose.errors import RegistrationError
 from drake_pose.fit.covariance import vuong_statistic
 from drake_pose.fit.explain_kernel import Explained
 from drake_pose.fit.problem import TIME_OFFSET
+from drake_pose.registration.offset_search import (
+    find_base_rotation,
+    joint_rotation,
+    joints_like_cameras,
+    scan_base,
+)
 from drake_pose.registration.picture_acceptance import (
     PictureRegistration,
     PictureStart,
     accept_fit,
     unexplained_error,
 )
-from drake_pose.registration.picture_search import (
-    PictureFit,
-    PictureSearch,
-    PosedPicture,
-)
+from drake_pose.registration.picture_search import PictureFit, PictureSearch, PosedPicture
 from drake_pose.registration.pyramid_level import evidence
 from drake_pose.registration.recording import (
     NO_CLOCK,
@@ -38,9 +40,7 @@ from drake_pose.registration.recording import (
     mean_time,
     posed_pictures,
 )
-from drake_pose.registration.register import (
-    RegistrationBody,
-)
+from drake_pose.registration.register import RegistrationBody
 from drake_pose.registration.shared_fit import SHARED
 from drake_pose.workers import map_ordered
 
@@ -365,10 +365,52 @@ def _fit_until_stable(
         assumed, turn = joint_offsets, np.array([found.get(name, 0.0) for name in names])
         most = SHARED.max_constant
         offset, joint_offsets = offset + by, np.clip(joint_offsets + turn, -most, most)
+        if offset_joints and left:
+            posed = search.with_offsets(joint_offsets)
+            camera, angle = _turn_to_base(body, camera, posed.frames, offset_joints)
+            joint_offsets, turn = joint_offsets - angle, turn - angle
         if not left or (abs(by) < 0.02 and np.abs(turn).max() < np.radians(0.3)):
             clock = replace(start.clock, value=offset)
             done = start._replace(camera=camera, clock=clock, joint_offsets=joint_offsets)
             return best, as_now, done, assumed
+
+
+def _turn_to_base(
+    body: RegistrationBody,
+    camera: PinholeCamera,
+    frames: Sequence[PosedPicture],
+    offset_joints: Sequence[str],
+    *,
+    within: float = 0.45,
+    step: float = 0.0175,
+) -> tuple[PinholeCamera, Array]:
+    """Turn a camera about the first joint's axis to where the robot's base fits its pictures.
+
+    Args:
+        body: the robot's surfaces and pose tree.
+        camera: the camera at its fitted pose.
+        frames: f pictures with the values of the fit.
+        offset_joints: joints whose offsets are fitted. Without one whose offset looks like a
+            rotation of the camera, the camera stays.
+        within, step: bound and step of the angles [rad].
+
+    Returns:
+        the camera; and (m,) the angle that it turned [rad], at the joint whose offset falls by it.
+    """
+    kinematics, outlines = body.kinematics, body.medium
+    values = np.array([one.values for one in frames])
+    shown = np.array([len(one.vertices) > 0 for one in outlines])
+    like_cameras = joints_like_cameras(kinematics, values, shown)
+    joint = next((kinematics.names.index(k) for k in like_cameras if k in offset_joints), None)
+    turned = np.zeros(len(kinematics.names))
+    if joint is None:
+        return camera, turned
+    angles = np.arange(-within, within, step)
+    pictures = [one.picture for one in frames]
+    scores = scan_base(kinematics, outlines, camera, pictures, values, joint, angles)
+    turned[joint] = find_base_rotation(angles, scores)
+    X_WW = joint_rotation(kinematics, values[0], joint, turned[joint])
+    return camera.with_pose(np.linalg.inv(camera.X_CW @ X_WW)), turned
 
 
 def scan_time_offsets(

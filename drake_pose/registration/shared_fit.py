@@ -53,6 +53,8 @@ class SharedFitSettings(NamedTuple):
             stages are over the square root of the silhouettes' area. The last one is repeated:
             weakly observable constants, such as an offset correlated with the camera, converge
             slowly, and a stage ends when the cost hardly falls.
+        last_stages: number of these, from the last one on, for cameras and constants that were
+            fitted together before.
         inlier_stage: stage at which inliers and outliers are classified.
         final_stage: last stage of the fit of cameras.
         steps: limits and damping of a step.
@@ -80,6 +82,7 @@ class SharedFitSettings(NamedTuple):
         AnnealingStage(0.01, 0.01),
         *(5 * (AnnealingStage(0.005, 0.005, 6),)),
     )
+    last_stages: int = 7
     inlier_stage: AnnealingStage = AnnealingStage(0.025, 0.01)
     final_stage: AnnealingStage = AnnealingStage(0.005, 0.005)
     steps: StepSettings = StepSettings(max_step=0.3, damping=1e-2, uniform_damping=1e-6)

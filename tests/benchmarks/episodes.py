@@ -1,9 +1,9 @@
 """Benchmark of registration from images only: simulated episodes of arms in rooms, by Drake.
 
 Run as ``python -m tests.benchmarks.episodes DATA [--rooms N] [--first K] [--only TEXT]``; DATA is a
-folder with the arms ``arm_two_views/med7``, ``franka_one_view/panda`` and ``droid_episodes/robot``,
-N the number of rooms per arm and set. In sets with wrong rows, frames near the start and end of
-these rows are not evaluated.
+folder with the arms ``arm_two_views/med7``, ``franka_one_view/panda``, ``droid_episodes/robot`` and
+``so101``, N the number of rooms per arm and set. In sets with wrong rows, frames near the start and
+end of these rows are not evaluated.
 """
 
 import argparse
@@ -27,13 +27,23 @@ from tests.benchmarks.registration import pose_error
 from tests.benchmarks.rooms import LOG_HZ, SimulatedEpisode, simulate
 from tests.benchmarks.tables import print_table
 
+
+class Arm(NamedTuple):
+    """A model file, and bounds of a camera's distance from the point that it looks at [m]."""
+
+    file: str
+    distance: tuple[float, float] = (1.1, 1.7)
+    middle: tuple[float, float, float] = (0.0, 0.0, 0.4)
+
+
 _ARMS = {
-    "LBR Med 7": "arm_two_views/med7/med7.urdf",
-    "Franka Panda": "franka_one_view/panda/panda.urdf",
-    "Panda with Robotiq": "droid_episodes/robot/panda_robotiq.urdf",
+    "LBR Med 7": Arm("arm_two_views/med7/med7.urdf"),
+    "Franka Panda": Arm("franka_one_view/panda/panda.urdf"),
+    "Panda with Robotiq": Arm("droid_episodes/robot/panda_robotiq.urdf"),
+    "SO-101": Arm("so101/so101_new_calib.urdf", (0.6, 0.9), (0.05, 0.0, 0.12)),
 }
-# Prefixes of arm joints, without those of grippers.
-_JOINTS = ("A", "panda_joint", "lbr_")
+# Prefixes of arm joints, without those of grippers of several joints.
+_JOINTS = ("A", "panda_joint", "lbr_", "shoulder_", "elbow_", "wrist_", "gripper")
 # Every fifth room has little contrast (grey on grey).
 _GREY = 5
 # Maximum time offset [s], joint offset [deg], and duration of wrong rows [s].
@@ -45,19 +55,25 @@ _BETWEEN = 0.15
 
 
 class EpisodeSet(NamedTuple):
-    """Episodes with one kind of error: time offset, log rate, joint offsets, or wrong rows."""
+    """Episodes with one kind of error: time offset, log rate, joint offsets, or wrong rows.
+
+    off: bound of the offsets of all joints [deg]; zeros: offsets of three joints.
+    """
 
     name: str
     late: bool = False
     log_hz: float = LOG_HZ
     zeros: bool = False
     wrong: bool = False
+    off: float = 0.0
 
 
 SETS = (
     EpisodeSet("as recorded"),
     EpisodeSet("clock off by up to .3 s, log at 33 Hz", late=True, log_hz=33.0),
     EpisodeSet("three zeros off by 2 degrees", zeros=True),
+    EpisodeSet("all zeros off by up to 10 degrees", off=10.0),
+    EpisodeSet("all zeros off by up to 20 degrees", off=20.0),
     EpisodeSet("a third of the rows wrong", wrong=True),
 )
 
@@ -71,7 +87,8 @@ class Outcome(NamedTuple):
         off: position and orientation error of the camera [mm, deg].
         inside: number of the pose's six coordinates inside their 95 % intervals.
         clock: error of the time offset [s].
-        zeros: errors of the three wrong joint offsets [deg].
+        zeros: errors of the wrong joint offsets [deg]; without the first joint's.
+        first: error of the first joint's offset [deg]; NaN: it is right, or not determined.
         false: number of correct joint offsets reported as wrong.
         named: fractions of wrong and of correct frames reported as outliers.
     """
@@ -82,15 +99,17 @@ class Outcome(NamedTuple):
     inside: int = 0
     clock: float = np.nan
     zeros: tuple[float, ...] = ()
+    first: float = np.nan
     false: int = 0
     named: tuple[float, float] = (np.nan, np.nan)
 
 
-def measure_episode(path: Path, folder: Path, seed: int, kind: EpisodeSet) -> Outcome:
+def measure_episode(path: Path, arm: Arm, folder: Path, seed: int, kind: EpisodeSet) -> Outcome:
     """Simulate an episode with errors, and find its camera.
 
     Args:
         path: the arm's model file.
+        arm: where its camera stands.
         folder: folder for the files.
         seed: seed of the episode.
         kind: errors of the episode.
@@ -98,7 +117,8 @@ def measure_episode(path: Path, folder: Path, seed: int, kind: EpisodeSet) -> Ou
     rng = np.random.default_rng([10, seed])
     model = load_model(path, check=False)
     late = float(rng.uniform(-_LATE, _LATE)) if kind.late else 0.0
-    episode = simulate(model, folder, seed, grey=seed % _GREY == _GREY - 1, late=late)
+    grey = seed % _GREY == _GREY - 1
+    episode = simulate(model, folder, seed, grey, late, distance=arm.distance, middle=arm.middle)
     moving = [
         name
         for name, low, high in zip(model.position_names, model.lower, model.upper, strict=True)
@@ -109,12 +129,14 @@ def measure_episode(path: Path, folder: Path, seed: int, kind: EpisodeSet) -> Ou
         # Offsets of the first joint are absorbed by the camera, those of the last are invisible.
         three = rng.choice(moving[1:-1], 3, replace=False).tolist()
         turned = dict(zip(three, rng.choice([-_ZERO, _ZERO], 3).tolist(), strict=True))
+    if kind.off:
+        turned = dict(zip(moving, rng.uniform(-kind.off, kind.off, len(moving)), strict=True))
     wrong = (0.0, 0.0)
     if kind.wrong:
         begin = float(rng.uniform(0.5, episode.times[-1] - _WRONG - 0.5))
         wrong = (begin, begin + _WRONG)
     _write(folder, model, episode, kind.log_hz, turned, wrong)
-    settings = RegistrationSettings(zeros=("all",) if kind.zeros else ())
+    settings = RegistrationSettings(zeros=("all",) if turned else ())
     start = time.process_time()
     try:
         found = register_scene(folder, path, settings=settings)
@@ -168,16 +190,15 @@ def _outcome(
     one, summary = found.registered["camera"], found.summary
     error = pose_error(one.camera.X_WC, episode.camera.X_WC)
     inside = np.abs(error) < 1.96 * np.sqrt(np.diag(one.covariance))
-    offset, zeros, false = summary["time_offset_s"], list[float](), 0
+    offset, false, off = summary["time_offset_s"], 0, dict[str, float]()
     for name, estimate in summary["zeros"].items():
-        if name in turned:
-            # The estimated offset is added to readings, so it should cancel the error.
-            error_deg = (
-                (estimate["value_deg"] or 0.0) + turned[name] if estimate["significant"] else _ZERO
-            )
-            zeros.append(abs(error_deg))
-        else:
+        if name not in turned:
             false += bool(estimate["significant"])
+        elif estimate["determined"]:
+            # The estimated offset is added to readings, so it should cancel the error.
+            value = estimate["value_deg"] if estimate["significant"] else 0.0
+            off[name] = abs(value + turned[name])
+    first = off.pop(next(iter(summary["zeros"]), ""), np.nan)
     outliers = set(one.outliers)
     is_wrong = (episode.times >= wrong[0]) & (episode.times < wrong[1])
     between = np.abs(episode.times[:, None] - np.array(wrong)).min(axis=1) < _BETWEEN
@@ -189,7 +210,7 @@ def _outcome(
     return Outcome(
         True, seconds, (1e3 * float(np.linalg.norm(error[3:])),
         float(np.degrees(np.linalg.norm(error[:3])))), int(inside.sum()),
-        np.nan if offset is None else offset - late, tuple(zeros), false,
+        np.nan if offset is None else offset - late, tuple(off.values()), first, false,
         (fractions[0], fractions[1]),
     )  # fmt: skip
 
@@ -201,6 +222,7 @@ def _row(name: str, outcomes: Sequence[Outcome]) -> list[str]:
     off = np.array([one.off for one in found]).reshape(-1, 2)
     clocks = np.abs([one.clock for one in found if np.isfinite(one.clock)])
     zeros = [off for one in found for off in one.zeros]
+    first = [one.first for one in found if np.isfinite(one.first)]
     named = np.array([one.named for one in found]).reshape(-1, 2)
     return [
         name,
@@ -214,6 +236,7 @@ def _row(name: str, outcomes: Sequence[Outcome]) -> list[str]:
         f"{np.median(zeros):.2f} ({max(zeros):.2f}), {sum(one.false for one in found)}"
         if zeros
         else "-",
+        f"{np.median(first):.2f} ({max(first):.2f}), {len(first)}" if first else "-",
         " / ".join(
             f"{100.0 * float(np.mean(own)):.0f}%" if np.isfinite(own).all() and len(own) else "-"
             for own in named.T
@@ -224,13 +247,13 @@ def _row(name: str, outcomes: Sequence[Outcome]) -> list[str]:
 
 def _rows(data: Path, rooms: range, only: str) -> Iterator[list[str]]:
     for kind in SETS:
-        for name, file in _ARMS.items():
-            text = f"{kind.name}, {name}"
-            if only in text and (data / file).is_file():
+        for name, arm in _ARMS.items():
+            text, path = f"{kind.name}, {name}", data / arm.file
+            if only in text and path.is_file():
                 outcomes = []
                 for seed in rooms:
                     with tempfile.TemporaryDirectory() as folder:
-                        outcomes.append(measure_episode(data / file, Path(folder), seed, kind))
+                        outcomes.append(measure_episode(path, arm, Path(folder), seed, kind))
                         print(text, seed, outcomes[-1], flush=True)
                 yield _row(text, outcomes)
 
@@ -247,6 +270,7 @@ def main() -> None:
     headings = (
         "set, arm", "found", f"over {_FAR:g} mm off", "mm", "degrees", "inside 95 %",
         "clock [ms] (worst)", "zeros [degrees] (worst), sound ones named",
+        "first joint's zero (worst), determined",
         "frames named: wrong / right", "CPU s",
     )  # fmt: skip
     print_table("Cameras from pictures alone", headings, _rows(given.data, rooms, given.only))

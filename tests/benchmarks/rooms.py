@@ -34,8 +34,7 @@ LOG_HZ = 50.0
 """Rows of a joint log per second."""
 
 _PICTURES, _RATE_HZ = 60, 10.0
-_WIDTH, _HEIGHT, _FOCAL, _DISTANCE = 640, 480, 600.0, (1.1, 1.7)
-_MIDDLE = np.array([0.0, 0.0, 0.4])
+_WIDTH, _HEIGHT, _FOCAL = 640, 480, 600.0
 _NOISE = 4.0
 
 
@@ -173,6 +172,8 @@ def simulate(
     grey: bool = False,
     late: float = 0.0,
     moved: Callable[[int], Array] | None = None,
+    distance: tuple[float, float] = (1.1, 1.7),
+    middle: tuple[float, float, float] = (0.0, 0.0, 0.4),
 ) -> SimulatedEpisode:
     """Simulate an arm that swings, seen by a camera on any side.
 
@@ -180,6 +181,8 @@ def simulate(
         late: how late the pictures are [s].
         moved: returns the pose (4, 4) of the camera that takes picture k in the returned one;
             None: it stands still.
+        distance: bounds of the camera's distance from the point that it looks at [m].
+        middle: this point (x, y, z) in the world [m].
     """
     rng = np.random.default_rng([9, seed])
     moving = np.isfinite(model.lower) & (model.upper - model.lower > 0.1)
@@ -193,7 +196,7 @@ def simulate(
         q[:, moving] = centre + amplitude * np.sin(phase * 4.0 + rate * times[:, None])
         return q
 
-    away = rng.uniform(*_DISTANCE) * _around(rng, rng.uniform(-0.1, 0.8))
+    away = rng.uniform(*distance) * _around(rng, rng.uniform(-0.1, 0.8))
     X_WC = np.eye(4)
     forward = -away / np.linalg.norm(away)
     right = np.cross(forward, [0, 0, 1])
@@ -201,7 +204,7 @@ def simulate(
     X_WC[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
     tilt = RollPitchYaw(rng.normal(0, 0.1), rng.normal(0, 0.1), rng.normal(0, 0.15))
     X_WC[:3, :3] = X_WC[:3, :3] @ tilt.ToRotationMatrix().matrix()
-    X_WC[:3, 3] = _MIDDLE + away
+    X_WC[:3, 3] = np.array(middle) + away
     camera = PinholeCamera(
         "camera", _WIDTH, _HEIGHT, _FOCAL, _FOCAL, _WIDTH / 2 - 0.5, _HEIGHT / 2 - 0.5, X_WC
     )

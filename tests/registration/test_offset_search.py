@@ -3,10 +3,16 @@
 import numpy as np
 import pytest
 
-from drake_pose.registration.offset_search import joints_like_cameras
+from drake_pose.registration.offset_search import (
+    find_base_rotation,
+    joint_rotation,
+    joints_like_cameras,
+    scan_base,
+)
 from drake_pose.registration.picture_registration import register_pictures
 from drake_pose.registration.picture_search import PictureSearch, PosedPicture
-from tests.registration.arm_pictures import errors
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.registration.arm_pictures import errors, looking_at
 
 OFF = np.radians([0.0, 15.0, -12.0, 14.0, -15.0])
 """Offsets of the arm's joints. All its boxes move with the first one, whose offset is 0."""
@@ -52,3 +58,38 @@ def test_camera_and_large_offsets_are_found_within_their_deviations(episode, rec
         row = one.fit.fit.names.index(name)
         value = one.joint_offsets[k] + one.fit.found.shared[row]
         assert value == pytest.approx(OFF[k], abs=4.0 * deviations[row] + 1e-3)
+
+
+@pytest.mark.parametrize("degrees", [14.0, -14.0, 0.0])
+def test_a_base_is_turned_to_its_outline(model, body, degrees: float) -> None:
+    """The turret rests and stands for the base; all other boxes move with the shoulder."""
+    camera = looking_at(np.array([1.2, 0.5, 0.9]), np.array([0.0, 0.0, 0.2]), 0.1)
+    rng, kinematics = np.random.default_rng(3), body.kinematics
+    values = rng.uniform(0.3 * kinematics.lower, 0.3 * kinematics.upper, (6, 5))
+    values[:, 0] = 0.4
+    renderer, pictures = LabelRenderer(model, camera), []
+    for row in values:
+        labels = renderer.segments(*body.tree.positions_from(kinematics.split(row)))
+        painted = np.where((labels >= 0)[..., None], [90.0, 60.0, 30.0], [120.0, 130.0, 120.0])
+        pictures.append(np.uint8(painted + rng.normal(0.0, 3.0, painted.shape)))
+    # Camera and offset are wrong together, and the moving boxes stay where they are.
+    by = np.radians(degrees)
+    X_WW = joint_rotation(kinematics, values[0], 1, by)
+    wrong = camera.with_pose(np.linalg.inv(camera.X_CW @ X_WW))
+    values[:, 1] -= by
+    for row in values:
+        np.testing.assert_allclose(
+            wrong.X_CW @ kinematics.poses(row)[-1],
+            camera.X_CW @ kinematics.poses(row + np.array([0.0, by, 0.0, 0.0, 0.0]))[-1],
+            atol=1e-9,
+        )
+    angles = np.radians(np.arange(-24.0, 25.0))
+    scores = scan_base(kinematics, body.medium, wrong, pictures, values, 1, angles)
+    assert np.degrees(angles[np.argmax(scores)]) == pytest.approx(-degrees, abs=1.0)
+    found = find_base_rotation(angles, scores)
+    assert found == (angles[np.argmax(scores)] if degrees else 0.0)
+    # A base outside the pictures says nothing.
+    aside = wrong.with_pose(wrong.X_WC @ np.diag([-1.0, 1.0, -1.0, 1.0]))
+    nothing = scan_base(kinematics, body.medium, aside, pictures, values, 1, angles)
+    assert np.isnan(nothing).all()
+    assert find_base_rotation(angles, nothing) == 0.0

@@ -542,8 +542,11 @@ class _Registration:
         """
         if not self.pictures:
             return {}
-        found = np.mean([one.joint_offsets for one in self.pictures.values()], axis=0)
-        return dict(zip(self.body.kinematics.names, found.tolist(), strict=True))
+        names, several = self.body.kinematics.names, []
+        for one in self.pictures.values():
+            own = dict(zip(one.fit.fit.names, one.fit.found.shared, strict=True))
+            several.append(one.joint_offsets + [own.get(name, 0.0) for name in names])
+        return dict(zip(names, np.mean(several, axis=0).tolist(), strict=True))
 
     def _update(
         self,

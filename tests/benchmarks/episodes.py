@@ -36,7 +36,7 @@ class Arm(NamedTuple):
     middle: tuple[float, float, float] = (0.0, 0.0, 0.4)
 
 
-_ARMS = {
+ARMS = {
     "LBR Med 7": Arm("arm_two_views/med7/med7.urdf"),
     "Franka Panda": Arm("franka_one_view/panda/panda.urdf"),
     "Panda with Robotiq": Arm("droid_episodes/robot/panda_robotiq.urdf"),
@@ -45,11 +45,11 @@ _ARMS = {
 # Prefixes of arm joints, without those of grippers of several joints.
 _JOINTS = ("A", "panda_joint", "lbr_", "shoulder_", "elbow_", "wrist_", "gripper")
 # Every fifth room has little contrast (grey on grey).
-_GREY = 5
+GREY = 5
 # Maximum time offset [s], joint offset [deg], and duration of wrong rows [s].
 _LATE, _ZERO, _WRONG = 0.3, 2.0, 2.0
 # Maximum position error of a correct camera [mm].
-_FAR = 50.0
+FAR = 50.0
 # Frames this close to the start or end of wrong rows are not evaluated [s].
 _BETWEEN = 0.15
 
@@ -117,7 +117,7 @@ def measure_episode(path: Path, arm: Arm, folder: Path, seed: int, kind: Episode
     rng = np.random.default_rng([10, seed])
     model = load_model(path, check=False)
     late = float(rng.uniform(-_LATE, _LATE)) if kind.late else 0.0
-    grey = seed % _GREY == _GREY - 1
+    grey = seed % GREY == GREY - 1
     episode = simulate(model, folder, seed, grey, late, distance=arm.distance, middle=arm.middle)
     moving = [
         name
@@ -218,7 +218,7 @@ def _outcome(
 def _row(name: str, outcomes: Sequence[Outcome]) -> list[str]:
     """Return a row of the table."""
     found = [one for one in outcomes if one.found]
-    right = [one for one in found if one.off[0] <= _FAR]
+    right = [one for one in found if one.off[0] <= FAR]
     off = np.array([one.off for one in found]).reshape(-1, 2)
     clocks = np.abs([one.clock for one in found if np.isfinite(one.clock)])
     zeros = [off for one in found for off in one.zeros]
@@ -247,7 +247,7 @@ def _row(name: str, outcomes: Sequence[Outcome]) -> list[str]:
 
 def _rows(data: Path, rooms: range, only: str) -> Iterator[list[str]]:
     for kind in SETS:
-        for name, arm in _ARMS.items():
+        for name, arm in ARMS.items():
             text, path = f"{kind.name}, {name}", data / arm.file
             if only in text and path.is_file():
                 outcomes = []
@@ -268,7 +268,7 @@ def main() -> None:
     given = parser.parse_args()
     rooms = range(given.first, given.first + given.rooms)
     headings = (
-        "set, arm", "found", f"over {_FAR:g} mm off", "mm", "degrees", "inside 95 %",
+        "set, arm", "found", f"over {FAR:g} mm off", "mm", "degrees", "inside 95 %",
         "clock [ms] (worst)", "zeros [degrees] (worst), sound ones named",
         "first joint's zero (worst), determined",
         "frames named: wrong / right", "CPU s",

@@ -145,7 +145,7 @@ def _register(
         clock = scan_time_offsets(body, start, recording.with_offsets(offsets), rows)
     # The same search with joint positions of other pictures tells what chance explains.
     exchanged = search.with_frames(exchange_values(search.frames))
-    chance = _search(body, exchanged, offset_joints, most)
+    chance = _search(body, exchanged, (), most)
     by_chance = max((one.compared.explained(k.X_CW)[0] for one, k in chance[:1]), default=0.0)
     found = PictureStart(start, rows, clock, alternatives, by_chance, offsets)
     return fit_pictures(body, found, recording, focal, offset_joints)

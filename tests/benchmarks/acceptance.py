@@ -1,8 +1,8 @@
 """Benchmark of what a registration from pictures accepts and refuses.
 
 Run as ``python -m tests.benchmarks.acceptance DATA [--rooms N] [--first K] [--only TEXT]``, see
-``tests.benchmarks.episodes``. Positives are episodes as recorded; negatives have the joint positions
-of another episode, mirrored pictures, or the model of another arm.
+``tests.benchmarks.episodes``. Positives are episodes as recorded; negatives have the joint
+positions of another episode, mirrored pictures, or the model of another arm.
 """
 
 import argparse

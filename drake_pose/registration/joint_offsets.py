@@ -209,6 +209,7 @@ def calibrate_joints(
     again = describe_constants(
         fit, found, freedom, least, covariance, sought, determined=0.2 * still_factor
     )
+    found = fit_cameras_alone(fit, found, included)
     parameters |= {
         k: replace(one, significant=parameters[k].significant, gauge=gauges.get(k, one.gauge))
         for k, one in again.items()
@@ -364,6 +365,31 @@ def shrink_constants(
         covariance[np.ix_(known, known)] + np.diag(1.0 / information[known])
     )
     return np.asarray(found.shared - gain @ found.shared[known])
+
+
+def fit_cameras_alone(
+    fit: SharedFit, found: SharedValues, included: Mask, steps: int = 3
+) -> SharedValues:
+    """Return the values with the cameras' unknowns fitted again, and all others held.
+
+    Shrunk offsets move the cameras by the covariance, which has parts for errors that are not
+    fitted. Contours then fit badly.
+
+    Args:
+        fit, found: the fit, and its values after ``shrink_constants``.
+        included: (rows,) which masks enter.
+        steps: number of Gauss-Newton steps at each of two scales.
+    """
+    first = fit.problem.own_count
+    rows = slice(first, first + fit.per_camera * len(fit.views))
+    for stage in (SHARED.inlier_stage, SHARED.final_stage):
+        for _ in range(steps):
+            equations = fit.equations(found, stage, included)
+            H, g = equations.H.sum(axis=0)[rows, rows], equations.g.sum(axis=0)[rows]
+            shared = found.shared.copy()
+            shared[: rows.stop - first] -= np.linalg.solve(H, g)
+            found = found._replace(shared=shared)
+    return found
 
 
 def significant_constants(

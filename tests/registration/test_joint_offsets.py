@@ -13,6 +13,7 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.jobs.registration.diagnosis import likely_offset_warnings
 from drake_pose.registration.joint_offsets import (
     calibrate_joints,
+    fit_cameras_alone,
     shrink_constants,
     shrink_widened,
     widen_with_cameras,
@@ -195,3 +196,19 @@ def test_still_factor_enlarges_constants_correlated_with_a_camera() -> None:
     np.testing.assert_allclose(wider[1, 1], 2.5**2 * covariance[1, 1])
     np.testing.assert_allclose(wider[0, 0] - covariance[0, 0], 2.5**2 - 1.0)
     np.linalg.cholesky(wider)
+
+
+def test_cameras_follow_held_constants_back_to_the_contours(model, body, camera) -> None:
+    """A camera that a wrong covariance moved returns; the constants stay."""
+    frames = see(model, body, camera, 4, 6)
+    views = [PosedFrames(body.kinematics, body.full, camera, frames)]
+    fit = SharedFit(views, [camera.X_CW], NAMES)
+    shared = np.zeros(len(fit.names))
+    shared[:6] = [0.012, -0.009, 0.006, 0.009, -0.006, 0.03]
+    moved = fit.start._replace(shared=shared)
+    found = fit_cameras_alone(fit, moved, np.ones(len(frames), bool))
+    assert fit.inlier_ratios(found).mean() > fit.inlier_ratios(moved).mean() + 0.1
+    shift, turn = errors(fit.cameras(found)[0].X_WC, camera.X_WC)
+    assert shift < 2e-3
+    assert turn < np.radians(0.1)
+    np.testing.assert_array_equal(found.shared[6:], 0.0)

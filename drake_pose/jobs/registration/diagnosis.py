@@ -484,7 +484,7 @@ def parameter_warnings(found: JointCalibration) -> list[str]:
     with_cameras = [
         f"{what} is correlated with {', '.join(one.gauge)}: only static parts separate the two, "
         "and pictures show these badly, so the camera may be turned with it about the robot. Check "
-        "in the overlays whether the robot's base fits, or give masks or a second camera"
+        "in the overlays whether the robot's base fits, or give masks, or a camera with its pose"
         for what, one in requested
         if one.determined and one.gauge
     ]

@@ -130,11 +130,21 @@ class ArticulatedModel(ParsedModel):
     def without(self, links: Collection[str]) -> "ArticulatedModel":
         """Return the model without the visual geometry of some links and without their skin bands.
 
+        The plant of a model that is no URDF still draws them; pose trees do not.
+
         Raises:
             UnknownNameError: a link does not exist.
-            ModelError: the model is no URDF, or no visual geometry is left.
+            ModelError: no visual geometry is left.
         """
-        return self.reshaped(hidden=links)
+        if self.changes_shape:
+            return self.reshaped(hidden=links)
+        for name in links:
+            self.link_index(name)
+        left = {name: mesh for name, mesh in self.link_meshes.items() if name not in links}
+        if not left:
+            raise ModelError(f"{self.path}: no link with visual geometry is left")
+        kept = [band for band in self.skin if not {band.parent, band.child} & set(links)]
+        return replace(self, link_meshes=MappingProxyType(left), skin=tuple(kept))
 
     def reshaped(
         self,

@@ -469,6 +469,19 @@ class ParsedModel:
             raise UnknownNameError("link", name, self.link_names, str(self.path))
         return self.link_names.index(name)
 
+    def carried_by(self, link: str) -> tuple[str, ...]:
+        """Return a link and all links that it carries, by joints or welded to it, base first.
+
+        Raises UnknownNameError: there is no such link.
+        """
+        plant, names = self.plant, self.link_names
+        joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+        pairs = [(int(j.parent_body().index()), int(j.child_body().index())) for j in joints]
+        found = [self.link_index(link)]
+        for parent in found:
+            found += [child for own, child in pairs if own == parent and child not in found]
+        return tuple(names[k] for k in found)
+
     def position_index(self, name: str) -> int:
         """Return a position's index in q; UnknownNameError if it does not exist."""
         if name not in self.position_names:

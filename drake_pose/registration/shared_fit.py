@@ -32,6 +32,7 @@ from drake_pose.fit.covariance import (
     values_covariance,
 )
 from drake_pose.fit.evidence import Observation
+from drake_pose.fit.kernel import Sum
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, Equations, StepSettings
 from drake_pose.fit.parameters import (
     CAMERA_NAMES,
@@ -269,6 +270,19 @@ class SharedFit:
 
         masks = zip(self._observations, self._parameters(found), strict=True)
         return np.array(map_ordered(ratio, masks))
+
+    def matched_lengths(self, found: SharedValues) -> Array:
+        """Return the length of each node's contours in all masks, and how much of it fits.
+
+        The result is (nodes, 2) [pixel].
+        """
+
+        def lengths(mask: tuple[Observation, Array]) -> Array:
+            sums = self.problem.compare(*mask, SHARED.inlier_stage)[0].sums
+            return np.asarray(sums[:, :-1, [Sum.COMPARED, Sum.FITTING]].sum(axis=0))
+
+        masks = zip(self._observations, self._parameters(found), strict=True)
+        return np.sum(map_ordered(lengths, masks), axis=0)
 
     def inliers(self, ratios: Array) -> Mask:
         """Return which masks (rows,) are inliers, from all masks' inlier ratios (rows,).

@@ -136,6 +136,18 @@ class RegistrationInputs:
         return tuple(replace(one, values=own) for one, own in frames)
 
 
+def read_robot(path: Path, settings: AuditSettings) -> ArticulatedModel:
+    """Return the robot of a model file, without the links that are left out and what they carry.
+
+    Raises:
+        ModelError: the file cannot be used, or no link with a surface is left.
+        UnknownNameError: a link that is to be left out does not exist.
+    """
+    robot = load_model(path, package_paths=settings.packages)
+    left_out = dict.fromkeys(one for name in settings.without for one in robot.carried_by(name))
+    return robot.without(tuple(left_out)) if left_out else robot
+
+
 def uses_pictures(path: Path, settings: AuditSettings) -> bool:
     """Return whether a scene is used as an episode: it is one, or the settings say so."""
     return settings.pictures or is_episode(path, settings)
@@ -161,7 +173,7 @@ def read_inputs(
     if not scene.is_dir():
         raise SceneError(f"{scene}: no such folder; a scene has {CAMERA_FILE} and masks")
     require_recording(scene)
-    robot = load_model(model, package_paths=settings.packages)
+    robot = read_robot(model, settings)
     joints = joints or _own_joints(scene, robot, settings)
     if isinstance(settings, RegistrationSettings):
         return _read_masks(scene, robot, joints, cameras, settings)
@@ -183,7 +195,7 @@ def read_inputs(
         )
     held = tuple(found.cameras.values())
     tree = make_tree(robot, EstimateSettings(hold=settings.hold))
-    positions = read_known_positions(joints, TreeKinematics(tree))
+    positions = read_known_positions(joints, TreeKinematics(tree), bool(settings.without))
     warnings = [*read, *found.warnings, *robot.warnings, *positions.warnings]
     if positions.are_one_pose(positions.of(frame, held[0].name) for frame in frames):
         warnings.append(
@@ -219,7 +231,7 @@ def _read_episode(
             f"{path}: holds no joint positions, and none are given (--joints FILE): pictures alone "
             f"do not determine a robot's pose. {episode.warnings[-1]}"
         )
-    robot, target, standing = load_model(model, package_paths=settings.packages), None, None
+    robot, target, standing = read_robot(model, settings), None, None
     if isinstance(settings, RegistrationSettings):
         target = read_target(robot, settings)
         tree, standing = make_registration_tree(robot, settings, target)
@@ -339,8 +351,8 @@ def _read_masks(
         )
         positions = estimate_positions(path, robot, kinematics, held, asked)
     else:
-        on_link = settings.on is not None
-        positions = read_known_positions(joints, kinematics, on_link, table)
+        unobserved = settings.on is not None or bool(settings.without)
+        positions = read_known_positions(joints, kinematics, unobserved, table)
     found, unplaced = [camera.name for camera in searched], (*file.unplaced, *file.links)
     left_out = tuple(name for name in unplaced if name not in found)
     warnings = [*file.warnings, *scene.warnings, *robot.warnings, *positions.warnings]

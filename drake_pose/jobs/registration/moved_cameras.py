@@ -197,9 +197,7 @@ def motion_findings(
             if pixels and part.of == name:
                 angle = pixels / float(np.mean(camera.kernel_parameters()[1:3]))
                 findings.append(
-                    Finding(
-                        "moved", name, angle, 0.0, 0.0, 0.0, pixels, 0.0, link="camera", text=what
-                    )
+                    Finding("moved", name, angle, 0.0, 0.0, 0.0, pixels, 0.0, text=what)
                 )
     for (name, part), (other, later) in pairwise(inputs.parts.items()):
         if part.of == later.of and name in found and other in found:

@@ -32,6 +32,7 @@ from drake_pose.jobs.registration.diagnosis import (
 from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs
 from drake_pose.jobs.registration.lerobot_files import lerobot_files, require_data_set
 from drake_pose.jobs.registration.moved_cameras import register_recordings, split_moved_cameras
+from drake_pose.jobs.registration.odd_links import odd_link_warnings
 from drake_pose.jobs.registration.result import (
     check_exports,
     compared_frames,
@@ -384,6 +385,8 @@ class _Registration:
                 own = [replace(k, values=k.values + self._joint_offsets) for k in picture.frames]
             if not self._settings.zeros:
                 self.warnings += likely_offset_warnings(body, fitted, own)
+            if inputs.target is None and not inputs.positions.is_estimate:
+                self.warnings += odd_link_warnings(body, fitted, own, self._settings.without)
             if self._settings.focal or (picture is not None and picture.focal_deviation):
                 continue
             checked, deviation, texts = check_focal_length(body, fitted, own)

@@ -31,6 +31,9 @@ class AuditSettings(EpisodeSettings):
 
     hold: Positions = field(default_factory=dict)
     """Hold this joint at a known position [deg or m]; repeat for several."""
+    without: Annotated[tuple[str, ...], Parameter(metavar="LINK")] = ()
+    """Leave this link out, with all links that it carries: a gripper that is not the model's, or a
+    part that looks otherwise. It is neither drawn nor compared; repeat for several."""
     pictures: Annotated[bool, Parameter(negative="")] = False
     """Use the scene's pictures and joint log, even if it has masks."""
 

@@ -1,0 +1,71 @@
+"""Name links that do not look like the model's, such as another gripper."""
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+from pydrake.multibody.tree import BodyIndex
+
+from drake_pose.files.settings import percent
+from drake_pose.registration.posed_frames import LAST_SPACING, PosedFrame, PosedFrames
+from drake_pose.registration.register import RegisteredCamera, RegistrationBody, evenly_spaced
+from drake_pose.registration.shared_fit import SharedFit
+
+
+def odd_link_warnings(
+    body: RegistrationBody,
+    found: RegisteredCamera,
+    frames: Sequence[PosedFrame],
+    without: Collection[str] = (),
+    *,
+    max_ratio: float = 0.75,
+    min_fraction: float = 0.04,
+    most: int = 24,
+) -> list[str]:
+    """Return a warning of each link whose contours hardly fit, while the others' do.
+
+    Args:
+        body: the robot's surfaces.
+        found: the registered camera.
+        frames: its frames; at most `most` inliers are used.
+        without: links that were left out; those that they are fixed to are not judged.
+        max_ratio: a link is named if a smaller fraction of its contour fits than this times the
+            links' median. In masks by Drake's renderer right links have 0.93 or more, one with
+            another gripper 0.61 at most, one with a box of its own size 0.64 at most.
+        min_fraction: links with a smaller fraction of all contours are not judged.
+
+    """
+    names = {one.frame for one in found.frames if one.is_inlier}
+    some = evenly_spaced([one for one in frames if one.name in names], most)
+    if not some:
+        return []
+    posed = PosedFrames(body.kinematics, body.full, found.camera, some, LAST_SPACING)
+    fit = SharedFit([posed], [found.camera.X_CW])
+    lengths, fitting = fit.matched_lengths(fit.start).T
+    ratios = fitting / np.maximum(lengths, 1e-9)
+    shown = lengths >= min_fraction * max(float(lengths.sum()), 1e-9)
+    is_odd = shown & (ratios < max_ratio * np.median(ratios[shown]))
+    if not is_odd.any():
+        return []
+    others = shown & ~is_odd
+    elsewhere = percent(float(fitting[others].sum() / lengths[others].sum()))
+    texts, model = [], body.tree.model
+    joints = [model.plant.get_joint(index) for index in model.plant.GetJointIndices()]
+    cut = [one.parent_body() for one in joints if one.child_body().name() in without]
+    for k in np.flatnonzero(is_odd):
+        node = body.tree.nodes[k].name
+        # The gripper is welded to the last link, as a rule.
+        group = model.plant.GetBodiesWeldedTo(
+            model.plant.get_body(BodyIndex(model.link_index(node)))
+        )
+        if any(one.index() == other.index() for one in group for other in cut):
+            continue
+        fixed = [model.link_names[int(one.index())] for one in group]
+        welded = [name for name in fixed if name in model.link_meshes]
+        outermost = min(welded, key=lambda name: len(model.carried_by(name)), default=node)
+        more = "" if outermost == node else f" (with {outermost})"
+        texts.append(
+            f"camera '{found.camera.name}': {percent(float(ratios[k]))} of the contour of link "
+            f"'{node}'{more} fits, elsewhere {elsewhere}: is another gripper or tool mounted, a "
+            f"camera or a cable? --without {outermost} leaves it out, with what it carries"
+        )
+    return texts

@@ -1,0 +1,93 @@
+"""An arm whose gripper or forearm, by Drake's renderer, does not look like the model's."""
+
+import csv
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from drake_pose.body import load_model
+from drake_pose.camera.camera_files import dump_cameras
+from drake_pose.errors import UnknownNameError
+from drake_pose.jobs.registration.register import SceneRegistration, register_scene
+from drake_pose.jobs.registration.settings import RegistrationSettings
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.benchmarks.registration import write_box_arm
+from tests.registration.arm_pictures import errors, looking_at
+
+BOX = '<visual><origin xyz="{}"/><geometry><box size="{}"/></geometry></visual>'
+HAND, OTHER_HAND = BOX.format("0 0 0.05", "0.04 0.12 0.1"), BOX.format("0.05 0 0.1", "0.2 0.03 0.2")
+CAMERA = looking_at(np.array([1.2, -1.0, 0.8]), np.array([0.0, 0.0, 0.45]), 0.05)
+
+
+def write_arm(path: Path, hand: str, more: str = "") -> Path:
+    """Write the arm of boxes with a hand and a finger; more: another visual of its third link."""
+    text = write_box_arm(path).read_text().replace("</robot>", "")
+    text = text.replace('<link name="box2">', f'<link name="box2">{more}')
+    text += (
+        f'<link name="hand">{hand}</link><joint name="weld" type="fixed"><parent link="box4"/>'
+        '<child link="hand"/><origin xyz="0 0 0.1"/></joint>'
+        f'<link name="finger">{BOX.format("0 0.02 0.13", "0.02 0.02 0.06")}</link>'
+        '<joint name="slide" type="prismatic"><parent link="hand"/><child link="finger"/>'
+        '<axis xyz="0 1 0"/><limit lower="0" upper="0.02" effort="1" velocity="1"/></joint>'
+    )
+    path.write_text(f"{text}</robot>")
+    return path
+
+
+@pytest.fixture(scope="module", params=["another gripper", "a box on a link"])
+def odd(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory):
+    """A scene of masks with its joint positions, the model file given, and the odd link."""
+    folder = tmp_path_factory.mktemp("odd")
+    gripper = request.param == "another gripper"
+    extra = "" if gripper else BOX.format("0.06 0 0.1", "0.22 0.2 0.18")
+    drawn = load_model(write_arm(folder / "drawn.urdf", OTHER_HAND if gripper else HAND, extra))
+    given, rng = write_arm(folder / "given.urdf", HAND), np.random.default_rng(2)
+    masks = folder / "scene" / "masks" / "eye"
+    masks.mkdir(parents=True)
+    renderer, rows = LabelRenderer(drawn, CAMERA), [["frame", *drawn.position_names]]
+    for k in range(8):
+        q = rng.uniform(0.6 * drawn.lower, 0.6 * drawn.upper)
+        mask = renderer.mask(q)
+        cv2.imwrite(str(masks / f"{k:04d}.png"), 255 * mask.astype(np.uint8))
+        rows.append([f"{k:04d}", *q.tolist()])
+    with (folder / "scene" / "joint_angles.csv").open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
+    content = yaml.safe_load(dump_cameras([CAMERA]))
+    del content["eye"]["X_WC"]
+    (folder / "scene" / "cameras.yaml").write_text(yaml.safe_dump(content))
+    return folder / "scene", given, "box4' (with hand)" if gripper else "box2'"
+
+
+def off(found: SceneRegistration) -> tuple[float, float]:
+    """Return the errors of the camera [m, rad]."""
+    return errors(found.cameras["eye"].X_WC, CAMERA.X_WC)
+
+
+def test_what_does_not_look_like_the_model_is_named_and_the_rest_fitted(odd) -> None:
+    scene, given, link = odd
+    found = register_scene(scene, given)
+    texts = [one for one in found.warnings if "of the contour of link" in one]
+    assert any(f"link '{link} fits" in one for one in texts)
+    assert off(found) < (0.003, 0.003)
+
+
+def test_links_that_are_left_out_are_neither_drawn_nor_named(odd) -> None:
+    scene, given, link = odd
+    if "hand" not in link:
+        pytest.skip("a link in the middle carries the others")
+    found = register_scene(scene, given, settings=RegistrationSettings(without=("hand",)))
+    assert not [one for one in found.warnings if "of the contour of link" in one]
+    assert off(found) < (0.003, 0.003)
+    with pytest.raises(UnknownNameError, match="gripper"):
+        register_scene(scene, given, settings=RegistrationSettings(without=("gripper",)))
+
+
+def test_a_link_is_left_out_with_what_it_carries(odd) -> None:
+    model = load_model(odd[1], check=False)
+    assert model.carried_by("box3") == ("box3", "box4", "hand", "finger")
+    assert model.carried_by("finger") == ("finger",)
+    left = model.without(model.carried_by("box4"))
+    assert {*left.link_meshes} == {"box0", "box1", "box2", "box3"}

@@ -129,7 +129,12 @@ def _register(
         raise unexplained_error(camera, "no pose shows the body in two pictures")
     search, start = near[0]
     if explained_as_mirrored(body, search, start):
-        raise unexplained_error(camera, "the mirrored pictures are explained better")
+        explained = search.compared.explained(start.X_CW)[0]
+        raise unexplained_error(
+            camera,
+            f"the best one explains {max(explained, 0.0):.0%} of all changes, and one in mirrored "
+            "pictures explains more",
+        )
     gains = search.compared.tile_gains(start.X_CW)
     # Hypotheses that explain about as much are fitted again: they may converge to the best one.
     close = [

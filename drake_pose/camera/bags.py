@@ -241,7 +241,7 @@ def _clock_shifts(
 
     Args:
         pictures, states: rows by topic, and by (topic, names).
-        differs: clocks differ if headers lag behind the times in the bag by so much more or less
+        differs: clocks differ if headers lag behind the times in the bag by this much more or less
             than those of the joints [s]: more than recorders delay messages.
         max_fraction: maximum fraction of a stream's messages whose headers may have no stamp; they
             are left out.

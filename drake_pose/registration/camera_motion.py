@@ -32,9 +32,9 @@ class MotionSettings:
             are told apart [pixel of the tracked pictures].
         least_corners: minimum number of tracked corners.
         least_share: minimum fraction of the tracked corners that follow the common motion.
-        static_share: a background is static if so many corners do not move, as a fraction of those
-            that follow the best common motion. An object with many corners that fills a quarter of
-            the picture leaves 0.17, a camera nudged by 1.6 pixels 0.02.
+        static_share: a background is static if at least this many corners do not move, as a
+            fraction of those that follow the best common motion. An object with many corners
+            that fills a quarter of the picture leaves 0.17, a camera nudged by 1.6 pixels 0.02.
         least_step: minimum root mean square shift of a nudge or drift, and least shake
             [pixel of the tracked pictures].
         noises: the same, in standard deviations of the shifts about their median.
@@ -78,7 +78,7 @@ class Nudge(NamedTuple):
     rotation: Array
 
 
-class CameraMotion(NamedTuple):
+class PictureMotion(NamedTuple):
     """The motion of a camera that should stand still.
 
     Args:
@@ -101,7 +101,7 @@ class CameraPart(NamedTuple):
         rotation: (3, 3) approximate rotation of the camera in its frame in the first part.
         since, until: times of the part's first and last picture [s]; None: they have none.
         is_whole: whether it is the whole recording.
-        drift, shake: of ``CameraMotion`` [pixel].
+        drift, shake: of ``PictureMotion`` [pixel].
     """
 
     of: str
@@ -116,7 +116,7 @@ class CameraPart(NamedTuple):
 
 def find_camera_motion(
     read: Callable[[int], Picture], count: int, camera: PinholeCamera
-) -> CameraMotion:
+) -> PictureMotion:
     """Return how a camera moved while it took pictures.
 
     Args:
@@ -125,7 +125,7 @@ def find_camera_motion(
         camera: its intrinsics; its pose is not used.
     """
     if count < 4:
-        return CameraMotion(())
+        return PictureMotion(())
     rows = np.linspace(0, count - 1, min(count, MOTION.most)).round().astype(int)
     rows = np.unique([*range(3), *rows.tolist(), *range(count - 3, count)])
     tracker = _Background(read, int(rows[len(rows) // 2]), camera)
@@ -133,7 +133,7 @@ def find_camera_motion(
     known = np.isfinite(shifts).all(axis=1)
     # Where the background is often hidden or lost, nothing is known of the camera's motion.
     if known.sum() < max(4, 0.5 * len(rows)):
-        return CameraMotion(())
+        return PictureMotion(())
     rows, shifts = rows[known], shifts[known]
     steps = find_steps(shifts, tracker.least)
     steps = steps if len(steps) <= MOTION.most_nudges else []
@@ -149,7 +149,7 @@ def find_camera_motion(
         nudges.append(Nudge(before, after, pixels, tracker.rotation(by)))
     drift, shake = (max(sizes) for sizes in zip(*map(_drift_and_shake, parts), strict=True))
     least = tracker.least
-    return CameraMotion(
+    return PictureMotion(
         tuple(nudges),
         drift / tracker.scale if drift >= max(least, MOTION.noises * shake) else 0.0,
         shake / tracker.scale if shake >= least else 0.0,

@@ -217,8 +217,7 @@ def calibrate_joints(
     ratios = fit.inlier_ratios(found)
     require_fit_kept(float(ratios.mean()), before)
     deviations = np.sqrt(np.diag(covariance))[: len(views) * fit.per_camera]
-    first = len(fit.names) - len(fit.constants)
-    target_rows = slice(first, first + len(target_positions))
+    target_rows = np.arange(len(target_positions)) + len(fit.names) - len(fit.constants)
     held = {*joints} - {*sought} if start else set[str]()
     covariances = fit.camera_covariances(found, covariance)
     covariances += _unknown_rotations(views, fit.cameras(found), held)
@@ -229,7 +228,7 @@ def calibrate_joints(
         covariances,
         deviations[fit.per_camera - 1 :: fit.per_camera] if focal else np.zeros(len(views)),
         found.shared[target_rows],
-        covariance[target_rows, target_rows],
+        covariance[np.ix_(target_rows, target_rows)],
         tuple(ratios[fit.rows == c] for c in range(len(views))),
         tuple(fit.inliers(ratios)[fit.rows == c] for c in range(len(views))),
     )

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.registration.camera_motion import CameraMotion, find_camera_motion
+from drake_pose.registration.camera_motion import PictureMotion, find_camera_motion
 
 WIDTH, HEIGHT, FOCAL, COUNT = 320, 240, 300.0, 40
 CAMERA = PinholeCamera("eye", WIDTH, HEIGHT, FOCAL, FOCAL, 159.5, 119.5, np.eye(4))
@@ -16,7 +16,7 @@ K = np.array([[FOCAL, 0.0, 159.5], [0.0, FOCAL, 119.5], [0.0, 0.0, 1.0]])
 STILL = np.eye(3)
 
 
-def told(turned: Callable[[int], np.ndarray], seed: int, *, lamp: bool = False) -> CameraMotion:
+def told(turned: Callable[[int], np.ndarray], seed: int, *, lamp: bool = False) -> PictureMotion:
     """Return the motion found of a camera whose pose at picture k is turned by R (3, 3).
 
     A dark arm swings, a box as high as the picture crosses, a stack is taken away at picture 20,
@@ -72,7 +72,7 @@ def test_nudges_are_found_at_their_picture_with_their_angle(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_camera_that_stands_still_has_no_motion(seed: int) -> None:
-    assert told(lambda _: STILL, 10 + seed, lamp=seed % 2 == 1) == CameraMotion(())
+    assert told(lambda _: STILL, 10 + seed, lamp=seed % 2 == 1) == PictureMotion(())
 
 
 def test_two_nudges_of_which_the_second_undoes_the_first() -> None:
@@ -104,5 +104,5 @@ def test_nothing_is_told_of_pictures_without_corners() -> None:
     def plain(k: int) -> np.ndarray:
         return np.full((HEIGHT, WIDTH, 3), 100 + k, np.uint8)
 
-    assert find_camera_motion(plain, COUNT, CAMERA) == CameraMotion(())
-    assert find_camera_motion(plain, 2, CAMERA) == CameraMotion(())
+    assert find_camera_motion(plain, COUNT, CAMERA) == PictureMotion(())
+    assert find_camera_motion(plain, 2, CAMERA) == PictureMotion(())

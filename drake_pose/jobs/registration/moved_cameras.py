@@ -13,8 +13,8 @@ from drake_pose.errors import RegistrationError
 from drake_pose.jobs.registration.diagnosis import compare_camera
 from drake_pose.jobs.registration.inputs import RegistrationInputs
 from drake_pose.registration.camera_motion import (
-    CameraMotion,
     CameraPart,
+    PictureMotion,
     find_camera_motion,
 )
 from drake_pose.registration.findings import Finding
@@ -70,7 +70,7 @@ def split_moved_cameras(inputs: RegistrationInputs) -> RegistrationInputs:
 
 
 def _parts(
-    name: str, recording: Recording, motion: CameraMotion, taken: Collection[str]
+    name: str, recording: Recording, motion: PictureMotion, taken: Collection[str]
 ) -> dict[str, CameraPart]:
     """Return the parts of a camera's recording by name, in order.
 
@@ -92,7 +92,9 @@ def _parts(
     return parts
 
 
-def motion_warnings(camera: PinholeCamera, recording: Recording, motion: CameraMotion) -> list[str]:
+def motion_warnings(
+    camera: PinholeCamera, recording: Recording, motion: PictureMotion
+) -> list[str]:
     """Return warnings of a camera's nudges, drift and shake; empty: it stands still."""
 
     def as_turn(pixels: float) -> str:

@@ -206,9 +206,7 @@ def calibrate_joints(
             values = _with_significance(fit, found, freedom, least, covariance, values)
         parameters |= values
     found, covariance, gauges = shrink_widened(fit, found, covariance, sought, still_factor)
-    again = describe_constants(
-        fit, found, freedom, least, covariance, sought, determined=0.2 * still_factor
-    )
+    again = describe_constants(fit, found, freedom, least, covariance, sought)
     found = fit_cameras_alone(fit, found, included)
     parameters |= {
         k: replace(one, significant=parameters[k].significant, gauge=gauges.get(k, one.gauge))
@@ -218,7 +216,7 @@ def calibrate_joints(
     require_fit_kept(float(ratios.mean()), before)
     deviations = np.sqrt(np.diag(covariance))[: len(views) * fit.per_camera]
     target_rows = np.arange(len(target_positions)) + len(fit.names) - len(fit.constants)
-    held = {*joints} - {*sought} if start else set[str]()
+    held = {k for k in joints if not parameters[k].determined} if start else set[str]()
     covariances = fit.camera_covariances(found, covariance)
     covariances += _unknown_rotations(views, fit.cameras(found), held)
     return JointCalibration(

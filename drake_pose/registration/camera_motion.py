@@ -29,7 +29,7 @@ class MotionSettings:
         most: number of pictures that are compared, evenly spaced, before a nudge is bracketed.
         tiles: number of tiles along a picture's width; each gives its best corner.
         near, close: distances within which a corner follows a motion, and within which motions
-            are told apart [pixel of the tracked pictures].
+            are distinguished [pixel of the tracked pictures].
         least_corners: minimum number of tracked corners.
         least_share: minimum fraction of the tracked corners that follow the common motion.
         static_share: a background is static if at least this many corners do not move, as a

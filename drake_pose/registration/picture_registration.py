@@ -124,7 +124,7 @@ def _register(
     """
     chosen, moving = frames
     pictures = posed_pictures(recording, chosen, 0.0)
-    near = _search(body, PictureSearch(body, camera, pictures), offset_joints, most, guessed_lens)
+    near = _search(PictureSearch(body, camera, pictures), offset_joints, most, guessed_lens)
     if not near:
         raise unexplained_error(camera, "no pose shows the body in two pictures")
     search, start = near[0]
@@ -150,14 +150,13 @@ def _register(
         clock = scan_time_offsets(body, start, recording.with_offsets(offsets), rows)
     # The same search with joint positions of other pictures tells what chance explains.
     exchanged = search.with_frames(exchange_values(search.frames))
-    chance = _search(body, exchanged, (), most)
+    chance = _search(exchanged, (), most)
     by_chance = max((one.compared.explained(k.X_CW)[0] for one, k in chance[:1]), default=0.0)
     found = PictureStart(start, rows, clock, alternatives, by_chance, offsets)
     return fit_pictures(body, found, recording, focal, offset_joints)
 
 
 def _search(
-    body: RegistrationBody,
     search: PictureSearch,
     offset_joints: Sequence[str],
     most: int,
@@ -167,11 +166,11 @@ def _search(
 
     Args:
         search: the search; those returned have joint offsets added, or another lens.
-        body, offset_joints, most, guessed_lens: as of `_register`.
+        offset_joints, most, guessed_lens: as of `_register`.
     """
     poses = search.search()[:most]
     if guessed_lens:
-        search, poses = _scan_lenses(body, search, poses)
+        search, poses = _scan_lenses(search, poses)
     searches = [search] * len(poses)
     if offset_joints:
         both = map_ordered(partial(search.fit_offsets, offset_joints), poses)
@@ -239,7 +238,6 @@ def explained_as_mirrored(
 
 
 def _scan_lenses(
-    body: RegistrationBody,
     search: PictureSearch,
     found: Sequence[Array],
     factors: Sequence[float] = (0.5, 0.63, 0.8, 1.0, 1.25, 1.6, 2.0),
@@ -247,7 +245,6 @@ def _scan_lenses(
     """Improve poses with other focal lengths and aspect ratios of the pixels.
 
     Args:
-        body: the robot's surfaces.
         search: a search with a camera whose focal length is a guess.
         found: poses X_CW (4, 4) that it found.
         factors: of the focal length.
@@ -260,7 +257,7 @@ def _scan_lenses(
         for factor in factors:
             focal_x, focal_y = factor * squeezed.focal_x, factor * squeezed.focal_y
             camera = replace(squeezed, focal_x=focal_x, focal_y=focal_y)
-            own = PictureSearch(body, camera, search.frames)
+            own = search.with_camera(camera)
             # A longer focal length shows a body that is as much farther away at the same size.
             starts = [np.vstack([X[:2], X[2] * [1, 1, 1, factor], X[3]]) for X in found]
             scores, improved = own.compared.improve(starts, evaluations=150, turn=0.06)

@@ -188,6 +188,14 @@ class PictureSearch:
         other.joint_offsets = self.joint_offsets + joint_offsets
         return other
 
+    def with_camera(self, camera: PinholeCamera) -> "PictureSearch":
+        """Return the same search with another lens of the camera; its backgrounds stay."""
+        other = copy.copy(self)
+        other.__dict__.pop("_small", None)
+        other.camera = camera
+        other._levels = {width: level.with_camera(camera) for width, level in self._levels.items()}
+        return other
+
     def with_frames(self, frames: Sequence[PosedPicture]) -> "PictureSearch":
         """Return the same search with other values of its f frames; their pictures are the same.
 

@@ -99,6 +99,13 @@ class PyramidLevel:
         off = self._points - self._middle
         self._size = float(np.sqrt((off**2).sum(axis=1).mean()))
 
+    def with_camera(self, camera: PinholeCamera) -> "PyramidLevel":
+        """Return the same pictures with another lens, that of a camera of any picture size."""
+        other = copy.copy(self)
+        other.camera = camera.resized(self.camera.width, self.camera.height)
+        other._parameters = other.camera.kernel_parameters()
+        return other
+
     def with_poses(self, X_WN: Array) -> "PyramidLevel":
         """Return the same pictures with other poses of the nodes (f, nodes, 4, 4)."""
         other = copy.copy(self)

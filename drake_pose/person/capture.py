@@ -215,7 +215,7 @@ class _Capture:
         return shape, PersonPoseTracker(shaped, LENIENT, shape_values(fit.tree), shape.values, plan)
 
     def find_explanations(self, frame: int, start: PoseFit | None = None) -> list["_Explanation"]:
-        """Return the distinct poses that explain a frame, best first; [] if nobody is visible.
+        """Return the distinct poses that explain a frame, best first; [] if no person is visible.
 
         Where the shape is unknown, the shape of a first fit is used in the search, and each
         explanation gets its own shape before they are compared: in a body of other proportions a

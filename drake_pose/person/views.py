@@ -176,7 +176,7 @@ def shows_somebody(view: SilhouetteView | None, least: float = 0.15) -> bool:
     """Return whether a view shows more than a speck: searching a person in specks takes seconds.
 
     The silhouette's edge must be at least as long as the fraction `least` of the picture's height.
-    None, a camera without a view, shows nobody.
+    None, a camera without a view, shows no person.
     """
     return view is not None and float(view.edge.lengths.sum()) >= least * len(view.region)
 

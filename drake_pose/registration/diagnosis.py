@@ -340,7 +340,7 @@ class _Diagnoser:
         groups = [("", [*range(len(names))])] if len(names) > 1 else []
         groups += [(f" of camera '{name}'", [c]) for c, name in enumerate(names)]
         for where, group in groups:
-            # For one camera, a wrong pose is likelier than a wrong principal point.
+            # For one camera, a wrong pose explains more often than a wrong principal point.
             many, rank = ("", 6.5) if where else ("s", 2.0)
             focal, center = fit.focal_jacobian(group), fit.center_jacobian(group)
             if focal.any():

@@ -272,7 +272,7 @@ class PersonTracker(MemorySystem):
     def _follow_one(self, last: TrackState | None, seen: FrameViews) -> TrackState | None:
         """Return the person's next state in the views ``seen``, given the last state.
 
-        None if nobody was found or fewer than two cameras see somebody.
+        None if no person was found or fewer than two cameras see one.
         """
         return self._tracker.follow(last, seen) if len(seen.showing) >= 2 else None
 

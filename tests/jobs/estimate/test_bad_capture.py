@@ -186,7 +186,7 @@ def test_warnings_name_frames_without_the_person_and_with_others():
     views = ViewFaults((3,), {"a": (1,)}, {"a": (0, 1), "b": (1,)}, {"b": (1,)})
     nobody, blind, others = describe_views(views, NAMED)
     assert nobody.startswith("frame 3: fewer than two cameras")
-    assert "camera 'a' sees nobody in frame 1" in blind
+    assert "camera 'a' sees no person in frame 1" in blind
     assert "frame 0-1: somebody else is in view of cameras 'a' and 'b'" in others
     assert "in camera 'b' both share a silhouette (frame 1)" in others
 

@@ -89,7 +89,7 @@ def test_each_damaged_file_is_named_and_others_are_used(
     expected = [
         ("camera_7", "no camera", "8 masks"),
         ("0001", "camera_1", "not a PNG"),
-        ("camera_2", "nobody in frame 0006"),
+        ("camera_2", "no person in frame 0006"),
         ("camera_3", "7 of 8 frames", "0002"),
         ("camera_3", "Thumbs.db"),
     ]

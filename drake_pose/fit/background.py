@@ -14,7 +14,7 @@ pixel shows the body. Search lines across the contour then locate its edge (``fi
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -22,8 +22,10 @@ import numpy as np
 from scipy.ndimage import convolve1d
 
 from drake_pose.arrays import Array, Floats, Mask, Picture
+from drake_pose.compiled import compiled
 from drake_pose.fit.colours import COLOURS, Colour, colour_numbers
 from drake_pose.fit.explain_kernel import PixelSums
+from drake_pose.workers import map_ordered
 
 
 @dataclass(frozen=True)
@@ -129,11 +131,25 @@ class Backgrounds:
         """Estimate the backgrounds of a static camera's images (f, H, W, 3) red, green, blue."""
         floats = pictures.astype(np.float32)
         reference = np.median(floats, axis=0)
-        gains = tuple(estimate_gain(one, reference) for one in floats)
+        gains = tuple(map_ordered(lambda one: estimate_gain(one, reference), floats))
         even = np.array([apply_gain(*one) for one in zip(floats, gains, strict=True)])
         deviation = np.median(_largest(np.abs(even - reference)), axis=0)
         deviations = _deviations(reference, 1.4826 * float(np.median(deviation)))
         return Backgrounds(even, gains, _find_colours(even, deviations), deviations)
+
+    def mirrored(self) -> "Backgrounds":
+        """Return the backgrounds of the images with left and right exchanged."""
+        sums, gains = self.sums, self.gains
+        visible, covered, uncovered, edges, pictures, colours, deviations = (
+            np.ascontiguousarray(np.flip(one, axis))
+            for one, axis in (
+                (sums.visible, 1), (sums.covered, 1), (sums.uncovered, 1), (sums.edges, 3),
+                (self.pictures, 2), (self.colours, 2), (self.deviations, 1),
+            )
+        )  # fmt: skip
+        other = Backgrounds(pictures, gains, colours, deviations)
+        vars(other)["sums"] = PixelSums(visible, covered, uncovered, edges)
+        return other
 
     @cached_property
     def sums(self) -> PixelSums:
@@ -143,14 +159,16 @@ class Backgrounds:
         covered = np.empty((*size, len(self.pictures), count), np.float32)
         edges = np.empty((2, *self.pictures.shape[:3]), np.float32)
         noise = float(self.deviations.min())
-        for f, picture in enumerate(self.pictures):
+
+        def score(f: int) -> Floats:
+            """Fill in the sums of one frame, and return log-likelihoods of its backgrounds."""
+            picture = self.pictures[f]
             likeness = [_likeness(picture, one, self.deviations) for one in self.colours]
             stacked = np.stack(likeness, axis=-1)
             log_visible = np.log(MODEL.visible_match * stacked + (1.0 - MODEL.visible_match))
             covered[:, :, f] = (
                 np.log(MODEL.covered_match * stacked + (1.0 - MODEL.covered_match)) - log_visible
             )
-            visible += log_visible
             u, v = (_largest(np.abs(one)) for one in _slopes(picture))
             # Strength saturates at four standard deviations of the noise. An edge crosses an axis
             # unless the gradient along the other axis is much larger.
@@ -158,6 +176,10 @@ class Backgrounds:
             for k, (across, along) in enumerate(((u, v), (v, u))):
                 own = np.where(along <= 1.7 * across, strength, 0.0)
                 edges[k, f] = cv2.dilate(own, np.ones((3, 3), np.uint8))
+            return np.asarray(log_visible)
+
+        for log_visible in map_ordered(score, range(len(self.pictures))):
+            visible += log_visible
         return PixelSums(visible, covered, _largest(visible), edges - edges.mean())
 
     @cached_property
@@ -188,13 +210,50 @@ class Backgrounds:
         Args:
             covered: (f, H, W) approximate silhouettes of the body.
         """
-        totals = self.sums.visible.copy()
-        for f, own in enumerate(covered):
-            np.add(totals, self.sums.covered[:, :, f], out=totals, where=own[..., None])
-        best = totals.argmax(axis=-1)[None, ..., None]
-        colours = np.take_along_axis(self.colours, best, axis=0)[0]
-        deviation = _largest(np.abs(self.pictures - colours)) / self.deviations
-        return np.asarray((deviation < MODEL.match_deviations) & ~_grown(covered, MODEL.margin))
+        sums, shows = self.sums, np.empty(covered.shape, np.bool_)
+        _compare_likeliest(
+            sums.visible, sums.covered, covered, self.pictures, self.colours, self.deviations,
+            MODEL.match_deviations, shows,
+        )  # fmt: skip
+        return shows & ~_grown(covered, MODEL.margin)
+
+
+@compiled
+def _compare_likeliest(
+    visible: Floats,
+    sums: Floats,
+    covered: Mask,
+    pictures: Floats,
+    colours: Floats,
+    deviations: Floats,
+    most: float,
+    shows: Mask,
+) -> None:
+    """Write (f, H, W) whether frames look like the likeliest background of a pixel.
+
+    Args:
+        visible, sums: `visible` and `covered` of ``PixelSums``.
+        covered: (f, H, W) the pixels that the body covers.
+        pictures, colours, deviations: of ``Backgrounds``.
+        most: maximum deviation [standard deviations].
+        shows: (f, H, W) output.
+    """
+    frames, height, width = covered.shape
+    for row in range(height):
+        for column in range(width):
+            a, b, c = visible[row, column]
+            for f in range(frames):
+                if covered[f, row, column]:
+                    a += sums[row, column, f, 0]
+                    b += sums[row, column, f, 1]
+                    c += sums[row, column, f, 2]
+            best = 0 if a >= b and a >= c else 1 if b >= c else 2
+            for f in range(frames):
+                off = np.float32(0.0)
+                for k in range(3):
+                    own = pictures[f, row, column, k] - colours[best, row, column, k]
+                    off = max(off, abs(own))
+                shows[f, row, column] = off / deviations[row, column] < most
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +276,11 @@ class KnownBackground:
 
     @staticmethod
     def estimate(
-        pictures: Sequence[Picture], gains: Sequence[Floats], showing: Mask, covered: Mask
+        pictures: Sequence[Picture],
+        gains: Sequence[Floats],
+        showing: Mask,
+        covered: Mask,
+        at_once: int = 4,
     ) -> "KnownBackground":
         """Estimate the background from images of a static camera, of any size.
 
@@ -226,24 +289,32 @@ class KnownBackground:
             gains: (3, 4) photometric gain of each image.
             showing: (f, h, w) whether a frame shows the background, at a lower resolution.
             covered: (f, H, W) approximate silhouettes of the body.
+            at_once: number of frames in memory with corrected colours.
         """
         height, width = covered.shape[1:]
         total, count = np.zeros((height, width, 3), np.float32), np.zeros((height, width))
         on, beside = (np.zeros(COLOURS) for _ in range(2))
         inside, near = ~_grown(~covered, MODEL.margin), _grown(covered, MODEL.margin)
-        samples, differences = [], []
-        for f, (picture, gain) in enumerate(zip(pictures, gains, strict=True)):
-            even = apply_gain(picture, gain)
+        samples = []
+
+        def look(f: int) -> tuple[Floats, Mask, Array, Array]:
+            """Return a frame's even colours, where it shows the background, and two histograms."""
+            even = apply_gain(pictures[f], gains[f])
             shown = showing[f].astype(np.uint8)
             shown = cv2.resize(shown, (width, height), interpolation=cv2.INTER_NEAREST)
-            shows = shown.astype(np.bool_) & ~near[f]
-            cv2.accumulate(even, total, mask=shows.view(np.uint8))
-            count += shows
             numbers = colour_numbers(np.clip(even, 0.0, 255.0).astype(np.uint8))
-            on += np.bincount(numbers[inside[f]], minlength=COLOURS)
-            beside += np.bincount(numbers[~near[f]], minlength=COLOURS)
-            rows = np.flatnonzero(shows)[::37]
-            samples.append((rows, even.reshape(-1, 3)[rows]))
+            counts = (np.bincount(numbers[own], minlength=COLOURS) for own in (inside[f], ~near[f]))
+            return even, shown.astype(np.bool_) & ~near[f], *counts
+
+        for k in range(0, len(covered), at_once):
+            some = range(k, min(k + at_once, len(covered)))
+            for even, shows, own_on, own_beside in map_ordered(look, some):
+                cv2.accumulate(even, total, mask=shows.view(np.uint8))
+                count += shows
+                on += own_on
+                beside += own_beside
+                rows = np.flatnonzero(shows)[::37]
+                samples.append((rows, even.reshape(-1, 3)[rows]))
         colours = (total / np.maximum(count, 1.0)[..., None]).astype(np.float32)
         differences = [
             _largest(np.abs(own - colours.reshape(-1, 3)[rows])) for rows, own in samples
@@ -252,6 +323,15 @@ class KnownBackground:
         deviations = _deviations(colours, 1.4826 * float(np.median(noise)))
         return KnownBackground(
             colours, deviations, count == 0, _log_frequencies(on), _log_frequencies(beside)
+        )
+
+    def part(self, part: tuple[slice, slice]) -> "KnownBackground":
+        """Return the background in some rows and columns."""
+        return replace(
+            self,
+            colours=self.colours[part],
+            deviations=self.deviations[part],
+            unseen=self.unseen[part],
         )
 
     def foreground(self, picture: Picture, gain: Floats) -> Floats:
@@ -344,7 +424,8 @@ def _deviations(picture: Floats, noise: float) -> Floats:
 def _grown(masks: Mask, by: int) -> Mask:
     """Return masks (f, H, W) dilated by a disc whose radius is ``by`` pixels."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * by + 1,) * 2)
-    return np.array([cv2.dilate(one.astype(np.uint8), disc) for one in masks]).astype(np.bool_)
+    grown = map_ordered(lambda one: cv2.dilate(one.view(np.uint8), disc), masks)
+    return np.array(grown).view(np.bool_)
 
 
 def _likeness(pictures: Floats, colours: Floats, deviations: Floats) -> Floats:
@@ -382,8 +463,8 @@ def _find_colours(pictures: Floats, deviations: Floats, rows: int = 8) -> Floats
         deviations: (H, W) standard deviations of a background's colours.
         rows: height of a strip [pixel].
     """
-    strips = []
-    for k in range(0, pictures.shape[1], rows):
+
+    def find(k: int) -> Floats:
         own, count = pictures[:, k : k + rows], len(pictures)
         deviation = np.zeros((count, count, *own.shape[1:3]), np.float32)
         for f, picture in enumerate(own):
@@ -401,5 +482,7 @@ def _find_colours(pictures: Floats, deviations: Floats, rows: int = 8) -> Floats
             mean = (own * shared[..., None]).sum(axis=0) / np.maximum(number, 1)
             found.append(np.where(number > 0, mean, found[0] if found else mean).astype(np.float32))
             remaining &= ~shared
-        strips.append(np.array(found))
+        return np.array(found)
+
+    strips = map_ordered(find, range(0, pictures.shape[1], rows))
     return np.concatenate(strips, axis=1)

@@ -98,8 +98,11 @@ LINES = LineSettings()
 
 def colour_numbers(pixels: Picture) -> NDArray[np.intp]:
     """Return (...) histogram indices, below COLOURS, of pixels (..., 3 or 4) without alpha."""
-    red, green, blue = np.moveaxis(pixels[..., :3].astype(np.intp) >> 4, -1, 0)
-    return (red * 16 + green) * 16 + blue
+    red, green, blue = np.moveaxis(pixels[..., :3] & 240, -1, 0)
+    numbers = red.astype(np.uint16) << 4
+    numbers |= green
+    numbers |= blue >> 4
+    return numbers.astype(np.intp)
 
 
 @dataclass(frozen=True, eq=False)

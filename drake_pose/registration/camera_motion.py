@@ -5,7 +5,7 @@ motion is the background's shift. A body, people and shadows move fewer corners 
 has. A step of the shift is a nudge, a slow change a drift.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Floats, Picture
 from drake_pose.camera.models import PinholeCamera
+from drake_pose.workers import map_ordered
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,7 @@ def find_camera_motion(
     rows = np.linspace(0, count - 1, min(count, MOTION.most)).round().astype(int)
     rows = np.unique([*range(3), *rows.tolist(), *range(count - 3, count)])
     tracker = _Background(read, int(rows[len(rows) // 2]), camera)
-    shifts = np.array([tracker.shift(k) for k in rows])
+    shifts = tracker.shifts(rows.tolist())
     known = np.isfinite(shifts).all(axis=1)
     # Where the background is often hidden or lost, nothing is known of the camera's motion.
     if known.sum() < max(4, 0.5 * len(rows)):
@@ -209,7 +210,7 @@ def _bracket(
         tracker = _Background(read, reference, camera)
         while high - low > 1:
             k = (low + high) // 2
-            is_near = float(np.linalg.norm(tracker.shift(k))) < near
+            is_near = float(np.linalg.norm(tracker.shifts([k]))) < near
             low, high = (k, high) if is_near == from_low else (low, k)
         return low, high
 
@@ -239,13 +240,13 @@ class _Background:
         self._camera = camera.resized(*size)
         # The root mean square distance of a picture's pixels from its centre.
         self._radius = float(np.hypot(*size)) / np.sqrt(12.0)
-        self._reference = self._even(reference)
+        self._reference = self._even(read(reference))
         self._corners = _spread_corners(self._reference)
 
-    def _even(self, k: int) -> NDArray[np.uint8]:
-        """Return picture k (H, W) grey, with brightness and contrast made even everywhere."""
+    def _even(self, picture: Picture) -> NDArray[np.uint8]:
+        """Return a picture (H, W) grey, with brightness and contrast made even everywhere."""
         size = self._camera.width, self._camera.height
-        grey = cv2.cvtColor(self._read(k), cv2.COLOR_RGB2GRAY)
+        grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
         small: Floats = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
         small = np.asarray(cv2.GaussianBlur(small, (0, 0), 1.0))
         side = (2 * (size[0] // 40) + 1,) * 2
@@ -253,8 +254,15 @@ class _Background:
         spread = np.sqrt(cv2.blur(off * off, side))
         return np.clip(128.0 + 40.0 * off / (spread + 4.0), 0.0, 255.0).astype(np.uint8)
 
-    def shift(self, k: int) -> Array:
-        """Return the shift (4,) of picture k's background; nan: it is not determined.
+    def shifts(self, rows: Sequence[int], at_once: int = 8) -> Array:
+        """Return the shifts (n, 4) of several pictures; at_once: number of these in memory."""
+        found = list[Array]()
+        for k in range(0, len(rows), at_once):
+            found += map_ordered(self._shift, map(self._read, rows[k : k + at_once]))
+        return np.array(found)
+
+    def _shift(self, picture: Picture) -> Array:
+        """Return the shift (4,) of a picture's background; nan: it is not determined.
 
         It is the motion of the picture's centre along u and v, the rotation, and the relative
         growth times a picture's root mean square radius, all [pixel of the tracked pictures].
@@ -262,7 +270,7 @@ class _Background:
         unknown, corners = np.full(4, np.nan), self._corners
         if len(corners) < MOTION.least_corners:
             return unknown
-        found, is_tracked = _track(self._reference, self._even(k), corners)
+        found, is_tracked = _track(self._reference, self._even(picture), corners)
         one, other = corners[is_tracked], found[is_tracked]
         if len(one) < MOTION.least_corners:
             return unknown

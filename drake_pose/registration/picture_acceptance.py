@@ -16,6 +16,7 @@ from drake_pose.fit.problem import TIME_OFFSET
 from drake_pose.fit.surfaces import simplify_or_hull
 from drake_pose.registration.picture_search import (
     PictureFit,
+    PictureSearch,
     PosedPicture,
     segment_picture,
 )
@@ -71,7 +72,8 @@ class PictureStart(NamedTuple):
     camera: at its approximate pose. rows: indices of the recording's pictures to fit. clock: the
     time offset. alternatives: other poses X_CW (4, 4) that explain the pictures about as well.
     by_chance: fraction that a search explained with the joint positions of other pictures.
-    joint_offsets: (m,) approximate ones [rad or m]; None: 0.
+    joint_offsets: (m,) approximate ones [rad or m]; None: 0. search: a search in the pictures to
+    fit, whose backgrounds are used again; None: they are estimated.
     """
 
     camera: PinholeCamera
@@ -80,6 +82,7 @@ class PictureStart(NamedTuple):
     alternatives: Sequence[Array]
     by_chance: float
     joint_offsets: Array | None = None
+    search: PictureSearch | None = None
 
     @classmethod
     def of(cls, one: PictureRegistration) -> "PictureStart":
@@ -210,6 +213,7 @@ def evaluate_pictures(
     at_once: int = 20,
     shown: float = 0.01,
     min_overlap: float = 0.9,
+    around: float = 0.3,
 ) -> tuple[tuple[PosedFrame, ...], tuple[FrameMisfit, ...], tuple[str, ...]]:
     """Evaluate all pictures of a recording with a registered camera.
 
@@ -221,6 +225,7 @@ def evaluate_pictures(
         shown: minimum fraction of the picture that the body covers; other pictures are skipped.
         min_overlap: a frame is an inlier, too, if its intersection over union is at least this
             fraction of the fit's median: dark and blurred contours fit badly even in correct poses.
+        around: pictures are segmented up to this distance from the body [square root of its area].
 
     Returns:
         the frames that show the body, with masks and logged values; the misfit of each; and the
@@ -240,7 +245,7 @@ def evaluate_pictures(
         if covered.mean() < shown:
             return None
         gain = estimate_gain(posed.picture, known.colours)
-        return posed.name, segment_picture(posed, known, gain, covered)
+        return posed.name, segment_picture(posed, known, gain, covered, around)
 
     frames, misfits, lost = list[PosedFrame](), list[FrameMisfit](), list[str]()
     for k in range(0, len(rows), at_once):

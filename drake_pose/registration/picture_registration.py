@@ -7,6 +7,7 @@ frames and the fastest ones.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
@@ -69,18 +70,7 @@ def register_pictures(
         move, or no pose explains the pictures; the message says so if mirrored pictures fit.
     """
     chosen = choose_pictures(body, camera, recording)
-    try:
-        return _register(body, camera, recording, chosen, focal, offset_joints, guessed_lens)
-    except RegistrationError as error:
-        mirrored = camera.mirrored(), recording.mirrored()
-        try:
-            _register(body, *mirrored, chosen, focal, offset_joints, guessed_lens)
-        except RegistrationError:
-            raise error from None
-        raise RegistrationError(
-            f"camera '{camera.name}': its pictures are mirrored: a pose explains them only with "
-            "left and right exchanged. Mirror them again. Nothing was written"
-        ) from error
+    return _register(body, camera, recording, chosen, focal, offset_joints, guessed_lens)
 
 
 def register_near(
@@ -96,13 +86,14 @@ def register_near(
     by_chance: what a search explained by chance in other pictures of this camera.
     """
     try:
-        chosen, moving = choose_pictures(body, camera, recording)
-        rows, clock = [*chosen, *moving], NO_CLOCK
+        rows = [row for some in choose_pictures(body, camera, recording) for row in some]
+        search = PictureSearch(body, camera, posed_pictures(recording, rows, 0.0))
+        clock = NO_CLOCK
         if recording.times is not None:
-            clock = scan_time_offsets(body, camera, recording, rows)
-        exchanged = exchange_values(posed_pictures(recording, chosen, 0.0))
-        here = PictureSearch(body, camera, exchanged).compared.explained(camera.X_CW)[0]
-        start = PictureStart(camera, rows, clock, (), max(by_chance, here))
+            clock = scan_time_offsets(search, camera, recording)
+        exchanged = search.with_frames(exchange_values(search.frames))
+        here = exchanged.compared.explained(camera.X_CW)[0]
+        start = PictureStart(camera, rows, clock, (), max(by_chance, here), None, search)
         return fit_pictures(body, start, recording, focal, offset_joints)
     except RegistrationError:
         return register_pictures(body, camera, recording, focal, offset_joints)
@@ -117,10 +108,14 @@ def _register(
     offset_joints: Sequence[str],
     guessed_lens: bool = False,
     most: int = 3,
+    is_mirrored: bool = False,
 ) -> PictureRegistration:
-    """As register_pictures, without a test for mirrored pictures.
+    """As register_pictures.
 
-    frames: indices as of choose_pictures. most: maximum number of pose hypotheses that are fitted.
+    Args:
+        frames: indices as of choose_pictures.
+        most: maximum number of pose hypotheses that are fitted.
+        is_mirrored: whether these are pictures that were mirrored for a second search.
     """
     chosen, moving = frames
     pictures = posed_pictures(recording, chosen, 0.0)
@@ -128,13 +123,23 @@ def _register(
     if not near:
         raise unexplained_error(camera, "no pose shows the body in two pictures")
     search, start = near[0]
-    if explained_as_mirrored(body, search, start):
+    if explained_as_mirrored(search, start):
         explained = search.compared.explained(start.X_CW)[0]
-        raise unexplained_error(
+        error = unexplained_error(
             camera,
             f"the best one explains {max(explained, 0.0):.0%} of all changes, and one in mirrored "
             "pictures explains more",
         )
+        if is_mirrored:
+            raise error
+        both = camera.mirrored(), recording.mirrored()
+        with suppress(RegistrationError):
+            _register(body, *both, frames, focal, offset_joints, guessed_lens, most, True)
+            error = RegistrationError(
+                f"camera '{camera.name}': its pictures are mirrored: a pose explains them only "
+                "with left and right exchanged. Mirror them again. Nothing was written"
+            )
+        raise error
     gains = search.compared.tile_gains(start.X_CW)
     # Hypotheses that explain about as much are fitted again: they may converge to the best one.
     close = [
@@ -146,13 +151,15 @@ def _register(
     alike = [one.X_CW for _, one in again]
     alternatives = search.compared.distinct([start.X_CW, *alike])[1:]
     rows, clock, offsets = [*chosen, *moving], NO_CLOCK, search.joint_offsets
+    posed = posed_pictures(recording.with_offsets(offsets), rows, 0.0, search.frames)
+    fitted = search.with_frames(posed)
     if recording.times is not None:
-        clock = scan_time_offsets(body, start, recording.with_offsets(offsets), rows)
+        clock = scan_time_offsets(fitted, start, recording.with_offsets(offsets))
     # The same search with joint positions of other pictures tells what chance explains.
     exchanged = search.with_frames(exchange_values(search.frames))
     chance = _search(exchanged, (), most)
     by_chance = max((one.compared.explained(k.X_CW)[0] for one, k in chance[:1]), default=0.0)
-    found = PictureStart(start, rows, clock, alternatives, by_chance, offsets)
+    found = PictureStart(start, rows, clock, alternatives, by_chance, offsets, fitted)
     return fit_pictures(body, found, recording, focal, offset_joints)
 
 
@@ -201,7 +208,6 @@ def exchange_values(pictures: Sequence[PosedPicture], shift: int = 5) -> list[Po
 
 
 def explained_as_mirrored(
-    body: RegistrationBody,
     search: PictureSearch,
     camera: PinholeCamera,
     *,
@@ -217,17 +223,13 @@ def explained_as_mirrored(
     shown larger. That of the mirrored pictures is compared with the given one.
 
     Args:
-        body: the robot's surfaces.
         search: a search in the pictures.
         camera: at its pose in the pictures as they are.
         evaluations, turn: of each local search, see ``PyramidLevel.improve``.
         starts: number of local searches.
         threshold: minimum Vuong statistic of the mirrored pictures' advantage.
     """
-    frames = [
-        replace(one, picture=np.ascontiguousarray(one.picture[:, ::-1])) for one in search.frames
-    ]
-    mirrored, level = PictureSearch(body, camera.mirrored(), frames), search.compared
+    mirrored, level = search.mirrored(), search.compared
     X_CW = level.opposite(camera.X_CW)
     _, improved = mirrored.compared.improve([X_CW] * starts, evaluations, turn)
     opposite = mirrored.coarse_fit(improved[0])
@@ -356,9 +358,13 @@ def _fit_until_stable(
     if offset_joints and start.joint_offsets is not None:
         joint_offsets = start.joint_offsets
     as_now = recording.with_drift(start.clock.drift, mean_time(recording, start.rows))
+    search = start.search
     while True:
         left -= 1
-        search = PictureSearch(body, camera, posed_pictures(as_now, start.rows, offset))
+        frames = posed_pictures(as_now, start.rows, offset, () if search is None else search.frames)
+        if search is None:
+            search = PictureSearch(body, camera, frames)
+        search = search.with_camera(camera).with_frames(frames)
         best = search.with_offsets(joint_offsets).fit(camera, constants, focal)
         if best is None:
             raise unexplained_error(camera, "the body leaves the pictures")
@@ -416,10 +422,9 @@ def _turn_to_base(
 
 
 def scan_time_offsets(
-    body: RegistrationBody,
+    search: PictureSearch,
     camera: PinholeCamera,
     recording: Recording,
-    indices: Sequence[int],
     *,
     rates: Sequence[float] = (-0.2, -0.15, -0.1, -0.05, 0.05, 0.1, 0.15, 0.2, 0.25),
     start_within: float = 0.3,
@@ -431,26 +436,27 @@ def scan_time_offsets(
     estimated (infinite).
 
     Args:
-        indices: of the pictures that are used.
+        search: a search in the pictures that are used.
+        camera: at its pose.
+        recording: their recording, with the same joint offsets.
         rates: scanned drifts [s/s].
         start_within: for a drift both clocks start together within this time [s].
         much_better: minimum ratio of a drift's score to that of the best constant offset.
     """
     offsets = np.linspace(-1.0, 1.0, 81)
-    frames = posed_pictures(recording, indices, 0.0)
-    level = PictureSearch(body, camera, frames).compared
-    names = [one.name for one in frames]
-    rows = [recording.names.index(name) for name in names]
+    level = search.compared
+    rows = [recording.names.index(one.name) for one in search.frames]
 
     def gains_at(clock: Recording, tried: Array) -> Array:
         """Return log-likelihood gains (k,) at k time offsets [s]; NaN without logged joints."""
-        found = np.full(len(tried), np.nan)
-        for k, offset in enumerate(tried):
-            values = clock.values_at(float(offset))[rows]
-            if np.isfinite(values).all():
-                X_WN = np.array([body.kinematics.poses(one) for one in values])
-                found[k] = level.statistics(camera.X_CW, X_WN)[Explained.GAIN]
-        return found
+        several = [clock.values_at(offset)[rows] for offset in tried.tolist()]
+
+        def gain(values: Array) -> float:
+            if not np.isfinite(values).all():
+                return np.nan
+            return float(level.statistics(camera.X_CW, search.nodes_at(values))[Explained.GAIN])
+
+        return np.array(map_ordered(gain, several))
 
     scores = gains_at(recording, offsets)
     k = int(np.nanargmax(scores))

@@ -8,7 +8,7 @@ fitted on search lines across the contour in the pixels' foreground log-odds.
 """
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
@@ -144,7 +144,7 @@ class PictureSearch:
         least = 0.25 * max(one.ball[3] for one in coarse)
         coarse = tuple(one if one.ball[3] >= least else EMPTY_OUTLINE for one in coarse)
         self._outlines = (coarse, *finer)
-        self._X_WN = np.array([body.kinematics.poses(one.values) for one in frames])
+        self._X_WN = self.nodes_at(np.array([one.values for one in frames]))
         self._levels = dict[int, PyramidLevel]()
         self.joint_offsets = np.zeros(len(body.kinematics.names))
 
@@ -190,25 +190,43 @@ class PictureSearch:
 
     def with_camera(self, camera: PinholeCamera) -> "PictureSearch":
         """Return the same search with another lens of the camera; its backgrounds stay."""
-        other = copy.copy(self)
-        other.__dict__.pop("_small", None)
-        other.camera = camera
-        other._levels = {width: level.with_camera(camera) for width, level in self._levels.items()}
-        return other
+        return self._copy(lambda level: level.with_camera(camera), camera=camera)
+
+    def mirrored(self) -> "PictureSearch":
+        """Return the search in the mirrored pictures, whose backgrounds are mirrored, too."""
+        frames = tuple(
+            replace(one, picture=np.ascontiguousarray(one.picture[:, ::-1])) for one in self.frames
+        )
+        return self._copy(PyramidLevel.mirrored, camera=self.camera.mirrored(), frames=frames)
 
     def with_frames(self, frames: Sequence[PosedPicture]) -> "PictureSearch":
-        """Return the same search with other values of its f frames; their pictures are the same.
+        """Return the same search in other frames, with values without offsets.
 
-        frames: f pictures in the same order.
+        If they are the same pictures with other values, their backgrounds stay.
         """
+        X_WN = self.nodes_at(np.array([one.values for one in frames]))
+        other = self._copy(
+            lambda level: level.with_poses(X_WN[: len(level.backgrounds.pictures)]),
+            frames=tuple(frames),
+            _X_WN=X_WN,
+            joint_offsets=np.zeros_like(self.joint_offsets),
+        )
+        if [one.name for one in frames] != [one.name for one in self.frames]:
+            other._levels = {}
+        return other
+
+    def nodes_at(self, values: Array) -> Array:
+        """Return the nodes' poses X_WN (f, nodes, 4, 4) at values (f, m) of the pose tree."""
+        return np.array([self._body.kinematics.poses(one) for one in values])
+
+    def _copy(
+        self, level: Callable[[PyramidLevel], PyramidLevel], **changes: Any
+    ) -> "PictureSearch":
+        """Return the search with other attributes, and with other levels made from its own."""
         other = copy.copy(self)
         other.__dict__.pop("_small", None)
-        other.frames = tuple(frames)
-        other._X_WN = np.array([self._body.kinematics.poses(one.values) for one in other.frames])
-        other._levels = {
-            width: level.with_poses(other._X_WN[: len(level.backgrounds.pictures)])
-            for width, level in self._levels.items()
-        }
+        other.__dict__.update(changes)
+        other._levels = {width: level(one) for width, one in self._levels.items()}
         return other
 
     def fit_offsets(
@@ -374,14 +392,16 @@ class PictureSearch:
         """
         level = self._level(PICTURES.background_width)
         small = camera.resized(level.camera.width, level.camera.height)
-        poses = camera.X_CW @ self._X_WN
-        both = [
-            np.array([draw_mask(self._outlines[-1], X_CN, one) for X_CN in poses])
-            for one in (small, camera)
-        ]
+
+        def draw(own: PinholeCamera) -> Mask:
+            poses = camera.X_CW @ self._X_WN
+            return np.array(map_ordered(lambda X: draw_mask(self._outlines[-1], X, own), poses))
+
+        covered = draw(camera)
+        same = small.width == camera.width
+        showing = level.backgrounds.shows_background(covered if same else draw(small))
         pictures, gains = [one.picture for one in frames], level.backgrounds.gains
-        showing = level.backgrounds.shows_background(both[0])
-        return KnownBackground.estimate(pictures, gains, showing, both[1]), both[1]
+        return KnownBackground.estimate(pictures, gains, showing, covered), covered
 
     def _segment(
         self,
@@ -435,7 +455,11 @@ def _stages(scales: Sequence[float], posed: PosedFrames) -> list[AnnealingStage]
 
 
 def segment_picture(
-    one: PosedPicture, known: KnownBackground, gain: Floats, covered: Mask
+    one: PosedPicture,
+    known: KnownBackground,
+    gain: Floats,
+    covered: Mask,
+    around: float | None = None,
 ) -> PosedFrame | None:
     """Return the frame of a picture with log-odds and a mask; None where no body is visible.
 
@@ -444,11 +468,20 @@ def segment_picture(
         known: the background.
         gain: (3, 4) slopes and offset that map the picture's colours to the background's.
         covered: (H, W) the pixels that the body covers approximately.
+        around: log-odds farther from the body are 0 [square root of its area]; None: none are.
     """
     if not covered.any():
         return None
-    foreground = known.foreground(one.picture, gain)
-    mask = mask_of_foreground(foreground, covered)
+    part = slice(None), slice(None)
+    if around is not None:
+        by = round(around * float(np.sqrt(np.count_nonzero(covered))))
+        (top, left), (bottom, right) = (
+            [int(k(np.flatnonzero(covered.any(axis=axis)))) for axis in (1, 0)] for k in (min, max)
+        )
+        part = slice(max(top - by, 0), bottom + by + 1), slice(max(left - by, 0), right + by + 1)
+    foreground, mask = np.zeros(covered.shape, np.float32), np.zeros(covered.shape, np.bool_)
+    foreground[part] = known.part(part).foreground(one.picture[part], gain)
+    mask[part] = mask_of_foreground(foreground[part], covered[part])
     if not mask.any():
         return None
     return PosedFrame(one.name, one.values, mask, foreground_picture(foreground), one.rates)

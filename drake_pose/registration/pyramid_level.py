@@ -106,6 +106,12 @@ class PyramidLevel:
         other._parameters = other.camera.kernel_parameters()
         return other
 
+    def mirrored(self) -> "PyramidLevel":
+        """Return the level of the mirrored pictures."""
+        other = self.with_camera(self.camera.mirrored())
+        other.backgrounds = self.backgrounds.mirrored()
+        return other
+
     def with_poses(self, X_WN: Array) -> "PyramidLevel":
         """Return the same pictures with other poses of the nodes (f, nodes, 4, 4)."""
         other = copy.copy(self)

@@ -164,14 +164,21 @@ def choose_pictures(
 
 
 def posed_pictures(
-    recording: Recording, indices: Sequence[int], offset: float
+    recording: Recording,
+    indices: Sequence[int],
+    offset: float,
+    known: Sequence[PosedPicture] = (),
 ) -> list[PosedPicture]:
-    """Return pictures, by their indices, that have logged values at a time offset [s]."""
+    """Return pictures, by their indices, that have logged values at a time offset [s].
+
+    known: some of the recording's pictures, which are not read again.
+    """
     values, rates = recording.values_at(offset), recording.rates_at(offset)
-    return [
-        PosedPicture(
-            recording.names[k], values[k], recording.read(k), None if rates is None else rates[k]
-        )
-        for k in indices
-        if np.isfinite(values[k]).all()
-    ]
+    pictures = {one.name: one.picture for one in known}
+
+    def posed(k: int) -> PosedPicture:
+        name = recording.names[k]
+        picture = pictures[name] if name in pictures else recording.read(k)
+        return PosedPicture(name, values[k], picture, None if rates is None else rates[k])
+
+    return [posed(k) for k in indices if np.isfinite(values[k]).all()]

@@ -214,8 +214,15 @@ def test_recording_with_drift_and_offsets(episode, recording) -> None:
     np.testing.assert_allclose(poses[1].values, episode.values_at(given.times + 0.2)[1])
 
 
+def scanned(episode: PaintedEpisode, given: Recording) -> TimeOffset:
+    """Return the time offset of every second picture."""
+    frames = posed_pictures(given, range(0, 16, 2), 0.0)
+    search = PictureSearch(episode.body, episode.camera, frames)
+    return scan_time_offsets(search, episode.camera, given)
+
+
 def test_time_offset_is_scanned(episode, recording) -> None:
-    clock = scan_time_offsets(episode.body, episode.camera, recording(), range(0, 16, 2))
+    clock = scanned(episode, recording())
     offset, scores = clock.value, clock.scores
     assert (offset, clock.drift) == (pytest.approx(LATE, abs=0.012), 0.0)
     assert scores[:, 1].max() == 1.0
@@ -227,9 +234,7 @@ def test_time_offset_is_scanned(episode, recording) -> None:
         before = np.min(by) <= -0.31
         return np.full((16, 5), np.nan) if before else episode.values_at(episode.times + by)
 
-    told = scan_time_offsets(
-        episode.body, episode.camera, recording(values_at=logged), range(0, 16, 2)
-    )
+    told = scanned(episode, recording(values_at=logged))
     assert told.value == offset
     assert told.scores[0, 0] == pytest.approx(-0.3)
 
@@ -244,7 +249,7 @@ def test_drift_is_scanned_with_the_offset_at_the_mean_time(episode, recording, r
         return episode.values_at(first + since / (1.0 + rate) + LATE)
 
     shown = range(0, 16, 2)
-    told = scan_time_offsets(episode.body, episode.camera, recording(values_at=logged), shown)
+    told = scanned(episode, recording(values_at=logged))
     assert told.drift == pytest.approx(rate)
     middle = float(np.mean(episode.times[list(shown)] - first))
     assert told.value == pytest.approx(rate * middle, abs=0.051)
@@ -493,7 +498,7 @@ def test_mirrored_pictures_are_distinguished_at_the_opposite_pose(episode, recor
         search = PictureSearch(episode.body, camera, pictures)
         X_CW = search.compared.improve([X_CW], evaluations=150, turn=0.08)[1][0]
         camera = camera.with_pose(np.linalg.inv(X_CW))
-    assert explained_as_mirrored(episode.body, search, camera) == mirrored
+    assert explained_as_mirrored(search, camera) == mirrored
 
 
 @pytest.mark.parametrize(

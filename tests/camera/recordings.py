@@ -42,6 +42,25 @@ def distorted(D: Sequence[float], fisheye: bool = False) -> np.ndarray:
     return shade(undistort(GRID, K, np.array(D)))
 
 
+def write_pictures(
+    path: Path, pictures: Sequence[np.ndarray], times: Sequence[float], codec: str, **options: str
+) -> None:
+    """Write a video of images (H, W, 3) at times [s], with an encoder's options such as crf."""
+    import av
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=30, options=options)
+        stream.height, stream.width = pictures[0].shape[:2]
+        stream.pix_fmt = "yuv420p"
+        stream.time_base = stream.codec_context.time_base = Fraction(1, 90000)
+        for picture, time in zip(pictures, times, strict=True):
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+            frame.pts, frame.time_base = round(90000 * time), Fraction(1, 90000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
 def write_video(
     path: Path,
     numbers: Sequence[int],

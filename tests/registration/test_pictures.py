@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
+from drake_pose.camera.picture_files import TimedVideo
 from drake_pose.errors import RegistrationError
 from drake_pose.fit.explain_kernel import Explained
 from drake_pose.fit.problem import TIME_OFFSET
@@ -36,6 +37,7 @@ from drake_pose.registration.pyramid_level import PyramidLevel, evidence, uprigh
 from drake_pose.registration.recording import Recording, TimeOffset, choose_pictures, posed_pictures
 from drake_pose.registration.standing_object import require_detections
 from tests.benchmarks.registration import pose_error
+from tests.camera.recordings import write_pictures
 from tests.registration.arm_pictures import errors
 from tests.registration.episodes import LATE, PaintedEpisode
 
@@ -441,6 +443,16 @@ def test_camera_is_found_without_initial_guess_within_its_deviations(episode, re
     # The best scanned offset is next to the fitted one.
     offsets, scores = found.time_offset.scores.T
     assert offsets[scores.argmax()] == pytest.approx(LATE, abs=0.03)
+
+
+@pytest.mark.slow
+def test_camera_is_found_in_compressed_pictures(episode, recording, tmp_path):
+    path = tmp_path / "camera.mp4"
+    write_pictures(path, episode.pictures, episode.times, "libx264", crf="33")
+    found = register_pictures(episode.body, episode.camera, recording(read=TimedVideo(path).read))
+    error = pose_error(found.found.camera.X_WC, episode.camera.X_WC)
+    assert (np.abs(error) < 3.0 * np.sqrt(np.diag(found.found.covariance))).all()
+    assert np.linalg.norm(error[3:]) < 0.025
 
 
 @pytest.mark.slow

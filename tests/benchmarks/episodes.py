@@ -26,6 +26,7 @@ from drake_pose.jobs.registration.settings import RegistrationSettings
 from tests.benchmarks.registration import pose_error
 from tests.benchmarks.rooms import LOG_HZ, SimulatedEpisode, simulate
 from tests.benchmarks.tables import print_table
+from tests.camera.recordings import write_pictures
 
 
 class Arm(NamedTuple):
@@ -57,7 +58,9 @@ _BETWEEN = 0.15
 class EpisodeSet(NamedTuple):
     """Episodes with one kind of error: time offset, log rate, joint offsets, or wrong rows.
 
-    off: bound of the offsets of all joints [deg]; zeros: offsets of three joints.
+    Attributes:
+        off: bound of the offsets of all joints [deg]; zeros: offsets of three joints.
+        codec: encoder of the pictures' video, with its option `crf`; "": PNG files.
     """
 
     name: str
@@ -66,10 +69,14 @@ class EpisodeSet(NamedTuple):
     zeros: bool = False
     wrong: bool = False
     off: float = 0.0
+    codec: str = ""
+    crf: int = 23
 
 
 SETS = (
     EpisodeSet("as recorded"),
+    EpisodeSet("in a video (H.264)", codec="libx264"),
+    EpisodeSet("in a video (AV1, as LeRobot's)", codec="libsvtav1", crf=30),
     EpisodeSet("clock off by up to .3 s, log at 33 Hz", late=True, log_hz=33.0),
     EpisodeSet("three zeros off by 2 degrees", zeros=True),
     EpisodeSet("all zeros off by up to 10 degrees", off=10.0),
@@ -135,7 +142,7 @@ def measure_episode(path: Path, arm: Arm, folder: Path, seed: int, kind: Episode
     if kind.wrong:
         begin = float(rng.uniform(0.5, episode.times[-1] - _WRONG - 0.5))
         wrong = (begin, begin + _WRONG)
-    _write(folder, model, episode, kind.log_hz, turned, wrong)
+    _write(folder, model, episode, kind.log_hz, turned, wrong, kind.codec, kind.crf)
     settings = RegistrationSettings(zeros=("all",) if turned else ())
     start = time.process_time()
     try:
@@ -153,14 +160,23 @@ def _write(
     log_hz: float,
     turned: dict[str, float],
     wrong: tuple[float, float],
+    codec: str = "",
+    crf: int = 23,
 ) -> None:
-    """Write an episode's files: images, a joint log at some rate, and a camera without pose."""
-    images = folder / "images" / "camera"
-    images.mkdir(parents=True)
-    for k, picture in enumerate(episode.pictures):
-        cv2.imwrite(str(images / f"{k:04d}.png"), picture[..., ::-1])
-    rows = [f"{k:04d},{t}" for k, t in enumerate(episode.times)]
-    (images / "timestamps.csv").write_text("\n".join(["frame,time", *rows]))
+    """Write an episode's files: images, a joint log at some rate, and a camera without pose.
+
+    codec, crf: as of EpisodeSet.
+    """
+    if codec:
+        video = folder / "videos" / "camera.mp4"
+        write_pictures(video, episode.pictures, episode.times, codec, crf=str(crf))
+    else:
+        images = folder / "images" / "camera"
+        images.mkdir(parents=True)
+        for k, picture in enumerate(episode.pictures):
+            cv2.imwrite(str(images / f"{k:04d}.png"), picture[..., ::-1])
+        rows = [f"{k:04d},{t}" for k, t in enumerate(episode.times)]
+        (images / "timestamps.csv").write_text("\n".join(["frame,time", *rows]))
     content = yaml.safe_load(dump_cameras({"camera": episode.camera}))
     del content["camera"]["X_WC"]
     (folder / "cameras.yaml").write_text(yaml.safe_dump(content))
@@ -199,10 +215,10 @@ def _outcome(
             value = estimate["value_deg"] if estimate["significant"] else 0.0
             off[name] = abs(value + turned[name])
     first = off.pop(next(iter(summary["zeros"]), ""), np.nan)
-    outliers = set(one.outliers)
+    outliers = {int(name) for name in one.outliers}
     is_wrong = (episode.times >= wrong[0]) & (episode.times < wrong[1])
     between = np.abs(episode.times[:, None] - np.array(wrong)).min(axis=1) < _BETWEEN
-    named = np.array([f"{k:04d}" in outliers for k in range(len(episode.times))])
+    named = np.array([k in outliers for k in range(len(episode.times))])
     fractions = [
         float(named[own].mean()) if own.any() else np.nan
         for own in (is_wrong & ~between, ~is_wrong & ~between)

@@ -260,7 +260,7 @@ def describe_views(views: ViewFaults, frames: Sequence[str]) -> tuple[str, ...]:
             "no pose; add a camera, or check the masks"
         )
     found += [
-        f"camera '{camera}' sees no person in frame {listed(indices)}, where others see the person, "
+        f"camera '{camera}' sees no person in frame {listed(indices)}, where others see one, "
         "and is left out there; check its masks"
         for camera, indices in views.blind.items()
     ]

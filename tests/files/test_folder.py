@@ -204,3 +204,11 @@ def test_a_damaged_summary_is_named(tmp_path, text):
         (tmp_path / "summary.json").write_text(text)
     with pytest.raises(OutputError, match=r"summary\.json"):
         read_summary(tmp_path)
+
+
+def test_summary_has_a_line_for_each_frame(tmp_path):
+    frames = {"0000": {"found": True, "joints": {"a\n": {"low": 1.0}}}, "0001": {}}
+    write_summary(tmp_path, {"frames": frames, "warnings": ["ä"], "settings": {}})
+    lines = (tmp_path / "summary.json").read_text().splitlines()
+    assert read_summary(tmp_path) == {"frames": frames, "warnings": ["ä"], "settings": {}}
+    assert [line.split('"')[1] for line in lines if line.startswith("    ")] == ["0000", "0001"]

@@ -22,6 +22,7 @@ from drake_pose.files.report_page import (
     draw_grid,
     make_report,
     plot_curves,
+    plot_uri,
 )
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.scene import estimate_scene
@@ -221,6 +222,20 @@ def plotted(values, **more):
     names = [str(k) for k in range(len(values))]
     (axes,) = plot_curves(names, [("one", values)], **{"joined": True, **more}).axes
     return axes, axes.get_lines()[0]
+
+
+def test_a_plot_drawn_onto_another_is_the_same_as_a_new_one():
+    frames, rng = [f"{k:03d}" for k in range(40)], np.random.default_rng(0)
+    for values, limits in ((rng.normal(size=(4, 40)), (-3.0, 90.0)), (rng.random((4, 40)), None)):
+        given = {
+            "values": [("measured", values[0]), ("one", values[1])],
+            "joined": True,
+            "limits": limits,
+            "intervals": (values[2], values[3], rng.random(40) < 0.5),
+        }
+        first = plot_curves(frames, [("one", 1e3 * values[1])], joined=True, limits=(0.0, 1.0))
+        again = plot_curves(frames, **given, onto=first)
+        assert plot_uri(again) == plot_uri(plot_curves(frames, **given))
 
 
 def test_plots_show_only_limits_that_are_near():

@@ -112,6 +112,11 @@ def read_binary_mask(
         layers = layers[:, :, 3:]  # Only the alpha channel varies.
     if data.startswith(b"\xff\xd8"):
         mask, is_one_colour = threshold_mask(picture, str(path), error_type), True
+    elif picture.ndim == 2:
+        mask = picture != 0
+        is_one_colour = np.count_nonzero(mask) == np.count_nonzero(
+            mask & (picture == picture.max())
+        )
     else:
         layers = np.ascontiguousarray(layers)
         mask = cv2.inRange(layers, (0, 0, 0, 0), (0, 0, 0, 0)) == 0

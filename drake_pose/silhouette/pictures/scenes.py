@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from drake_pose.arrays import Array
@@ -68,7 +69,7 @@ class Scene:
     times: Array = field(default_factory=lambda: np.empty(0), compare=False)
     joints: JointLog | None = None
     _videos: dict[Path, VideoPictures] = field(default_factory=dict, repr=False, compare=False)
-    _packed: dict[tuple[Path, int, int], bytes] = field(
+    _packed: dict[tuple[Path, int, int], tuple[Sequence[int], bytes]] = field(
         default_factory=dict, repr=False, compare=False
     )
     _latest: dict[str, tuple[str, np.ndarray]] = field(
@@ -164,13 +165,18 @@ class Scene:
         key = path, size.width, size.height
         if (packed := self._packed.get(key)) is None:
             mask = read_mask(path, size.width, size.height, may_be_empty=may_be_empty)
-            if mask.any():
-                # Kept in one or two kilobytes; decoding the PNG again takes ten times as long.
-                self._packed[key] = zlib.compress(np.packbits(mask).tobytes(), level=1)
+            left, top, width, height = box = cv2.boundingRect(mask.view(np.uint8))
+            if width:
+                # The object's box is kept, in about a kilobyte: decoding the PNG again takes ten
+                # times as long.
+                bits = np.packbits(mask[top : top + height, left : left + width])
+                self._packed[key] = box, zlib.compress(bits.tobytes(), level=1)
             return mask
-        bits = np.frombuffer(zlib.decompress(packed), np.uint8)
-        mask = np.unpackbits(bits, count=size.width * size.height).view(np.bool_)
-        return mask.reshape(size.height, size.width)
+        (left, top, width, height), data = packed
+        bits = np.unpackbits(np.frombuffer(zlib.decompress(data), np.uint8), count=width * height)
+        mask = np.zeros((size.height, size.width), dtype=np.bool_)
+        mask[top : top + height, left : left + width] = bits.reshape(height, width)
+        return mask
 
     def read_image(self, camera: str, frame: str) -> np.ndarray:
         """Return the picture (H, W, 3), RGB, of a camera's frame.

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.arrays import Array, Indices, Mask
+from drake_pose.arrays import Array, Indices, Mask, halton_sequence
 from drake_pose.body import landmarks_of_nodes, load_landmarks
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.errors import ModelError, SettingsError
@@ -221,8 +221,6 @@ class BodyPlan:
 
         The middle joint is at rest, mostly stretched, in one of eight poses.
         """
-        from scipy.stats import qmc  # Slow to import, and needed for persons alone.
-
         kinematics, tree = self.kinematics, self.kinematics.tree
         rest = kinematics.flatten(tree.default_values())
         moves = kinematics.motions(rest).moves
@@ -231,7 +229,7 @@ class BodyPlan:
         free = kinematics.is_angle & (kinematics.upper > kinematics.lower)
         values = np.flatnonzero(own & free)
         nodes = np.flatnonzero((moves & own).any(axis=1))
-        fractions = qmc.Halton(len(values), scramble=False).random(count)
+        fractions = halton_sequence(count, len(values))
         lower, upper = (ends[values] for ends in kinematics.local_limits(rest))
         poses = np.clip(rest[values], lower, upper) * np.ones((count, 1))
         poses[1:] = lower + fractions[1:] * (upper - lower)

@@ -2,7 +2,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import qmc
 
+from drake_pose.arrays import halton_sequence
 from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.models import circle_of_cameras
 from drake_pose.errors import ModelError, SettingsError
@@ -164,3 +166,8 @@ def test_stills_of_a_motion_are_not_mistaken_for_similar_poses(person):
         views = [see_silhouette(renderer.mask(q), 4.0) for renderer in renderers]
         found = tracker.follow(None, FrameViews(cameras, views))
         assert joint_error(tracker, found.values, q) < 60.0
+
+
+def test_haltons_sequence_is_scipys():
+    expected = qmc.Halton(9, scramble=False).random(300)
+    np.testing.assert_allclose(halton_sequence(300, 9), expected, rtol=0, atol=1e-15)

@@ -60,7 +60,7 @@ from drake_pose.silhouette.pictures.scene_checks import (
     read_scene,
 )
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, SCENE_FILE, Scene
-from drake_pose.silhouette.scoring import draw_labels, require_visible
+from drake_pose.silhouette.scoring import draw_labels, draw_mask, require_visible
 
 
 def make_search(
@@ -382,7 +382,7 @@ def read_inputs(
 
 
 def draw_parts(
-    outlines: Sequence[Outline], X_WN: np.ndarray, cameras: Iterable[Camera]
+    outlines: Sequence[Outline], X_WN: np.ndarray, cameras: Iterable[Camera], are_told: bool = True
 ) -> dict[str, np.ndarray]:
     """Return the index (H, W) of the visible part at each pixel by camera, -1 outside the body.
 
@@ -390,7 +390,12 @@ def draw_parts(
         outlines: surface of each part of the body.
         X_WN: (parts, 4, 4) poses of the parts in the world.
         cameras: the cameras.
+        are_told: whether the parts are told apart; if not, all have the index 0, which is drawn in
+            a third of the time.
     """
+    if not are_told:
+        bodies = {one.name: draw_mask(outlines, one.X_CW @ X_WN, one) for one in cameras}
+        return {name: body.view(np.int8) - 1 for name, body in bodies.items()}
     labels = range(1, 1 + len(outlines))
     return {one.name: draw_labels(outlines, labels, one.X_CW @ X_WN, one) - 1 for one in cameras}
 

@@ -74,7 +74,7 @@ MODEL = BackgroundModel()
 def estimate_gain(picture: Picture | Floats, reference: Floats, rounds: int = 4) -> Floats:
     """Return the photometric gain that maps an image's colours to those of a reference image.
 
-    A robust line is fitted to each channel, on about 160 sampled columns. Slopes are limited to the
+    A robust line is fitted to each channel, on about 80 sampled columns. Slopes are limited to the
     range 0.5 to 2.
 
     Args:
@@ -87,7 +87,7 @@ def estimate_gain(picture: Picture | Floats, reference: Floats, rounds: int = 4)
         (3, 4) slopes and offsets of the channels, as ``cv2.transform`` takes them.
     """
     gain = np.zeros((3, 4), np.float32)
-    step = max(1, picture.shape[1] // 160)
+    step = max(1, picture.shape[1] // 80)
     for channel in range(3):
         both = (one[::step, ::step, channel].ravel() for one in (picture, reference))
         x, y = (np.asarray(one, np.float32) for one in both)

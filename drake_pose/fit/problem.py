@@ -487,13 +487,13 @@ class Problem:
         chosen, frames = self.entries < self._first_bias, len(observations)
         p = int(np.count_nonzero(chosen[: self.own_count]))
         q = int(np.count_nonzero(chosen[self.own_count :]))
-        found = []
-        for k, (frame, theta) in enumerate(zip(observations, parameters, strict=True)):
-            compared, (X_CW, kernel, motions) = self.compare(frame, theta, stage)
+        found, given = [], [*zip(observations, parameters, strict=True)]
+        several = map_ordered(lambda one: self.compare(*one, stage), given)
+        for k, (compared, (X_CW, kernel, motions)) in enumerate(several):
             X_WN = compared.placement.X_WN
             sizes = 1.0 / pixels_per_metre((X_CW, kernel), X_WN[:, :3, 3].mean(axis=0))
             for c in np.flatnonzero(compared.A.any(axis=(1, 2, 3))).tolist():
-                terms = self._moves(compared, motions, c, frame.rates)[:, chosen]
+                terms = self._moves(compared, motions, c, observations[k].rates)[:, chosen]
                 own, shared = np.split(terms, [p], axis=1)
                 moves = np.zeros((len(X_WN), frames * p + q, 12))
                 moves[:, k * p : (k + 1) * p], moves[:, frames * p :] = own, shared

@@ -25,6 +25,7 @@ from drake_pose.fit.evidence import (
 from drake_pose.fit.parameters import BodyParameters
 from drake_pose.silhouette.outline import Outline
 from drake_pose.silhouette.scoring import prefix_sums
+from drake_pose.workers import map_ordered
 
 LAST_SPACING = 1.0 / 300.0
 """Spacing of silhouettes' edge points in the last stages of a fit [square root of the area]."""
@@ -107,7 +108,7 @@ class PosedFrames:
 
         poses: (frames, nodes, 4, 4) X_WN of the nodes.
         """
-        return [_placed_hull(self.outlines, X_WN.tobytes()) for X_WN in poses]
+        return map_ordered(lambda X_WN: _placed_hull(self.outlines, X_WN.tobytes()), poses)
 
     @cached_property
     def middle(self) -> Array:

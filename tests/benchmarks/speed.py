@@ -22,11 +22,15 @@ from drake_pose.papers.kameda import (
     run_experiment,
 )
 from drake_pose.person.date.walking import FEWEST_FRAMES, MOTIONS, make_motion
+from drake_pose.registration.picture_registration import register_pictures
+from drake_pose.registration.recording import Recording
 from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.scoring import prefix_sums, score_bodies
 from drake_pose.systems.images import picture_to_colour_image
+from drake_pose.workers import use_workers
 from tests.benchmarks.tables import print_table
+from tests.registration.episodes import painted_episode
 from tests.silhouette.agreement import measure_agreement
 
 # Kameda's scale of 2.26 pixels per centimetre, and a limb of his body.
@@ -120,6 +124,37 @@ def measure_cost(cameras: int, size: tuple[int, int] = (640, 480), seed: int = 0
     return np.asarray(np.median(laps, axis=0))
 
 
+def measure_pictures(size: tuple[int, int] = (640, 480), frames: int = 30) -> tuple[float, ...]:
+    """Return CPU times of a registration from pictures and of a Drake label image [s].
+
+    Returns:
+        the registration on one core; the label image, of the same arm with the same camera; and
+        the duration on two idle cores, if both share all work of threads other than the main one.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        episode = painted_episode(Path(folder), frames, size, every=0.2)
+    recording = Recording(
+        tuple(f"{k:04d}" for k in range(frames)),
+        lambda offset: episode.values_at(episode.times + offset),
+        episode.pictures.__getitem__,
+        episode.times,
+    )
+    body, camera = episode.body, episode.camera.with_pose(np.eye(4))
+
+    def register(workers: int) -> None:
+        with use_workers(workers):
+            register_pictures(body, camera, recording)
+
+    alone = fastest(lambda: register(1), 1)
+    start, own = time.process_time(), time.thread_time()
+    register(2)
+    seconds, own = time.process_time() - start, time.thread_time() - own
+    renderer = LabelRenderer(episode.model, episode.camera)
+    positions = body.tree.positions_from(body.kinematics.split(episode.values[0]))
+    image = fastest(lambda: renderer.segments(*positions), 10)
+    return alone, image, own + 0.5 * (seconds - own)
+
+
 def _kernel_rows() -> Iterator[tuple[str, ...]]:
     for columns, rows in ((14, 16), (72, 71)):
         triangles, kernel, image = measure_kernel(columns, rows)
@@ -146,12 +181,20 @@ def _cost_rows() -> Iterator[tuple[str, ...]]:
         yield str(cameras), *(f"{cost:.1f}" for cost in costs)
 
 
+def _picture_rows() -> Iterator[tuple[str, ...]]:
+    alone, image, shared = measure_pictures()
+    yield f"{alone:.1f} s", f"{1e3 * image:.1f} ms", f"{alone / image:.0f}", f"{shared / alone:.2f}"
+
+
 def main() -> None:
     """Print times of the kernel and the papers' methods, and the agreement with Drake."""
     headings: tuple[str, ...] = ("triangles", "kernel, a candidate", "Drake label image", "ratio")
     print_table("One segment, 700 x 700 pixels, one core", headings, _kernel_rows())
     title = "XOR of the kernel's masks and Drake's, 200 random poses"
     print_table(title, ("body", "projection", "worst", "mean"), _agreement_rows())
+    headings = ("one core", "Drake label image", "ratio", "two idle cores over one")
+    title = "Registration from 30 pictures of a simulated arm, 640 x 480"
+    print_table(title, headings, _picture_rows())
     headings = ("cameras", "region and edge", "pose", "all", "a camera")
     title = "Date, all silhouettes, 640 x 480, one core: milliseconds a frame"
     print_table(title, headings, _cost_rows())

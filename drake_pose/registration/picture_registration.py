@@ -233,9 +233,9 @@ def explained_as_mirrored(
     search: PictureSearch,
     camera: PinholeCamera,
     *,
-    evaluations: int = 150,
-    turn: float = 0.08,
-    starts: int = 3,
+    evaluations: int = 250,
+    turn: float = 0.25,
+    starts: int = 6,
     threshold: float = 1.96,
 ) -> bool:
     """Return whether a search's pictures are explained significantly better if mirrored.

@@ -1,5 +1,6 @@
 """Kernels are compiled once for all processes, and again if anything they call changes."""
 
+import ast
 import os
 import pickle
 import subprocess
@@ -109,3 +110,25 @@ def test_without_a_writable_folder_kernels_still_run(package: Path, tmp_path: Pa
     values, log = run(package, HOME=str(home), XDG_CACHE_HOME=str(home / ".cache"))
     assert values == [14, 1]
     assert log.count("set NUMBA_CACHE_DIR to a writable folder") == 1
+
+
+def test_python_calls_kernels_with_all_arguments() -> None:
+    """A call that leaves one out takes numba's slow path, which takes longer than the kernel."""
+    trees = [ast.parse(file.read_text()) for file in (ROOT / "drake_pose").rglob("*.py")]
+    functions = [
+        (one, any(ast.unparse(place).startswith("compiled") for place in one.decorator_list))
+        for tree in trees
+        for one in ast.walk(tree)
+        if isinstance(one, ast.FunctionDef)
+    ]
+    kernels = [one for one, is_kernel in functions if is_kernel and one.args.defaults]
+    counts = {one.name: len(one.args.args) for one in kernels}
+    short = []
+    for function in (one for one, is_kernel in functions if not is_kernel):
+        for call in ast.walk(function):
+            if isinstance(call, ast.Call) and isinstance(call.func, ast.Name):
+                given = len(call.args) + len(call.keywords)
+                is_whole = any(isinstance(one, ast.Starred) for one in call.args)
+                if given < counts.get(call.func.id, 0) and not is_whole:
+                    short.append(f"{function.name}: {call.func.id}")
+    assert not short

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Floats, Mask, Picture
 from drake_pose.camera.models import Camera
-from drake_pose.compiled import compiled
+from drake_pose.compiled import compiled, default_arguments
 from drake_pose.errors import SettingsError
 from drake_pose.fit.contour_fit import Comparison, Noise, camera_weights, pack_cameras
 from drake_pose.fit.kernel import (
@@ -247,7 +247,7 @@ def add_pictures(
             compare_lines(
                 placement.packed, placement.X_WN, (packed[0][c], packed[1][c]), picture,
                 histograms[c], weights[c], pixels, compared.A[c], compared.b[c], compared.sums[c],
-                compared.bias_terms[c],
+                compared.bias_terms[c], *default_arguments(compare_lines),
             )  # fmt: skip
 
 
@@ -325,7 +325,7 @@ def update_histograms(
             learn_colours(
                 placement.packed, placement.X_WN, (packed[0][c], packed[1][c]), picture, updated[c],
                 LINES.spacing, np.array(LINES.strip_widths), rate, max_residual, 0,
-                np.zeros((0, 0), np.bool_),
+                np.zeros((0, 0), np.bool_), *default_arguments(learn_colours),
             )  # fmt: skip
     return updated
 

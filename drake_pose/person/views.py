@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.camera.models import Camera, ParallelCamera
-from drake_pose.compiled import compiled
+from drake_pose.compiled import compiled, default_arguments
 from drake_pose.fit.colours import (
     check_picture,
     compare_lines,
@@ -91,7 +91,7 @@ class ColourViews:
                 compare_lines(
                     placement.packed, placement.X_WN, self._camera(c), self.pictures[c],
                     self.known[camera.name], weights[c], max(1, round(offset * weights[c, 1])),
-                    A[c], b[c], sums[c], wide[c],
+                    A[c], b[c], sums[c], wide[c], *default_arguments(compare_lines),
                 )  # fmt: skip
         return Comparison(A, b, sums, wide, placement)
 
@@ -141,6 +141,7 @@ class ColourViews:
                 math.inf if surely else max(agreeing * size, least_agreeing),
                 max(1, round(counted * size)),
                 np.zeros((0, 0), np.bool_) if region is None else np.ascontiguousarray(region),
+                *default_arguments(learn_colours),
             )  # fmt: skip
             learned[camera.name] = histograms
         return learned

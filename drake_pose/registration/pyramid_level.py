@@ -13,6 +13,7 @@ import numpy as np
 
 from drake_pose.arrays import Array, Picture
 from drake_pose.camera.models import PinholeCamera
+from drake_pose.compiled import default_arguments
 from drake_pose.fit.background import Backgrounds
 from drake_pose.fit.explain_kernel import Explained, explain, explain_poses
 from drake_pose.registration.pose_simplex import ScoredPictures, move_pose, search_simplexes
@@ -124,8 +125,10 @@ class PyramidLevel:
         X_WN: (f, nodes, 4, 4) other poses of the nodes; None: those of the pictures' values.
         """
         X_CN = X_CW[:3] @ (self._X_WN if X_WN is None else X_WN)
-        sums = self.backgrounds.sums
-        return explain(self._packed, X_CN, self._static, self._parameters, sums, 1.0, 0)[0]
+        return explain(
+            self._packed, X_CN, self._static, self._parameters, self.backgrounds.sums, 1.0, 0,
+            *default_arguments(explain),
+        )[0]  # fmt: skip
 
     def explained(self, X_CW: Array) -> tuple[float, float]:
         """Return the explained fraction and mean edge strength of a pose (4, 4).
@@ -188,7 +191,7 @@ class PyramidLevel:
         side = max(self.camera.width, self.camera.height) / squares
         _, gains = explain(
             self._packed, X_CW[:3] @ self._X_WN, self._static, self._parameters,
-            self.backgrounds.sums, side, squares,
+            self.backgrounds.sums, side, squares, *default_arguments(explain),
         )  # fmt: skip
         return gains
 

@@ -2,13 +2,15 @@
 
 Run as ``python -m tests.benchmarks.acceptance DATA [--rooms N] [--first K] [--only TEXT]``, see
 ``tests.benchmarks.episodes``. Positives are episodes as recorded; negatives have the joint
-positions of another episode, mirrored pictures, or the model of another arm.
+positions of another episode, mirrored pictures, or the model of another arm. The pictures are those
+of videos (H.264).
 """
 
 import argparse
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +18,7 @@ import numpy as np
 
 from drake_pose.arrays import Array
 from drake_pose.body import ArticulatedModel, load_model
+from drake_pose.camera.picture_files import TimedVideo
 from drake_pose.errors import RegistrationError
 from drake_pose.registration.picture_registration import register_pictures
 from drake_pose.registration.recording import Recording
@@ -24,6 +27,7 @@ from tests.benchmarks.episodes import ARMS, FAR, GREY
 from tests.benchmarks.registration import pose_error
 from tests.benchmarks.rooms import SimulatedEpisode, simulate
 from tests.benchmarks.tables import print_table
+from tests.camera.recordings import write_pictures
 
 KINDS = ("as recorded", "joints of another episode", "mirrored pictures", "model of another arm")
 
@@ -91,13 +95,18 @@ def decide(data: Path, name: str, kind: str, seed: int) -> Decision:
 
 
 def _episode(data: Path, name: str, seed: int) -> SimulatedEpisode:
-    """Return a simulated episode of an arm, see ``simulate``."""
+    """Return a simulated episode of an arm, see ``simulate``, with pictures from a video."""
     arm = ARMS[name]
     model, grey = load_model(data / arm.file, check=False), seed % GREY == GREY - 1
     with tempfile.TemporaryDirectory() as folder:
-        return simulate(
+        drawn = simulate(
             model, Path(folder), seed, grey=grey, distance=arm.distance, middle=arm.middle
         )
+        path = Path(folder) / "camera.mp4"
+        write_pictures(path, drawn.pictures, drawn.times, "libx264", crf="23")
+        video = TimedVideo(path)
+        pictures = [video.read(k) for k in range(len(drawn.times))]
+    return replace(drawn, pictures=np.array(pictures))
 
 
 def _as_positions(model: ArticulatedModel, logged: Array, other: ArticulatedModel) -> Array:

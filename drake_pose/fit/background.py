@@ -138,8 +138,8 @@ class Backgrounds:
         reference = _median(floats)
         gains = tuple(map_ordered(lambda one: estimate_gain(one, reference), floats))
         even = np.array([apply_gain(*one) for one in zip(floats, gains, strict=True)])
-        deviation = _median(_largest(np.abs(even - reference)))
-        deviations = _deviations(reference, 1.4826 * float(np.median(deviation)))
+        deviation = _median(largest(np.abs(even - reference)))
+        deviations = colour_deviations(reference, 1.4826 * float(np.median(deviation)))
         return Backgrounds(even, gains, _find_colours(even, deviations), deviations)
 
     def mirrored(self) -> "Backgrounds":
@@ -174,7 +174,7 @@ class Backgrounds:
             covered[:, :, f] = (
                 np.log(MODEL.covered_match * stacked + (1.0 - MODEL.covered_match)) - log_visible
             )
-            u, v = (_largest(np.abs(one)) for one in _slopes(picture))
+            u, v = (largest(np.abs(one)) for one in colour_slopes(picture))
             # Strength saturates at four standard deviations of the noise. An edge crosses an axis
             # unless the gradient along the other axis is much larger.
             strength = np.minimum(1.0, np.hypot(u, v) / (4.0 * noise))
@@ -185,13 +185,13 @@ class Backgrounds:
 
         for log_visible in map_ordered(score, range(len(self.pictures))):
             visible += log_visible
-        return PixelSums(visible, covered, _largest(visible), edges - edges.mean())
+        return PixelSums(visible, covered, largest(visible), edges - edges.mean())
 
     @cached_property
     def max_gain(self) -> float:
         """Upper bound of the log-likelihood gain over all sets of covered frames."""
         sums = self.sums
-        best = _largest(sums.visible + np.maximum(sums.covered, 0.0).sum(axis=2))
+        best = largest(sums.visible + np.maximum(sums.covered, 0.0).sum(axis=2))
         return float(np.maximum(best - sums.uncovered, 0.0).sum())
 
     def changed_frames(self) -> Floats:
@@ -207,8 +207,8 @@ class Backgrounds:
         return counts
 
     def _likeness(self, picture: Floats, colours: Floats) -> Floats:
-        """Return the likelihood ratios (H, W), see ``_likeness``, under a background (H, W, 3)."""
-        return _likeness(_largest(np.abs(picture - colours)) / self.deviations)
+        """Return the likelihood ratios (H, W), see ``likeness``, under a background (H, W, 3)."""
+        return likeness(largest(np.abs(picture - colours)) / self.deviations)
 
     def shows_background(self, covered: Mask) -> Mask:
         """Return (f, H, W) whether a frame shows the likeliest background of a pixel.
@@ -224,7 +224,7 @@ class Backgrounds:
             sums.visible, sums.covered, covered, self.pictures, self.colours, self.deviations,
             MODEL.match_deviations, shows,
         )  # fmt: skip
-        return shows & ~_grown(covered, MODEL.margin)
+        return shows & ~grown(covered, MODEL.margin)
 
 
 @compiled
@@ -303,7 +303,7 @@ class KnownBackground:
         height, width = covered.shape[1:]
         total, count = np.zeros((height, width, 3), np.float32), np.zeros((height, width))
         on, beside = (np.zeros(COLOURS) for _ in range(2))
-        inside, near = ~_grown(~covered, MODEL.margin), _grown(covered, MODEL.margin)
+        inside, near = ~grown(~covered, MODEL.margin), grown(covered, MODEL.margin)
         samples = []
 
         def look(f: int) -> tuple[Floats, Mask, Array, Array]:
@@ -325,13 +325,11 @@ class KnownBackground:
                 rows = np.flatnonzero(shows)[::37]
                 samples.append((rows, even.reshape(-1, 3)[rows]))
         colours = (total / np.maximum(count, 1.0)[..., None]).astype(np.float32)
-        differences = [
-            _largest(np.abs(own - colours.reshape(-1, 3)[rows])) for rows, own in samples
-        ]
+        differences = [largest(np.abs(own - colours.reshape(-1, 3)[rows])) for rows, own in samples]
         noise = np.concatenate([*differences, np.zeros(1, np.float32)])
-        deviations = _deviations(colours, 1.4826 * float(np.median(noise)))
+        deviations = colour_deviations(colours, 1.4826 * float(np.median(noise)))
         return KnownBackground(
-            colours, deviations, count == 0, _log_frequencies(on), _log_frequencies(beside)
+            colours, deviations, count == 0, log_frequencies(on), log_frequencies(beside)
         )
 
     def part(self, part: tuple[slice, slice]) -> "KnownBackground":
@@ -356,13 +354,13 @@ class KnownBackground:
         even = apply_gain(picture, gain)
         numbers = colour_numbers(np.clip(even, 0.0, 255.0).astype(np.uint8))
         on, beside = self.on[numbers], self.beside[numbers]
-        difference = _largest(np.abs(even - self.colours))
+        difference = largest(np.abs(even - self.colours))
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * MODEL.reach + 1,) * 2)
         near = np.float32(MODEL.spread) * cv2.dilate(difference, disc)
 
         def log_odds(deviations: Floats) -> Floats:
-            likeness = _likeness(difference / deviations) * np.float32(MODEL.known_factor)
-            log_visible = np.log(MODEL.visible_match * likeness + (1.0 - MODEL.visible_match))
+            ratio = likeness(difference / deviations) * np.float32(MODEL.known_factor)
+            log_visible = np.log(MODEL.visible_match * ratio + (1.0 - MODEL.visible_match))
             return np.asarray(on - np.where(self.unseen, beside, log_visible))
 
         return log_odds(self.deviations), log_odds(np.hypot(self.deviations, near))
@@ -407,13 +405,13 @@ def mask_of_foreground(
             within MODEL.margin if that is larger.
     """
     limit = max(MODEL.margin, round(reach * float(np.sqrt(np.count_nonzero(covered)))))
-    near = _grown(covered[None], limit)[0]
+    near = grown(covered[None], limit)[0]
     found = ((cv2.GaussianBlur(foreground, (0, 0), smooth) > 0.0) & near).astype(np.uint8)
     found = cv2.morphologyEx(found, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     return np.asarray(cv2.morphologyEx(found, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)), bool)
 
 
-def _largest(channels: Floats) -> Floats:
+def largest(channels: Floats) -> Floats:
     """Return the maximum over the last axis of (..., 3), ten times faster than numpy does."""
     red, green, blue = np.moveaxis(channels, -1, 0)
     return np.maximum(np.maximum(red, green), blue)
@@ -428,13 +426,13 @@ def _median(pictures: Floats, rows: int = 16) -> Floats:
     return np.concatenate(map_ordered(median, range(0, pictures.shape[1], rows)))
 
 
-def _slopes(picture: Floats) -> tuple[Floats, Floats]:
+def colour_slopes(picture: Floats) -> tuple[Floats, Floats]:
     """Return the gradients of an image along u and along v, each (H, W, 3) [per pixel]."""
     u, v = (cv2.Sobel(picture, cv2.CV_32F, *by, scale=0.125) for by in ((1, 0), (0, 1)))
     return np.asarray(u), np.asarray(v)
 
 
-def _deviations(picture: Floats, noise: float) -> Floats:
+def colour_deviations(picture: Floats, noise: float) -> Floats:
     """Return (H, W) standard deviations of a background's colours [of 255].
 
     They combine the noise, at least MODEL.min_noise, and shake, in proportion to the gradient.
@@ -443,19 +441,19 @@ def _deviations(picture: Floats, noise: float) -> Floats:
         picture: (H, W, 3) the background.
         noise: standard deviation of the noise [of 255].
     """
-    gradient = _largest(np.hypot(*_slopes(picture)))
+    gradient = largest(np.hypot(*colour_slopes(picture)))
     white = max(MODEL.min_noise, noise)
     return np.sqrt(white**2 + (MODEL.shake * gradient) ** 2).astype(np.float32)
 
 
-def _grown(masks: Mask, by: int) -> Mask:
+def grown(masks: Mask, by: int) -> Mask:
     """Return masks (f, H, W) dilated by a disc whose radius is ``by`` pixels."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * by + 1,) * 2)
     grown = map_ordered(lambda one: cv2.dilate(one.view(np.uint8), disc), masks)
     return np.array(grown).view(np.bool_)
 
 
-def _likeness(deviations: Floats) -> Floats:
+def likeness(deviations: Floats) -> Floats:
     """Return likelihood ratios of colours under a background to any colour.
 
     deviations: of the colours from the background's, in standard deviations.
@@ -464,7 +462,7 @@ def _likeness(deviations: Floats) -> Floats:
     return np.asarray(np.exp(MODEL.log_peak - 0.5 * beyond**2), np.float32)
 
 
-def _log_frequencies(numbers: Array) -> Floats:
+def log_frequencies(numbers: Array) -> Floats:
     """Return (COLOURS,) log relative colour frequencies, smoothed over neighbouring colours.
 
     Args:
@@ -492,7 +490,7 @@ def _find_colours(pictures: Floats, deviations: Floats, rows: int = 8) -> Floats
         own, count = pictures[:, k : k + rows], len(pictures)
         deviation = np.zeros((count, count, *own.shape[1:3]), np.float32)
         for f, picture in enumerate(own):
-            deviation[f, f:] = _largest(np.abs(own[f:] - picture)) / deviations[k : k + rows]
+            deviation[f, f:] = largest(np.abs(own[f:] - picture)) / deviations[k : k + rows]
             deviation[f:, f] = deviation[f, f:]
         close = deviation < MODEL.match_deviations
         # Among colours with equally many supporters prefer the closer ones.

@@ -25,6 +25,7 @@ from drake_pose.fit.background import (
 )
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import POSE_NAMES
+from drake_pose.fit.riding import RidingColours, RidingPictures
 from drake_pose.fit.surfaces import simplify_or_hull
 from drake_pose.registration.offset_search import joints_like_cameras, search_offsets
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
@@ -133,17 +134,25 @@ class PictureSearch:
         body: the robot's surfaces.
         camera: the camera; its pose is not used.
         frames: f pictures, the most dissimilar first.
+        riding: whether the body rides along with the camera, which moves; the "world" is then the
+            body's root, and its colours are repeated while those around it change.
     """
 
     def __init__(
-        self, body: RegistrationBody, camera: PinholeCamera, frames: Sequence[PosedPicture]
+        self,
+        body: RegistrationBody,
+        camera: PinholeCamera,
+        frames: Sequence[PosedPicture],
+        riding: bool = False,
     ) -> None:
         self._body, self.camera, self.frames = body, camera, tuple(frames)
+        self._riding = riding
         coarse, *finer = (simplify_or_hull(body.coarse, count) for count in PICTURES.triangles)
         # Small parts are invisible at the coarsest level.
         least = 0.25 * max(one.ball[3] for one in coarse)
         coarse = tuple(one if one.ball[3] >= least else EMPTY_OUTLINE for one in coarse)
-        self._outlines = (coarse, *finer)
+        # A body that rides along is near: its shape shows in small pictures, too.
+        self._outlines = (body.medium,) * 3 if riding else (coarse, *finer)
         self._X_WN = self.nodes_at(np.array([one.values for one in frames]))
         self._levels = dict[int, PyramidLevel]()
         self.joint_offsets = np.zeros(len(body.kinematics.names))
@@ -172,8 +181,9 @@ class PictureSearch:
         """
         level = self._level(rounds[0][0])
         found = level.starts(rotations)
-        # The four most dissimilar frames select a quarter of the starts.
-        for frames, fraction in ((4, 0.25), (len(self.frames), 1.0)):
+        # The most dissimilar frames select some of the starts.
+        first = ((2, 0.12), (4, 0.3)) if self._riding else ((4, 0.25),)
+        for frames, fraction in (*first, (len(self.frames), 1.0)):
             found = level.best(found, frames, fraction)
         after = (*(kept for _, kept, _, _ in rounds[1:]), rounds[-1][1])
         for (width, kept, evaluations, turn), most in zip(rounds, after, strict=True):
@@ -228,6 +238,15 @@ class PictureSearch:
         other.__dict__.update(changes)
         other._levels = {width: level(one) for width, one in self._levels.items()}
         return other
+
+    def with_shifted_pictures(self) -> "PictureSearch":
+        """Return a search in the same pictures, shifted by half their size with wrap-around."""
+        height, width = self.camera.height // 2, self.camera.width // 2
+        frames = [
+            replace(one, picture=np.roll(one.picture, (height, width), axis=(0, 1)))
+            for one in self.frames
+        ]
+        return PictureSearch(self._body, self.camera, frames, self._riding)
 
     def fit_offsets(
         self,
@@ -398,6 +417,9 @@ class PictureSearch:
             return np.array(map_ordered(lambda X: draw_mask(self._outlines[-1], X, own), poses))
 
         covered = draw(camera)
+        if isinstance(level.backgrounds, RidingPictures):
+            pictures = [one.picture for one in frames]
+            return RidingColours.of(level.backgrounds, pictures, covered), covered
         same = small.width == camera.width
         showing = level.backgrounds.shows_background(covered if same else draw(small))
         pictures, gains = [one.picture for one in frames], level.backgrounds.gains
@@ -437,7 +459,12 @@ class PictureSearch:
             count = PICTURES.search_frames if width < PICTURES.compare_width else len(self.frames)
             pictures = [one.picture for one in self.frames[:count]]
             self._levels[width] = PyramidLevel(
-                self._outlines[k], self.camera, pictures, self._X_WN[:count], width
+                self._outlines[k],
+                self.camera,
+                pictures,
+                self._X_WN[:count],
+                width,
+                self._riding,
             )
         return self._levels[width]
 

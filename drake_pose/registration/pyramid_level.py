@@ -16,6 +16,7 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.compiled import default_arguments
 from drake_pose.fit.background import Backgrounds
 from drake_pose.fit.explain_kernel import Explained, explain, explain_poses
+from drake_pose.fit.riding import RIDING, RidingPictures
 from drake_pose.registration.pose_simplex import ScoredPictures, move_pose, search_simplexes
 from drake_pose.registration.posed_frames import placed_points
 from drake_pose.registration.register import uniform_rotations
@@ -69,6 +70,7 @@ class PyramidLevel:
         pictures: f pictures (H, W, 3).
         X_WN: (f, nodes, 4, 4) the nodes' poses.
         width: width of this level's pictures [pixel]; at most that of the given ones.
+        riding: whether the body rides along with the camera.
     """
 
     def __init__(
@@ -78,22 +80,29 @@ class PyramidLevel:
         pictures: Sequence[Picture],
         X_WN: Array,
         width: int,
+        riding: bool = False,
     ) -> None:
         width = min(width, camera.width)
         height = max(8, round(camera.height * width / camera.width))
         self.camera, self._X_WN = camera.resized(width, height), X_WN
         small = [cv2.resize(one, (width, height), interpolation=cv2.INTER_AREA) for one in pictures]
-        self.backgrounds = Backgrounds.estimate(np.array(small))
         self._packed = pack(tuple(outlines))
         self._parameters = self.camera.kernel_parameters()
         points = np.array([placed_points(outlines, X) for X in X_WN])
         size = float(np.sqrt(((points - points.mean(axis=(0, 1))) ** 2).sum(axis=2).mean()))
+        self.backgrounds: Backgrounds | RidingPictures
+        if riding:
+            off = np.linalg.norm(points[:, None] - points, axis=3).max(axis=2)
+            alike = np.exp(-((off / (0.1 * size)) ** 2))
+            self.backgrounds = RidingPictures.estimate(np.array(small), alike)
+        else:
+            self.backgrounds = Backgrounds.estimate(np.array(small))
         moves = np.linalg.norm(np.ptp(points, axis=0), axis=1)
         owners = np.repeat(np.arange(len(outlines)), [len(one.vertices) for one in outlines])
         most = np.zeros(len(outlines))
         np.maximum.at(most, owners, moves)
         # A node is static if its points move by less than 0.06 of the body's size.
-        self._static = most < 0.06 * size
+        self._static = (most < 0.06 * size) & (not riding)
         moving = points[:, ~self._static[owners]]
         self._points = (moving if moving.size else points).reshape(-1, 3)
         self._middle = self._points.mean(axis=0)
@@ -110,6 +119,7 @@ class PyramidLevel:
     def mirrored(self) -> "PyramidLevel":
         """Return the level of the mirrored pictures."""
         other = self.with_camera(self.camera.mirrored())
+        assert isinstance(self.backgrounds, Backgrounds)
         other.backgrounds = self.backgrounds.mirrored()
         return other
 
@@ -169,10 +179,13 @@ class PyramidLevel:
         """Return the first pictures, prepared for scores; frames: their number; None: all."""
         X_WN = np.ascontiguousarray(self._X_WN[:frames, :, :3])
         possible = self.backgrounds.max_gain * len(X_WN) / len(self._X_WN)
-        outline = 0.3 * len(X_WN) * self.camera.width
+        outline, weight = 0.3 * len(X_WN) * self.camera.width, PICTURES.contour_weight
+        if isinstance(self.backgrounds, RidingPictures):
+            # The sum along the contours, over a length like theirs.
+            outline, weight = 1e9, 1e9 * RIDING.weight / (len(X_WN) * self.camera.width)
         return ScoredPictures(
             self._packed, X_WN, self._static, self._parameters, self.backgrounds.sums,
-            self._middle, np.array([max(possible, 1e-9), outline, PICTURES.contour_weight]),
+            self._middle, np.array([max(possible, 1e-9), outline, weight]),
         )  # fmt: skip
 
     def best(self, X_CW: Sequence[Array], frames: int, fraction: float) -> list[Array]:
@@ -203,6 +216,8 @@ class PyramidLevel:
         Each rotation is combined with three depths about that at which the body is as large as the
         changes, and with two positions in the picture: the changes' centre, and a random one.
         """
+        if isinstance(self.backgrounds, RidingPictures):
+            return self._starts_around(18 * rotations)
         changes = self.backgrounds.changed_frames()
         v, u = np.mgrid[: changes.shape[0], : changes.shape[1]]
         total = max(float(changes.sum()), 1e-9)
@@ -227,6 +242,21 @@ class PyramidLevel:
                 X[:, :3, 3] = p_CM - R_CW @ self._middle
                 found += list(X)
         return found
+
+    def _starts_around(self, count: int) -> list[Array]:
+        """Return `count` poses X_CW (4, 4) near the body, whose middle is in the picture or beside.
+
+        The middle is half the body's size to four times it away.
+        """
+        rng, size = np.random.default_rng(0), (self.camera.width, self.camera.height)
+        place = rng.uniform(-0.7, 1.7, (count, 2)) * size - self._parameters[3:5]
+        ray = np.column_stack([place / self._parameters[1:3], np.ones(count)])
+        away = self._size * np.exp(rng.uniform(np.log(0.5), np.log(4.0), count))
+        X = np.tile(np.eye(4), (count, 1, 1))
+        X[:, :3, :3] = uniform_rotations(count)[rng.permutation(count)]
+        p_CM = ray * (away / np.linalg.norm(ray, axis=1))[:, None]
+        X[:, :3, 3] = p_CM - X[:, :3, :3] @ self._middle
+        return list(X)
 
     def improve(
         self, X_CW: Sequence[Array], evaluations: int, turn: float

@@ -142,7 +142,7 @@ def measure_episode(path: Path, arm: Arm, folder: Path, seed: int, kind: Episode
     if kind.wrong:
         begin = float(rng.uniform(0.5, episode.times[-1] - _WRONG - 0.5))
         wrong = (begin, begin + _WRONG)
-    _write(folder, model, episode, kind.log_hz, turned, wrong, kind.codec, kind.crf)
+    write_episode(folder, model, episode, kind.log_hz, turned, wrong, kind.codec, kind.crf)
     settings = RegistrationSettings(zeros=("all",) if turned else ())
     start = time.process_time()
     try:
@@ -153,7 +153,7 @@ def measure_episode(path: Path, arm: Arm, folder: Path, seed: int, kind: Episode
     return _outcome(found, episode, late, turned, wrong, seconds)
 
 
-def _write(
+def write_episode(
     folder: Path,
     model: ArticulatedModel,
     episode: SimulatedEpisode,
@@ -168,17 +168,17 @@ def _write(
     codec, crf: as of EpisodeSet.
     """
     if codec:
-        video = folder / "videos" / "camera.mp4"
+        video = folder / "videos" / f"{episode.camera.name}.mp4"
         write_pictures(video, episode.pictures, episode.times, codec, crf=str(crf))
     else:
-        images = folder / "images" / "camera"
+        images = folder / "images" / episode.camera.name
         images.mkdir(parents=True)
         for k, picture in enumerate(episode.pictures):
             cv2.imwrite(str(images / f"{k:04d}.png"), picture[..., ::-1])
         rows = [f"{k:04d},{t}" for k, t in enumerate(episode.times)]
         (images / "timestamps.csv").write_text("\n".join(["frame,time", *rows]))
-    content = yaml.safe_load(dump_cameras({"camera": episode.camera}))
-    del content["camera"]["X_WC"]
+    content = yaml.safe_load(dump_cameras([episode.camera]))
+    del content[episode.camera.name]["X_WC"]
     (folder / "cameras.yaml").write_text(yaml.safe_dump(content))
     times = np.arange(episode.log_times[0], episode.log_times[-1], 1.0 / log_hz)
     logged = [np.interp(times, episode.log_times, column) for column in episode.positions.T]

@@ -61,8 +61,21 @@ class Room:
     """An arm in a room with textured walls, and a moving box of a person's size."""
 
     def __init__(
-        self, model: ArticulatedModel, folder: Path, seed: int, grey: bool, behind: float
+        self,
+        model: ArticulatedModel,
+        folder: Path,
+        seed: int,
+        grey: bool,
+        behind: float,
+        near: float = 0.05,
+        colour: tuple[float, float, float] | None = None,
     ) -> None:
+        """Build the room.
+
+        near: minimum distance from the camera at which things are drawn [m]. colour: of links
+        whose file gives none; None: the renderer's.
+        """
+        self._near = near
         rng = np.random.default_rng([8, seed])
         self.model, self._rng = model, rng
         self._scene_graph = SceneGraph()
@@ -76,29 +89,36 @@ class Room:
              ((-4, 0, 1.5), (0.1, 8, 3)), ((0, 4, 1.5), (8, 0.1, 3)), ((0, -4, 1.5), (8, 0.1, 3))]
         ):  # fmt: skip
             texture = folder / f"wall{seed}_{k}.png"
-            cv2.imwrite(str(texture), _texture(rng, grey))
+            write_texture(texture, texture_picture(rng, grey))
             self._wall(source, place, size, texture)
         for _ in range(5):
             angle = behind + rng.uniform(-1.8, 1.8)
             place = rng.uniform(0.8, 2.2) * np.array([np.cos(angle), np.sin(angle), 0.0])
             place[2] = rng.uniform(0.1, 0.8)
-            colour = np.full(3, rng.uniform(0.2, 0.9)) if grey else rng.uniform(0, 1, 3)
-            self._wall(source, place, rng.uniform(0.15, 0.6, 3), None, colour)
+            paint = np.full(3, rng.uniform(0.2, 0.9)) if grey else rng.uniform(0, 1, 3)
+            self._wall(source, place, rng.uniform(0.15, 0.6, 3), None, paint)
         self._person = own = self._plant.AddModelInstance("person")
         inertia = SpatialInertia.SolidCubeWithDensity(1.0, 1.0)
         person = self._plant.AddRigidBody("person", own, inertia)
         self._plant.AddJoint(
             PlanarJoint("walks", self._plant.world_frame(), person.body_frame(), [0, 0, 0])
         )
-        colour = [0.5, 0.5, 0.55] if grey else rng.uniform(0, 1, 3).tolist()
+        own_colour = [0.5, 0.5, 0.55] if grey else rng.uniform(0, 1, 3).tolist()
         self._plant.RegisterVisualGeometry(
-            person, RigidTransform([0, 0, 0.85]), Box(0.4, 0.3, 1.7), "person", [*colour, 1.0]
+            person, RigidTransform([0, 0, 0.85]), Box(0.4, 0.3, 1.7), "person", [*own_colour, 1.0]
         )
-        self._scene_graph.AddRenderer("vtk", MakeRenderEngineVtk(_lights(rng)))
+        engine = _lights(rng)
+        if colour is not None:
+            engine.default_diffuse = np.array([*colour, 1.0])
+        self._scene_graph.AddRenderer("vtk", MakeRenderEngineVtk(engine))
+        self._furnish()
         self._plant.Finalize()
         self._source = source
         self._context = self._plant.CreateDefaultContext()
         self._scene_context = self._scene_graph.CreateDefaultContext()
+
+    def _furnish(self) -> None:
+        """Add to the plant before it is finalized."""
 
     def _wall(self, source, place, size, texture, colour=(1.0, 1.0, 1.0)) -> None:
         properties = PerceptionProperties()
@@ -123,7 +143,7 @@ class Room:
             camera.width, camera.height, camera.focal_x, camera.focal_y,
             camera.center_x + 0.5, camera.center_y + 0.5,
         )  # fmt: skip
-        core = RenderCameraCore("vtk", info, ClippingRange(0.05, 20.0), RigidTransform())
+        core = RenderCameraCore("vtk", info, ClippingRange(self._near, 20.0), RigidTransform())
         query = self._scene_graph.get_query_output_port().Eval(self._scene_context)
         image = query.RenderColorImage(
             ColorRenderCamera(core, False), self._scene_graph.world_frame_id(),
@@ -132,7 +152,7 @@ class Room:
         return np.array(image.data[..., :3])
 
 
-def _texture(rng: np.random.Generator, grey: bool) -> NDArray[np.uint8]:
+def texture_picture(rng: np.random.Generator, grey: bool) -> NDArray[np.uint8]:
     """Return a random texture of patches and stripes."""
     picture = np.zeros((512, 512, 3), np.float32)
     for cells, weight in ((4, 0.5), (16, 0.3), (64, 0.2)):
@@ -145,6 +165,11 @@ def _texture(rng: np.random.Generator, grey: bool) -> NDArray[np.uint8]:
         picture = picture.mean(axis=-1, keepdims=True).repeat(3, axis=-1)
         picture = 90.0 + 0.4 * (picture - picture.mean()) + 60.0
     return np.clip(picture, 0, 255).astype(np.uint8)
+
+
+def write_texture(path: Path, picture: NDArray[np.uint8] | Array) -> None:
+    """Write a texture (H, W, 3) of values from 0 to 255."""
+    cv2.imwrite(str(path), np.clip(picture, 0, 255).astype(np.uint8))
 
 
 def _lights(rng: np.random.Generator) -> RenderEngineVtkParams:

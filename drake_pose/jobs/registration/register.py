@@ -69,6 +69,7 @@ from drake_pose.registration.standing_object import (
     find_target_frames,
     require_detections,
 )
+from drake_pose.registration.standing_scene.gripper import GripperSearch
 from drake_pose.registration.standing_scene.track_registration import (
     TrackRegistration,
     register_tracks,
@@ -278,11 +279,15 @@ class _Registration:
         base = inputs.tree.node_index((inputs.visible_nodes or ())[0])
         for camera in inputs.searched_cameras:
             name, start = camera.name, time.perf_counter()
+            recording, gripper = inputs.recordings[name], None
             assumed = name in inputs.assumed_focal
+            focal = self._settings.focal or assumed
+            if inputs.riding_nodes and not focal:
+                riding = RegistrationBody(inputs.tree, inputs.riding_nodes)
+                gripper = GripperSearch(riding, self.body, camera, recording)
             one = register_tracks(
-                self.body, link, base, camera, inputs.recordings[name],
-                self._settings.focal or assumed, inputs.offset_joints,
-            )  # fmt: skip
+                self.body, link, base, camera, recording, focal, inputs.offset_joints, gripper
+            )
             self.tracks[name] = one
             self.warnings += track_warnings(one, assumed)
             self._note(one.found, start)

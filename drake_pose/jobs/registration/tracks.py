@@ -1,9 +1,11 @@
 """Cameras on a link, registered from scenes that stand still: summary, warnings and overlays."""
 
+import math
 from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.errors import listed
@@ -14,22 +16,36 @@ from drake_pose.registration.register import evenly_spaced
 from drake_pose.registration.standing_scene.track_registration import TrackRegistration
 
 SCENE = "scene"
-"""The summary's `evidence` of a camera that was registered from a standing scene."""
+"""The summary's `evidence` of a camera on a link that was registered from a standing scene."""
+
+GRIPPER = "gripper"
+"""That of one registered from the gripper that it sees."""
+
+BOTH = "scene and gripper"
 
 
 def describe_tracks(one: TrackRegistration, kinematics: TreeKinematics) -> dict[str, Any]:
     """Return a camera's part of summary.json on its points, clock, focal length and offsets."""
     clock, focal = one.time_offset, one.found.camera.focal_x
     known = clock if clock is not None and clock.determined else None
+    view, seen = one.gripper, len(one.seen.uv) > 0
+    used = view is not None and not one.contradiction
     return {
-        "evidence": SCENE,
+        "evidence": (BOTH if seen else GRIPPER) if used else SCENE,
+        "gripper": view
+        and {
+            "contours_that_fit": view.ratio,
+            "told": view.explained,
+            "told_by_chance": None if math.isnan(view.chance) else view.chance,
+            "contradicts": one.contradiction or None,
+        },
         "masks": "none",
         "mean_iou": None,
-        "points": int(one.seen.points.max()) + 1,
+        "points": len(np.unique(one.seen.points)),
         "sightings": len(one.seen.uv),
-        "sightings_that_fit": float(one.inliers.mean()),
-        "explained": one.explained,
-        "explained_by_chance": one.chance,
+        "sightings_that_fit": float(one.inliers.mean()) if seen else None,
+        "explained": one.explained if seen else None,
+        "explained_by_chance": one.chance if seen else None,
         "time_offset_s": known and known.value,
         "time_offset_sd_s": known and known.deviation,
         "focal_px": focal,
@@ -54,8 +70,20 @@ def track_warnings(one: TrackRegistration, assumed: bool) -> list[str]:
     if one.likely:
         texts.append(
             f"camera '{name}': offsets of {listed(one.likely)} explain the pictures much better: "
-            "estimate them, too (--zeros all). The standard deviations include what they would "
-            "change"
+            "estimate them, too (--zeros all). The camera's pose is the one that fits with them; "
+            "the joint positions were left as they are"
+        )
+    if one.contradiction:
+        texts.append(
+            f"camera '{name}': the gripper in its pictures places it {one.contradiction} from "
+            "where the scene does; the scene's pose was taken: is the gripper the model's, is it "
+            "mounted as there, and is its opening right?"
+        )
+    if one.gripper is not None and not len(one.seen.uv):
+        texts.append(
+            f"camera '{name}': its pose comes from the gripper in its pictures alone, as the scene "
+            "does not show enough: it is right only if the gripper is the model's, and if the "
+            "pictures are not mirrored, which a symmetric gripper does not show"
         )
     loose = [offset.name for offset in one.offsets if not offset.determined]
     if loose:
@@ -72,12 +100,20 @@ def track_warnings(one: TrackRegistration, assumed: bool) -> list[str]:
 
 
 def draw_tracks(folder: Path, one: TrackRegistration, most: int = 6) -> None:
-    """Draw the points of up to `most` pictures: blue where they fit, orange where they do not."""
+    """Draw the points of up to `most` pictures: blue where they fit, orange where they do not.
+
+    The gripper's contours are orange lines.
+    """
     camera, frames = one.found.camera.name, one.found.frames
+    silhouettes = {} if one.gripper is None else one.gripper.silhouettes
     worst = sorted(range(len(frames)), key=lambda k: frames[k].inlier_ratio)
     for k in evenly_spaced(worst, most):
         name = frames[k].frame
         picture = one.pictures[name].copy()
+        if name in silhouettes:
+            shown = silhouettes[name].astype(np.uint8)
+            contours, _ = cv2.findContours(shown, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+            cv2.drawContours(picture, contours, -1, EXCESS_RGB, 1)
         own = one.seen.frames == k
         for (u, v), fits in zip(one.seen.uv[own], one.inliers[own], strict=True):
             colour = (0, 114, 178) if fits else EXCESS_RGB

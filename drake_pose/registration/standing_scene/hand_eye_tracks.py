@@ -153,6 +153,26 @@ LinkPoses = Callable[[Array], Array]
 """Returns the link's poses X_WL (frames, 4, 4) at the values (k,) of further constants."""
 
 
+class PosePrior(NamedTuple):
+    """What is known of a pose X_LC (4, 4) before a fit.
+
+    covariance: (6, 6) of its errors, rotation vector [rad] and translation [m] along its own axes.
+    """
+
+    X_LC: Array
+    covariance: Array
+
+    def off(self, X_LC: Array) -> Array:
+        """Return by how much a pose (4, 4) differs (6,), along the axes of the known one."""
+        by = inverse_transforms(self.X_LC) @ X_LC
+        return np.concatenate([Rotation.from_matrix(by[:3, :3]).as_rotvec(), by[:3, 3]])
+
+    def size(self, X_LC: Array) -> float:
+        """Return the root mean square of these differences, in standard deviations."""
+        off = self.off(X_LC)
+        return float(np.sqrt(off @ np.linalg.solve(self.covariance, off) / len(off)))
+
+
 class TrackProblem(NamedTuple):
     """What a bundle adjustment fits.
 
@@ -163,12 +183,14 @@ class TrackProblem(NamedTuple):
         seen: the sightings.
         prior_sds: (1 + k,) prior standard deviations of the logarithm of the focal length (0: it is
             known) and of the constants.
+        prior: of the camera's pose; None: it is not known.
     """
 
     camera: PinholeCamera
     link_poses: LinkPoses
     seen: Sightings
     prior_sds: Array
+    prior: PosePrior | None = None
 
     def without(self, frames: Indices) -> "TrackProblem":
         """Return the problem without the sightings of some frames."""
@@ -226,7 +248,10 @@ def fit_tracks(
         scales = [*TRACKS.fine, *last]
     free = problem.prior_sds > 0.0
     unknown = np.concatenate([np.ones(6, np.bool_), free])
-    information = np.concatenate([np.full(6, 1e-9), np.where(free, problem.prior_sds, 1.0) ** -2])
+    known = np.concatenate([np.full(6, 1e-9), np.where(free, problem.prior_sds, 1.0) ** -2])
+    information = np.diag(known)
+    if problem.prior is not None:
+        information[:6, :6] += np.linalg.inv(problem.prior.covariance)
     for scale in scales:
         r, A, B = _residuals(problem, fit)
         lengths = np.linalg.norm(r, axis=1)
@@ -235,17 +260,18 @@ def fit_tracks(
         w = _weights(lengths, TRACKS.inlier * sigma) / sigma**2
         G = _twists(problem, fit.X_LC, fit.constants)
         S, g, points_step = _without_points(problem.seen, r, A, B, w, len(fit.points))
-        H = (G.T @ S @ G + np.diag(information))[np.ix_(unknown, unknown)]
-        at = np.concatenate([np.zeros(6), fit.constants])
+        H = (G.T @ S @ G + information)[np.ix_(unknown, unknown)]
+        off = np.zeros(6) if problem.prior is None else problem.prior.off(fit.X_LC)
+        at = np.concatenate([off, fit.constants])
         step = np.zeros(6 + count)
-        step[unknown] = -np.linalg.solve(H, (G.T @ g + information * at)[unknown])
+        step[unknown] = -np.linalg.solve(H, (G.T @ g + information @ at)[unknown])
         fit = fit._replace(
             X_LC=fit.X_LC @ motion(step[:6]), constants=fit.constants + step[6:],
             points=fit.points + points_step(G @ step), sigma=sigma,
         )  # fmt: skip
     # The damping of the points' steps would hide motions of the whole scene.
     S, _, _ = _without_points(problem.seen, r, A, B, w, len(fit.points), damping=1e-12)
-    H = (G.T @ S @ G + np.diag(information))[np.ix_(unknown, unknown)]
+    H = (G.T @ S @ G + information)[np.ix_(unknown, unknown)]
     variances, axes = np.linalg.eigh(H)
     covariance = np.zeros((6 + count, 6 + count))
     covariance[np.ix_(unknown, unknown)] = axes / variances.clip(min=1e-9) @ axes.T
@@ -287,11 +313,23 @@ def intrinsics_effect(
     return np.asarray(off.T @ off)
 
 
+def prior_effect(problem: TrackProblem, fit: TrackFit) -> Array:
+    """Return the covariance (7 + k, 7 + k), see `TrackFit`, from errors of the pose's prior."""
+    if problem.prior is None:
+        return np.zeros((len(fit.covariance),) * 2)
+    variances, axes = np.linalg.eigh(problem.prior.covariance)
+    rows = []
+    for by in (axes * np.sqrt(variances.clip(min=0.0))).T:
+        wrong = problem.prior._replace(X_LC=problem.prior.X_LC @ motion(by))
+        rows.append(_moved(fit, fit_tracks(problem._replace(prior=wrong), fit)))
+    off = np.array(rows)
+    return np.asarray(off.T @ off)
+
+
 def _moved(fit: TrackFit, other: TrackFit) -> Array:
     """Return by how much another fit's unknowns (7 + k,), see `TrackFit`, differ from a fit's."""
-    by = inverse_transforms(fit.X_LC) @ other.X_LC
-    turn = Rotation.from_matrix(by[:3, :3]).as_rotvec()
-    return np.concatenate([turn, by[:3, 3], other.constants - fit.constants])
+    by = PosePrior(fit.X_LC, fit.covariance).off(other.X_LC)
+    return np.concatenate([by, other.constants - fit.constants])
 
 
 def gauge_constants(problem: TrackProblem, X_LC: Array, constants: Array) -> NDArray[np.bool_]:

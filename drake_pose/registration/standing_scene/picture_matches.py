@@ -57,6 +57,10 @@ class Sightings(NamedTuple):
     points: Indices
     uv: Array
 
+    def none(self) -> "Sightings":
+        """Return no sightings."""
+        return Sightings(self.frames[:0], self.points[:0], self.uv[:0])
+
 
 def match_pictures(pictures: Sequence[Picture]) -> tuple[Matches, Sightings]:
     """Match points between all pairs of pictures (H, W, 3), and join them into tracks."""

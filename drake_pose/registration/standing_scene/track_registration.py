@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from scipy.special import stdtr, stdtrit
 
 from drake_pose.arrays import Array, Picture
@@ -19,8 +18,10 @@ from drake_pose.registration.joint_offsets import KinematicParameter
 from drake_pose.registration.picture_registration import TimeOffset, choose_pictures
 from drake_pose.registration.recording import Recording
 from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
+from drake_pose.registration.standing_scene.gripper import GripperFit, GripperSearch
 from drake_pose.registration.standing_scene.hand_eye_tracks import (
     EpipolarSearch,
+    PosePrior,
     TrackFit,
     TrackProblem,
     fit_tracks,
@@ -28,6 +29,7 @@ from drake_pose.registration.standing_scene.hand_eye_tracks import (
     intrinsics_effect,
     jackknife,
     poses_differ,
+    prior_effect,
 )
 from drake_pose.registration.standing_scene.picture_matches import (
     Matches,
@@ -52,6 +54,14 @@ class TrackRegistrationSettings(NamedTuple):
         least_motion: minimum standard deviation of the link's position [mm].
         determined: maximum standard deviation of a determined constant, over the prior's.
         max_sd: maximum standard deviation of a determined pose along any axis [rad, m].
+        agrees: maximum root mean square difference of the poses from scene and gripper, over its
+            standard deviation.
+        near: rotation [rad] and distance [m] within which a pose of the gripper is refined by the
+            scene.
+        deciding: minimum number of matches that decide between poses of the gripper.
+        apart: of these poses the best one explains at least this many times what the next does.
+        most_explained: minimum explained fraction with which the scene improves a pose of the
+            gripper, if it does not determine one by itself.
         better: joint offsets that lower the residuals by this factor are likely.
     """
 
@@ -69,6 +79,11 @@ class TrackRegistrationSettings(NamedTuple):
     least_motion: float = 5.0
     determined: float = 0.2
     max_sd: float = 0.04
+    agrees: float = 2.5
+    near: tuple[float, float] = (0.1, 0.05)
+    deciding: int = 30
+    apart: float = 1.3
+    most_explained: float = 0.5
     better: float = 1.5
 
 
@@ -92,6 +107,9 @@ class TrackRegistration:
         seen: the points' sightings, by index of the frames of `found`.
         inliers: (n,) which sightings fit.
         pictures: the pictures by frame.
+        gripper: the pose from the gripper alone; None: it is not seen, or its contours do not fit.
+        contradiction: by how much this pose differs from the scene's, as words, if it differs
+            significantly; it was not used then. "": it does not.
     """
 
     found: RegisteredCamera
@@ -104,6 +122,8 @@ class TrackRegistration:
     seen: Sightings
     inliers: NDArray[np.bool_]
     pictures: dict[str, Picture]
+    gripper: GripperFit | None = None
+    contradiction: str = ""
 
 
 def register_tracks(
@@ -114,8 +134,11 @@ def register_tracks(
     recording: Recording,
     focal: bool = False,
     offset_joints: Sequence[str] = (),
+    gripper: GripperSearch | None = None,
 ) -> TrackRegistration:
     """Estimate the pose of a camera on a link from its pictures; nothing in them need be known.
+
+    The scene is fitted together with the gripper, if the camera sees it.
 
     Args:
         body: the robot, whose pose tree starts at the link.
@@ -125,6 +148,7 @@ def register_tracks(
         recording: the camera's pictures and the joint log.
         focal: whether the focal length is fitted.
         offset_joints: joints whose offsets are fitted.
+        gripper: what rides along with the camera; None: nothing that is known.
 
     Raises RegistrationError: too little is matched, no pose explains it, or the link's motion does
         not determine the pose; the message says what would help.
@@ -133,43 +157,58 @@ def register_tracks(
     slow, fast = choose_pictures(body, camera, recording, settings.pictures, moving=settings.moving)
     rows = sorted({*slow, *fast})
     link_poses = _link_poses(body, base, recording, rows)
-    _require_motion(camera, link, link_poses(np.zeros(1 + len(names))))
-    pictures = [recording.read(k) for k in rows]
+    pictures, timed = [recording.read(k) for k in rows], recording.times is not None
     matches, seen = match_pictures(pictures)
-    _require_matches(camera, matches, len(rows))
-    nothing = np.zeros(2 + len(names))
-    start = _search(camera, matches, link_poses, nothing, focal, recording.times is not None)
-    _require_explained(camera, link, start)
     asked = np.array([name in offset_joints for name in names])
-    sds = np.concatenate(
-        [
-            [settings.focal_sd * focal, settings.time_sd * (recording.times is not None)],
-            settings.joint_sd * asked,
-        ]
-    )
+    lens_sds = [settings.focal_sd * focal, settings.time_sd * timed]
+    sds = np.concatenate([lens_sds, settings.joint_sd * asked])
     problem = TrackProblem(camera, link_poses, seen, sds)
-    problem, fit = _fit_determined(problem, start.X_LC[0], start.constants)
-    _require_determined(camera, link, link_poses(fit.constants[1:]), fit.X_LC, fit.covariance)
-    covariance = jackknife(problem, fit) + intrinsics_effect(problem, fit)
-    others = [fit_tracks(problem, X, start.constants) for X in start.X_LC[1:]]
-    alike = [
-        one.X_LC
-        for one in others
-        if one.sigma < 1.1 * fit.sigma and poses_differ(one.X_LC, fit.X_LC)
-    ]
-    likely: tuple[str, ...] = ()
-    if not asked.any():
-        likely, effect = _likely_offsets(body, problem, fit)
-        covariance[:6, :6] += np.outer(effect, effect)
-    _require_determined(camera, link, link_poses(fit.constants[1:]), fit.X_LC, covariance, likely)
+    scene = _Scene(body, link, problem, matches, focal, timed)
+    view, why = None, ""
+    try:
+        _require_motion(camera, link, link_poses(np.zeros(1 + len(names))))
+        _require_matches(camera, matches, len(rows))
+        start = scene.search()
+        _require_explained(camera, link, start)
+        fitted = scene.fit(start, None)
+    except RegistrationError as error:
+        if gripper is None:
+            raise
+        view, start = _start_at_gripper(gripper, scene, error)
+        fitted = scene.fit(start, view) if start.matches else scene.without(view)
+        prior = PosePrior(view.X_LC, view.covariance + fitted.covariance[:6, :6])
+        if start.matches and prior.size(fitted.fit.X_LC) > settings.agrees:
+            raise RegistrationError(
+                f"{str(error).removesuffix(' Nothing was written')} The gripper in its pictures "
+                "contradicts the scene. Nothing was written"
+            ) from error
+    else:
+        clock = float(fitted.fit.constants[1])
+        view = None if gripper is None else gripper.near(fitted.fit.X_LC, clock)
+        if view is not None:
+            prior = PosePrior(view.X_LC, view.covariance + fitted.covariance[:6, :6])
+            if prior.size(fitted.fit.X_LC) < settings.agrees:
+                fitted = scene.fit(start, view)
+            else:
+                off = prior.off(fitted.fit.X_LC)
+                why = (
+                    f"{1e3 * np.linalg.norm(off[3:]):.0f} mm and "
+                    f"{np.degrees(np.linalg.norm(off[:3])):.1f} degrees"
+                )
+    problem, fit, covariance = fitted.problem, fitted.fit, fitted.covariance
     scale = float(np.exp(fit.constants[0]))
     placed = replace(
         camera, focal_x=scale * camera.focal_x, focal_y=scale * camera.focal_y
     ).with_pose(fit.X_LC)
     J = np.kron(np.eye(2), fit.X_LC[:3, :3])
     misfits = _misfits([recording.names[k] for k in rows], seen, fit)
+    if view is not None and not start.matches:
+        misfits = tuple(
+            FrameMisfit(name, math.nan, math.nan, view.ratio, True) for name in view.silhouettes
+        )
+        pictures, seen = [recording.picture(name) for name in view.silhouettes], seen.none()
     found = RegisteredCamera(
-        placed, J @ covariance[:6, :6] @ J.T, misfits, np.array(alike).reshape(-1, 4, 4)
+        placed, J @ covariance[:6, :6] @ J.T, misfits, np.array(fitted.alike).reshape(-1, 4, 4)
     )
     deviations = np.sqrt(np.diag(covariance))
     return TrackRegistration(
@@ -177,12 +216,14 @@ def register_tracks(
         _time_offset(recording, float(fit.constants[1]), float(deviations[7])),
         float(deviations[6]),
         _describe_offsets(names, offset_joints, problem, fit, deviations),
-        likely,
+        fitted.likely,
         start.explained,
         start.chance,
         seen,
         fit.inliers,
         dict(zip((one.frame for one in misfits), pictures, strict=True)),
+        view,
+        why,
     )
 
 
@@ -218,43 +259,170 @@ class _Start(NamedTuple):
     matches: int
 
 
-def _search(
-    camera: PinholeCamera,
-    matches: Matches,
-    link_poses: Callable[[Array], Array],
-    nothing: Array,
-    focal: bool,
-    timed: bool,
-) -> _Start:
-    """Search the pose, the time offset (if `timed`) and the focal length (if `focal`).
+class _Fitted(NamedTuple):
+    """Result of a bundle adjustment.
 
-    nothing: (2 + m,) the constants 0.
+    problem, fit: what was fitted. covariance: (7 + k, 7 + k) as of ``TrackFit``. alike: other poses
+    (4, 4) that fit as well. likely: see ``TrackRegistration``.
     """
-    settings, X_WL = STANDING_SCENE, link_poses(nothing[1:])
-    scales = settings.focals if focal else (1.0,)
-    tried = []
-    for scale in scales:
-        scaled = replace(camera, focal_x=scale * camera.focal_x, focal_y=scale * camera.focal_y)
-        search = EpipolarSearch(scaled, matches)
-        tried.append((search.search(X_WL), scale, search))
-    found, scale, search = max(tried, key=lambda one: one[0][0][0])
-    (explained, X_LC), constants = found[0], nothing.copy()
-    constants[0] = math.log(scale)
-    for time in settings.times if timed else ():
-        at = constants.copy()
-        at[1] = time
-        gain, X = search.refine(link_poses(at[1:]), X_LC)
-        if gain > explained:
-            explained, best, constants = gain, X, at
-            found = [(gain, best), *found[1:]]
-    n = len(X_WL)
-    shifts = {max(1, round(part * n)) for part in (0.25, 0.5, 0.75)}
-    chance = max(
-        search.search(np.roll(X_WL, shift, axis=0), settings.chance_rotations)[0][0]
-        for shift in shifts
-    )
-    poses = [X for gain, X in found if gain > 0.7 * explained]
-    return _Start(poses[:3], constants, explained, chance, len(matches.uv))
+
+    problem: TrackProblem
+    fit: TrackFit
+    covariance: Array
+    alike: Sequence[Array] = ()
+    likely: tuple[str, ...] = ()
+
+
+class _Scene(NamedTuple):
+    """A scene that stands still, in a camera's pictures.
+
+    body, link: the robot, and the link's name. problem: what is fitted. matches: of its pictures.
+    focal, timed: whether focal length and clock are searched.
+    """
+
+    body: RegistrationBody
+    link: str
+    problem: TrackProblem
+    matches: Matches
+    focal: bool
+    timed: bool
+
+    def search(self) -> _Start:
+        """Search the pose, the time offset and the focal length."""
+        settings, camera = STANDING_SCENE, self.problem.camera
+        constants = np.zeros(len(self.problem.prior_sds))
+        X_WL = self.problem.link_poses(constants[1:])
+        tried = []
+        for scale in settings.focals if self.focal else (1.0,):
+            focal_x, focal_y = scale * camera.focal_x, scale * camera.focal_y
+            scaled = replace(camera, focal_x=focal_x, focal_y=focal_y)
+            search = EpipolarSearch(scaled, self.matches)
+            tried.append((search.search(X_WL), scale, search))
+        found, scale, search = max(tried, key=lambda one: one[0][0][0])
+        constants[0] = math.log(scale)
+        explained, X_LC, constants = self._timed(search, *found[0], constants)
+        found = [(explained, X_LC), *found[1:]]
+        chance = max(
+            search.search(np.roll(X_WL, shift, axis=0), settings.chance_rotations)[0][0]
+            for shift in self._shifts()
+        )
+        poses = [X for gain, X in found if gain > 0.7 * explained]
+        return _Start(poses[:3], constants, explained, chance, len(self.matches.uv))
+
+    def compare(self, X_LC: Array, offset: float) -> _Start:
+        """Return how well a pose (4, 4) explains the matches, at about a time offset [s]."""
+        search = EpipolarSearch(self.problem.camera, self.matches)
+        constants = np.zeros(len(self.problem.prior_sds))
+        constants[1] = offset
+        X_WL = self.problem.link_poses(constants[1:])
+        gain, X = search.refine(X_WL, X_LC)
+        explained, X, constants = self._timed(search, gain, X, constants)
+        if poses_differ(X, X_LC, turn=STANDING_SCENE.near[0], shift=STANDING_SCENE.near[1]):
+            explained = 0.0  # Another pose explains them, not this one.
+        chance = max(
+            search.refine(np.roll(X_WL, shift, axis=0), X_LC)[0] for shift in self._shifts()
+        )
+        return _Start([X_LC], constants, explained, chance, len(self.matches.uv))
+
+    def _shifts(self) -> set[int]:
+        """Return by how many pictures joint positions are exchanged to learn what chance does."""
+        n = int(self.problem.seen.frames.max()) + 1
+        return {max(1, round(part * n)) for part in (0.25, 0.5, 0.75)}
+
+    def _timed(
+        self, search: EpipolarSearch, explained: float, X_LC: Array, constants: Array
+    ) -> tuple[float, Array, Array]:
+        """Return what is explained, the pose and the constants at the best time offset."""
+        best = explained, X_LC, constants
+        for time in STANDING_SCENE.times if self.timed else ():
+            at = constants.copy()
+            at[1] = time
+            gain, X = search.refine(self.problem.link_poses(at[1:]), X_LC)
+            if gain > best[0]:
+                best = gain, X, at
+        return best
+
+    def fit(self, start: _Start, view: GripperFit | None) -> _Fitted:
+        """Fit from a start, together with what the gripper tells (None: nothing).
+
+        Raises RegistrationError: the pose is not determined.
+        """
+        prior = None if view is None else PosePrior(view.X_LC, view.covariance)
+        problem = self.problem._replace(prior=prior)
+        asked = bool((problem.prior_sds[2:] > 0.0).any())
+        problem, fit = _fit_determined(problem, start.X_LC[0], start.constants)
+        self._require(problem, fit, fit.covariance)
+        likely: tuple[str, ...] = ()
+        if not asked:
+            likely, problem, fit = _with_likely_offsets(self.body, problem, fit)
+        covariance = jackknife(problem, fit) + intrinsics_effect(problem, fit)
+        covariance += prior_effect(problem, fit)
+        self._require(problem, fit, covariance, likely)
+        others = [fit_tracks(problem, X, start.constants) for X in start.X_LC[1:]]
+        alike = [
+            one.X_LC
+            for one in others
+            if one.sigma < 1.1 * fit.sigma and poses_differ(one.X_LC, fit.X_LC)
+        ]
+        return _Fitted(problem, fit, covariance, alike, likely)
+
+    def without(self, view: GripperFit) -> _Fitted:
+        """Return the pose from the gripper alone."""
+        count = len(self.problem.prior_sds)
+        constants, covariance = np.zeros(count), np.zeros((6 + count, 6 + count))
+        covariance[:6, :6], covariance[7, 7] = view.covariance, np.inf
+        if view.time_offset is not None:
+            constants[1], covariance[7, 7] = view.time_offset[0], view.time_offset[1] ** 2
+        none = np.zeros(0)
+        fit = TrackFit(view.X_LC, constants, np.zeros((0, 3)), math.nan, covariance, none)
+        problem = self.problem._replace(prior_sds=0.0 * self.problem.prior_sds)
+        return _Fitted(problem, fit, covariance)
+
+    def _require(
+        self, problem: TrackProblem, fit: TrackFit, covariance: Array, likely: Sequence[str] = ()
+    ) -> None:
+        X_WL = problem.link_poses(fit.constants[1:])
+        _require_determined(problem.camera, self.link, X_WL, fit.X_LC, covariance, likely)
+
+
+def _start_at_gripper(
+    gripper: GripperSearch, scene: _Scene, error: RegistrationError
+) -> tuple[GripperFit, _Start]:
+    """Return what the gripper tells, and a start there, without matches if they do not help.
+
+    error: why the scene alone does not determine the pose.
+
+    Raises RegistrationError: the gripper does not determine it either.
+    """
+    views, why = gripper.find()
+    told = str(error).removesuffix(" Nothing was written")
+    if not views:
+        raise RegistrationError(
+            f"{told} Nor does the gripper in its pictures help, or it is not in view: {why}. "
+            "Nothing was written"
+        ) from error
+    count, starts = len(scene.matches.uv), list[_Start]()
+    if count >= STANDING_SCENE.deciding:
+        clocks = [0.0 if one.time_offset is None else one.time_offset[0] for one in views]
+        both = zip(views, clocks, strict=True)
+        starts = [scene.compare(one.X_LC, clock) for one, clock in both]
+    order = sorted(range(len(starts)), key=lambda k: -starts[k].explained)
+    best = starts[order[0]] if starts else None
+    helps = best is not None and best.explained > STANDING_SCENE.least_gain * best.chance
+    alone = _Start([], np.zeros(0), math.nan, math.nan, 0)
+    if len(views) > 1:
+        # A symmetric gripper looks the same from several sides; the scene does not.
+        apart = STANDING_SCENE.apart
+        if not helps or starts[order[0]].explained < apart * starts[order[1]].explained:
+            raise RegistrationError(
+                f"{told} The gripper in its pictures fits as well in {len(views)} poses of the "
+                "camera, as it looks the same from several sides, and the scene does not decide. "
+                "Nothing was written"
+            ) from error
+    if best is None or not helps:
+        return views[0], alone
+    enough = count >= STANDING_SCENE.least and best.explained > STANDING_SCENE.most_explained
+    return views[order[0]], best if enough else alone
 
 
 def _require_matches(camera: PinholeCamera, matches: Matches, count: int) -> None:
@@ -364,26 +532,23 @@ def _fit_determined(
         sds[2 + int(np.argmax(ratios))] = 0.0
 
 
-def _likely_offsets(
+def _with_likely_offsets(
     body: RegistrationBody, problem: TrackProblem, fit: TrackFit
-) -> tuple[tuple[str, ...], Array]:
-    """Return the joints whose offsets explain the pictures much better, and their effect.
+) -> tuple[tuple[str, ...], TrackProblem, TrackFit]:
+    """Return the joints whose offsets explain the pictures much better, with the fit of these.
 
-    The effect (6,) is how X_LC would change, as a twist along the camera's axes.
+    Without such joints the problem and the fit are returned as they are.
     """
     sds = problem.prior_sds.copy()
     sds[2:] = np.where(body.kinematics.is_angle, STANDING_SCENE.joint_sd, 0.0)
     free = problem._replace(prior_sds=sds)
     free, other = _fit_determined(free, fit.X_LC, fit.constants)
     if fit.sigma < STANDING_SCENE.better * other.sigma:
-        return (), np.zeros(6)
+        return (), problem, fit
     deviations = np.sqrt(np.diag(jackknife(free, other)))[8:]
     off = np.abs(other.constants[2:]) > 2.0 * np.maximum(deviations, 1e-9)
-    by = inverse_transforms(fit.X_LC) @ other.X_LC
-    return (
-        tuple(name for name, one in zip(body.kinematics.names, off, strict=True) if one),
-        np.concatenate([Rotation.from_matrix(by[:3, :3]).as_rotvec(), by[:3, 3]]),
-    )
+    names = tuple(name for name, one in zip(body.kinematics.names, off, strict=True) if one)
+    return names, free, other
 
 
 def _misfits(

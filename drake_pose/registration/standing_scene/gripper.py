@@ -40,6 +40,8 @@ class GripperSettings(NamedTuple):
             same pose. Grippers of other models have 0.5 at most.
         least_gain: a pose explains at least this many times what the best one explains in pictures
             that are shifted by half their size.
+        least_vuong: minimum Vuong statistic of a pose that explains significantly more than others,
+            and than with the joint positions of other pictures.
         opening: minimum motion of a finger that tells the clock [m].
         max_sd: maximum standard deviation of a pose along any axis [rad, m].
         clock_sd: maximum standard deviation of a time offset that is determined [s].
@@ -57,6 +59,7 @@ class GripperSettings(NamedTuple):
     shown: float = 0.01
     least_ratio: tuple[float, float] = (0.7, 0.5)
     least_gain: float = 1.3
+    least_vuong: float = 2.6
     opening: float = 0.005
     clock_sd: float = 0.1
     max_sd: float = 0.04
@@ -134,8 +137,10 @@ class GripperSearch:
         Returns:
             the fits; and, if there are none, why.
         """
+        if not self._moves:
+            return [], "its fingers are not logged or do not move, and an outline may be anything's"
         search = self._search(0.0)
-        constants = (TIME_OFFSET,) if self._moves and self._recording.times is not None else ()
+        constants = (TIME_OFFSET,) if self._recording.times is not None else ()
         fits = self._fits(search, search.search(GRIPPER.rounds, GRIPPER.starts), constants)
         if fits:
             # Many grippers look nearly the same after half a turn about an axis of their link.
@@ -153,10 +158,16 @@ class GripperSearch:
                 f"its silhouettes tell {best.explained:.0%} about the pictures, and "
                 f"{chance:.0%} about shifted ones"
             )
-        gains = self._gains(search, best)
+        gains, count = self._gains(search, best), len(search.frames)
+        exchanged = [
+            vuong_statistic(gains, self._gains(search, best, shift))
+            for shift in {max(1, round(part * count)) for part in (0.25, 0.5, 0.75)}
+        ]
+        if min(exchanged) < GRIPPER.least_vuong:
+            return [], "its silhouettes fit as well with openings of other moments"
         accepted = list[GripperFit]()
         for one in fits:
-            alike = vuong_statistic(gains, self._gains(search, one)) < 1.96
+            alike = vuong_statistic(gains, self._gains(search, one)) < GRIPPER.least_vuong
             if one is best or alike:
                 fit = self._accepted(one, chance, search)
                 if fit is not None:
@@ -195,16 +206,20 @@ class GripperSearch:
         """Return whether a camera at X_LC (4, 4) sees enough of the gripper."""
         return float(self._masks(search, X_LC).mean()) > GRIPPER.shown
 
-    def _masks(self, search: PictureSearch, X_LC: Array) -> Mask:
-        """Return the gripper's silhouettes (f, h, w) at X_LC (4, 4) in the compared pictures."""
+    def _masks(self, search: PictureSearch, X_LC: Array, shift: int = 0) -> Mask:
+        """Return the gripper's silhouettes (f, h, w) at X_LC (4, 4) in the compared pictures.
+
+        shift: each picture gets the values of the one that is so many places ahead.
+        """
         camera, X_CL = search.compared.camera, np.linalg.inv(X_LC)
         poses = [self._body.kinematics.poses(one.values) for one in search.frames]
+        poses = [*poses[shift:], *poses[:shift]]
         return np.array([draw_mask(self._body.medium, X_CL @ X, camera) for X in poses])
 
-    def _gains(self, search: PictureSearch, fit: PictureFit) -> Array:
-        return silhouette_gains(
-            search.compared.backgrounds.sums, self._masks(search, fit.camera.X_WC)
-        )
+    def _gains(self, search: PictureSearch, fit: PictureFit, shift: int = 0) -> Array:
+        """Return what a fit's silhouettes tell by tiles; shift: as of `_masks`."""
+        masks = self._masks(search, fit.camera.X_WC, shift)
+        return silhouette_gains(search.compared.backgrounds.sums, masks)
 
     def _accepted(self, fit: PictureFit, chance: float, search: PictureSearch) -> GripperFit | None:
         """Return a fit whose contours fit; None for others."""

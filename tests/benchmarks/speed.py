@@ -13,7 +13,11 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from drake_pose.body import TriangleMesh, bundled_model, load_model
+from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
+from drake_pose.files.settings import EstimateSettings
+from drake_pose.jobs.estimate.inputs import bundled_person
+from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.papers.date_capture import SilhouetteTrack, Studio, one_core
 from drake_pose.papers.kameda import (
     experiment_camera,
@@ -26,7 +30,9 @@ from drake_pose.registration.picture_registration import register_pictures
 from drake_pose.registration.recording import Recording
 from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.silhouette.pictures.masks import read_mask, signed_distances, write_mask
 from drake_pose.silhouette.scoring import prefix_sums, score_bodies
+from drake_pose.silhouette.segmentation import person_region
 from drake_pose.systems.images import picture_to_colour_image
 from drake_pose.workers import use_workers
 from tests.benchmarks.tables import print_table
@@ -155,6 +161,42 @@ def measure_pictures(size: tuple[int, int] = (640, 480), frames: int = 30) -> tu
     return alone, image, own + 0.5 * (seconds - own)
 
 
+def measure_capture(folder: Path, frames: int = 60, cameras: int = 9) -> np.ndarray:
+    """Return the CPU times (3,) of a recorded person's capture [ms]: a frame of all cameras.
+
+    They are those of decoding all masks with one distance transform of each, of the capture without
+    overlays, and with overlays. The capture includes the search for the person, the fit of the
+    lengths and the report.
+    """
+    studio = Studio.build(cameras, (640, 480), np.random.default_rng([5, 1]))
+    save_cameras(folder / "cameras.yaml", studio.cameras)
+    (folder / "scene.yaml").write_text("sequence: true")
+    motion = make_motion(studio.skeleton, 4 * FEWEST_FRAMES, 5)
+    paths = []
+    for k, q in enumerate(motion.q[:frames]):
+        for name, picture in studio.pictures(q).items():
+            paths.append(folder / "masks" / name / f"{k:04d}.png")
+            paths[-1].parent.mkdir(parents=True, exist_ok=True)
+            write_mask(paths[-1], person_region(picture, studio.backgrounds[name]))
+
+    def capture(out: str, overlay: bool, wanted: tuple[str, ...] = ()) -> None:
+        settings = EstimateSettings(method="person", frames=wanted)
+        estimate_scene(folder, bundled_person(), folder / out, settings, overlay=overlay)
+
+    times = []
+    with one_core():
+        capture("warm", True, ("0:2",))
+        for work in (
+            lambda: [signed_distances(read_mask(path)) for path in paths],
+            lambda: capture("bare", False),
+            lambda: capture("drawn", True),
+        ):
+            start = time.process_time()
+            work()
+            times.append(1e3 * (time.process_time() - start) / frames)
+    return np.array(times)
+
+
 def _kernel_rows() -> Iterator[tuple[str, ...]]:
     for columns, rows in ((14, 16), (72, 71)):
         triangles, kernel, image = measure_kernel(columns, rows)
@@ -186,6 +228,14 @@ def _picture_rows() -> Iterator[tuple[str, ...]]:
     yield f"{alone:.1f} s", f"{1e3 * image:.1f} ms", f"{alone / image:.0f}", f"{shared / alone:.2f}"
 
 
+def _capture_rows() -> Iterator[tuple[str, ...]]:
+    with tempfile.TemporaryDirectory() as folder:
+        decoded, *captured = measure_capture(Path(folder))
+    yield "decoding and a distance transform", f"{decoded:.1f}", "1.0"
+    for what, one in zip(("overlays left out", "overlays"), captured, strict=True):
+        yield f"capture, {what}", f"{one:.1f}", f"{one / decoded:.1f}"
+
+
 def main() -> None:
     """Print times of the kernel and the papers' methods, and the agreement with Drake."""
     headings: tuple[str, ...] = ("triangles", "kernel, a candidate", "Drake label image", "ratio")
@@ -198,6 +248,8 @@ def main() -> None:
     headings = ("cameras", "region and edge", "pose", "all", "a camera")
     title = "Date, all silhouettes, 640 x 480, one core: milliseconds a frame"
     print_table(title, headings, _cost_rows())
+    title = "Capture of 60 recorded frames, nine views, 640 x 480, one core"
+    print_table(title, ("work", "milliseconds a frame", "ratio"), _capture_rows())
     start = time.process_time()
     result = run_experiment(experiment_search())
     seconds = time.process_time() - start

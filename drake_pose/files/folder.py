@@ -57,7 +57,11 @@ def write_file(folder: Path, name: str, content: bytes | str) -> None:
 
 def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
     """Write a mapping to summary.json in a result folder, as `without_nan` converts it to JSON."""
-    write_file(folder, SUMMARY, _json_text(without_nan(summary)) + "\n")
+    try:
+        text = _json_text(summary)
+    except (TypeError, ValueError):  # It has arrays, or numbers that are not finite.
+        text = _json_text(without_nan(summary))
+    write_file(folder, SUMMARY, text + "\n")
 
 
 def _json_text(value: Any, levels: int = 2, indent: str = "\n") -> str:

@@ -175,7 +175,7 @@ class ResultWriter:
 
         ``replay``: whether replay.html is written, too. Without a folder no file is written.
         """
-        records = self.result().records
+        records = self._in_order()
         self.warnings += frame_warnings(records)
         self.warnings += camera_warnings(records, self.warnings)
         held = self._job.get("settings", {}).get("hold", {})
@@ -218,9 +218,13 @@ class ResultWriter:
         X_WB = np.array([base_pose(one.base) for one in found])
         return make_replay(self.model, q, X_WB, cameras, period, ghost)
 
+    def _in_order(self) -> dict[str, FrameRecord]:
+        """Return the finished frames by name, in the scene's order."""
+        return {f: self.records[f] for f in self.scene.frames if f in self.records}
+
     def result(self) -> SceneEstimate:
         """Return the estimate so far, in the scene's order, including frames of an earlier job."""
-        records = {f: self.records[f] for f in self.scene.frames if f in self.records}
+        records = self._in_order()
         more = {**self.more, "warnings": self.warnings}
         if self.scene.frame_rate_hz is not None:
             more["frame_rate_hz"] = self.scene.frame_rate_hz

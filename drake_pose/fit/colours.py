@@ -171,8 +171,8 @@ class PartColours:
             labels = draw_labels(outlines, range(1, 1 + len(outlines)), camera.X_CW @ X_WN, camera)
             covered = labels > 0
             parts = labels[covered] - 1
-            np.add.at(counts[0], parts, self.is_own[parts, colour_numbers(picture[covered])])
-            np.add.at(counts[1], parts, 1.0)
+            own = parts[self.is_own[parts, colour_numbers(picture[covered])]]
+            counts += [np.bincount(one, minlength=len(outlines)) for one in (own, parts)]
         return np.where(counts[1] < 100, np.nan, counts[0] / np.maximum(counts[1], 1.0))
 
 

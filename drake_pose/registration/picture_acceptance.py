@@ -120,7 +120,7 @@ def accept_fit(
     focal: float,
     *,
     max_p_value: float = 0.15,
-    min_ratio: float = 0.33,
+    min_ratio: float = 0.4,
     sufficient_ratio: float = 0.75,
     min_explained: float = 0.12,
     max_sd: float = 0.04,
@@ -136,7 +136,7 @@ def accept_fit(
         max_p_value: maximum of `p_value_of`. 33 of 36 correct poses have 0.07 or less; the others
             belong to arms that cover the same pixels in most frames.
         min_ratio: minimum mean inlier ratio of all frames. Where the joint positions of other
-            episodes or models of other robots explain much, it is 0.32 at most.
+            episodes or models of other robots explain much, it is 0.38 at most.
         sufficient_ratio, min_explained: with this inlier ratio and explained fraction, the p-value
             does not matter. Wrong poses have a ratio of 0.62 at most, and then explain nothing.
         max_sd: maximum standard deviation of the pose [distance from the body; rad]. Correct poses

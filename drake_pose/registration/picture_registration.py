@@ -226,7 +226,7 @@ def explained_by_chance(
     Args:
         search: a search with the pictures' own joint positions.
         rounds, rotations: as of ``PictureSearch.search``. With a third of the usual hypotheses the
-            fractions have the same distribution: over 20 drawn rooms their logarithms differ by
+            fractions have the same distribution: over 15 drawn rooms their logarithms differ by
             0.02 in the mean, with a standard deviation of 0.15.
     """
     exchanged = search.with_frames(exchange_values(search.frames))

@@ -112,27 +112,10 @@ def p_value_of(
     return float(ndtr(-np.log(ratio) / deviation))
 
 
-def accept_fit(
-    best: PictureFit,
-    recording: Recording,
-    start: PictureStart,
-    joint_offsets: Array,
-    focal: float,
-    *,
-    max_p_value: float = 0.15,
-    min_ratio: float = 0.4,
-    sufficient_ratio: float = 0.75,
-    min_explained: float = 0.12,
-    max_sd: float = 0.04,
-    max_clock_sd: float = 0.1,
-    guessed_lens_error: float = 0.25,
-) -> PictureRegistration:
-    """Return the registration of a fit, if it explains the pictures.
-
-    The first four arguments are what `_fit_until_stable` returns.
+class AcceptanceSettings(NamedTuple):
+    """What a fit must reach to be accepted.
 
     Args:
-        focal: prior standard deviation of the focal length's logarithm; 0: it was not fitted.
         max_p_value: maximum of `p_value_of`. 33 of 36 correct poses have 0.07 or less; the others
             belong to arms that cover the same pixels in most frames.
         min_ratio: minimum mean inlier ratio of all frames. Where the joint positions of other
@@ -144,19 +127,46 @@ def accept_fit(
         max_clock_sd: a time offset with a larger standard deviation is not determined [s].
         guessed_lens_error: relative error of focal lengths that pictures alone determine, which
             enlarges the covariance. Simulated ones err by 1 %, real ones by 2 to 50 %.
+    """
 
-    Raises RegistrationError: a criterion is not met.
+    max_p_value: float = 0.15
+    min_ratio: float = 0.4
+    sufficient_ratio: float = 0.75
+    min_explained: float = 0.12
+    max_sd: float = 0.04
+    max_clock_sd: float = 0.1
+    guessed_lens_error: float = 0.25
+
+
+ACCEPTANCE = AcceptanceSettings()
+
+
+def accept_fit(
+    best: PictureFit,
+    recording: Recording,
+    start: PictureStart,
+    joint_offsets: Array,
+    focal: float,
+) -> PictureRegistration:
+    """Return the registration of a fit, if it explains the pictures.
+
+    The first four arguments are what `_fit_until_stable` returns.
+
+    Args:
+        focal: prior standard deviation of the focal length's logarithm; 0: it was not fitted.
+
+    Raises RegistrationError: a criterion of ACCEPTANCE is not met.
     """
     fit, (posed,) = best.fit, best.fit.views
     p_value, ratio = p_value_of(best.explained, start.by_chance), float(best.ratios.mean())
-    fits = ratio >= sufficient_ratio and best.explained >= min_explained
-    if not fits and (p_value > max_p_value or ratio < min_ratio):
+    fits = ratio >= ACCEPTANCE.sufficient_ratio and best.explained >= ACCEPTANCE.min_explained
+    if not fits and (p_value > ACCEPTANCE.max_p_value or ratio < ACCEPTANCE.min_ratio):
         raise unexplained_error(
             start.camera,
             f"the best one explains {max(best.explained, 0.0):.0%} of all changes, and one fitted "
             f"with the joint positions of other pictures {max(start.by_chance, 0.0):.0%} (p-value "
-            f"{p_value:.2g}, at most {max_p_value:g}); {ratio:.0%} of the contours fit (minimum "
-            f"{min_ratio:.0%}; less is usual for the model of another robot)",
+            f"{p_value:.2g}, at most {ACCEPTANCE.max_p_value:g}); {ratio:.0%} of the contours fit "
+            f"(minimum {ACCEPTANCE.min_ratio:.0%}; less is usual for the model of another robot)",
         )
     deviations = np.sqrt(np.diag(best.covariance))
     pose = fit.camera_covariances(best.found, best.covariance)[0]
@@ -165,7 +175,7 @@ def accept_fit(
         np.array([np.linalg.inv(X) for X in start.alternatives]).reshape(-1, 4, 4),
     )  # fmt: skip
     distance = float(np.linalg.norm(best.camera.X_WC[:3, 3] - posed.middle))
-    if found.translation_sd > max_sd * distance or found.rotation_sd > max_sd:
+    if found.translation_sd > ACCEPTANCE.max_sd * distance or found.rotation_sd > ACCEPTANCE.max_sd:
         raise unexplained_error(
             start.camera,
             f"the best, {distance:.1f} m away, has a standard deviation of "
@@ -174,13 +184,15 @@ def accept_fit(
     focal_index = len(POSE_NAMES)
     if focal > SHARED.focal_deviation:
         by = best.covariance[:, focal_index] / best.covariance[focal_index, focal_index]
-        covariance = best.covariance + guessed_lens_error**2 * np.outer(by, by)
+        covariance = best.covariance + ACCEPTANCE.guessed_lens_error**2 * np.outer(by, by)
         pose = fit.camera_covariances(best.found, covariance)[0]
         found, deviations = replace(found, covariance=pose), np.sqrt(np.diag(covariance))
     clock = None
     if TIME_OFFSET in fit.names:
         deviation = float(deviations[fit.names.index(TIME_OFFSET)])
-        clock = replace(start.clock, deviation=deviation if deviation < max_clock_sd else np.inf)
+        clock = replace(
+            start.clock, deviation=deviation if deviation < ACCEPTANCE.max_clock_sd else np.inf
+        )
     return PictureRegistration(
         found,
         tuple(replace(frame, values=frame.values - joint_offsets) for frame in posed.frames),

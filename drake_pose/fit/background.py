@@ -355,8 +355,7 @@ class KnownBackground:
         numbers = colour_numbers(np.clip(even, 0.0, 255.0).astype(np.uint8))
         on, beside = self.on[numbers], self.beside[numbers]
         difference = largest(np.abs(even - self.colours))
-        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * MODEL.reach + 1,) * 2)
-        near = np.float32(MODEL.spread) * cv2.dilate(difference, disc)
+        near = np.float32(MODEL.spread) * cv2.dilate(difference, _disc(MODEL.reach))
 
         def log_odds(deviations: Floats) -> Floats:
             ratio = likeness(difference / deviations) * np.float32(MODEL.known_factor)
@@ -446,9 +445,14 @@ def colour_deviations(picture: Floats, noise: float) -> Floats:
     return np.sqrt(white**2 + (MODEL.shake * gradient) ** 2).astype(np.float32)
 
 
+def _disc(radius: int) -> Picture:
+    """Return a disc (n, n) of ones whose radius is given [pixel], for ``cv2.dilate``."""
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2), np.uint8)
+
+
 def grown(masks: Mask, by: int) -> Mask:
     """Return masks (f, H, W) dilated by a disc whose radius is ``by`` pixels."""
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * by + 1,) * 2)
+    disc = _disc(by)
     grown = map_ordered(lambda one: cv2.dilate(one.view(np.uint8), disc), masks)
     return np.array(grown).view(np.bool_)
 

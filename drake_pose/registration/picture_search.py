@@ -225,6 +225,16 @@ class PictureSearch:
             other._levels = {}
         return other
 
+    def silhouettes(self, camera: PinholeCamera, shift: int = 0) -> Mask:
+        """Return the body's silhouettes (f, H, W) in all frames, in pictures of a camera's size.
+
+        Args:
+            camera: at its pose.
+            shift: each frame gets the values of the one this number of places ahead.
+        """
+        poses = camera.X_CW @ np.roll(self._X_WN, -shift, axis=0)
+        return np.array(map_ordered(lambda X: draw_mask(self._outlines[-1], X, camera), poses))
+
     def nodes_at(self, values: Array) -> Array:
         """Return the nodes' poses X_WN (f, nodes, 4, 4) at values (f, m) of the pose tree."""
         return np.array([self._body.kinematics.poses(one) for one in values])
@@ -411,17 +421,12 @@ class PictureSearch:
         """
         level = self._level(PICTURES.background_width)
         small = camera.resized(level.camera.width, level.camera.height)
-
-        def draw(own: PinholeCamera) -> Mask:
-            poses = camera.X_CW @ self._X_WN
-            return np.array(map_ordered(lambda X: draw_mask(self._outlines[-1], X, own), poses))
-
-        covered = draw(camera)
+        covered = self.silhouettes(camera)
         if isinstance(level.backgrounds, RidingPictures):
             pictures = [one.picture for one in frames]
             return RidingColours.of(level.backgrounds, pictures, covered), covered
         same = small.width == camera.width
-        showing = level.backgrounds.shows_background(covered if same else draw(small))
+        showing = level.backgrounds.shows_background(covered if same else self.silhouettes(small))
         pictures, gains = [one.picture for one in frames], level.backgrounds.gains
         return KnownBackground.estimate(pictures, gains, showing, covered), covered
 

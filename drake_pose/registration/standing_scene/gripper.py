@@ -23,8 +23,7 @@ from drake_pose.registration.picture_search import (
 )
 from drake_pose.registration.recording import Recording, posed_pictures
 from drake_pose.registration.register import RegistrationBody
-from drake_pose.registration.standing_scene.hand_eye_tracks import poses_differ
-from drake_pose.silhouette.scoring import draw_mask
+from drake_pose.registration.standing_scene.hand_eye_tracks import PosePrior, poses_differ
 
 
 class GripperSettings(NamedTuple):
@@ -89,6 +88,15 @@ class GripperFit(NamedTuple):
     chance: float
     time_offset: tuple[float, float] | None
     silhouettes: dict[str, Mask]
+
+    def prior(self, other: Array | None = None) -> PosePrior:
+        """Return the pose as a prior of a fit.
+
+        other: covariance of another pose, with which it is to be compared; its first six unknowns
+            are the pose's. None: there is none.
+        """
+        covariance = self.covariance if other is None else self.covariance + other[:6, :6]
+        return PosePrior(self.X_LC, covariance)
 
 
 class GripperSearch:
@@ -209,12 +217,9 @@ class GripperSearch:
     def _masks(self, search: PictureSearch, X_LC: Array, shift: int = 0) -> Mask:
         """Return the gripper's silhouettes (f, h, w) at X_LC (4, 4) in the compared pictures.
 
-        shift: each picture gets the values of the one that is so many places ahead.
+        shift: as of ``PictureSearch.silhouettes``.
         """
-        camera, X_CL = search.compared.camera, np.linalg.inv(X_LC)
-        poses = [self._body.kinematics.poses(one.values) for one in search.frames]
-        poses = [*poses[shift:], *poses[:shift]]
-        return np.array([draw_mask(self._body.medium, X_CL @ X, camera) for X in poses])
+        return search.silhouettes(search.compared.camera.with_pose(X_LC), shift)
 
     def _gains(self, search: PictureSearch, fit: PictureFit, shift: int = 0) -> Array:
         """Return what a fit's silhouettes tell by tiles; shift: as of `_masks`."""
@@ -240,7 +245,6 @@ class GripperSearch:
                 clock = float(fit.found.shared[k]), deviation
         X_LC = fit.camera.X_WC
         J = np.kron(np.eye(2), X_LC[:3, :3])
-        poses = ((one.name, self._body.kinematics.poses(one.values)) for one in search.frames)
-        X_CL = fit.camera.X_CW
-        drawn = {name: draw_mask(self._body.medium, X_CL @ X, fit.camera) for name, X in poses}
+        names = (one.name for one in search.frames)
+        drawn = dict(zip(names, search.silhouettes(fit.camera), strict=True))
         return GripperFit(X_LC, J.T @ pose @ J, ratio, fit.explained, chance, clock, drawn)

@@ -153,6 +153,16 @@ LinkPoses = Callable[[Array], Array]
 """Returns the link's poses X_WL (frames, 4, 4) at the values (k,) of further constants."""
 
 
+def pose_difference(X_LC: Array, other: Array) -> Array:
+    """Return rotation vectors [rad] and translations [m] (..., 6) from poses to others.
+
+    X_LC, other: (..., 4, 4). The result is along the axes of X_LC.
+    """
+    by = inverse_transforms(X_LC) @ other
+    turns = Rotation.from_matrix(by[..., :3, :3].reshape(-1, 3, 3)).as_rotvec()
+    return np.concatenate([turns.reshape(*by.shape[:-2], 3), by[..., :3, 3]], axis=-1)
+
+
 class PosePrior(NamedTuple):
     """What is known of a pose X_LC (4, 4) before a fit.
 
@@ -164,8 +174,7 @@ class PosePrior(NamedTuple):
 
     def off(self, X_LC: Array) -> Array:
         """Return by how much a pose (4, 4) differs (6,), along the axes of the known one."""
-        by = inverse_transforms(self.X_LC) @ X_LC
-        return np.concatenate([Rotation.from_matrix(by[:3, :3]).as_rotvec(), by[:3, 3]])
+        return pose_difference(self.X_LC, X_LC)
 
     def size(self, X_LC: Array) -> float:
         """Return the root mean square of these differences, in standard deviations."""
@@ -328,7 +337,7 @@ def prior_effect(problem: TrackProblem, fit: TrackFit) -> Array:
 
 def _moved(fit: TrackFit, other: TrackFit) -> Array:
     """Return by how much another fit's unknowns (7 + k,), see `TrackFit`, differ from a fit's."""
-    by = PosePrior(fit.X_LC, fit.covariance).off(other.X_LC)
+    by = pose_difference(fit.X_LC, other.X_LC)
     return np.concatenate([by, other.constants - fit.constants])
 
 
@@ -385,9 +394,7 @@ def _twists(problem: TrackProblem, X_LC: Array, constants: Array, h: float = 1e-
             columns.append(np.zeros(6 * frames))
             continue
         behind, ahead = (problem.link_poses(constants[1:] + by) @ X_LC for by in (-one, one))
-        by = inverse_transforms(behind) @ ahead
-        turn = Rotation.from_matrix(by[:, :3, :3]).as_rotvec()
-        columns.append(np.column_stack([turn, by[:, :3, 3]]).ravel() / (2.0 * h))
+        columns.append(pose_difference(behind, ahead).ravel() / (2.0 * h))
     G = np.zeros((6 * frames + 1, 6 + count))
     G[:-1, :6], G[-1, 6] = np.tile(np.eye(6), (frames, 1)), 1.0
     for k, column in enumerate(columns):

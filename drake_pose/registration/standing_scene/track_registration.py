@@ -21,7 +21,6 @@ from drake_pose.registration.register import FrameMisfit, RegisteredCamera, Regi
 from drake_pose.registration.standing_scene.gripper import GripperFit, GripperSearch
 from drake_pose.registration.standing_scene.hand_eye_tracks import (
     EpipolarSearch,
-    PosePrior,
     TrackFit,
     TrackProblem,
     fit_tracks,
@@ -176,8 +175,7 @@ def register_tracks(
             raise
         view, start = _start_at_gripper(gripper, scene, error)
         fitted = scene.fit(start, view) if start.matches else scene.without(view)
-        prior = PosePrior(view.X_LC, view.covariance + fitted.covariance[:6, :6])
-        if start.matches and prior.size(fitted.fit.X_LC) > settings.agrees:
+        if start.matches and view.prior(fitted.covariance).size(fitted.fit.X_LC) > settings.agrees:
             raise RegistrationError(
                 f"{str(error).removesuffix(' Nothing was written')} The gripper in its pictures "
                 "contradicts the scene. Nothing was written"
@@ -186,7 +184,7 @@ def register_tracks(
         clock = float(fitted.fit.constants[1])
         view = None if gripper is None else gripper.near(fitted.fit.X_LC, clock)
         if view is not None:
-            prior = PosePrior(view.X_LC, view.covariance + fitted.covariance[:6, :6])
+            prior = view.prior(fitted.covariance)
             if prior.size(fitted.fit.X_LC) < settings.agrees:
                 fitted = scene.fit(start, view)
             else:
@@ -259,7 +257,7 @@ class _Start(NamedTuple):
     matches: int
 
 
-class _Fitted(NamedTuple):
+class _SceneFit(NamedTuple):
     """Result of a bundle adjustment.
 
     problem, fit: what was fitted. covariance: (7 + k, 7 + k) as of ``TrackFit``. alike: other poses
@@ -342,13 +340,12 @@ class _Scene(NamedTuple):
                 best = gain, X, at
         return best
 
-    def fit(self, start: _Start, view: GripperFit | None) -> _Fitted:
+    def fit(self, start: _Start, view: GripperFit | None) -> _SceneFit:
         """Fit from a start, together with what the gripper tells (None: nothing).
 
         Raises RegistrationError: the pose is not determined.
         """
-        prior = None if view is None else PosePrior(view.X_LC, view.covariance)
-        problem = self.problem._replace(prior=prior)
+        problem = self.problem._replace(prior=None if view is None else view.prior())
         asked = bool((problem.prior_sds[2:] > 0.0).any())
         problem, fit = _fit_determined(problem, start.X_LC[0], start.constants)
         self._require(problem, fit, fit.covariance)
@@ -364,9 +361,9 @@ class _Scene(NamedTuple):
             for one in others
             if one.sigma < 1.1 * fit.sigma and poses_differ(one.X_LC, fit.X_LC)
         ]
-        return _Fitted(problem, fit, covariance, alike, likely)
+        return _SceneFit(problem, fit, covariance, alike, likely)
 
-    def without(self, view: GripperFit) -> _Fitted:
+    def without(self, view: GripperFit) -> _SceneFit:
         """Return the pose from the gripper alone."""
         count = len(self.problem.prior_sds)
         constants, covariance = np.zeros(count), np.zeros((6 + count, 6 + count))
@@ -376,7 +373,7 @@ class _Scene(NamedTuple):
         none = np.zeros(0)
         fit = TrackFit(view.X_LC, constants, np.zeros((0, 3)), math.nan, covariance, none)
         problem = self.problem._replace(prior_sds=0.0 * self.problem.prior_sds)
-        return _Fitted(problem, fit, covariance)
+        return _SceneFit(problem, fit, covariance)
 
     def _require(
         self, problem: TrackProblem, fit: TrackFit, covariance: Array, likely: Sequence[str] = ()

@@ -43,20 +43,26 @@ def distorted(D: Sequence[float], fisheye: bool = False) -> np.ndarray:
 
 
 def write_pictures(
-    path: Path, pictures: Sequence[np.ndarray], times: Sequence[float], codec: str, **options: str
+    path: Path,
+    pictures: Sequence[np.ndarray],
+    times: Sequence[float],
+    codec: str,
+    container_options: dict[str, str] | None = None,
+    rate: int = 30,
+    **options: str,
 ) -> None:
     """Write a video of images (H, W, 3) at times [s], with an encoder's options such as crf."""
     import av
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=30, options=options)
+    with av.open(str(path), "w", options=container_options or {}) as container:
+        stream = container.add_stream(codec, rate=rate, options=options)
         stream.height, stream.width = pictures[0].shape[:2]
         stream.pix_fmt = "yuv420p"
-        stream.time_base = stream.codec_context.time_base = Fraction(1, 90000)
+        stream.time_base = stream.codec_context.time_base = Fraction(1, 60000)
         for picture, time in zip(pictures, times, strict=True):
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
-            frame.pts, frame.time_base = round(90000 * time), Fraction(1, 90000)
+            frame.pts, frame.time_base = round(60000 * time), Fraction(1, 60000)
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
 
@@ -70,20 +76,9 @@ def write_video(
     **options: str,
 ) -> Path:
     """Write a video of numbered images at times [s]; by default at 10 Hz."""
-    import av
-
-    path.parent.mkdir(parents=True, exist_ok=True)
     settings = {"g": "5"} | ({} if codec == "libsvtav1" else {"bf": "2"})
-    with av.open(str(path), "w", options={"movflags": "faststart", **options}) as container:
-        stream = container.add_stream(codec, rate=10, options=settings)
-        stream.width, stream.height, stream.pix_fmt = width, SIDE, "yuv420p"
-        stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
-        for k, number in enumerate(numbers):
-            frame = av.VideoFrame.from_ndarray(numbered(number, width), format="rgb24")
-            frame.pts, frame.time_base = (
-                round(100 * k if times is None else 1000 * times[k]),
-                Fraction(1, 1000),
-            )
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+    if times is None:
+        times = 0.1 * np.arange(len(numbers))
+    pictures, container = [numbered(k, width) for k in numbers], {"movflags": "faststart"} | options
+    write_pictures(path, pictures, times, codec, container, 10, **settings)
     return path

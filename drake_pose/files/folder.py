@@ -65,7 +65,7 @@ def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
 
 
 def _json_text(value: Any, levels: int = 2, indent: str = "\n") -> str:
-    """Return a JSON value as text; mappings are broken into indented lines on so many levels.
+    """Return a JSON value as text; mappings on the first levels have a line for each key.
 
     What lies deeper, such as the content of a frame, takes one line, which is written ten times as
     fast.

@@ -382,7 +382,7 @@ def read_inputs(
 
 
 def draw_parts(
-    outlines: Sequence[Outline], X_WN: np.ndarray, cameras: Iterable[Camera], are_told: bool = True
+    outlines: Sequence[Outline], X_WN: np.ndarray, cameras: Iterable[Camera], by_part: bool = True
 ) -> dict[str, np.ndarray]:
     """Return the index (H, W) of the visible part at each pixel by camera, -1 outside the body.
 
@@ -390,10 +390,10 @@ def draw_parts(
         outlines: surface of each part of the body.
         X_WN: (parts, 4, 4) poses of the parts in the world.
         cameras: the cameras.
-        are_told: whether the parts are told apart; if not, all have the index 0, which is drawn in
-            a third of the time.
+        by_part: whether each part has its index; if not, all have the index 0, which is drawn in a
+            third of the time.
     """
-    if not are_told:
+    if not by_part:
         bodies = {one.name: draw_mask(outlines, one.X_CW @ X_WN, one) for one in cameras}
         return {name: body.view(np.int8) - 1 for name, body in bodies.items()}
     labels = range(1, 1 + len(outlines))

@@ -219,7 +219,7 @@ def _record_frame(
     found, by_colour = bool(np.isfinite(q).all()), not masks and np.isfinite(distance)
     names = {} if not found else scene.cameras if by_colour else {**masks, **shown}
     seen = [scene.cameras[name] for name in names]
-    parts = draw_parts(captured.outlines, X_WN, seen, are_told=overlay)
+    parts = draw_parts(captured.outlines, X_WN, seen, by_part=overlay)
     wrong, area = np.nan, 1.0
     if found and by_colour:
         # Without masks, E_total is the area between both contours divided by the body's area.

@@ -126,10 +126,11 @@ def map_joints(
         angles = {column: readings_of[column] for column in revolute}
         low, high = np.array([limits[joint] for joint in revolute.values()]).T
         units, why = _find_unit(angles, np.array([*others.values()]), low, high)
-        warnings.append(
-            f"angles of the joint log are assumed to be in {units}: {why}; if they are not, give "
-            "the unit (units)"
-        )
+        if why:
+            warnings.append(
+                f"angles of the joint log are assumed to be in {units}: {why}; if they are not, "
+                "give the unit (units)"
+            )
     scale = UNITS.get(units or "rad", 1.0)
     columns |= {j: Column(c, scale if c in revolute else 1.0) for c, j in matched.items()}
     positions = np.full((len(log.positions), len(names)), np.nan)
@@ -368,8 +369,9 @@ def _find_unit(
     slack: float = 0.1,
     full_turn: float = 2.0 * math.pi,
     normalised: tuple[float, float] = (99.0, 100.001),
+    moves: float = 0.5,
 ) -> tuple[str, str]:
-    """Return the unit of columns of angles, "rad" or "deg", and the reason, for messages.
+    """Return the unit of columns of angles, "rad" or "deg", and the reason if it may be wrong.
 
     Readings within the limits as radians are radians. Otherwise they are degrees if they are within
     the limits as degrees, and as radians exceed them by more than a full turn.
@@ -383,6 +385,8 @@ def _find_unit(
             without limits is assumed to stay within twice this.
         normalised: if the largest magnitude of ``others`` is in this range, or a column's name
             ends in ".pos", LeRobot may have normalised the readings to -100 ... 100.
+        moves: readings of a column that extend over more than this are surely radians if they may
+            be: as degrees they would be of a robot that stands still.
 
     Raises:
         SceneError: the readings fit neither radians nor degrees, or seem to be normalised.
@@ -403,10 +407,9 @@ def _find_unit(
     is_named = any(name.endswith(".pos") for name in readings)
     if is_named or normalised[0] <= largest <= normalised[1]:
         reason = "seem to be normalised to -100 ... 100, as in LeRobot"
-    elif worst["rad"] <= slack and worst["deg"] <= 0.0:
-        return "rad", "but as degrees they would be within the limits, too"
     elif worst["rad"] <= slack:
-        return "rad", "only as radians all are within the limits"
+        doubtful = worst["deg"] <= 0.0 and np.fmax.reduce(maxima - minima) <= moves
+        return "rad", "but as degrees they would be within the limits, too" if doubtful else ""
     elif worst["deg"] <= slack and worst["rad"] > full_turn:
         return "deg", "only as degrees all are within the limits"
     raise SceneError(

@@ -81,16 +81,19 @@ def test_units_are_given_or_inferred_from_the_limits():
     names, degrees = ARM["names"], np.rad2deg(POSES)
     wide = ARM | {"lower": np.full(7, -3.0), "upper": np.full(7, 3.0)}
     holes = np.where(np.eye(2, 7, dtype=bool), np.nan, POSES)
+    swings = POSES * [[1.0], [0.5]]
     for readings, model, units, message in (
-        (POSES, ARM, None, "in rad: only as radians"),
-        (holes, ARM, None, "in rad: only as radians"),
+        (POSES, ARM, None, None),
+        (holes, ARM, None, None),
         (degrees, ARM, None, "in deg: only as degrees"),
         (POSES, wide, None, "in rad: but as degrees they would be within"),
+        # No robot is recorded that moves by 1.2 degrees.
+        (swings, wide, None, None),
         (POSES, ARM, "rad", None),
         (degrees, ARM, "deg", None),
     ):
         found = map_log(names, readings, model, units=units)
-        expected = holes if readings is holes else POSES
+        expected = POSES if readings is degrees else readings
         np.testing.assert_allclose(found.log.positions, expected, atol=1e-12)
         assert message in found.warnings[0] if message else found.warnings == ()
     # Readings 0.3 rad beyond a limit do not suffice to infer degrees.

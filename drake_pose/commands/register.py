@@ -153,28 +153,15 @@ def audit(
 
 
 def _print_registration(result: SceneRegistration) -> None:
-    """Print the worst frames, the camera poses with standard deviations, and other estimates."""
+    """Print the camera poses with standard deviations, other estimates, and the worst frames."""
     from drake_pose.files.folder import REPORT
     from drake_pose.jobs.registration.result import PARAMETERS, parameter_rows
     from drake_pose.jobs.registration.tracks import SCENE
     from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 
     console = output_console()
-    misfits = [(name, one) for name, own in result.registered.items() for one in own.frames]
-    if next(iter(result.summary["cameras"].values())).get("evidence") == SCENE:
-        shown, which = worst_frames([-misfit.inlier_ratio for _, misfit in misfits])
-        frames = Table("camera", "frame", "points that fit", "", title=f"Standing scene{which}")
-        shares: list[tuple[str, ...]] = [(percent(misfit.inlier_ratio),) for _, misfit in misfits]
-    else:
-        shown, which = worst_frames([misfit.E_total for _, misfit in misfits])
-        frames = Table("camera", "frame", "E_total", "IoU", "", title=f"Masks and robot{which}")
-        shares = [(percent(misfit.E_total), percent(misfit.iou)) for _, misfit in misfits]
-    for k in shown:
-        name, misfit = misfits[k]
-        word = "" if misfit.is_inlier else "outlier"
-        frames.add_row(escape(name), escape(misfit.frame), *shares[k], word)
     table = Table(
-        "camera", "position [m]", "sd [mm]", "sd [deg]", "poses", "inliers", "mean IoU", "seconds",
+        "camera", "position, m", "sd, mm", "sd, deg", "poses", "inliers", "mean IoU", "seconds",
         title="Cameras in the robot's world",
     )  # fmt: skip
     for name, found in result.registered.items():
@@ -190,7 +177,6 @@ def _print_registration(result: SceneRegistration) -> None:
             percent(one["mean_iou"]),
             f"{one['seconds']:.1f}",
         )
-    console.print(frames)
     console.print(table)
     for name, one in result.summary["cameras"].items():
         if "time_offset_scores" in one or one.get("evidence") == SCENE:
@@ -212,6 +198,20 @@ def _print_registration(result: SceneRegistration) -> None:
                     f"camera '{name}': a picture at {values} would show which of its poses is right"
                 )
             )
+    misfits = [(name, one) for name, own in result.registered.items() for one in own.frames]
+    if next(iter(result.summary["cameras"].values())).get("evidence") == SCENE:
+        shown, which = worst_frames([-misfit.inlier_ratio for _, misfit in misfits], 8)
+        frames = Table("camera", "frame", "points that fit", "", title=f"Standing scene{which}")
+        shares: list[tuple[str, ...]] = [(percent(misfit.inlier_ratio),) for _, misfit in misfits]
+    else:
+        shown, which = worst_frames([misfit.E_total for _, misfit in misfits], 8)
+        frames = Table("camera", "frame", "E_total", "IoU", "", title=f"Masks and robot{which}")
+        shares = [(percent(misfit.E_total), percent(misfit.iou)) for _, misfit in misfits]
+    for k in shown:
+        name, misfit = misfits[k]
+        word = "" if misfit.is_inlier else "outlier"
+        frames.add_row(escape(name), escape(misfit.frame), *shares[k], word)
+    console.print(frames)
     if result.folder is not None:
         print_files(("cameras", result.folder / CAMERA_FILE), ("report", result.folder / REPORT))
 

@@ -1,5 +1,6 @@
 """The command line: start, help, Ctrl-C, check."""
 
+import ast
 import json
 import os
 import re
@@ -168,3 +169,11 @@ def test_tables_show_the_worst_of_many_frames() -> None:
     shown, which = worst_frames(many)
     assert shown == list(range(11, 41))
     assert "30 of 41" in which
+
+
+def test_headings_of_tables_keep_their_units() -> None:
+    """Rich takes words in square brackets for styles and leaves them out."""
+    for path in (ROOT / "drake_pose" / "commands").glob("*.py"):
+        for call in ast.walk(ast.parse(path.read_text())):
+            if isinstance(call, ast.Call) and getattr(call.func, "id", "") == "Table":
+                assert "[" not in ast.unparse(call).replace("escape", ""), (path.name, call.lineno)

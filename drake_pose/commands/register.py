@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,6 +23,7 @@ from drake_pose.commands.common import (
     say,
     worst_frames,
 )
+from drake_pose.errors import RegistrationError, listed
 from drake_pose.files.settings import percent
 from drake_pose.jobs.registration.settings import AuditSettings, RegistrationSettings
 
@@ -94,6 +95,7 @@ def register(
             on_camera=advance,
         )  # fmt: skip
     print_result(result, json, _print_registration)
+    _stop_if_refused([*result.refused], len(result.registered))
 
 
 def audit(
@@ -150,6 +152,16 @@ def audit(
             scene, model, joints, out, settings, cameras=cameras, overlay=overlay, on_frame=advance
         )
     print_result(result, json, _print_audit)
+    refused = [one["name"] for one in result.summary["findings"] if one["what"] == "refused"]
+    _stop_if_refused(refused, len(result.summary["found_cameras"]))
+
+
+def _stop_if_refused(refused: Sequence[str], accepted: int) -> None:
+    """Raise a RegistrationError if cameras, given by name, were refused beside accepted ones."""
+    if refused:
+        raise RegistrationError(
+            f"{len(refused)} of {len(refused) + accepted} cameras refused: {listed(refused)}"
+        )
 
 
 def _print_registration(result: SceneRegistration) -> None:

@@ -77,8 +77,9 @@ class SceneState:
 
     @property
     def frame_count(self) -> int:
-        """Number of all frames."""
-        return sum(len(task.frames) for task in self.tasks)
+        """Number of all frames; of an audited episode those of all cameras, once it is known."""
+        planned = sum(len(task.frames) for task in self.tasks)
+        return int(self.totals.get("frame_count") or planned)
 
     @property
     def frames_done(self) -> int:
@@ -311,9 +312,10 @@ class Batch:
             if len(state.done) == len(state.tasks):
                 self.waiting.appendleft(state.whole)
         else:
-            state.totals = outcome.totals or {}
+            planned, state.totals = state.frame_count, outcome.totals or {}
             count = state.totals.get("frame_count")
-            if count == state.frame_count:
+            # In an episode some pictures do not show the body, and there may be several cameras.
+            if count == planned or camera_set(state.job) is not None:
                 state.done.update(one.index for one in state.tasks)
                 shutil.rmtree(task.work, ignore_errors=True)
                 with suppress(OSError):
@@ -323,7 +325,7 @@ class Batch:
                 self._fail(
                     state,
                     "",
-                    f"{task.place}: has {count} frames, but the scene has {state.frame_count} now; "
+                    f"{task.place}: has {count} frames, but the scene has {planned} now; "
                     "remove that folder to run the scene again",
                 )
         self._report()

@@ -13,7 +13,8 @@ class Finding:
     Args:
         kind: what is wrong. "joint": an offset; "camera" or "base": its pose; "focal": focal
             lengths; "center": principal points; "clock": a camera's time offset; "rate": its
-            drift; "joints": several joints; "unexplained": nothing within reach explains the frame.
+            drift; "joints": several joints; "unexplained": nothing within reach explains the frame;
+            "refused": a camera whose pictures no pose explains.
             In all frames also "sign" or "log": a joint's column in the log; "link": a link's shape;
             "reading": the meaning of what is given; "moved": a pose that changed after a frame.
         name: of the joint or camera, "" for several; for a "reading" a sentence.

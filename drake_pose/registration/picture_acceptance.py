@@ -1,6 +1,6 @@
 """Accept a camera that was fitted to pictures, and evaluate all its pictures."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -214,6 +214,20 @@ def unexplained_error(camera: PinholeCamera, why: str) -> RegistrationError:
         "pictures' times (no picture dropped or repeated), in the model's zeros and signs, and is "
         "the focal length about right? Nothing was written"
     )
+
+
+def offsets_in_pictures(
+    names: Sequence[str], registrations: Iterable[PictureRegistration]
+) -> dict[str, float]:
+    """Return the mean joint offsets from registrations in pictures, by name [rad or m].
+
+    names: (m,) of the body's values. Without registrations the mapping is empty.
+    """
+    several = []
+    for one in registrations:
+        own = dict(zip(one.fit.fit.names, one.fit.found.shared, strict=True))
+        several.append(one.joint_offsets + [own.get(name, 0.0) for name in names])
+    return dict(zip(names, np.mean(several, axis=0).tolist(), strict=True)) if several else {}
 
 
 def evaluate_pictures(

@@ -224,6 +224,12 @@ class MultiViewFrame:
     foreground: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
     rates: Array | None = None
 
+    @classmethod
+    def alone(cls, camera: str, frame: PosedFrame) -> "MultiViewFrame":
+        """Return a frame of one camera, given by its name."""
+        foreground = {} if frame.foreground is None else {camera: frame.foreground}
+        return cls(frame.name, frame.values, {camera: frame.mask}, foreground, frame.rates)
+
     def of(self, camera: str) -> PosedFrame:
         """Return the frame of one camera, given by its name, which must have a mask."""
         foreground = self.foreground.get(camera)

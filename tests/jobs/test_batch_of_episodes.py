@@ -101,9 +101,12 @@ def test_episodes_start_at_the_cameras_of_the_first(tmp_path, out):
 
     def work(task):
         done.append((task.job.name, task.near))
-        return Outcome("lost" if task.job.name == "one" else None, 0.0, {"frame_count": 6})
+        # The frames of two cameras, one of which does not show the body in one picture.
+        return Outcome("lost" if task.job.name == "one" else None, 0.0, {"frame_count": 11})
 
-    run_batch(read_job(tmp_path / "jobs.yaml"), out, work=work)
+    batch = run_batch(read_job(tmp_path / "jobs.yaml"), out, work=work)
+    assert batch.failed == ("one",)
+    assert batch.scenes["two"].frame_count == 11
     first = out / "one"
     assert sorted(done[1:]) == [("three", first), ("two", first)]
     assert done[0] == ("one", None)

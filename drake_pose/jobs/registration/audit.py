@@ -17,7 +17,7 @@ import numpy as np
 from drake_pose.arrays import Array
 from drake_pose.camera.camera_files import describe_camera
 from drake_pose.camera.models import Camera
-from drake_pose.errors import DrakePoseError, SceneError
+from drake_pose.errors import DrakePoseError, RegistrationError, SceneError
 from drake_pose.files.folder import read_summary, write_summary, writes_folder
 from drake_pose.files.records import mask_digests, user_units
 from drake_pose.files.settings import percent
@@ -33,6 +33,7 @@ from drake_pose.jobs.registration.large_errors import SceneComparison
 from drake_pose.jobs.registration.moved_cameras import (
     motion_findings,
     register_recordings,
+    say_refused,
     split_moved_cameras,
 )
 from drake_pose.jobs.registration.result import (
@@ -191,6 +192,11 @@ class _Pictures:
     findings: tuple[Finding, ...] = ()
     names: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
+    @property
+    def refused(self) -> tuple[Finding, ...]:
+        """Cameras whose pictures no pose explains."""
+        return tuple(one for one in self.findings if one.kind == "refused")
+
 
 def _find_cameras(
     inputs: RegistrationInputs,
@@ -215,7 +221,7 @@ def _find_cameras(
 
     Raises:
         SceneError: no camera has a pose.
-        RegistrationError: no pose of a camera explains its pictures.
+        RegistrationError: no pose of any camera explains its pictures.
     """
     path = inputs.scene.path
     if not inputs.given_cameras:
@@ -226,9 +232,10 @@ def _find_cameras(
     alone = len(inputs.given_cameras) == 1
     body = RegistrationBody(inputs.tree, inputs.visible_nodes)
     warnings = left_out_warnings(inputs.recordings, [one.name for one in inputs.given_cameras])
-    compared, findings = list[Camera](), list[Finding]()
+    compared, findings = list[Camera](), [] if before is None else list(before.refused)
     names, frames = dict[str, tuple[str, str]](), list[MultiViewFrame]()
-    placed = {one.name for one in inputs.given_cameras}
+    placed = {one.name for one in inputs.given_cameras} if before is None else before.found
+    refused = dict[str, RegistrationError]()
     searched = [one for one in inputs.searched_cameras if one.name in placed]
     pictures = {
         one.found.camera.name: one
@@ -237,11 +244,16 @@ def _find_cameras(
             inputs,
             searched,
             warnings,
+            refused,
             offset_joints=offset_joints,
             before=None if before is None else before.found,
             near=None if others is None else _found_poses(others),
         )
     }
+    findings += [
+        Finding("refused", name, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, text=say_refused(why))
+        for name, why in refused.items()
+    ]
     findings += motion_findings(body, inputs, pictures)
     for given in (one for one in inputs.given_cameras if one.name in pictures):
         name, recording, one = given.name, inputs.recordings[given.name], pictures[given.name]

@@ -1,7 +1,7 @@
 """Read and check all inputs of a registration or an audit before any work begins."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -132,6 +132,15 @@ class RegistrationInputs:
     def of(self, camera: str) -> list[PosedFrame]:
         """Return those of `frames` in which a camera, given by name, has a mask."""
         return [one.of(camera) for one in self.frames if camera in one.masks]
+
+    def without(self, cameras: Collection[str]) -> "RegistrationInputs":
+        """Return the inputs with some cameras, given by name, left out, and without their masks."""
+        frames = [
+            replace(one, masks={k: mask for k, mask in one.masks.items() if k not in cameras})
+            for one in self.frames
+        ]
+        left_out = tuple(dict.fromkeys((*self.left_out, *cameras)))
+        return replace(self, frames=tuple(k for k in frames if k.masks), left_out=left_out)
 
     def with_values(self, values: Iterable[Array]) -> tuple[MultiViewFrame, ...]:
         """Return `frames` at other values (m,) of the tree, one array for each frame."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from drake_pose.camera.joint_map import MappedJoints, motors_of
-from drake_pose.camera.lerobot import INFO, camera_key
+from drake_pose.camera.lerobot import INFO, camera_key, camera_name
 from drake_pose.camera.lerobot_cameras import camera_fields
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.camera.servo_readings import HomingCorrection, correct_homing, dump_column
@@ -73,7 +73,7 @@ def lerobot_files(
         files[f"{FOLDER}/{source.name}"] = json.dumps(content, indent=4) + "\n"
     for file in sorted(one for one in (path / INFO).parent.rglob("*") if one.is_file()):
         files[f"{FOLDER}/{file.relative_to(path)}"] = file.read_bytes()
-    info = json.loads((path / INFO).read_bytes())
+    info, written = json.loads((path / INFO).read_bytes()), set[str]()
     for camera in cameras:
         part = inputs.parts.get(camera.name)
         reason = ""
@@ -87,8 +87,20 @@ def lerobot_files(
                 f"{reason}: use cameras.yaml"
             )
         elif isinstance(camera, PinholeCamera):
-            own = info["features"][camera_key(info["features"], camera.name)]
+            key = camera_key(info["features"], camera.name)
+            own = info["features"][key]
+            written.add(key)
             own["info"] = (own.get("info") or {}) | camera_fields(camera, link)
+    for key in {*info["features"]} - written:
+        named = camera_name(key)
+        if named in inputs.left_out:
+            notes.append(
+                f"--export lerobot: camera '{named}' is left out of {FOLDER}/{INFO}, as it has no "
+                "pose"
+            )
+        if named in {*inputs.left_out, *(part.of for part in inputs.parts.values())}:
+            # The data set's own pose would look like one that was found.
+            (info["features"][key].get("info") or {}).pop("camera_extrinsics", None)
     files[f"{FOLDER}/{INFO}"] = json.dumps(info, indent=4) + "\n"
     name = source.name if corrections and source is not None else None
     files[f"{FOLDER}/README.md"] = _readme(path, name, corrections, offsets)

@@ -130,6 +130,7 @@ def register_recordings(
     inputs: RegistrationInputs,
     cameras: Sequence[PinholeCamera],
     warnings: list[str],
+    refused: dict[str, RegistrationError],
     focal: Collection[str] = (),
     offset_joints: Sequence[str] = (),
     before: Mapping[str, PictureRegistration] | None = None,
@@ -142,13 +143,14 @@ def register_recordings(
         inputs: the episode, with the recordings' parts.
         cameras: some of its searched cameras.
         warnings: gets a warning of each part that no pose explains, if another part is registered.
+        refused: gets by camera the error of those that no pose explains in any part.
         focal: names of cameras whose focal length is fitted; unknown ones always are.
         offset_joints: joints whose offsets are fitted.
         before: earlier registrations by camera, from which fits start; None: poses are searched.
         near: by camera the pose X_WC (4, 4) found in another episode, at which fits start, and what
             chance explained there; a camera that does not fit is searched. None: there are none.
 
-    Raises RegistrationError: no pose explains a camera's pictures, in any part of its recording.
+    Raises RegistrationError: no pose explains the pictures of any camera.
     """
     done, errors = dict[str, PictureRegistration](), dict[str, RegistrationError]()
     of = {name: one.of for name, one in inputs.parts.items()}
@@ -172,17 +174,22 @@ def register_recordings(
             else:
                 one = register_pictures(body, camera, recording, prior, offset_joints, guessed)
         except RegistrationError as error:
-            if inputs.parts[name].is_whole:
-                raise
             errors[name] = error
             continue
         done[name] = one
         yield one
     for name, why in errors.items():
-        if of[name] not in {of[other] for other in done}:
+        if not done:
             raise why
-        text = str(why).replace(" Nothing was written", "")
-        warnings.append(f"{text}: this part of the recording is left out")
+        if of[name] in {of[other] for other in done}:
+            warnings.append(f"this part of the recording is left out: {say_refused(why)}")
+        else:
+            refused.setdefault(of[name], why)
+
+
+def say_refused(why: RegistrationError) -> str:
+    """Return the message of a camera's error for a result with other cameras."""
+    return str(why).replace(" Nothing was written", "")
 
 
 def motion_findings(

@@ -1,7 +1,8 @@
 """Register the cameras of a scene or an episode."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,12 +10,11 @@ from typing import Any
 import numpy as np
 
 from drake_pose.arrays import Array, Picture
-from drake_pose.body import TARGET_POSITIONS, PoseTree
+from drake_pose.body import TARGET_POSITIONS
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
-from drake_pose.errors import CameraError
+from drake_pose.errors import CameraError, RegistrationError
 from drake_pose.files.folder import write_file, writes_folder
-from drake_pose.fit.parameters import carried_joints
 from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.registration.diagnosis import (
     Search,
@@ -31,7 +31,11 @@ from drake_pose.jobs.registration.diagnosis import (
 )
 from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs
 from drake_pose.jobs.registration.lerobot_files import lerobot_files, require_data_set
-from drake_pose.jobs.registration.moved_cameras import register_recordings, split_moved_cameras
+from drake_pose.jobs.registration.moved_cameras import (
+    register_recordings,
+    say_refused,
+    split_moved_cameras,
+)
 from drake_pose.jobs.registration.odd_links import odd_link_warnings
 from drake_pose.jobs.registration.result import (
     check_exports,
@@ -46,12 +50,16 @@ from drake_pose.jobs.registration.result import (
 )
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.jobs.registration.tracks import describe_tracks, draw_tracks, track_warnings
-from drake_pose.jobs.registration.trees import corrected_urdf, make_registration_tree
+from drake_pose.jobs.registration.trees import corrected_urdf, joint_shifts, make_registration_tree
 from drake_pose.person.shape import shape_parts, shape_values
 from drake_pose.registration.bundle import adjust_bundle
-from drake_pose.registration.joint_offsets import KinematicParameter, calibrate_joints
-from drake_pose.registration.picture_acceptance import PictureRegistration, evaluate_pictures
-from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrames
+from drake_pose.registration.joint_offsets import calibrate_joints
+from drake_pose.registration.picture_acceptance import (
+    PictureRegistration,
+    evaluate_pictures,
+    offsets_in_pictures,
+)
+from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrame, PosedFrames
 from drake_pose.registration.recording import choose_pictures, posed_pictures
 from drake_pose.registration.register import (
     CameraSearch,
@@ -90,6 +98,7 @@ class SceneRegistration:
         summary: contents of summary.json.
         warnings: for the user.
         folder: the result's folder; None: nothing was written.
+        refused: the reason for each camera, by name, of which no pose was accepted.
     """
 
     cameras: Mapping[str, Camera]
@@ -97,6 +106,7 @@ class SceneRegistration:
     summary: Mapping[str, Any]
     warnings: tuple[str, ...]
     folder: Path | None
+    refused: Mapping[str, str]
 
 
 @writes_folder
@@ -127,7 +137,8 @@ def register_scene(
         on_camera: called after each camera.
 
     Raises:
-        RegistrationError: no pose of a camera explains its masks. Nothing is written then.
+        RegistrationError: no pose of any camera explains its masks or pictures. Nothing is written
+            then; if only some cameras are refused, the others are written.
         DrakePoseError: names the wrong file, camera, frame or joint.
     """
     settings = settings or RegistrationSettings()
@@ -148,6 +159,8 @@ def register_scene(
         work.check_focal_lengths()
         work.evaluate()
         described = work.describe((time.perf_counter() - start) / len(work.registered))
+    refused = {name: say_refused(why) for name, why in work.refused.items()}
+    work.warnings += [f"left out: {why}" for why in refused.values()]
     placed = {
         name: work.registered[name].camera if name in work.registered else camera
         for name, camera in work.inputs.scene.cameras.items()
@@ -162,9 +175,10 @@ def register_scene(
     seconds = sum(one["seconds"] for one in described.values())
     summary = {
         # A single camera's part is also at the top level.
-        **(next(iter(described.values())) if len(described) == 1 else {}),
+        **(next(iter(described.values())) if len(described) == 1 and not refused else {}),
         **describe_run(inputs, settings, work.warnings, seconds),
         "cameras": described,
+        "refused": refused,
     }
     if folder is not None:
         for name, content in files.items():
@@ -175,7 +189,8 @@ def register_scene(
         write_result(
             folder, work.inputs, placed, work.registered, summary, overlay, urdf, work.shown
         )
-    return SceneRegistration(placed, work.registered, summary, tuple(work.warnings), folder)
+    warnings = tuple(work.warnings)
+    return SceneRegistration(placed, work.registered, summary, warnings, folder, refused)
 
 
 class _Registration:
@@ -190,6 +205,7 @@ class _Registration:
         pictures: registrations from pictures, by camera; empty for masks, and for a target.
         target_pictures: by camera and frame, pictures in which the target was found.
         tracks: registrations of cameras on a link from a standing scene, by camera.
+        refused: by camera the reason why it has no pose.
     """
 
     def __init__(
@@ -199,9 +215,7 @@ class _Registration:
         self.body = RegistrationBody(
             inputs.tree, inputs.visible_nodes, radius_scales=inputs.positions.radius_scales
         )
-        self._known_cameras = [
-            one for one in inputs.known_cameras if isinstance(one, PinholeCamera)
-        ]
+        self._known_cameras = [k for k in inputs.known_cameras if isinstance(k, PinholeCamera)]
         self.warnings = list(inputs.warnings)
         self.registered = dict[str, RegisteredCamera]()
         self.seconds = dict[str, float]()
@@ -210,6 +224,7 @@ class _Registration:
         self.pictures = dict[str, PictureRegistration]()
         self.target_pictures = dict[str, dict[str, Picture]]()
         self.tracks = dict[str, TrackRegistration]()
+        self.refused = dict[str, RegistrationError]()
         self._joint_offsets = np.zeros(len(self.body.kinematics.names))
 
     @property
@@ -231,7 +246,7 @@ class _Registration:
 
         Raises:
             CameraError: a camera's focal length is unknown.
-            RegistrationError: no pose of a camera explains its masks or pictures.
+            RegistrationError: no pose of any camera explains its masks or pictures.
         """
         inputs = self.inputs
         if not inputs.recordings:
@@ -246,35 +261,38 @@ class _Registration:
             frames, start = list[MultiViewFrame](), time.perf_counter()
             focal = [*inputs.recordings] if self._settings.focal else []
             for one in register_recordings(
-                self.body,
-                inputs,
-                inputs.searched_cameras,
-                self.warnings,
-                focal,
+                self.body, inputs, inputs.searched_cameras, self.warnings, self.refused, focal,
                 inputs.offset_joints,
-            ):
+            ):  # fmt: skip
                 name = one.found.camera.name
-                frames += [
-                    MultiViewFrame(
-                        frame.name, frame.values, {name: frame.mask},
-                        {} if frame.foreground is None else {name: frame.foreground}, frame.rates,
-                    )
-                    for frame in one.frames
-                ]  # fmt: skip
+                frames += [MultiViewFrame.alone(name, frame) for frame in one.frames]
                 self.pictures[name] = one
                 self.warnings += picture_warnings(one, name in inputs.assumed_focal)
                 self._note(one.found, start)
                 start = time.perf_counter()
             unexplained = [name for name in inputs.recordings if name not in self.pictures]
-            self.inputs = replace(
-                inputs, frames=tuple(frames), left_out=(*inputs.left_out, *unexplained)
-            )
+            self.inputs = replace(inputs, frames=tuple(frames)).without(unexplained)
+        self._require_registered()
+
+    @contextmanager
+    def _refusing(self, name: str) -> Iterator[None]:
+        """Refuse a camera, by name, if a RegistrationError is raised in this context."""
+        try:
+            yield
+        except RegistrationError as error:
+            self.refused[name] = error
+            for one in (self.registered, self.pictures, self.target_pictures, self.tracks):
+                one.pop(name, None)
+
+    def _require_registered(self) -> None:
+        """Leave refused cameras out of the inputs; raise the first one's error if none is left."""
+        if not self.registered:
+            raise next(iter(self.refused.values()))
+        if self.refused:
+            self.inputs = self.inputs.without(self.refused)
 
     def _find_in_scene(self, link: str) -> None:
-        """Register each camera on a link from whatever stands still in its pictures.
-
-        Raises RegistrationError: the pictures do not determine the camera's pose on the link.
-        """
+        """Register each camera on a link from whatever stands still in its pictures."""
         inputs = self.inputs
         base = inputs.tree.node_index((inputs.visible_nodes or ())[0])
         for camera in inputs.searched_cameras:
@@ -285,28 +303,31 @@ class _Registration:
             if inputs.riding_nodes and not focal:
                 riding = RegistrationBody(inputs.tree, inputs.riding_nodes)
                 gripper = GripperSearch(riding, self.body, camera, recording)
-            one = register_tracks(
-                self.body, link, base, camera, recording, focal, inputs.offset_joints, gripper
-            )
-            self.tracks[name] = one
-            self.warnings += track_warnings(one, assumed)
-            self._note(one.found, start)
+            with self._refusing(name):
+                one = register_tracks(
+                    self.body, link, base, camera, recording, focal, inputs.offset_joints, gripper
+                )
+                self.tracks[name] = one
+                self.warnings += track_warnings(one, assumed)
+                self._note(one.found, start)
 
     def _find_each(self) -> None:
         """Register each camera from its masks.
 
         The pose of a calibration target is estimated with the first camera, and then known.
-
-        Raises RegistrationError: no pose of a camera explains its masks.
         """
         inputs, target, target_pose = self.inputs, self.inputs.target, None
         search: Search = CameraSearch(self.body) if target is None else TargetSearch(target)
         measured = not inputs.positions.is_estimate
-        for camera in inputs.searched_cameras:
+        for camera in (one for one in inputs.searched_cameras if one.name not in self.refused):
             start, frames = time.perf_counter(), inputs.of(camera.name)
-            found = search.register(camera, frames)
-            if measured:
-                require_explained(search, found, frames)
+            found = None
+            with self._refusing(camera.name):
+                found = search.register(camera, frames)
+                if measured:
+                    require_explained(search, found, frames)
+            if found is None or camera.name in self.refused:
+                continue
             if target is not None:
                 if found.target is not None:
                     target_pose, self.body = found.target, target.body(found.target.X_WT)
@@ -342,9 +363,7 @@ class _Registration:
 
         most: maximum number of pictures of each camera.
 
-        Raises:
-            CameraError: a camera's focal length is unknown.
-            RegistrationError: the target is found in too few pictures, or no pose explains them.
+        Raises CameraError: a camera's focal length is unknown.
         """
         inputs, frames, start = self.inputs, list[MultiViewFrame](), time.perf_counter()
         body = target.body(np.eye(4))
@@ -357,11 +376,15 @@ class _Registration:
                 )
             recording = inputs.recordings[name]
             rows, _ = choose_pictures(body, camera, recording, most)
-            segmented = find_target_frames(target, camera, posed_pictures(recording, rows, 0.0))
+            segmented: Sequence[PosedFrame] = ()
+            with self._refusing(name):
+                segmented = find_target_frames(target, camera, posed_pictures(recording, rows, 0.0))
+            if name in self.refused:
+                continue
             self.target_pictures[name] = {
                 one.name: recording.picture(one.name) for one in segmented
             }
-            frames += [MultiViewFrame(one.name, one.values, {name: one.mask}) for one in segmented]
+            frames += [MultiViewFrame.alone(name, one) for one in segmented]
             found_names = self.target_pictures[name]
             lost = [recording.names[k] for k in rows if recording.names[k] not in found_names]
             if lost:
@@ -369,10 +392,11 @@ class _Registration:
         self.inputs = replace(inputs, frames=tuple(frames))
         seconds = time.perf_counter() - start
         self._find_each()
-        for name, found in self.registered.items():
+        for name, found in list(self.registered.items()):
             inlier_count = len(found.frames) - len(found.outliers)
-            require_detections(name, inlier_count, len(self.target_pictures[name]))
             self.seconds[name] += seconds / len(self.registered)
+            with self._refusing(name):
+                require_detections(name, inlier_count, len(self.target_pictures[name]))
 
     def check_focal_lengths(self) -> None:
         """Compare given focal lengths and joint zeros with the masks, and warn of errors.
@@ -409,8 +433,10 @@ class _Registration:
 
         shown: maximum number of outlier pictures of each camera that are kept.
 
-        Raises RegistrationError: the frames do not determine a camera's pose on its link, or half
-            of a camera's masks or more are outliers.
+        A camera is refused if its frames do not determine its pose on its link, or half of its
+        masks or more are outliers.
+
+        Raises RegistrationError: that is so, and the other cameras, if any, were fitted with it.
         """
         inputs, body, frames = self.inputs, self.body.with_tree(self.inputs.tree), []
         # All pictures of cameras that were registered from some of them.
@@ -432,12 +458,16 @@ class _Registration:
                 self.warnings.append(lost_frames_warning(name, lost, recording.names))
         if frames:
             inputs = self.inputs = replace(inputs, frames=tuple(frames))
-        for name, found in self.registered.items():
-            if inputs.target is not None:
-                require_determined(found)
-            picture = self.pictures.get(name)
-            from_pictures = picture is not None or name in {**self.target_pictures, **self.tracks}
-            self.warnings += outlier_warnings(found, from_pictures)
+        before, joint = len(self.refused), self.has_constants or inputs.positions.is_estimate
+        for name, found in list(self.registered.items()):
+            from_pictures = name in {**self.pictures, **self.target_pictures, **self.tracks}
+            with self._refusing(name):
+                if inputs.target is not None:
+                    require_determined(found)
+                self.warnings += outlier_warnings(found, from_pictures)
+        if joint and len(self.refused) > before:
+            raise list(self.refused.values())[before]
+        self._require_registered()
         self.warnings += common_outlier_warnings(
             self.registered.values(), from_pictures=bool(self.pictures)
         )
@@ -507,7 +537,8 @@ class _Registration:
         found = calibrate_joints(
             self.body, list(cameras.values()), [inputs.of(name) for name in cameras],
             inputs.offset_joints, self._settings.focal, links=inputs.scaled_links,
-            start=self._offsets_in_pictures(), still_factor=2.5 if self.pictures else 1.0,
+            start=offsets_in_pictures(names, self.pictures.values()),
+            still_factor=2.5 if self.pictures else 1.0,
         )  # fmt: skip
         self.parameters = describe_parameters(
             found.offsets, found.link_scales, self.body.kinematics
@@ -543,19 +574,6 @@ class _Registration:
             self._update(kinematics, camera, covariance, target_pose)
         return corrected_urdf(inputs.model, folder, offsets_in_file, shifts_in_file)
 
-    def _offsets_in_pictures(self) -> dict[str, float]:
-        """Return the mean joint offsets from registrations in pictures, by name [rad or m].
-
-        Without pictures the mapping is empty.
-        """
-        if not self.pictures:
-            return {}
-        names, several = self.body.kinematics.names, []
-        for one in self.pictures.values():
-            own = dict(zip(one.fit.fit.names, one.fit.found.shared, strict=True))
-            several.append(one.joint_offsets + [own.get(name, 0.0) for name in names])
-        return dict(zip(names, np.mean(several, axis=0).tolist(), strict=True))
-
     def _update(
         self,
         kinematics: TreeKinematics,
@@ -579,13 +597,3 @@ class _Registration:
         self.registered[camera.name] = replace(
             before, camera=camera, covariance=covariance, frames=tuple(again), target=target_pose
         )
-
-
-def joint_shifts(tree: PoseTree, scales: Sequence[KinematicParameter]) -> dict[str, list[float]]:
-    """Return by joint the shift (3,) of its origin in its parent link's frame [m].
-
-    scales: of links; only joints that links with another scale than 1 carry are shifted.
-    """
-    longer = {one.name: one.value for one in scales if one.value}
-    offsets = carried_joints(tree, longer)
-    return {one.joint: (longer[one.link] * one.p_L).tolist() for one in offsets}

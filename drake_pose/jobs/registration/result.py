@@ -432,7 +432,7 @@ def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
     figures = [(name, plot_offset(one)) for name, one in summary["cameras"].items()]
     return page_template("drake_pose.jobs.registration").render(
         summary=summary,
-        answer=registration_answer(summary["cameras"]),
+        answer=registration_answer(summary["cameras"], summary.get("refused", ())),
         kind="camera poses",
         title=Path(str(summary["scene"])).name or str(summary["scene"]),
         model=Path(str(summary["model"])).name,
@@ -453,8 +453,15 @@ def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
     )
 
 
-def registration_answer(cameras: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the result in a few sentences; cameras: the parts of summary.json by camera."""
+def registration_answer(
+    cameras: Mapping[str, Mapping[str, Any]], refused: Collection[str] = ()
+) -> str:
+    """Return the result in a few sentences.
+
+    Args:
+        cameras: the parts of summary.json by camera.
+        refused: names of cameras without an accepted pose.
+    """
     parts = list(cameras.values())
     shift, turn = (
         max(one[key] for one in parts) for key in ("translation_sd_mm", "rotation_sd_deg")
@@ -465,6 +472,8 @@ def registration_answer(cameras: Mapping[str, Mapping[str, Any]]) -> str:
     words = "Camera found" if len(parts) == 1 else f"{len(parts)} cameras found"
     up_to = "" if len(parts) == 1 else "up to "
     texts = [f"{words}, with a standard deviation of {up_to}{shift:.1f} mm and {turn:.2f} deg."]
+    if refused:
+        texts.insert(0, f"{len(refused)} refused, see the warnings: {listed([*refused])}.")
     are = "is an outlier" if outliers == 1 else "are outliers"
     texts.append(f"{outliers} of {count} {what}s {are}.")
     if ambiguous := [name for name, one in cameras.items() if len(one["modes"]) > 1]:

@@ -17,8 +17,10 @@ from drake_pose.body import (
 )
 from drake_pose.errors import SettingsError
 from drake_pose.files.settings import EstimateSettings
+from drake_pose.fit.parameters import carried_joints
 from drake_pose.jobs.estimate.inputs import make_tree
 from drake_pose.jobs.registration.settings import RegistrationSettings
+from drake_pose.registration.joint_offsets import KinematicParameter
 from drake_pose.registration.standing_object import CalibrationTarget, fixed_link_error
 
 
@@ -104,3 +106,13 @@ def corrected_urdf(
         if "://" not in name:
             mesh.set("filename", os.path.relpath(path.parent / name, folder))
     return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
+
+
+def joint_shifts(tree: PoseTree, scales: Sequence[KinematicParameter]) -> dict[str, list[float]]:
+    """Return by joint the shift (3,) of its origin in its parent link's frame [m].
+
+    scales: of links; only joints that links with another scale than 1 carry are shifted.
+    """
+    longer = {one.name: one.value for one in scales if one.value}
+    offsets = carried_joints(tree, longer)
+    return {one.joint: (longer[one.link] * one.p_L).tolist() for one in offsets}

@@ -71,6 +71,8 @@ def describe_common_finding(one: Finding) -> str:
         return f"{link}: joint '{one.name}' differs from the log, {one.text}{pixels}"
     if one.kind == "link":
         return f"{link}: {one.text}"
+    if one.kind == "refused":
+        return one.text
     if one.kind == "reading":
         return f"{one.name}{pixels}"
     if one.kind == "moved" and not one.link:

@@ -9,6 +9,7 @@ import pyarrow
 import pyarrow.parquet
 import pytest
 
+from drake_pose.camera.lerobot_cameras import camera_fields
 from drake_pose.errors import CameraError, SettingsError
 from drake_pose.jobs.registration.inputs import read_inputs
 from drake_pose.jobs.registration.lerobot_files import lerobot_files, require_data_set
@@ -138,6 +139,15 @@ def test_what_is_left_out_is_said(recorded, tmp_path):
     inputs = read(folder, painted)
     _, notes = lerobot_files(inputs, [painted.camera], None, {})
     assert "no joint offset is significant" in notes[0]
+    own = json.loads((other / "meta" / "info.json").read_text())
+    own["features"][KEY]["info"] = camera_fields(painted.camera)
+    (other / "meta" / "info.json").write_text(json.dumps(own))
+    refused = read(other, painted, units="normalised").without(["camera"])
+    files, notes = lerobot_files(refused, [], None, {})
+    assert "camera 'camera' is left out of lerobot/meta/info.json, as it has no pose" in notes[1]
+    feature = json.loads(files["lerobot/meta/info.json"])["features"][KEY]
+    assert "camera_intrinsics" in feature["info"]
+    assert "camera_extrinsics" not in feature["info"]
     halves = {k: CameraPart("camera", slice(0, 8), np.eye(3), 0.0, 1.0, False, 0.0, 0.0)
               for k in ("camera", "camera_2")}  # fmt: skip
     cameras = [replace(painted.camera, name=name) for name in halves]

@@ -9,6 +9,7 @@ together with the parameters that it is correlated with.
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.special import stdtr, stdtrit
@@ -19,7 +20,7 @@ from drake_pose.body import TARGET_POSITIONS, PoseTree
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
 from drake_pose.fit.parameters import POSE_NAMES, carried_joints, link_scale_name
-from drake_pose.registration.offset_search import joints_like_cameras
+from drake_pose.registration.offset_search import BASE, joints_like_cameras
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import RegisteredCamera, RegistrationBody
 from drake_pose.registration.shared_fit import SHARED, SharedFit, SharedValues
@@ -77,6 +78,11 @@ class JointCalibration:
     object_covariance: Array
     inlier_ratios: tuple[Array, ...]
     is_inlier: tuple[Mask, ...]
+
+
+def undetermined(name: str, gauge: tuple[str, ...]) -> KinematicParameter:
+    """Return the description of a parameter that is not determined; gauge: its attribute."""
+    return KinematicParameter(name, 0.0, math.inf, -math.inf, math.inf, False, gauge)
 
 
 def scalable_links(tree: PoseTree) -> tuple[str, ...]:
@@ -141,7 +147,7 @@ def calibrate_joints(
     links: Sequence[str] = (),
     level: float = 0.05,
     start: Mapping[str, float] | None = None,
-    still_factor: float = 1.0,
+    static: Mapping[str, tuple[float, float]] | None = None,
 ) -> JointCalibration:
     """Fit joint offsets and link scales together with the cameras' poses.
 
@@ -159,10 +165,9 @@ def calibrate_joints(
         level: probability that anything is significant by chance.
         start: offsets by name [rad or m] that the cameras were fitted with, 0 for other names.
             Only parameters that a camera hides are then dropped, and its covariance includes them.
-        still_factor: factor of the standard deviation of parameters correlated with a camera, such
-            as a first joint's offset: only static parts separate the two, and pictures show these
-            badly. 2.5 for pictures (six rooms with an SO-101, whose first offset was off by 0.1 to
-            3 standard deviations).
+        static: offsets that look like a rotation of a camera, as edges of static parts show them,
+            and their standard deviations [rad], by name (``locate_base``). Those that are not
+            determined are held at 0. None: masks alone count.
 
     Raises:
         UnknownNameError: the body has no such position, or no such scalable link.
@@ -178,40 +183,43 @@ def calibrate_joints(
     offsets = carried_joints(body.tree, links)
     requested, per_camera = [*joints, *map(link_scale_name, links)], len(POSE_NAMES) + focal
     target_positions = [name for name in body.kinematics.names if name in TARGET_POSITIONS]
-    parameters: dict[str, KinematicParameter] = {}
+    parameters, static = unseen_rotations(views, static or {}), static or {}
     sought: list[str] | None = None
-    kept = requested
+    kept = first = [name for name in requested if name not in parameters]
+    describe = partial(describe_constants, measured={*static} - {*parameters})
     while kept != sought:
         sought = kept
         names = [*target_positions, *sought]
         fit = SharedFit(views, X_CW, names, offsets=offsets, camera_unknowns=per_camera)
         begin = fit.start
         begin.shared[:] = [(start or {}).get(name, 0.0) for name in fit.names]
-        if sought == requested:
+        if sought == first:
             before = float(fit.inlier_ratios(begin).mean())
         # One camera and its offsets may have been fitted together before.
-        known = bool(start) and sought == requested and not links and len(views) == 1
+        known = bool(start) and sought == first and not links and len(views) == 1
         fit, found, included = _fit_to_inliers(fit, begin, known)
         # Each mask contributes six affine motions to the estimate of the error sizes.
         freedom = max(1, 6 * int(np.count_nonzero(included)) - len(fit.names))
         own, shared = fit.covariances(found, included)
         covariance, least = own + shared, level / max(1, len(requested))
-        values = describe_constants(fit, found, freedom, least, covariance, sought)
+        values = describe(fit, found, freedom, least, covariance, sought)
         kept = _kept(values, fit if start else None)
         if kept == sought:
             covariance = widen_to_cost_curvature(fit, found, included, own) + shared
-            values = describe_constants(fit, found, freedom, least, covariance, sought)
+            values = describe(fit, found, freedom, least, covariance, sought)
             kept = _kept(values, fit if start else None)
         if kept == sought:
             values = _with_significance(fit, found, freedom, least, covariance, values)
         parameters |= values
-    found, covariance, gauges = shrink_widened(fit, found, covariance, sought, still_factor)
-    again = describe_constants(fit, found, freedom, least, covariance, sought)
+    found, covariance, gauges = shrink_measured(fit, found, covariance, sought, static)
+    again = describe(fit, found, freedom, least, covariance, sought)
+    doubtful = ambiguous_constants(fit, found, included, covariance, sought)
+    again |= {k: undetermined(k, one.gauge) for k, one in again.items() if k in doubtful}
     found = fit_cameras_alone(fit, found, included)
-    parameters |= {
-        k: replace(one, significant=parameters[k].significant, gauge=gauges.get(k, one.gauge))
-        for k, one in again.items()
-    }
+    for k, one in again.items():
+        # Shrunk values may have an interval with 0.
+        significant = parameters[k].significant and not one.low <= 0.0 <= one.high
+        parameters[k] = replace(one, gauge=gauges.get(k, one.gauge), significant=significant)
     ratios = fit.inlier_ratios(found)
     require_fit_kept(float(ratios.mean()), before)
     deviations = np.sqrt(np.diag(covariance))[: len(views) * fit.per_camera]
@@ -311,24 +319,53 @@ def _unknown_rotations(
     return missing
 
 
-def shrink_widened(
-    fit: SharedFit, found: SharedValues, covariance: Array, names: Sequence[str], factor: float
+def shrink_measured(
+    fit: SharedFit,
+    found: SharedValues,
+    covariance: Array,
+    names: Sequence[str],
+    static: Mapping[str, tuple[float, float]],
+    *,
+    factor: float = 2.5,
+    floor: float = 0.014,
 ) -> tuple[SharedValues, Array, dict[str, tuple[str, ...]]]:
-    """Widen the covariance along constants correlated with a camera, then shrink the constants.
+    """Combine constants with what edges of static parts show, then shrink them.
 
-    In this order, constants that are less certain than the fit says shrink further.
+    In this order, constants that are less certain than the fit says shrink further. The covariance
+    is first enlarged along these constants, since masks of static parts follow the assumed pose.
 
     Args:
         fit, found, covariance: the fit, its values, and their covariance (u, u).
         names: of the constants that shrink.
-        factor: of the standard deviations (``widen_with_cameras``).
+        static: see ``calibrate_joints``.
+        factor, floor: factor of the fit's standard deviation of these constants, and what is added
+            in quadrature, at least the measured deviation [rad]; errors of 0.1 to 3 standard
+            deviations were seen in ten rooms.
 
     Returns:
-        the shrunk values, the widened covariance, and the gauges of ``widen_with_cameras``.
+        the shrunk values; their covariance; and by name of each of these constants the names of the
+        cameras' unknowns that it is correlated with.
     """
-    covariance, gauges = widen_with_cameras(fit, covariance, factor)
-    shared = shrink_constants(fit, found, covariance, names)
-    return found._replace(shared=shared), covariance, gauges
+    C, shared, gauges = covariance.copy(), found.shared.copy(), dict[str, tuple[str, ...]]()
+    cameras = len(fit.names) - len(fit.constants)
+    for name, (value, deviation) in static.items():
+        if name not in names:
+            continue
+        k = fit.names.index(name)
+        along = C[:, k] / np.sqrt(C[k, k])
+        wider = (factor**2 - 1.0) + max(floor, deviation) ** 2 / C[k, k]
+        C += wider * np.outer(along, along)
+        sizes = np.sqrt(np.diag(C))
+        with_it = np.flatnonzero(np.abs(C[k, :cameras]) > 0.9 * sizes[k] * sizes[:cameras])
+        gauges[name] = tuple(fit.names[j] for j in with_it)
+        # Kalman update with the measured value; a contradiction makes both less certain.
+        off = value - shared[k]
+        noise = max(deviation**2, 0.25 * off**2 - C[k, k])
+        gain = C[:, k] / (C[k, k] + noise)
+        shared = shared + gain * off
+        C -= np.outer(gain, C[k])
+    found = found._replace(shared=shared)
+    return found._replace(shared=shrink_constants(fit, found, C, names)), C, gauges
 
 
 def shrink_constants(
@@ -364,31 +401,6 @@ def shrink_constants(
     return np.asarray(found.shared - gain @ found.shared[known])
 
 
-def fit_cameras_alone(
-    fit: SharedFit, found: SharedValues, included: Mask, steps: int = 3
-) -> SharedValues:
-    """Return the values with the cameras' unknowns fitted again, and all others held.
-
-    Shrunk offsets move the cameras by the covariance, which has parts for errors that are not
-    fitted. Contours then fit badly.
-
-    Args:
-        fit, found: the fit, and its values after ``shrink_constants``.
-        included: (rows,) which masks enter.
-        steps: number of Gauss-Newton steps at each of two scales.
-    """
-    first = fit.problem.own_count
-    rows = slice(first, first + fit.per_camera * len(fit.views))
-    for stage in (SHARED.inlier_stage, SHARED.final_stage):
-        for _ in range(steps):
-            equations = fit.equations(found, stage, included)
-            H, g = equations.H.sum(axis=0)[rows, rows], equations.g.sum(axis=0)[rows]
-            shared = found.shared.copy()
-            shared[: rows.stop - first] -= np.linalg.solve(H, g)
-            found = found._replace(shared=shared)
-    return found
-
-
 def significant_constants(
     fit: SharedFit, found: SharedValues, covariance: Array, names: Sequence[str], most: float
 ) -> list[str]:
@@ -415,6 +427,105 @@ def significant_constants(
     return kept
 
 
+def unseen_rotations(
+    views: Sequence[PosedFrames],
+    static: Mapping[str, tuple[float, float]],
+    *,
+    min_part: float = 0.5,
+) -> dict[str, KinematicParameter]:
+    """Return descriptions, by name, of offsets that edges of static parts do not determine.
+
+    Args:
+        views: for each camera its frames.
+        static: see ``calibrate_joints``.
+        min_part: rotations of the cameras about axes along which the joint's axis has a smaller
+            component are not named.
+    """
+    unknown = {}
+    for name, (_, deviation) in static.items():
+        if deviation > BASE.max_deviation:
+            kinematics, values = views[0].kinematics, views[0].frames[0].values
+            axis = kinematics.motions(values).twists[kinematics.names.index(name), :3]
+            gauge = tuple(
+                f"{one.camera.name}.{POSE_NAMES[k]}"
+                for one in views
+                for k in np.flatnonzero(np.abs(one.camera.X_CW[:3, :3] @ axis) > min_part)
+            )
+            unknown[name] = undetermined(name, gauge)
+    return unknown
+
+
+def ambiguous_constants(
+    fit: SharedFit,
+    found: SharedValues,
+    included: Mask,
+    covariance: Array,
+    names: Sequence[str],
+    *,
+    away: Sequence[float] = (0.1, 0.2, 0.3, 0.4, 0.5),
+    min_sds: float = 4.0,
+    threshold: float = 2.0,
+) -> list[str]:
+    """Return names of angular constants of a last link that other values explain about as well.
+
+    A round flange looks alike at several angles. Its facets and holes let the fit stop at one.
+
+    Args:
+        fit, found, included, covariance: see ``widen_to_cost_curvature``.
+        names: of the constants that are tested.
+        away: differences from the found value that are tried, to both sides [rad].
+        min_sds: those within this many standard deviations are not.
+        threshold: minimum of the costs' increase over its standard deviation, from the scatter
+            between masks.
+    """
+    view, doubtful = fit.views[0], list[str]()
+    shown = np.array([len(one.vertices) > 0 for one in view.outlines])
+    kinematics, values = view.kinematics, view.frames[0].values
+    moves = kinematics.motions(values).moves[shown]
+    before = fit.costs(found)[included]
+    for name in names:
+        if name not in kinematics.names:
+            continue
+        k, joint = fit.names.index(name), kinematics.names.index(name)
+        if not kinematics.is_angle[joint] or np.count_nonzero(moves[:, joint]) > 1:
+            continue
+        for by in np.outer([-1.0, 1.0], away).ravel().tolist():
+            if abs(by) < min_sds * math.sqrt(covariance[k, k]):
+                continue
+            shared = found.shared.copy()
+            shared[k] += by
+            more = fit.costs(found._replace(shared=shared))[included] - before
+            if more.sum() < threshold * math.sqrt(len(more)) * float(more.std()):
+                doubtful.append(name)
+                break
+    return doubtful
+
+
+def fit_cameras_alone(
+    fit: SharedFit, found: SharedValues, included: Mask, steps: int = 3
+) -> SharedValues:
+    """Return the values with the cameras' unknowns fitted again, and all others held.
+
+    Shrunk offsets move the cameras by the covariance, which has parts for errors that are not
+    fitted. Contours then fit badly.
+
+    Args:
+        fit, found: the fit, and its values after ``shrink_constants``.
+        included: (rows,) which masks enter.
+        steps: number of Gauss-Newton steps at each of two scales.
+    """
+    first = fit.problem.own_count
+    rows = slice(first, first + fit.per_camera * len(fit.views))
+    for stage in (SHARED.inlier_stage, SHARED.final_stage):
+        for _ in range(steps):
+            equations = fit.equations(found, stage, included)
+            H, g = equations.H.sum(axis=0)[rows, rows], equations.g.sum(axis=0)[rows]
+            shared = found.shared.copy()
+            shared[: rows.stop - first] -= np.linalg.solve(H, g)
+            found = found._replace(shared=shared)
+    return found
+
+
 def widen_to_cost_curvature(
     fit: SharedFit, found: SharedValues, included: Mask, covariance: Array
 ) -> Array:
@@ -430,39 +541,13 @@ def widen_to_cost_curvature(
     found_covariance = covariance.copy()
     for k in range(len(fit.names) - len(fit.constants), len(fit.names)):
         along = covariance[:, k] / math.sqrt(covariance[k, k])
-        # Differences over two standard deviations; the ratio is clipped at a thousandth.
+        # Differences over two standard deviations; without any curvature only the prior is left.
         measured, predicted = fit.cost_curvature(
             found, 2.0 * along, SHARED.stages_with_constants[-1], included
         )
-        ratio = min(1.0, max(1e-3, measured / predicted))
+        ratio = min(1.0, max(1e-3, measured / predicted)) if predicted > 1e-6 else 1.0
         found_covariance += (1.0 / ratio - 1.0) * np.outer(along, along)
     return found_covariance
-
-
-def widen_with_cameras(
-    fit: SharedFit, covariance: Array, factor: float, min_correlation: float = 0.9
-) -> tuple[Array, dict[str, tuple[str, ...]]]:
-    """Enlarge the covariance (u, u) by a factor along constants correlated with a camera.
-
-    Args:
-        fit: the fit that the covariance belongs to.
-        factor: of the standard deviations; at most 1: nothing changes.
-        min_correlation: minimum absolute correlation with an unknown of a camera.
-
-    Returns:
-        the covariance (u, u); and by name of each widened constant the names of the cameras'
-        unknowns that it is correlated with.
-    """
-    deviations, cameras = np.sqrt(np.diag(covariance)), len(fit.names) - len(fit.constants)
-    wider, gauges = covariance.copy(), dict[str, tuple[str, ...]]()
-    for k in range(cameras, len(fit.names)) if factor > 1.0 else ():
-        correlations = covariance[k, :cameras] / (deviations[k] * deviations[:cameras])
-        with_it = np.flatnonzero(np.abs(correlations) > min_correlation)
-        if len(with_it):
-            along = covariance[:, k] / deviations[k]
-            wider += (factor**2 - 1.0) * np.outer(along, along)
-            gauges[fit.names[k]] = tuple(fit.names[j] for j in with_it)
-    return wider, gauges
 
 
 def describe_constants(
@@ -473,6 +558,7 @@ def describe_constants(
     covariance: Array,
     names: Sequence[str],
     *,
+    measured: Collection[str] = (),
     determined: float = 0.2,
     min_correlation: float = 0.9,
 ) -> dict[str, KinematicParameter]:
@@ -483,6 +569,7 @@ def describe_constants(
         names: of the constants.
         freedom: degrees of freedom of Student's t distribution.
         level: p-value below which a constant is significant.
+        measured: names of constants that something else determines, too.
         determined: maximum standard deviation of a determined constant, over the prior's. A
             constant at the fit's bound is not determined, either.
         min_correlation: minimum correlation of the unknowns listed for an undetermined constant.
@@ -493,11 +580,11 @@ def describe_constants(
         k = fit.names.index(name)
         value, deviation = float(found.shared[k]), float(deviations[k])
         at_bound = abs(value) > 0.98 * SHARED.max_constant
-        if at_bound or deviation > determined * SHARED.constant_deviation:
+        wide = at_bound or deviation > determined * SHARED.constant_deviation
+        if wide and name not in measured:
             correlated = np.abs(covariance[:, k]) > min_correlation * deviations * deviation
             gauge = tuple(fit.names[j] for j in np.flatnonzero(correlated) if j != k)
-            ends = (-math.inf, math.inf)
-            parameters[name] = KinematicParameter(name, 0.0, math.inf, *ends, False, gauge)
+            parameters[name] = undetermined(name, gauge)
             continue
         width = float(stdtrit(freedom, 1.0 - 0.5 * 0.05)) * deviation
         p_value = 2.0 * float(stdtr(freedom, -abs(value) / deviation))

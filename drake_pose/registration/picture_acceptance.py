@@ -216,20 +216,6 @@ def unexplained_error(camera: PinholeCamera, why: str) -> RegistrationError:
     )
 
 
-def offsets_in_pictures(
-    names: Sequence[str], registrations: Iterable[PictureRegistration]
-) -> dict[str, float]:
-    """Return the mean joint offsets from registrations in pictures, by name [rad or m].
-
-    names: (m,) of the body's values. Without registrations the mapping is empty.
-    """
-    several = []
-    for one in registrations:
-        own = dict(zip(one.fit.fit.names, one.fit.found.shared, strict=True))
-        several.append(one.joint_offsets + [own.get(name, 0.0) for name in names])
-    return dict(zip(names, np.mean(several, axis=0).tolist(), strict=True)) if several else {}
-
-
 def evaluate_pictures(
     body: RegistrationBody,
     one: PictureRegistration,

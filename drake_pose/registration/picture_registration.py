@@ -6,7 +6,7 @@ pose, time offset and, if requested, focal length and joint offsets are fitted t
 frames and the fastest ones.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -20,10 +20,10 @@ from drake_pose.fit.covariance import vuong_statistic
 from drake_pose.fit.explain_kernel import Explained
 from drake_pose.fit.problem import TIME_OFFSET
 from drake_pose.registration.offset_search import (
-    find_base_rotation,
+    BASE,
     joint_rotation,
     joints_like_cameras,
-    scan_base,
+    locate_base,
 )
 from drake_pose.registration.picture_acceptance import (
     ACCEPTANCE,
@@ -394,6 +394,7 @@ def _fit_until_stable(
         joint_offsets = start.joint_offsets
     as_now = recording.with_drift(start.clock.drift, mean_time(recording, start.rows))
     search = start.search
+    to_turn = bool(offset_joints)
     while True:
         left -= 1
         frames = posed_pictures(as_now, start.rows, offset, () if search is None else search.frames)
@@ -408,10 +409,11 @@ def _fit_until_stable(
         assumed, turn = joint_offsets, np.array([found.get(name, 0.0) for name in names])
         most = SHARED.max_constant
         offset, joint_offsets = offset + by, np.clip(joint_offsets + turn, -most, most)
-        if offset_joints and left:
+        if to_turn and left:
             posed = search.with_offsets(joint_offsets)
             camera, angle = _turn_to_base(body, camera, posed.frames, offset_joints)
             joint_offsets, turn = joint_offsets - angle, turn - angle
+            to_turn = bool(angle.any())
         if not left or (abs(by) < 0.02 and np.abs(turn).max() < np.radians(0.3)):
             clock = replace(start.clock, value=offset)
             done = start._replace(camera=camera, clock=clock, joint_offsets=joint_offsets)
@@ -423,9 +425,6 @@ def _turn_to_base(
     camera: PinholeCamera,
     frames: Sequence[PosedPicture],
     offset_joints: Sequence[str],
-    *,
-    within: float = 0.45,
-    step: float = 0.0175,
 ) -> tuple[PinholeCamera, Array]:
     """Turn a camera about the first joint's axis to where the robot's base fits its pictures.
 
@@ -434,26 +433,96 @@ def _turn_to_base(
         camera: the camera at its fitted pose.
         frames: f pictures with the values of the fit.
         offset_joints: joints whose offsets are fitted. Without one whose offset looks like a
-            rotation of the camera, the camera stays.
-        within, step: bound and step of the angles [rad].
+            rotation of the camera, the camera stays. It stays, too, where the angle is not
+            determined, or small.
 
     Returns:
         the camera; and (m,) the angle that it turned [rad], at the joint whose offset falls by it.
     """
-    kinematics, outlines = body.kinematics, body.medium
-    values = np.array([one.values for one in frames])
-    shown = np.array([len(one.vertices) > 0 for one in outlines])
+    turned = np.zeros(len(body.kinematics.names))
+    found = base_rotation(body, camera, frames, offset_joints)
+    if found is None or found[2] > BASE.max_deviation or abs(found[1]) < BASE.min_turn:
+        return camera, turned
+    joint, turned[found[0]] = found[:2]
+    X_WW = joint_rotation(body.kinematics, frames[0].values, joint, turned[joint])
+    return camera.with_pose(np.linalg.inv(camera.X_CW @ X_WW)), turned
+
+
+def base_rotation(
+    body: RegistrationBody,
+    camera: PinholeCamera,
+    frames: Sequence[PosedPicture],
+    offset_joints: Sequence[str],
+) -> tuple[int, float, float] | None:
+    """Return by how much a camera is turned about the first joint's axis, see ``locate_base``.
+
+    Args:
+        body: the robot's surfaces and pose tree.
+        camera: the camera at its pose.
+        frames: f pictures with the values that the camera was fitted with.
+        offset_joints: joints whose offsets are fitted.
+
+    Returns:
+        index of the joint, the angle and its standard deviation [rad]; None: no offset of these
+        joints looks like a rotation of the camera.
+    """
+    kinematics, values = body.kinematics, np.array([one.values for one in frames])
+    shown = np.array([len(one.vertices) > 0 for one in body.full])
     like_cameras = joints_like_cameras(kinematics, values, shown)
     joint = next((kinematics.names.index(k) for k in like_cameras if k in offset_joints), None)
-    turned = np.zeros(len(kinematics.names))
     if joint is None:
-        return camera, turned
-    angles = np.arange(-within, within, step)
+        return None
     pictures = [one.picture for one in frames]
-    scores = scan_base(kinematics, outlines, camera, pictures, values, joint, angles)
-    turned[joint] = find_base_rotation(angles, scores)
-    X_WW = joint_rotation(kinematics, values[0], joint, turned[joint])
-    return camera.with_pose(np.linalg.inv(camera.X_CW @ X_WW)), turned
+    return joint, *locate_base(kinematics, body.full, camera, pictures, values, joint)
+
+
+def offsets_in_pictures(
+    body: RegistrationBody,
+    found: Mapping[str, PictureRegistration],
+    offset_joints: Sequence[str],
+) -> tuple[dict[str, float], dict[str, tuple[float, float]], dict[str, PinholeCamera]]:
+    """Return joint offsets of registrations in pictures, all cameras together.
+
+    Args:
+        body: the robot's surfaces and pose tree.
+        found: registrations by camera.
+        offset_joints: joints whose offsets are fitted.
+
+    Returns:
+        mean offsets by name [rad or m]; of these, those that look like a rotation of a camera, as
+        edges of static parts show them, with standard deviations; and the cameras, turned to these
+        offsets. All are empty without registrations.
+    """
+    if not found:
+        return {}, {}, {}
+    names, kinematics = body.kinematics.names, body.kinematics
+    offsets, measured = dict[str, Array](), dict[str, list[tuple[str, float, float]]]()
+    for name, one in found.items():
+        own = dict(zip(one.fit.fit.names, one.fit.found.shared, strict=True))
+        offsets[name] = one.joint_offsets + [own.get(joint, 0.0) for joint in names]
+        frames = [
+            PosedPicture(k.name, k.values + offsets[name], one.pictures[k.name]) for k in one.frames
+        ]
+        rotation = base_rotation(body, one.found.camera, frames, offset_joints)
+        if rotation is not None:
+            joint, angle, deviation = rotation
+            several = measured.setdefault(names[joint], [])
+            several.append((name, float(offsets[name][joint]) - angle, deviation))
+    start = dict(zip(names, np.mean([*offsets.values()], axis=0).tolist(), strict=True))
+    static, cameras = dict[str, tuple[float, float]](), dict[str, PinholeCamera]()
+    for joint_name, several in measured.items():
+        weights = np.array([deviation**-2 for _, _, deviation in several])
+        deviation = float(weights.sum() ** -0.5) if weights.any() else np.inf
+        value = float(np.average([one for _, one, _ in several], weights=weights + 1e-30))
+        static[joint_name] = value, deviation
+        joint = names.index(joint_name)
+        start[joint_name] = start[joint_name] if deviation <= BASE.max_deviation else 0.0
+        for name, _, _ in several:
+            by = float(offsets[name][joint]) - start[joint_name]
+            camera, values = found[name].found.camera, found[name].frames[0].values
+            X_CW = camera.X_CW @ joint_rotation(kinematics, values, joint, by)
+            cameras[name] = camera.with_pose(np.linalg.inv(X_CW))
+    return start, static, cameras
 
 
 def scan_time_offsets(

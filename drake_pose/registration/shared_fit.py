@@ -284,6 +284,16 @@ class SharedFit:
         masks = zip(self._observations, self._parameters(found), strict=True)
         return np.sum(map_ordered(lengths, masks), axis=0)
 
+    def costs(self, found: SharedValues) -> Array:
+        """Return the cost (rows,) of each mask's contours, without priors, at the final stage."""
+
+        def cost(mask: tuple[Observation, Array]) -> float:
+            sums = self.problem.compare(*mask, SHARED.final_stage)[0].sums
+            return float(sums[..., Sum.COST].sum())
+
+        masks = zip(self._observations, self._parameters(found), strict=True)
+        return np.array(map_ordered(cost, masks))
+
     def inliers(self, ratios: Array) -> Mask:
         """Return which masks (rows,) are inliers, from all masks' inlier ratios (rows,).
 

@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 
 from drake_pose.registration.offset_search import (
-    find_base_rotation,
+    BASE,
+    draw_normals,
     joint_rotation,
     joints_like_cameras,
-    scan_base,
+    locate_base,
 )
 from drake_pose.registration.picture_registration import register_pictures
 from drake_pose.registration.picture_search import PictureSearch, PosedPicture
-from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.benchmarks.rooms import Room
 from tests.registration.arm_pictures import errors, looking_at
 
 OFF = np.radians([0.0, 15.0, -12.0, 14.0, -15.0])
@@ -61,17 +62,17 @@ def test_camera_and_large_offsets_are_found_within_their_deviations(episode, rec
 
 
 @pytest.mark.parametrize("degrees", [14.0, -14.0, 0.0])
-def test_a_base_is_turned_to_its_outline(model, body, degrees: float) -> None:
+def test_a_base_is_turned_to_its_edges(model, body, tmp_path, degrees: float) -> None:
     """The turret rests and stands for the base; all other boxes move with the shoulder."""
     camera = looking_at(np.array([1.2, 0.5, 0.9]), np.array([0.0, 0.0, 0.2]), 0.1)
     rng, kinematics = np.random.default_rng(3), body.kinematics
     values = rng.uniform(0.3 * kinematics.lower, 0.3 * kinematics.upper, (6, 5))
     values[:, 0] = 0.4
-    renderer, pictures = LabelRenderer(model, camera), []
+    room, pictures = Room(model, tmp_path, 4, False, np.pi), []
     for row in values:
-        labels = renderer.segments(*body.tree.positions_from(kinematics.split(row)))
-        painted = np.where((labels >= 0)[..., None], [90.0, 60.0, 30.0], [120.0, 130.0, 120.0])
-        pictures.append(np.uint8(painted + rng.normal(0.0, 3.0, painted.shape)))
+        q = body.tree.positions_from(kinematics.split(row))[0]
+        picture = room.picture(q, np.array([9.0, 9.0, 0.0]), camera)
+        pictures.append(np.uint8(np.clip(picture + rng.normal(0.0, 3.0, picture.shape), 0, 255)))
     # Camera and offset are wrong together, and the moving boxes stay where they are.
     by = np.radians(degrees)
     X_WW = joint_rotation(kinematics, values[0], 1, by)
@@ -83,13 +84,22 @@ def test_a_base_is_turned_to_its_outline(model, body, degrees: float) -> None:
             camera.X_CW @ kinematics.poses(row + np.array([0.0, by, 0.0, 0.0, 0.0]))[-1],
             atol=1e-9,
         )
-    angles = np.radians(np.arange(-24.0, 25.0))
-    scores = scan_base(kinematics, body.medium, wrong, pictures, values, 1, angles)
-    assert np.degrees(angles[np.argmax(scores)]) == pytest.approx(-degrees, abs=1.0)
-    found = find_base_rotation(angles, scores)
-    assert found == (angles[np.argmax(scores)] if degrees else 0.0)
+    found, deviation = locate_base(kinematics, body.full, wrong, pictures, values, 1)
+    assert deviation < BASE.max_deviation
+    assert abs(found + by) < 2.5 * deviation
+    assert np.degrees(found) == pytest.approx(-degrees, abs=1.0)
     # A base outside the pictures says nothing.
     aside = wrong.with_pose(wrong.X_WC @ np.diag([-1.0, 1.0, -1.0, 1.0]))
-    nothing = scan_base(kinematics, body.medium, aside, pictures, values, 1, angles)
-    assert np.isnan(nothing).all()
-    assert find_base_rotation(angles, nothing) == 0.0
+    assert locate_base(kinematics, body.full, aside, pictures, values, 1) == (0.0, np.inf)
+
+
+def test_the_nearest_triangle_is_drawn_at_each_pixel() -> None:
+    """Two triangles cross; each pixel's depth is that of the nearer plane."""
+    corners = np.array([[[-1.0, -1.0], [40.0, -1.0], [-1.0, 40.0]]] * 2)
+    depths = np.array([[1.0, 3.0, 1.0], [2.0, 2.0, 2.0]])
+    picture = np.zeros((12, 16, 4), np.float32)
+    draw_normals(corners, 1.0 / depths, np.array([[0.0, 0.6, -0.8], [0.0, 0.0, -1.0]]), picture)
+    share = (np.tile(np.arange(16), (12, 1)) + 1.0) / 41.0
+    sloped = (1.0 - share) + share / 3.0
+    np.testing.assert_allclose(picture[..., 3], np.maximum(sloped, 0.5), rtol=1e-5)
+    np.testing.assert_array_equal(picture[..., 1] > 0.0, sloped > 0.5)

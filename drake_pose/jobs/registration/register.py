@@ -54,11 +54,8 @@ from drake_pose.jobs.registration.trees import corrected_urdf, joint_shifts, mak
 from drake_pose.person.shape import shape_parts, shape_values
 from drake_pose.registration.bundle import adjust_bundle
 from drake_pose.registration.joint_offsets import calibrate_joints
-from drake_pose.registration.picture_acceptance import (
-    PictureRegistration,
-    evaluate_pictures,
-    offsets_in_pictures,
-)
+from drake_pose.registration.picture_acceptance import PictureRegistration, evaluate_pictures
+from drake_pose.registration.picture_registration import offsets_in_pictures
 from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrame, PosedFrames
 from drake_pose.registration.recording import choose_pictures, posed_pictures
 from drake_pose.registration.register import (
@@ -534,11 +531,11 @@ class _Registration:
             self.parameters = describe_parameters(one.offsets, (), self.body.kinematics)
             significant = {each.name: each.value for each in one.offsets if each.significant}
             return corrected_urdf(inputs.model, folder, significant, {})
+        start, static, turned = offsets_in_pictures(self.body, self.pictures, inputs.offset_joints)
+        own = [replace(one, camera=turned.get(name, one.camera)) for name, one in cameras.items()]
         found = calibrate_joints(
-            self.body, list(cameras.values()), [inputs.of(name) for name in cameras],
-            inputs.offset_joints, self._settings.focal, links=inputs.scaled_links,
-            start=offsets_in_pictures(names, self.pictures.values()),
-            still_factor=2.5 if self.pictures else 1.0,
+            self.body, own, [inputs.of(name) for name in cameras], inputs.offset_joints,
+            self._settings.focal, links=inputs.scaled_links, start=start, static=static,
         )  # fmt: skip
         self.parameters = describe_parameters(
             found.offsets, found.link_scales, self.body.kinematics

@@ -19,8 +19,9 @@ from drake_pose.arrays import Array, Mask
 from drake_pose.body import TARGET_POSITIONS, PoseTree
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
+from drake_pose.fit.base_edges import BASE
 from drake_pose.fit.parameters import POSE_NAMES, carried_joints, link_scale_name
-from drake_pose.registration.offset_search import BASE, joints_like_cameras
+from drake_pose.registration.offset_search import joints_like_cameras
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import RegisteredCamera, RegistrationBody
 from drake_pose.registration.shared_fit import SHARED, SharedFit, SharedValues
@@ -166,8 +167,7 @@ def calibrate_joints(
         start: offsets by name [rad or m] that the cameras were fitted with, 0 for other names.
             Only parameters that a camera hides are then dropped, and its covariance includes them.
         static: offsets that look like a rotation of a camera, as edges of static parts show them,
-            and their standard deviations [rad], by name (``locate_base``). Those that are not
-            determined are held at 0. None: masks alone count.
+            and standard deviations [rad], by name (``locate_base``); uncertain ones are held at 0.
 
     Raises:
         UnknownNameError: the body has no such position, or no such scalable link.
@@ -183,10 +183,11 @@ def calibrate_joints(
     offsets = carried_joints(body.tree, links)
     requested, per_camera = [*joints, *map(link_scale_name, links)], len(POSE_NAMES) + focal
     target_positions = [name for name in body.kinematics.names if name in TARGET_POSITIONS]
-    parameters, static = unseen_rotations(views, static or {}), static or {}
+    static = static or {}
+    parameters = unseen_rotations(static, views)
     sought: list[str] | None = None
     kept = first = [name for name in requested if name not in parameters]
-    describe = partial(describe_constants, measured={*static} - {*parameters})
+    describe = partial(describe_constants, measured=static)
     while kept != sought:
         sought = kept
         names = [*target_positions, *sought]
@@ -428,31 +429,17 @@ def significant_constants(
 
 
 def unseen_rotations(
-    views: Sequence[PosedFrames],
-    static: Mapping[str, tuple[float, float]],
-    *,
-    min_part: float = 0.5,
+    static: Mapping[str, tuple[float, float]], views: Sequence[PosedFrames]
 ) -> dict[str, KinematicParameter]:
     """Return descriptions, by name, of offsets that edges of static parts do not determine.
 
-    Args:
-        views: for each camera its frames.
-        static: see ``calibrate_joints``.
-        min_part: rotations of the cameras about axes along which the joint's axis has a smaller
-            component are not named.
+    They are correlated with the rotations of all cameras.
+
+    static: see ``calibrate_joints``. views: for each camera its frames.
     """
-    unknown = {}
-    for name, (_, deviation) in static.items():
-        if deviation > BASE.max_deviation:
-            kinematics, values = views[0].kinematics, views[0].frames[0].values
-            axis = kinematics.motions(values).twists[kinematics.names.index(name), :3]
-            gauge = tuple(
-                f"{one.camera.name}.{POSE_NAMES[k]}"
-                for one in views
-                for k in np.flatnonzero(np.abs(one.camera.X_CW[:3, :3] @ axis) > min_part)
-            )
-            unknown[name] = undetermined(name, gauge)
-    return unknown
+    gauge = tuple(f"{one.camera.name}.{turn}" for one in views for turn in POSE_NAMES[:3])
+    unseen = (name for name, (_, deviation) in static.items() if deviation > BASE.max_deviation)
+    return {name: undetermined(name, gauge) for name in unseen}
 
 
 def ambiguous_constants(

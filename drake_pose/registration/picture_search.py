@@ -171,6 +171,7 @@ class PictureSearch:
             (160, 10, 80, 0.06),
         ),
         rotations: int = 1200,
+        least_width: int = 0,
     ) -> list[Array]:
         """Return pose hypotheses X_CW (4, 4), best first.
 
@@ -178,8 +179,9 @@ class PictureSearch:
             rounds: for each round of local search the width of the pictures [pixel], the number of
                 hypotheses, the number of evaluations for each, and the first step's rotation [rad].
             rotations: number of rotations over the sphere, and again near upright.
+            least_width: minimum width of the pictures in all rounds [pixel].
         """
-        level = self._level(rounds[0][0])
+        level = self._level(max(rounds[0][0], least_width))
         found = level.starts(rotations)
         # The most dissimilar frames select some of the starts.
         first = ((2, 0.12), (4, 0.3)) if self._riding else ((4, 0.25),)
@@ -187,7 +189,7 @@ class PictureSearch:
             found = level.best(found, frames, fraction)
         after = (*(kept for _, kept, _, _ in rounds[1:]), rounds[-1][1])
         for (width, kept, evaluations, turn), most in zip(rounds, after, strict=True):
-            level = self._level(width)
+            level = self._level(max(width, least_width))
             found = level.distinct(level.improve(found[:kept], evaluations, turn)[1], most)
         return found
 

@@ -193,11 +193,24 @@ def test_first_offsets_that_no_edges_determine_are_not_fitted(model, body, camer
     frames = see(model, body, camera, 4, 6)
     views = [PosedFrames(body.kinematics, body.full, camera, frames)]
     first, second = body.kinematics.names[:2]
-    unknown = unseen_rotations(views, {first: (0.2, 0.3), second: (0.1, 0.01)})
+    unknown = unseen_rotations({first: (0.2, 0.3), second: (0.1, 0.01)}, views)
     assert [*unknown] == [first]
     assert not unknown[first].determined
-    # Its axis is upright, and the camera looks down a little.
     assert f"{camera.name}.turn_y" in unknown[first].gauge
+
+
+def test_a_significant_offset_never_has_zero_in_its_interval(model, body, camera) -> None:
+    """Masks show an offset of 2 degrees that edges contradict."""
+    zeros = np.zeros(len(body.kinematics.names))
+    zeros[body.kinematics.names.index("elbow_turn")] = np.radians(2.0)
+    frames = misread(see(model, body, camera, 4, 4), zeros)
+    how = body, [known(camera)], [frames], NAMES
+    elbow = calibrate_joints(*how).offsets[2]
+    assert elbow.significant
+    contradicted = calibrate_joints(*how, static={"elbow_turn": (0.0, 0.001)}).offsets[2]
+    assert contradicted.deviation > 2.0 * elbow.deviation
+    assert contradicted.low < 0.0 < contradicted.high
+    assert not contradicted.significant
 
 
 def test_cameras_follow_held_constants_back_to_the_contours(model, body, camera) -> None:

@@ -3,13 +3,8 @@
 import numpy as np
 import pytest
 
-from drake_pose.registration.offset_search import (
-    BASE,
-    draw_normals,
-    joint_rotation,
-    joints_like_cameras,
-    locate_base,
-)
+from drake_pose.fit.base_edges import BASE, draw_normals, joint_rotation, locate_base
+from drake_pose.registration.offset_search import joints_like_cameras
 from drake_pose.registration.picture_registration import register_pictures
 from drake_pose.registration.picture_search import PictureSearch, PosedPicture
 from tests.benchmarks.rooms import Room

@@ -1,6 +1,6 @@
 """Accept a camera that was fitted to pictures, and evaluate all its pictures."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 

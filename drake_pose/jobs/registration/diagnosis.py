@@ -482,9 +482,9 @@ def parameter_warnings(found: JointCalibration) -> list[str]:
             "written"
         ]
     with_cameras = [
-        f"{what} is correlated with {', '.join(one.gauge)}: only static parts separate the two, "
-        "and pictures show these badly, so the camera may be turned with it about the robot. Check "
-        "in the overlays whether the robot's base fits, or give masks, or a camera with its pose"
+        f"{what} is good to {np.degrees(one.deviation):.2g} degrees only, and turns the camera "
+        f"about the robot (correlated with {', '.join(one.gauge)}): edges of static parts separate "
+        "the two. Check in the overlays whether the base fits, or give a camera with its pose"
         for what, one in requested
         if one.determined and one.gauge
     ]

@@ -117,6 +117,25 @@ class RidingPictures:
         """About the most that silhouettes tell about the kinds."""
         return RIDING.full_gain * self.pictures[..., 0].size
 
+    def mirrored(self) -> "RidingPictures":
+        """Return the pictures with left and right exchanged."""
+        flipped = (np.flip(one, axis) for one, axis in ((self.pictures, 2), (self.colours, 1)))
+        pictures, colours = map(np.ascontiguousarray, flipped)
+        deviations = np.ascontiguousarray(np.flip(self.deviations, 1))
+        return RidingPictures(pictures, self.gains, colours, deviations, self.alike)
+
+    def contour_terms(self, size: float, weight: float) -> tuple[float, float]:
+        """As of ``Backgrounds``, but edges count by their sum; weight: is not used."""
+        longer = 1e9
+        return longer, longer * RIDING.weight / size
+
+    def changed_frames(self) -> None:
+        """Return None: all pixels change, and changes do not locate the body."""
+
+    def known(self, pictures: Sequence[Picture], covered: Mask, small: Mask) -> "RidingColours":
+        """Return the body's colours, see ``RidingColours.of``; small: is not used."""
+        return RidingColours.of(self, pictures, covered)
+
     def _lasting_edges(self) -> Floats:
         """Return (2, f, H, W) the strength of edges across u and v that last between images.
 

@@ -25,7 +25,6 @@ from drake_pose.fit.background import (
 )
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import POSE_NAMES
-from drake_pose.fit.riding import RidingColours, RidingPictures
 from drake_pose.fit.surfaces import simplify_or_hull
 from drake_pose.registration.offset_search import joints_like_cameras, search_offsets
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
@@ -424,13 +423,12 @@ class PictureSearch:
         level = self._level(PICTURES.background_width)
         small = camera.resized(level.camera.width, level.camera.height)
         covered = self.silhouettes(camera)
-        if isinstance(level.backgrounds, RidingPictures):
-            pictures = [one.picture for one in frames]
-            return RidingColours.of(level.backgrounds, pictures, covered), covered
         same = small.width == camera.width
-        showing = level.backgrounds.shows_background(covered if same else self.silhouettes(small))
-        pictures, gains = [one.picture for one in frames], level.backgrounds.gains
-        return KnownBackground.estimate(pictures, gains, showing, covered), covered
+        pictures = [one.picture for one in frames]
+        known = level.backgrounds.known(
+            pictures, covered, covered if same else self.silhouettes(small)
+        )
+        return known, covered
 
     def _segment(
         self,

@@ -16,7 +16,7 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.compiled import default_arguments
 from drake_pose.fit.background import Backgrounds
 from drake_pose.fit.explain_kernel import Explained, explain, explain_poses
-from drake_pose.fit.riding import RIDING, RidingPictures
+from drake_pose.fit.riding import RidingPictures
 from drake_pose.registration.pose_simplex import ScoredPictures, move_pose, search_simplexes
 from drake_pose.registration.posed_frames import placed_points
 from drake_pose.registration.register import uniform_rotations
@@ -119,7 +119,6 @@ class PyramidLevel:
     def mirrored(self) -> "PyramidLevel":
         """Return the level of the mirrored pictures."""
         other = self.with_camera(self.camera.mirrored())
-        assert isinstance(self.backgrounds, Backgrounds)
         other.backgrounds = self.backgrounds.mirrored()
         return other
 
@@ -156,9 +155,6 @@ class PyramidLevel:
     def scores(self, X_CW: Sequence[Array] | Array, frames: int | None = None) -> Array:
         """Return the scores (n,), see `evidence`, of n poses (4, 4).
 
-        A constant is added to the outlines' length. It limits the score of short outlines, whose
-        edges are strong by chance.
-
         frames: number of frames that are used, from the first on; None: all.
         """
         own, poses = self._scored(frames), np.asarray(X_CW)[:, :3]
@@ -179,10 +175,9 @@ class PyramidLevel:
         """Return the first pictures, prepared for scores; frames: their number; None: all."""
         X_WN = np.ascontiguousarray(self._X_WN[:frames, :, :3])
         possible = self.backgrounds.max_gain * len(X_WN) / len(self._X_WN)
-        outline, weight = 0.3 * len(X_WN) * self.camera.width, PICTURES.contour_weight
-        if isinstance(self.backgrounds, RidingPictures):
-            # The sum along the contours, over a length like theirs.
-            outline, weight = 1e9, 1e9 * RIDING.weight / (len(X_WN) * self.camera.width)
+        outline, weight = self.backgrounds.contour_terms(
+            len(X_WN) * self.camera.width, PICTURES.contour_weight
+        )
         return ScoredPictures(
             self._packed, X_WN, self._static, self._parameters, self.backgrounds.sums,
             self._middle, np.array([max(possible, 1e-9), outline, weight]),
@@ -216,9 +211,9 @@ class PyramidLevel:
         Each rotation is combined with three depths about that at which the body is as large as the
         changes, and with two positions in the picture: the changes' centre, and a random one.
         """
-        if isinstance(self.backgrounds, RidingPictures):
-            return self._starts_around(18 * rotations)
         changes = self.backgrounds.changed_frames()
+        if changes is None:
+            return self._starts_around(18 * rotations)
         v, u = np.mgrid[: changes.shape[0], : changes.shape[1]]
         total = max(float(changes.sum()), 1e-9)
         middle = np.array([float((changes * one).sum()) / total for one in (u, v)])

@@ -1,0 +1,90 @@
+"""Scores of a body that rides along with a camera."""
+
+import cv2
+import numpy as np
+import pytest
+from scipy.stats import entropy
+
+from drake_pose.fit.explain_kernel import Explained, explain
+from drake_pose.fit.riding import RidingColours, RidingPictures, silhouette_gains
+from drake_pose.silhouette.outline import pack
+from drake_pose.silhouette.scoring import draw_mask
+from tests.registration.episodes import painted_episode
+
+COUNT = 6
+
+
+def worlds(count):
+    """Return pictures (count, 60, 80, 3) of smooth random colours."""
+    small = np.random.default_rng(2).uniform(0.0, 255.0, (count, 9, 12, 3))
+    large = np.array([cv2.resize(one, (80, 60), interpolation=cv2.INTER_CUBIC) for one in small])
+    return np.clip(large, 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def wrist(tmp_path_factory):
+    """Return the pictures of a painted body before a world that changes, and its silhouettes."""
+    episode = painted_episode(tmp_path_factory.mktemp("wrist"), frames=COUNT, size=(80, 60))
+    X_CW, outlines = episode.camera.X_CW, episode.body.coarse
+    poses = np.array([X_CW @ episode.body.kinematics.poses(one) for one in episode.values])
+    masks = np.array([draw_mask(outlines, X, episode.camera) for X in poses])
+    pictures = np.where(masks[..., None], episode.pictures, worlds(COUNT))
+    return pictures, masks, (pack(outlines), np.ascontiguousarray(poses[:, :, :3])), episode.camera
+
+
+def test_gain_is_the_information_of_silhouettes_about_kinds(wrist) -> None:
+    pictures, masks, (packed, X_CN), camera = wrist
+    sums = RidingPictures.estimate(pictures, np.ones((COUNT, COUNT))).sums
+    is_static = np.zeros(X_CN.shape[1], bool)
+    totals, _ = explain(packed, X_CN, is_static, camera.kernel_parameters(), sums, 1.0, 0)
+    kinds = np.moveaxis(sums.kinds, -1, 0)
+    both = [np.bincount(kinds[one], minlength=len(sums.counts)) for one in (masks, ~masks)]
+    separate = sum(one.sum() * entropy(one) for one in both)
+    expected = kinds.size * entropy(sums.counts) - separate
+    np.testing.assert_allclose(totals[Explained.GAIN], expected, rtol=1e-6)
+    # By tiles the sum is the same, up to what is added to the counts.
+    np.testing.assert_allclose(silhouette_gains(sums, masks).sum(), expected, rtol=0.02)
+    shifted, _ = explain(
+        packed,
+        X_CN + np.array([0.0, 0.0, 0.0, 0.2]),
+        is_static,
+        camera.kernel_parameters(),
+        sums,
+        1.0,
+        0,
+    )
+    assert shifted[Explained.GAIN] < 0.7 * expected
+
+
+def test_only_edges_that_last_count(wrist) -> None:
+    """With the body in one pose its contour lasts, and the world's edges do not."""
+    pictures, masks, _, _ = wrist
+    held = np.where(masks[:1, ..., None], pictures[:1], worlds(20))
+    edges = RidingPictures.estimate(held, np.ones((20, 20))).sums.edges.max(axis=0)
+    inner = masks[0] & np.roll(masks[0], 1, 1) & np.roll(masks[0], 1, 0)
+    contour = masks[0] & ~(inner & np.roll(inner, -1, 1) & np.roll(inner, -1, 0))
+    far = ~np.any([np.roll(masks[0], k, a) for k in range(-3, 4) for a in (0, 1)], axis=0)
+    assert edges[0][contour].mean() > edges[0][far].mean() + 0.2
+
+
+def test_colours_of_the_body_segment_further_pictures(wrist) -> None:
+    pictures, masks, _, _ = wrist
+    riding = RidingPictures.estimate(pictures, np.ones((COUNT, COUNT)))
+    known = riding.known(list(pictures), masks, masks)
+    assert isinstance(known, RidingColours)
+    found, tolerant = known.foreground(pictures[2], riding.gains[2])
+    np.testing.assert_array_equal(found, tolerant)
+    on, beside = found[masks[2]] > 0.0, found[~masks[2]] > 0.0
+    assert on.mean() > 4.0 * beside.mean()
+
+
+def test_mirrored_pictures_have_mirrored_sums(wrist) -> None:
+    pictures, *_ = wrist
+    riding = RidingPictures.estimate(pictures, np.eye(COUNT))
+    mirrored = riding.mirrored()
+    np.testing.assert_allclose(mirrored.sums.edges, riding.sums.edges[..., ::-1], atol=1e-5)
+    np.testing.assert_array_equal(mirrored.mirrored().pictures, riding.pictures)
+    assert riding.contour_terms(100.0, 4.0)[1] == pytest.approx(
+        4.0 * riding.contour_terms(400.0, 4.0)[1]
+    )
+    assert riding.changed_frames() is None

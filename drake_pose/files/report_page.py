@@ -1,6 +1,7 @@
 """The page report.html of an estimate, in one file with all pictures, and parts of other pages."""
 
 import base64
+import io
 import math
 from collections.abc import Sequence
 from importlib.resources import files
@@ -12,12 +13,13 @@ import cv2
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from drake_pose.arrays import Array
+from drake_pose.arrays import Array, Mask
 from drake_pose.body import ArticulatedModel
 from drake_pose.errors import listed
 from drake_pose.files.folder import OVERLAY
-from drake_pose.files.page_plots import PagePlot, draw_grid, plot_curves
 from drake_pose.files.records import SceneEstimate, measured_positions, user_units
 from drake_pose.silhouette.pictures.scenes import Scene
 
@@ -44,12 +46,12 @@ def make_report(
     pictures = _pick_pictures(folder, scene, estimate)
     grid, plots = None, {}
     if {*found}.union(*use.values()) != {"found", "used"}:
-        grid = draw_grid(frames, [*use.items(), ("pose", found)])
+        grid = plot_uri(draw_grid(frames, [*use.items(), ("pose", found)]))
     if len(frames) > 1 and estimate.found_count:
         curves = {"errors": [("E_total", np.array(errors))], "ious": ious}
         for name, values in curves.items():
             least = 0.0 if name == "errors" else None
-            plots[name] = plot_curves(frames, values, joined=joined, least=least)
+            plots[name] = plot_uri(plot_curves(frames, values, joined=joined, least=least))
     about = {
         "poses.csv": "every position in every frame [rad or m]",
         "joints.csv": "95 % interval of each joint, and whether it is determined [deg or m]",
@@ -178,18 +180,20 @@ def _joint_rows(
     q = to_page * np.array([record.q for record in records])
     measured = to_page * measured_positions(model, records)
     limits, rows = to_page * [model.lower, model.upper], list[dict[str, Any]]()
+    drawn: Figure | None = None
     unknown = {"determined": False, "low": np.nan, "high": np.nan}
     for k, (name, kind) in enumerate(zip(model.position_names, model.position_kinds, strict=True)):
-        ends, own = _ends(q[:, k]), (float(limits[0, k]), float(limits[1, k]))
-        plot: PagePlot | None = None
+        ends, own, plot = _ends(q[:, k]), (float(limits[0, k]), float(limits[1, k])), None
         known = [record.joints.get(name, unknown) for record in records]
         low, high = scale[k] * np.array([(one["low"], one["high"]) for one in known]).T
         determined = np.array([one["determined"] for one in known])
         if ends[1] - ends[0] >= 1e-9:
             curves = [("measured", measured[:, k]), (name, q[:, k])]
-            plot = plot_curves(
-                frames, curves, joined=joined, limits=own, intervals=(low, high, determined)
-            )
+            drawn = plot_curves(
+                frames, curves, joined=joined, limits=own, intervals=(low, high, determined),
+                onto=drawn,
+            )  # fmt: skip
+            plot = plot_uri(drawn)
         elif np.isnan(ends[0]) or (np.isnan(low).all() and math.isinf(own[0])):
             continue
         unit, _, digits = units[kind]
@@ -368,3 +372,129 @@ def overlay_picture(
     _, encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 82])
     uri = "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
     return {"camera": camera, "frame": frame, "E_total": E_total, "uri": uri, "link": quote(place)}
+
+
+def new_plot(height: float = 1.5, left: float = 0.09) -> tuple[Figure, Axes]:
+    """Return an empty plot for a page.
+
+    Args:
+        height: height of the figure [inch].
+        left: space left of the axes, as a fraction of the width.
+    """
+    figure = Figure(figsize=(6.4, height), dpi=120)
+    axes = figure.add_axes((left, 0.3 / height, 0.985 - left, 1.0 - 0.38 / height))
+    axes.tick_params(labelsize=8, length=2, colors="#57606a")
+    for side in axes.spines.values():
+        side.set_color("#d8dee4")
+    _restart_colours(axes)
+    return figure, axes
+
+
+def _restart_colours(axes: Axes) -> None:
+    """Give the next curve of a plot the first of the colours."""
+    colours = "#0072b2 #d55e00 #009e73 #b8468f #7a5c00 #2f8fc4 #666666 #8c2d04"
+    axes.set_prop_cycle(color=colours.split())
+
+
+def plot_uri(figure: Figure) -> str:
+    """Return a figure as the data URI of a PNG picture."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png")
+    return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode()
+
+
+def plot_curves(
+    frames: Sequence[str],
+    values: Sequence[tuple[str, Array]],
+    *,
+    joined: bool,
+    limits: tuple[float, float] | None = None,
+    intervals: tuple[Array, Array, Mask] | None = None,
+    least: float | None = None,
+    limits_within: float = 0.3,
+    onto: Figure | None = None,
+) -> Figure:
+    """Plot curves over frames; nan leaves a gap.
+
+    Args:
+        frames: names of the frames.
+        values: label and (frames,) values of each curve; the curve "measured" is wide.
+        joined: whether neighbouring frames are joined by a line.
+        limits: lower and upper limit, each drawn only if it is near; None: no limits.
+        intervals: low and high (frames,), and whether the joint is determined (frames,), drawn as
+            bars behind the curves; None: no bars, and a legend if there are several curves.
+        least: lower end of the axis, such as 0; None: chosen from the curves.
+        limits_within: a limit is near if its distance to curves and intervals is at most this
+            fraction of their span.
+        onto: plot of the same frames by an earlier call, without a legend. Its curves are replaced,
+            which takes a third of the time of a new plot; None: a new one is made.
+    """
+    figure, axes = new_plot() if onto is None else (onto, onto.axes[0])
+    for artist in (*axes.lines, *axes.collections):
+        artist.remove()
+    _restart_colours(axes)
+    places = np.arange(len(frames))
+    shown = np.concatenate([value for _, value in values])
+    if intervals is not None:
+        low, high, determined = intervals
+        shown = np.concatenate([shown, low, high])
+        # As wide as a frame, at most 1/40 of the axis [point].
+        width = 1.1 * 420.0 / max(len(frames), 40)
+        for where, colour in ((determined, "#c5dfee"), (~determined, "#e4e6e8")):
+            axes.vlines(places[where], low[where], high[where], colour, linewidth=width)
+    shown = shown[np.isfinite(shown)]
+    bottom, top = (float(shown.min()), float(shown.max())) if len(shown) else (0.0, 1.0)
+    near = limits_within * (top - bottom)
+    if limits is not None and bottom - near <= limits[0] < bottom:
+        bottom = limits[0]
+    if limits is not None and top < limits[1] <= top + near:
+        top = limits[1]
+    bottom = bottom if least is None else min(bottom, least)
+    margin = 0.08 * (top - bottom if top > bottom else max(1e-3, 0.02 * abs(top)))
+    axes.set_ylim(bottom - (0.0 if bottom == least else margin), top + margin)
+    # Markers show single frames between gaps, where there is no line.
+    style: dict[str, Any] = {"linestyle": "-" if joined else "", "marker": ".", "linewidth": 1.2}
+    wide = {"color": "#009e7380", "linewidth": 4, "markersize": 4 if joined else 16, "zorder": 1.5}
+    for label, value in values:
+        own = wide if label == "measured" else {"markersize": 2 if joined else 8}
+        axes.plot(places, value, label=label, **(style | own))
+    for limit in limits or ():
+        if bottom <= limit <= top:
+            axes.axhline(limit, color="#b3400a", linestyle="--", linewidth=0.8)
+    if len(values) > 1 and intervals is None:
+        axes.legend(fontsize=7, loc="lower right", ncols=4, framealpha=0.8)
+    if onto is None:
+        axes.grid(axis="y", color="#d8dee4", linewidth=0.5)
+        _mark_frames(axes, frames)
+    return figure
+
+
+def _mark_frames(axes: Axes, frames: Sequence[str], count: int = 6) -> None:
+    """Label the x axis with the names of about ``count`` frames."""
+    step = max(1, -(-len(frames) // count))
+    names = [name[:20] for name in frames[::step]]
+    axes.set_xticks(range(0, len(frames), step), names, parse_math=False)
+    axes.set_xlim(-0.5, max(len(frames), 1) - 0.5)
+
+
+def draw_grid(frames: Sequence[str], rows: Sequence[tuple[str, Sequence[str]]]) -> Figure:
+    """Plot states over frames: a row of bars for each name; equal neighbours are one bar.
+
+    Args:
+        frames: names of the frames.
+        rows: name and (frames,) states of each row. "used" and "found" are blue, "no-picture" is
+            grey, other states are orange.
+    """
+    colours = {"used": "#0072b2", "found": "#0072b2", "no-picture": "#d8dee4"}
+    figure, axes = new_plot(0.4 + 0.2 * len(rows), 0.2)
+    for number, (_, states) in enumerate(rows):
+        starts = [k for k in range(len(states)) if k == 0 or states[k] != states[k - 1]]
+        runs = zip(starts, [*starts[1:], len(states)], strict=True)
+        spans = [(start - 0.5, end - start) for start, end in runs]
+        faces = [colours.get(states[start], "#d55e00") for start in starts]
+        axes.broken_barh(spans, (number - 0.4, 0.8), facecolors=faces)
+    names = [name if len(name) <= 20 else f"{name[:19]}…" for name, _ in rows]
+    axes.set_yticks(range(len(rows)), names, parse_math=False)
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+    _mark_frames(axes, frames)
+    return figure

@@ -16,10 +16,14 @@ from pydrake.geometry import Meshcat, MeshcatParams
 from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.models import ParallelCamera, PinholeCamera, look_at
 from drake_pose.files import report_page
-from drake_pose.files.page_plots import PagePlot, draw_grid, plot_curves
 from drake_pose.files.records import FrameRecord, SceneEstimate, summarize
 from drake_pose.files.replay import make_replay
-from drake_pose.files.report_page import make_report
+from drake_pose.files.report_page import (
+    draw_grid,
+    make_report,
+    plot_curves,
+    plot_uri,
+)
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.silhouette.pictures.scenes import Scene
@@ -44,8 +48,8 @@ class Page:
         ]
         self.plots = {}
         for figure in self.root.iter("figure"):
-            if (drawn := figure.find("svg[@class='plot']")) is not None:
-                label = drawn.get("aria-label").split(" by frame")[0]
+            if (drawn := figure.find("img[@class='plot']")) is not None:
+                label = drawn.get("alt").split(" by frame")[0]
                 self.plots[figure.get("data-joint") or label] = figure
         assert all(one.get("alt") for one in self.root.iter("img"))
 
@@ -180,7 +184,8 @@ def part(whole, frames, errors=None, **changes):
 
 
 def test_legend_explains_only_what_plots_show(report, monkeypatch):
-    monkeypatch.setattr(report_page, "plot_curves", lambda *_, **__: PagePlot((0, 1), (0, 1)))
+    for name in ("plot_curves", "plot_uri"):
+        monkeypatch.setattr(report_page, name, lambda *_, **__: "data:,")
     model, scene, whole = report
     frames = [f"{k:04d}" for k in range(20)]
     text = make_report(Path("nowhere"), model, scene, part(whole, frames))
@@ -212,109 +217,65 @@ def test_page_of_one_frame_has_a_table_and_no_plots(report):
             assert row[3:5] == ["deg", "no"]
 
 
-def drawn_paths(plot):
-    """Return the paths of a plot in its values' units: colour, and (n, 2) points of each stroke."""
-    root = ElementTree.fromstring(str(plot.svg("a plot")))
-    paths = []
-    for one in root.findall("path"):
-        strokes = []
-        for stroke in one.get("d")[1:].split("M"):
-            points = []
-            for what, numbers in re.findall(r"([MLVHh])?([-\d. ]+)", stroke):
-                told = [float(number) for number in numbers.split()]
-                before = points[-1] if points else None
-                place = {"V": [before and before[0], told[0]], "H": [told[0], before and before[1]]}
-                points += [] if what == "h" else [place.get(what, told)]
-            u, v = np.array(points).T
-            (x0, x1), (y0, y1) = plot.x, plot.y
-            x = x0 + (u - plot.left) / (plot.width - 12.0 - plot.left) * (x1 - x0)
-            strokes.append(np.c_[x, y1 - (v - 10.0) / (plot.height - 46.0) * (y1 - y0)])
-        paths.append((one.get("stroke"), strokes))
-    return paths
-
-
 def plotted(values, **more):
-    """Return a plot with one curve, the paths before the curve, and the strokes of the curve."""
+    """Return the axes of a plot with one curve, and the curve."""
     names = [str(k) for k in range(len(values))]
-    plot = plot_curves(names, [("one", values)], **{"joined": True, **more})
-    paths = drawn_paths(plot)
-    place = [colour for colour, _ in paths].index("#0072b2")
-    return plot, paths[:place], paths[place][1], paths[place + 1 :]
+    (axes,) = plot_curves(names, [("one", values)], **{"joined": True, **more}).axes
+    return axes, axes.get_lines()[0]
 
 
-def test_a_curve_has_gaps_and_plots_show_only_limits_that_are_near():
-    values = np.sin(np.linspace(0.0, 20.0, 500))
-    values[250], values[100:110] = 3.0, np.nan
-    plot, _, strokes, limits = plotted(values, limits=(-1, 4))
-    places = np.flatnonzero(np.isfinite(values))
-    expected = np.c_[places, values[places]]
-    assert [len(one) for one in strokes] == [100, 390]
-    # Coordinates are rounded to a tenth of a pixel.
-    np.testing.assert_allclose(np.concatenate(strokes) - expected, 0.0, atol=0.04)
-    assert [one[0][0, 1] for _, one in limits] == pytest.approx([-1.0, 4.0], abs=0.01)
-    assert plot.y[0] < -1 < 4 < plot.y[1]
+def test_a_plot_drawn_onto_another_is_the_same_as_a_new_one():
+    frames, rng = [f"{k:03d}" for k in range(40)], np.random.default_rng(0)
+    for values, limits in ((rng.normal(size=(4, 40)), (-3.0, 90.0)), (rng.random((4, 40)), None)):
+        given = {
+            "values": [("measured", values[0]), ("one", values[1])],
+            "joined": True,
+            "limits": limits,
+            "intervals": (values[2], values[3], rng.random(40) < 0.5),
+        }
+        first = plot_curves(frames, [("one", 1e3 * values[1])], joined=True, limits=(0.0, 1.0))
+        again = plot_curves(frames, **given, onto=first)
+        assert plot_uri(again) == plot_uri(plot_curves(frames, **given))
+
+
+def test_plots_show_only_limits_that_are_near():
+    values = np.sin(np.linspace(0.0, 20.0, 5000))
+    values[2500], values[1000:1100] = 3.0, np.nan
+    axes, curve = plotted(values, limits=(-1, 4))
+    np.testing.assert_array_equal(curve.get_ydata(), values)
+    np.testing.assert_array_equal(curve.get_xdata(), np.arange(5000))
+    assert [line.get_ydata()[0] for line in axes.get_lines()[1:]] == [-1, 4]
+    low, high = axes.get_ylim()
+    assert low < -1 < 4 < high
     # Distant limits do not change the scale.
-    plot, _, _, limits = plotted(np.linspace(0.0, 1.0, 50), limits=(-90, 90))
-    assert np.ptp(plot.y) < 1.3
-    assert not limits
-    assert plotted(np.array([0.3, 0.4]), least=0.0)[0].y[0] == 0.0
-
-
-def test_a_curve_of_many_frames_keeps_its_peaks_and_gaps():
-    values = np.random.default_rng(0).normal(size=50_000)
-    values[25_003], values[10_000:10_500] = 9.0, np.nan
-    low, high = values - 1.0, values + 1.0
-    known = np.arange(50_000) < 20_000
-    plot, bars, strokes, _ = plotted(values, intervals=(low, high, known))
-    assert len(plot.svg("")) < 60_000
-    assert len(strokes) == 2
-    points = np.concatenate(strokes)
-    x, y = points[points[:, 1].argmax()]
-    assert (x, y) == pytest.approx((25_003, 9.0), abs=0.1 * 50_000 / 687)
-    assert points[:, 1].min() == pytest.approx(np.nanmin(values), abs=0.02)
-    of_known, of_open = (np.array(one) for _, one in bars)
-    assert of_open[:, :, 1].max() == pytest.approx(10.0, abs=0.02)
-    assert of_known[:, :, 0].max() < 20_000 <= of_open[:, :, 0].min() + 80.0
-
-
-def test_axes_have_round_values():
-    root = ElementTree.fromstring(str(plotted(np.array([-31.0, 62.0, 150.0]))[0].svg("")))
-    texts = [one.text for one in root.find("g").iter("text")]
-    assert texts == ["0", "50", "100", "150", "0", "1", "2"]
-    for span in (3e-4, 0.07, 0.99, 1.0, 5.0, 7e5):
-        root = ElementTree.fromstring(str(plotted(np.array([span, 2.0 * span]))[0].svg("")))
-        numbers = [float(one.text) for one in root.find("g").iter("text")][:-2]
-        assert 2 <= len(numbers) <= 6
-        np.testing.assert_allclose(np.diff(numbers), np.diff(numbers)[0])
+    axes, _ = plotted(np.linspace(0.0, 1.0, 50), limits=(-90, 90))
+    assert np.ptp(axes.get_ylim()) < 1.3
+    assert len(axes.get_lines()) == 1
+    axes, _ = plotted(np.array([0.3, 0.4]), least=0.0)
+    assert axes.get_ylim()[0] == 0.0
 
 
 def test_stills_are_dots_and_intervals_are_at_their_frames():
-    _, _, strokes, _ = plotted(np.array([1.0, np.nan, 2.0]), joined=False)
-    assert [len(one) for one in strokes] == [1, 1]
+    _, curve = plotted(np.array([1.0, np.nan]), joined=False)
+    assert curve.get_linestyle() == "None"
     known = np.array([True, False, True])
     low, high = np.array([0.0, 1.0, 2.0]), np.array([1.0, 3.0, 5.0])
-    _, bars, _, _ = plotted(np.ones(3), intervals=(low, high, known))
-    of_known, of_open = (np.array(one) for _, one in bars)
-    np.testing.assert_allclose(of_known, [[[0, 0], [0, 1]], [[2, 2], [2, 5]]], atol=0.01)
-    np.testing.assert_allclose(of_open, [[[1, 1], [1, 3]]], atol=0.01)
+    axes, _ = plotted(np.ones(3), intervals=(low, high, known))
+    of_known, of_open = ([s.tolist() for s in one.get_segments()] for one in axes.collections)
+    assert of_known == [[[0, 0], [0, 1]], [[2, 2], [2, 5]]]
+    assert of_open == [[[1, 1], [1, 3]]]
 
 
 def test_grid_joins_equal_neighbours():
     states = ["used", "used", "no-picture", "used"]
-    plot = draw_grid(["0", "1", "2", "3"], [("left", states), ("<right>", states)])
-    root = ElementTree.fromstring(str(plot.svg("use")))
-    bars = [one for one in root.findall("rect") if one.get("fill") != "none"]
-    x, y, width, height = (
-        np.array([float(one.get(key)) for one in bars]) for key in ("x", "y", "width", "height")
-    )
+    (axes,) = draw_grid(["0", "1", "2", "3"], [("left", states), ("right", states)]).axes
+    rows = [[path.get_extents() for path in one.get_paths()] for one in axes.collections]
     # The bars of a row are at its name, and rows do not overlap.
-    names = {one.text: float(one.get("y")) - 4.5 for one in root.find("g").iter("text")}
-    levels = np.repeat([names["left"], names["<right>"]], 3)
-    np.testing.assert_allclose(y + 0.5 * height, levels, atol=0.1)
-    assert (y + height)[0] < y[3]
-    spans = np.c_[x, x + width][:3] - x[0]
-    np.testing.assert_allclose(spans / spans[-1, 1], [[0, 0.5], [0.5, 0.75], [0.75, 1]], atol=1e-4)
-    first, second, third = (one.get("fill") for one in bars[:3])
+    assert [one.y0 + one.y1 for row in rows for one in row] == pytest.approx([0.0] * 3 + [2.0] * 3)
+    assert rows[0][0].y1 < rows[1][0].y0
+    spans = rows[0]
+    assert [(one.x0, one.x1) for one in spans] == [(-0.5, 1.5), (1.5, 2.5), (2.5, 3.5)]
+    first, second, third = axes.collections[0].get_facecolors().tolist()
     assert first == third != second
 
 

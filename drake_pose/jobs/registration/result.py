@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Picture
@@ -20,10 +21,9 @@ from drake_pose.csv_files import csv_text
 from drake_pose.errors import listed
 from drake_pose.files.folder import OVERLAY, REPORT, without_nan, write_file, write_summary
 from drake_pose.files.overlay import draw_overlay, draw_shapes, encode_png
-from drake_pose.files.page_plots import PagePlot
 from drake_pose.files.records import describe_job, file_digest, versions
 from drake_pose.files.replay import Pictures, import_rerun, make_recording
-from drake_pose.files.report_page import overlay_picture, page_template
+from drake_pose.files.report_page import new_plot, overlay_picture, page_template, plot_uri
 from drake_pose.files.settings import percent
 from drake_pose.jobs.registration.inputs import RegistrationInputs
 from drake_pose.jobs.registration.settings import AuditSettings
@@ -429,6 +429,7 @@ def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
             pictures.append(overlay_picture(folder, camera, frame, errors[frame]))
         for frame in compared_frames(errors):
             pairs.append(overlay_picture(folder, camera, frame, errors[frame], AS_GIVEN))
+    figures = [(name, plot_offset(one)) for name, one in summary["cameras"].items()]
     return page_template("drake_pose.jobs.registration").render(
         summary=summary,
         answer=registration_answer(summary["cameras"], summary.get("refused", ())),
@@ -445,7 +446,7 @@ def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
         by_points=first["masks"] == "none",
         # Cameras that see a target have no time offset.
         clocks=first["masks"] == "found" and "time_offset_scores" in first,
-        offsets={name: plot_offset(one) for name, one in summary["cameras"].items()},
+        offsets={name: figure and plot_uri(figure) for name, figure in figures},
         normal=_NORMAL,
         pictures=[picture for picture in pictures if picture is not None],
         pairs=[picture for picture in pairs if picture is not None],
@@ -493,28 +494,24 @@ def compared_frames(errors: Mapping[str, float]) -> Sequence[str]:
     return tuple(dict.fromkeys([in_order[0], in_order[len(in_order) // 2]]))
 
 
-def plot_offset(camera: Mapping[str, Any]) -> PagePlot | None:
+def plot_offset(camera: Mapping[str, Any]) -> Figure | None:
     """Plot the scores of scanned time offsets; None: there are none.
 
     A vertical line marks the estimated offset, in its 95 % interval.
 
     camera: its part of summary.json.
     """
-    tried = np.array(camera.get("time_offset_scores") or ()).reshape(-1, 2) * [1e3, 100.0]
+    tried = np.array(camera.get("time_offset_scores") or ()).reshape(-1, 2)
     if len(tried) < 2:
         return None
-    (first, low), (last, high) = tried.min(axis=0).tolist(), tried.max(axis=0).tolist()
-    margin = 0.08 * max(high - low, 1.0)
-    plot = PagePlot((first, last), (low - margin, high + margin))
+    figure, axes = new_plot()
+    axes.plot(1e3 * tried[:, 0], 100.0 * tried[:, 1], marker=".", markersize=3)
     if camera["time_offset_s"] is not None:
-        value, half = (1e3 * camera[key] for key in ("time_offset_s", "time_offset_sd_s"))
-        ends = np.clip([value - _NORMAL * half, value + _NORMAL * half], first, last)
-        left, right = plot.columns(ends).tolist()
-        middle = np.array([0.5 * ends.sum()])
-        plot.bars(middle, np.array([plot.y[0]]), np.array([plot.y[1]]), "#c5dfee", right - left)
-        plot.line("#d55e00", x=value)
-    plot.curve(tried[:, 0], tried[:, 1], "#0072b2", 2.0)
-    return plot
+        value, margin = 1e3 * camera["time_offset_s"], 1e3 * _NORMAL * camera["time_offset_sd_s"]
+        axes.axvspan(value - margin, value + margin, color="#c5dfee")
+        axes.axvline(value, color="#d55e00")
+        axes.set_xlim(1e3 * tried[0, 0], 1e3 * tried[-1, 0])
+    return figure
 
 
 def check_exports(formats: Collection[str], cameras: Iterable[Camera]) -> None:

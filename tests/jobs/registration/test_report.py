@@ -12,7 +12,6 @@ from drake_pose.jobs.registration.result import (
     plot_offset,
 )
 from drake_pose.registration.recording import TimeOffset
-from tests.files.test_report_page import drawn_paths
 from tests.search.arms import arm_cameras
 
 
@@ -48,15 +47,13 @@ def test_time_offset_is_drawn_at_the_peak_of_the_scores(tmp_path, late):
     assert re.search(
         r"explains 42\S*.% of the changes in its pictures, chance 6\S*.% \(p-value 2e-06\)", page
     )
-    assert page.count('<svg class="plot"') == 1
-    plot = plot_offset({"time_offset_scores": scores.tolist(), **told})
-    band, line, curve = (strokes for _, strokes in drawn_paths(plot))
-    # Coordinates are rounded to a tenth of a pixel, of 687 and 134.
-    found = np.concatenate(curve) / [1e3, 100.0]
-    np.testing.assert_allclose(found, scores, atol=0.001)
-    np.testing.assert_allclose([line[0][:, 0], band[0][:, 0]], 1e3 * late, atol=0.2)
-    width = float(re.search('stroke="#c5dfee" stroke-width="([\\d.]+)"', plot.svg(""))[1])
-    assert width / 687.0 * 2000.0 == pytest.approx(2.0 * 39.2, rel=0.01)
+    assert page.count('<img class="plot" src="data:image/') == 1
+    (axes,) = plot_offset({"time_offset_scores": scores.tolist(), **told}).axes
+    curve, line = (one.get_xydata() for one in axes.lines)
+    np.testing.assert_allclose(curve, scores * [1e3, 100.0])
+    np.testing.assert_allclose(line[:, 0], curve[curve[:, 1].argmax(), 0], atol=1e-9)
+    band = axes.patches[0].get_extents().transformed(axes.transData.inverted())
+    assert (band.x0, band.x1) == pytest.approx((1e3 * late - 39.2, 1e3 * late + 39.2))
 
 
 def test_undetermined_time_offset_and_given_focal_length(tmp_path):

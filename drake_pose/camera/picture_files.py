@@ -75,6 +75,21 @@ def decode_colours(data: bytes, path: Path, error_type: type[DrakePoseError]) ->
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
+def picture_size(path: Path, error_type: type[DrakePoseError]) -> tuple[int, int] | None:
+    """Return width and height [pixel] of a PNG or JPEG image, without decoding its pixels.
+
+    The file is as whole as `read_picture` asks. None: a check needs the pixels, or the file's EXIF
+    data may turn the image.
+
+    Raises:
+        error_type: the file is unreadable; the message names it.
+    """
+    data = _read(path, error_type)
+    size = _require_whole(data, path, error_type)
+    is_deep_png = data[24:25] == b"\x10" and data.startswith(b"\x89PNG")
+    return None if is_deep_png or b"eXIf" in data or b"Exif\0" in data else size
+
+
 def read_binary_mask(
     path: Path,
     error_type: type[DrakePoseError],
@@ -224,8 +239,28 @@ def _decode(
     """Return a complete PNG or JPEG image as OpenCV decodes it: blue, green, red, or grey values.
 
     Args:
-        data: content of the file.
+        data, path, error_type, only_png: as of `_require_whole`, whose errors are raised.
         how: OpenCV's reading mode, which determines the shape.
+    """
+    _require_whole(data, path, error_type, only_png=only_png)
+    is_deep = how == cv2.IMREAD_COLOR and data[24:25] == b"\x10" and data[:1] != b"\xff"
+    how |= cv2.IMREAD_ANYDEPTH if is_deep else 0
+    try:
+        decoded = cv2.imdecode(np.frombuffer(data, np.uint8), how)
+    except cv2.error:
+        decoded = None
+    if decoded is None:
+        raise error_type(f"{path}: not a whole PNG or JPEG picture")
+    return upper_bits(decoded, str(path), error_type) if is_deep else np.asarray(decoded)
+
+
+def _require_whole(
+    data: bytes, path: Path, error_type: type[DrakePoseError], *, only_png: bool = False
+) -> tuple[int, int]:
+    """Return width and height of a complete PNG or JPEG image [pixel]; pixels are not decoded.
+
+    Args:
+        data: content of the file.
         path: the file, for messages.
         error_type: class of the exceptions.
         only_png: refuse JPEG.
@@ -258,15 +293,7 @@ def _decode(
         raise error_type(
             f"{path}: {width} x {height} pixels are too many: at most {LARGEST_SIDE} a side"
         )
-    is_deep = how == cv2.IMREAD_COLOR and data[24:25] == b"\x10" and not is_jpeg
-    how |= cv2.IMREAD_ANYDEPTH if is_deep else 0
-    try:
-        decoded = cv2.imdecode(np.frombuffer(data, np.uint8), how)
-    except cv2.error:
-        decoded = None
-    if decoded is None:
-        raise error_type(f"{path}: not a whole PNG or JPEG picture")
-    return upper_bits(decoded, str(path), error_type) if is_deep else np.asarray(decoded)
+    return width, height
 
 
 def upper_bits(picture: Any, where: str, error_type: type[DrakePoseError]) -> Picture:
@@ -380,6 +407,17 @@ class VideoPictures:
         self._next += 1
         self.time = 1e-3 * self._capture.get(cv2.CAP_PROP_POS_MSEC)
         return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+    def require_before(self, number: int) -> None:
+        """Check that the images before the one just read can be decoded.
+
+        OpenCV has decoded them on its way.
+
+        Raises:
+            SceneError: an image cannot be decoded.
+        """
+        for earlier in range(number if self._timed is not None else 0):
+            self.read(earlier)
 
 
 class TimedVideo:

@@ -169,11 +169,29 @@ class PartColours:
         counts = np.zeros((2, len(outlines)))
         for camera, picture in views:
             labels = draw_labels(outlines, range(1, 1 + len(outlines)), camera.X_CW @ X_WN, camera)
-            covered = labels > 0
-            parts = labels[covered] - 1
-            own = parts[self.is_own[parts, colour_numbers(picture[covered])]]
-            counts += [np.bincount(one, minlength=len(outlines)) for one in (own, parts)]
+            _count_own(labels, picture, self.is_own, counts)
         return np.where(counts[1] < 100, np.nan, counts[0] / np.maximum(counts[1], 1.0))
+
+
+@compiled
+def _count_own(labels: NDArray[np.int16], picture: Picture, is_own: Mask, counts: Array) -> None:
+    """Add each part's pixels with own colours, and all of its pixels.
+
+    Args:
+        labels: (H, W) index of the part from 1 on, 0 beside the body.
+        picture: (H, W, 3 or 4) image.
+        is_own: (nodes, COLOURS) whether a colour is the part's own.
+        counts: (2, nodes) numbers of pixels, added to in place.
+    """
+    for row in range(labels.shape[0]):
+        for column in range(labels.shape[1]):
+            part = labels[row, column] - 1
+            if part >= 0:
+                red, green, blue = picture[row, column, :3]
+                # As `colour_numbers`.
+                number = ((red & 240) << 4) | (green & 240) | (blue >> 4)
+                counts[0, part] += is_own[part, number]
+                counts[1, part] += 1.0
 
 
 def search_line_step(number: int) -> int:

@@ -492,10 +492,7 @@ def _check_start(
             f"{scene.path}: the pose in the first frame, '{first}', is unknown; add its mask "
             f"{where} (drake-pose masks makes one), or its joint positions (--start FILE.csv)"
         )
-    wanted = set(frames)
-    for name, frame in scene.images:
-        if frame in wanted:
-            scene.read_image(name, frame)
+    scene.require_images(set(frames))
 
 
 def bundled_person() -> Path:

@@ -2,7 +2,7 @@
 
 import os
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -22,6 +22,7 @@ from drake_pose.camera.picture_files import (
     frame_number,
     in_order,
     natural_key,
+    picture_size,
     read_picture,
 )
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
@@ -204,6 +205,30 @@ class Scene:
         # Return a copy, since callers draw over the picture.
         self._latest[camera] = frame, picture
         return picture.copy()
+
+    def require_images(self, frames: Collection[str]) -> None:
+        """Check that the pictures of these frames can be read, before the work on them begins.
+
+        Of PNG and JPEG files size and structure are checked, videos are decoded.
+
+        Raises:
+            SceneError: the file is not a picture of the camera's size.
+        """
+        last: dict[str, str] = {}
+        for (name, frame), file in self.images.items():
+            if frame not in frames:
+                continue
+            size = self.cameras[name]
+            if name not in self.readers and file.suffix.lower() in VIDEOS:
+                last[name] = max(frame, last.get(name, frame), key=int)
+            elif name in self.readers or picture_size(file, SceneError) != (
+                size.width,
+                size.height,
+            ):
+                self.read_image(name, frame)
+        for name, frame in last.items():
+            self.read_image(name, frame)
+            self._videos[self.images[name, frame]].require_before(int(frame))
 
     def _file(self, files: Mapping[tuple[str, str], Path], camera: str, frame: str) -> Path:
         """Return the file of a camera's frame in ``files``, which are by (camera, frame).

@@ -21,7 +21,7 @@ from drake_pose.silhouette.outline import Outline, outline_of_triangles
 def load_or_make(
     made_of: tuple[bytes, ...],
     make: Callable[[], Outline],
-    least_time: float = 0.1,
+    least_time: float = 0.004,
     most_files: int = 500,
 ) -> Outline:
     """Return a surface from its file, or make and store it.
@@ -30,8 +30,8 @@ def load_or_make(
         made_of: everything the surface depends on, including versions of the code that makes it;
             its digest is the file's name.
         make: makes the surface; it is called if there is no valid file.
-        least_time: minimum time [s] of making a surface for it to be stored. Fits of persons make
-            many surfaces faster than this, and a file saves little.
+        least_time: minimum time [s] of making a surface for it to be stored; reading a file takes
+            about a millisecond.
         most_files: maximum number of files (60 kB for 2500 triangles); the least recently used ones
             are removed.
     """

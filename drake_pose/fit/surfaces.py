@@ -7,9 +7,7 @@ from threading import Lock
 
 import fast_simplification
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from drake_pose.arrays import Array
 from drake_pose.body import TriangleMesh
@@ -89,6 +87,8 @@ def simplify_or_hull(
     for outline in outlines:
         few = _simplify(outline, count)
         if len(few.triangles) > limit * count:
+            import trimesh  # Slow to import, and needed for few models.
+
             hull = trimesh.convex.convex_hull(few.vertices)
             mesh = TriangleMesh(np.array(hull.vertices), np.array(hull.faces))
             few = _simplify(outline_from_mesh(mesh), count)
@@ -206,6 +206,10 @@ def surface_distance(one: Outline, other: Outline) -> float:
 
 def _squared_distances(one: Outline, other: Outline) -> Array:
     """Return (300,) squared distances of points spread over a surface to another one [m^2]."""
+    # Slow to import, and not needed where surfaces are stored.
+    import trimesh
+    from scipy.spatial import cKDTree
+
     points, corners = _sample_surface(one), other.vertices[other.triangles]
     centers = corners.mean(axis=1)
     radii = np.linalg.norm(corners - centers[:, None], axis=2).max(axis=1)

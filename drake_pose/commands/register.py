@@ -244,6 +244,12 @@ def _say_clock(one: Mapping[str, Any]) -> str:
             f"its pose explains {percent(one['explained'])} of the changes in its pictures, and "
             f"chance {percent(one['explained_by_chance'])} (p-value {one['p_value']:.1g})"
         ]
+        if other := one["runner_up"]:
+            texts.append(
+                f"of the best other pose, {other['distance_mm']:.0f} mm and "
+                f"{other['rotation_deg']:.0f} degrees away, less of the contours fits by "
+                f"{other['margin_sd']:.1f} standard deviations"
+            )
     if one["time_offset_s"] is not None:
         value, deviation = 1e3 * one["time_offset_s"], 1e3 * one["time_offset_sd_s"]
         word = "later" if value > 0.0 else "earlier"

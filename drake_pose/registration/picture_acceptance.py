@@ -48,6 +48,7 @@ class PictureRegistration:
         recording: the recording, with the drift of its clock removed.
         joint_offsets: (m,) added to the frames' values for their masks and log-odds.
         by_chance: fraction that a search explained with the joint positions of other pictures.
+        runner_up: as of ``PictureStart``.
     """
 
     found: RegisteredCamera
@@ -59,6 +60,14 @@ class PictureRegistration:
     recording: Recording
     joint_offsets: Array
     by_chance: float
+    runner_up: tuple[Array, float] | None
+
+    @property
+    def ratios(self) -> dict[str, float]:
+        """Inlier ratios by frame of the fit."""
+        (posed,) = self.fit.fit.views
+        names = [frame.name for frame in posed.frames]
+        return dict(zip(names, self.fit.ratios.tolist(), strict=True))
 
     @property
     def p_value(self) -> float:
@@ -73,7 +82,9 @@ class PictureStart(NamedTuple):
     time offset. alternatives: other poses X_CW (4, 4) that explain the pictures about as well.
     by_chance: fraction that a search explained with the joint positions of other pictures.
     joint_offsets: (m,) approximate ones [rad or m]; None: 0. search: a search in the pictures to
-    fit, whose backgrounds are used again; None: they are estimated.
+    fit, whose backgrounds are used again; None: they are estimated. runner_up: X_CW (4, 4) of the
+    best pose found elsewhere, and by how much less of the contours fits there (``ratio_margin``
+    [sd]); None: there is none.
     """
 
     camera: PinholeCamera
@@ -83,6 +94,7 @@ class PictureStart(NamedTuple):
     by_chance: float
     joint_offsets: Array | None = None
     search: PictureSearch | None = None
+    runner_up: tuple[Array, float] | None = None
 
     @classmethod
     def of(cls, one: PictureRegistration) -> "PictureStart":
@@ -203,6 +215,7 @@ def accept_fit(
         recording,
         joint_offsets,
         start.by_chance,
+        start.runner_up,
     )
 
 

@@ -18,7 +18,6 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.fit.base_edges import BASE, joint_rotation, locate_base
 from drake_pose.fit.covariance import vuong_statistic
-from drake_pose.fit.explain_kernel import Explained
 from drake_pose.fit.problem import TIME_OFFSET
 from drake_pose.registration.offset_search import joints_like_cameras
 from drake_pose.registration.picture_acceptance import (
@@ -29,15 +28,22 @@ from drake_pose.registration.picture_acceptance import (
     p_value_of,
     unexplained_error,
 )
-from drake_pose.registration.picture_search import PictureFit, PictureSearch, PosedPicture
+from drake_pose.registration.picture_search import (
+    PictureFit,
+    PictureSearch,
+    PosedPicture,
+    RoughPose,
+    ratio_margin,
+    rotation_between,
+)
 from drake_pose.registration.pyramid_level import evidence
 from drake_pose.registration.recording import (
     NO_CLOCK,
     Recording,
-    TimeOffset,
     choose_pictures,
     mean_time,
     posed_pictures,
+    scan_time_offsets,
 )
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.registration.shared_fit import SHARED
@@ -106,91 +112,138 @@ def _register(
     offset_joints: Sequence[str],
     guessed_lens: bool = False,
     most: int = 3,
+    undecided: float = 3.0,
     is_mirrored: bool = False,
-    before: Sequence[tuple[PictureSearch, PinholeCamera]] = (),
+    before: Sequence[RoughPose] = (),
 ) -> PictureRegistration:
     """As register_pictures.
 
     Args:
         frames: indices as of choose_pictures.
         most: maximum number of pose hypotheses that are fitted.
+        undecided: mirrored pictures are fitted, too, unless the rough fit in the pictures as they
+            are is better by this margin (``ratio_margin``). Where poses were right it was 6 to 15.
         is_mirrored: whether these are pictures that were mirrored for a second search.
         before: what a first search found, none of which was accepted; empty: this is the first.
     """
     chosen, moving = frames
-    pictures = posed_pictures(recording, chosen, 0.0)
-    how = PictureSearch(body, camera, pictures), offset_joints, most, guessed_lens
-    near = [*before] or _search(*how)
+    begun = PictureSearch(body, camera, posed_pictures(recording, chosen, 0.0))
+    near, poses = [*before], list[Array]()
+    if not near:
+        poses = begun.search()
+        near = _fit_near(begun, poses[:most], offset_joints, guessed_lens)
     if not near:
         raise unexplained_error(camera, "no pose shows the body in two pictures")
-    by_chance = explained_by_chance(near[0][0])
-    p_value = p_value_of(_explained(*near[0])[0], by_chance)
-    again = bool(before) or p_value > ACCEPTANCE.max_p_value
+    by_chance = explained_by_chance(near[0].search)
+    again = bool(before) or p_value_of(near[0].explained, by_chance) > ACCEPTANCE.max_p_value
     if again:
         # Other starts in larger pictures, which show thin links, may lead to a pose that the first
         # missed, as they did in 2 of 3 drawn rooms with an SO-100.
-        more = _search(*how, rotations=1700, least_width=150)
-        near = sorted([*near, *more], key=lambda one: -evidence(*_explained(*one)))
-        by_chance = max(by_chance, explained_by_chance(near[0][0], least_width=150))
-    search, start = near[0]
-    if explained_as_mirrored(search, start):
-        explained = _explained(search, start)[0]
+        more = begun.search(rotations=1700, least_width=150)
+        near = _in_order([*near, *_fit_near(begun, more[:most], offset_joints, guessed_lens)])
+        poses += more
+        by_chance = max(by_chance, explained_by_chance(near[0].search, least_width=150))
+    best = near[0]
+    opposite = opposite_pose(best)
+    advantage = -np.inf if opposite is None else ratio_margin(opposite.ratios, best.ratios)
+    if advantage > 1.96:
         error = unexplained_error(
             camera,
-            f"the best one explains {max(explained, 0.0):.0%} of all changes, and one in mirrored "
-            "pictures explains more",
+            f"at the best one {np.mean([*best.ratios.values()]):.0%} of the contours fit, and in "
+            "mirrored pictures more",
         )
         if is_mirrored:
             raise error
         both = camera.mirrored(), recording.mirrored()
         with suppress(RegistrationError):
-            _register(body, *both, frames, focal, offset_joints, guessed_lens, most, True)
-            error = RegistrationError(
-                f"camera '{camera.name}': its pictures are mirrored: a pose explains them only "
-                "with left and right exchanged. Mirror them again. Nothing was written"
-            )
+            _register(body, *both, frames, focal, offset_joints, guessed_lens, is_mirrored=True)
+            error = _mirrored_error(camera)
         raise error
-    gains = search.compared.tile_gains(start.X_CW)
-    # Hypotheses that explain about as much are fitted again: they may converge to the best one.
-    close = [
-        (each, one.X_CW)
-        for each, one in near[1:]
-        if vuong_statistic(gains, each.compared.tile_gains(one.X_CW)) <= 1.96
-    ]
-    fits = _coarse_fits([each for each, _ in close], [X_CW for _, X_CW in close])
-    alike = [one.X_CW for _, one in fits]
-    alternatives = search.compared.distinct([start.X_CW, *alike])[1:]
-    rows, clock, offsets = [*chosen, *moving], NO_CLOCK, search.joint_offsets
-    posed = posed_pictures(recording.with_offsets(offsets), rows, 0.0, search.frames)
-    fitted = search.with_frames(posed)
-    if recording.times is not None:
-        clock = scan_time_offsets(fitted, start, recording.with_offsets(offsets))
-    found = PictureStart(start, rows, clock, alternatives, by_chance, offsets, fitted)
+    alternatives, runner_up = _other_poses(near, poses)
+
+    def fit(pose: RoughPose, recording: Recording) -> PictureRegistration:
+        rows, offsets, clock = [*chosen, *moving], pose.search.joint_offsets, NO_CLOCK
+        corrected = recording.with_offsets(offsets)
+        fitted = pose.search.with_frames(posed_pictures(corrected, rows, 0.0, pose.search.frames))
+        if recording.times is not None:
+            clock = scan_time_offsets(fitted, pose.camera, corrected)
+        start = PictureStart(
+            pose.camera, rows, clock, alternatives, by_chance, offsets, fitted, runner_up
+        )
+        return fit_pictures(body, start, recording, focal, offset_joints)
+
     try:
-        return fit_pictures(body, found, recording, focal, offset_joints)
+        found = fit(best, recording)
     except RegistrationError:
         if again:
             raise
-    rest = frames, focal, offset_joints, guessed_lens, most, is_mirrored, near
-    return _register(body, camera, recording, *rest)
+        rest = frames, focal, offset_joints, guessed_lens, most, undecided, is_mirrored, near
+        return _register(body, camera, recording, *rest)
+    if opposite is not None and advantage > -undecided:
+        other = None
+        with suppress(RegistrationError):
+            other = fit(opposite, recording.mirrored())
+        if other is not None and ratio_margin(other.ratios, found.ratios) > 1.96:
+            raise _mirrored_error(camera)
+    return found
 
 
-def _search(
+def _other_poses(
+    near: Sequence[RoughPose], poses: Sequence[Array], apart: float = 0.1
+) -> tuple[list[Array], tuple[Array, float] | None]:
+    """Return other poses that fit about as well as the best one, and the runner-up.
+
+    Args:
+        near: roughly fitted poses, the best first.
+        poses: all poses X_CW (4, 4) of the search.
+        apart: minimum rotation between the best and the runner-up [rad]. Fits of the latter start
+            eight times as far away: from 0.5 rad many lead to the best one.
+
+    Returns:
+        Poses X_CW (4, 4); and the runner-up as of ``PictureStart``.
+    """
+    best = near[0]
+    level, X_CW = best.search.compared, best.camera.X_CW
+    gains = level.tile_gains(X_CW)
+    # Hypotheses that explain about as much are fitted again: they may converge to the best one.
+    close = [
+        one
+        for one in near[1:]
+        if vuong_statistic(gains, one.search.compared.tile_gains(one.camera.X_CW)) <= 1.96
+    ]
+    again = _coarse_fits([one.search for one in close], [one.camera.X_CW for one in close])
+    far = [one for one in poses if rotation_between(one, X_CW) > 8.0 * apart][:2]
+    others = _in_order([*again, *near[1:], *_coarse_fits([best.search] * len(far), far)])
+    others = [one for one in others if rotation_between(one.camera.X_CW, X_CW) > apart]
+    margins = [
+        (one.camera.X_CW, ratio_margin(best.ratios, one.ratios)) for one in [*again, *others]
+    ]
+    alike = [other for other, margin in margins if margin <= 1.96]
+    runner_up = margins[len(again)] if others else None
+    return level.distinct([X_CW, *alike])[1:], runner_up
+
+
+def _mirrored_error(camera: PinholeCamera) -> RegistrationError:
+    """Return the error for mirrored pictures."""
+    return RegistrationError(
+        f"camera '{camera.name}': its pictures are mirrored: a pose explains them only with left "
+        "and right exchanged. Mirror them again. Nothing was written"
+    )
+
+
+def _fit_near(
     search: PictureSearch,
+    poses: list[Array],
     offset_joints: Sequence[str],
-    most: int,
-    guessed_lens: bool = False,
-    rotations: int = 1200,
-    least_width: int = 0,
-) -> list[tuple[PictureSearch, PinholeCamera]]:
-    """Return searches with their cameras roughly fitted, best first.
+    guessed_lens: bool,
+) -> list[RoughPose]:
+    """Return roughly fitted cameras, best first.
 
     Args:
         search: the search; those returned have joint offsets added, or another lens.
-        offset_joints, most, guessed_lens: as of `_register`.
-        rotations, least_width: as of ``PictureSearch.search``.
+        poses: X_CW (4, 4) from which the fits start.
+        offset_joints, guessed_lens: as of `_register`.
     """
-    poses = search.search(rotations=rotations, least_width=least_width)[:most]
     if guessed_lens:
         search, poses = _scan_lenses(search, poses)
     searches = [search] * len(poses)
@@ -200,22 +253,18 @@ def _search(
     return _coarse_fits(searches, poses)
 
 
-def _explained(search: PictureSearch, camera: PinholeCamera) -> tuple[float, float]:
-    """Return what a search's pictures explain at a camera's pose, see ``PyramidLevel``."""
-    return search.compared.explained(camera.X_CW)
-
-
-def _coarse_fits(
-    searches: Sequence[PictureSearch], X_CW: Sequence[Array]
-) -> list[tuple[PictureSearch, PinholeCamera]]:
-    """Return searches with their cameras roughly fitted from poses (4, 4), best first.
+def _coarse_fits(searches: Sequence[PictureSearch], X_CW: Sequence[Array]) -> list[RoughPose]:
+    """Return cameras roughly fitted from poses (4, 4), best first.
 
     Poses at which the body leaves the pictures are left out.
     """
     fitted = map_ordered(lambda one: one[0].coarse_fit(one[1]), zip(searches, X_CW, strict=True))
-    both = zip(searches, fitted, strict=True)
-    near = sorted(((a, b) for a, b in both if b is not None), key=lambda one: -evidence(*one[1][1]))
-    return [(search, camera) for search, (camera, _) in near]
+    return _in_order([one for one in fitted if one is not None])
+
+
+def _in_order(poses: Sequence[RoughPose]) -> list[RoughPose]:
+    """Return poses, the one with the most evidence first."""
+    return sorted(poses, key=lambda one: -evidence(one.explained, one.contour))
 
 
 def explained_by_chance(
@@ -239,9 +288,9 @@ def explained_by_chance(
             logarithms differ by 0.04 in the mean, with a standard deviation of 0.17.
     """
     exchanged = search.with_frames(exchange_values(search.frames))
-    best = exchanged.search(rounds, rotations, least_width)[:1]
+    best = exchanged.search(rounds, rotations, least_width, others=0)[:1]
     found = _coarse_fits([exchanged] * len(best), best)
-    return max((exchanged.compared.explained(one.X_CW)[0] for _, one in found), default=0.0)
+    return max((one.explained for one in found), default=0.0)
 
 
 def exchange_values(pictures: Sequence[PosedPicture], shift: int = 5) -> list[PosedPicture]:
@@ -253,36 +302,27 @@ def exchange_values(pictures: Sequence[PosedPicture], shift: int = 5) -> list[Po
     ]
 
 
-def explained_as_mirrored(
-    search: PictureSearch,
-    camera: PinholeCamera,
-    *,
-    evaluations: int = 250,
-    turn: float = 0.25,
-    starts: int = 6,
-    threshold: float = 1.96,
-) -> bool:
-    """Return whether a search's pictures are explained significantly better if mirrored.
+def opposite_pose(
+    best: RoughPose, *, evaluations: int = 250, turn: float = 0.25, starts: int = 6
+) -> RoughPose | None:
+    """Return the best pose on the opposite side of the body, in the mirrored pictures.
 
     From behind, a distant body has the mirror image of its silhouette. So mirrored pictures are
     explained by a camera on the opposite side of the body, though less well, as near parts are
-    shown larger. That of the mirrored pictures is compared with the given one.
+    shown larger. Fewer of the contours fit then; what both poses explain differs too little.
 
     Args:
-        search: a search in the pictures.
-        camera: at its pose in the pictures as they are.
+        best: the pose in the pictures as they are.
         evaluations, turn: of each local search, see ``PyramidLevel.improve``.
         starts: number of local searches.
-        threshold: minimum Vuong statistic of the mirrored pictures' advantage.
+
+    Returns:
+        The pose; None: the body leaves the pictures.
     """
-    mirrored, level = search.mirrored(), search.compared
-    X_CW = level.opposite(camera.X_CW)
+    mirrored = best.search.mirrored()
+    X_CW = best.search.compared.opposite(best.camera.X_CW)
     _, improved = mirrored.compared.improve([X_CW] * starts, evaluations, turn)
-    opposite = mirrored.coarse_fit(improved[0])
-    if opposite is None:
-        return False
-    gains = mirrored.compared.tile_gains(opposite[0].X_CW)[:, ::-1]
-    return vuong_statistic(gains, level.tile_gains(camera.X_CW)) > threshold
+    return mirrored.coarse_fit(improved[0])
 
 
 def _scan_lenses(
@@ -534,62 +574,3 @@ def offsets_in_pictures(
             X_CW = camera.X_CW @ joint_rotation(kinematics, values, joint, by)
             cameras[name] = camera.with_pose(np.linalg.inv(X_CW))
     return start, static, cameras
-
-
-def scan_time_offsets(
-    search: PictureSearch,
-    camera: PinholeCamera,
-    recording: Recording,
-    *,
-    rates: Sequence[float] = (-0.2, -0.15, -0.1, -0.05, 0.05, 0.1, 0.15, 0.2, 0.25),
-    start_within: float = 0.3,
-    much_better: float = 1.01,
-) -> TimeOffset:
-    """Return the time offset that explains pictures best, for a camera at a known pose.
-
-    Offsets from -1 to 1 s are scanned, then drifts of the log's clock. Standard deviations are not
-    estimated (infinite).
-
-    Args:
-        search: a search in the pictures that are used.
-        camera: at its pose.
-        recording: their recording, with the same joint offsets.
-        rates: scanned drifts [s/s].
-        start_within: for a drift both clocks start together within this time [s].
-        much_better: minimum ratio of a drift's score to that of the best constant offset.
-    """
-    offsets = np.linspace(-1.0, 1.0, 81)
-    level = search.compared
-    rows = [recording.names.index(one.name) for one in search.frames]
-
-    def gains_at(clock: Recording, tried: Array) -> Array:
-        """Return log-likelihood gains (k,) at k time offsets [s]; NaN without logged joints."""
-        several = [clock.values_at(offset)[rows] for offset in tried.tolist()]
-
-        def gain(values: Array) -> float:
-            if not np.isfinite(values).all():
-                return np.nan
-            return float(level.statistics(camera.X_CW, search.nodes_at(values))[Explained.GAIN])
-
-        return np.array(map_ordered(gain, several))
-
-    scores = gains_at(recording, offsets)
-    k = int(np.nanargmax(scores))
-    offset, drift = float(offsets[k]), 0.0
-    if 0 < k < len(scores) - 1 and np.isfinite(scores[k - 1 : k + 2]).all():
-        low, middle, high = scores[k - 1 : k + 2]
-        bend = low - 2.0 * middle + high
-        if bend < 0.0:
-            offset += 0.5 * float((low - high) / bend) * float(offsets[1] - offsets[0])
-    best, most = scores[k], much_better * scores[k]
-    if recording.times is not None:
-        first, mean = float(recording.times[0]), mean_time(recording, rows)
-        starts = np.linspace(-start_within, start_within, 13)
-        for rate in rates:
-            gains = gains_at(recording.with_drift(rate, first), starts)
-            if np.isfinite(gains).any() and (gain := float(np.nanmax(gains))) > most:
-                most, drift = gain, rate
-                offset = float(starts[int(np.nanargmax(gains))]) + rate * (mean - first)
-    known = np.isfinite(scores)
-    tried = np.column_stack([offsets[known], scores[known] / max(best, 1e-9)])
-    return TimeOffset(offset, np.inf, tried, drift)

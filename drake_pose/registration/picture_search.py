@@ -8,10 +8,10 @@ fitted on search lines across the contour in the pixels' foreground log-odds.
 """
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -90,6 +90,46 @@ class PictureFit:
     def covariance(self) -> Array:
         """Covariance (u, u) of the shared unknowns."""
         return np.asarray(np.sum(self.fit.covariances(self.found, self.inliers), axis=0))
+
+
+class RoughPose(NamedTuple):
+    """A camera fitted roughly to pictures.
+
+    Attributes:
+        search: the search in these pictures.
+        camera: at its pose, with the pictures' original size.
+        explained, contour: as of ``PictureFit``.
+        ratios: inlier ratios by frame.
+    """
+
+    search: "PictureSearch"
+    camera: PinholeCamera
+    explained: float
+    contour: float
+    ratios: Mapping[str, float]
+
+
+def ratio_margin(
+    ratios: Mapping[str, float], others: Mapping[str, float], floor: float = 0.02
+) -> float:
+    """Return by how much more of the contours fits at one pose than at another [sd].
+
+    The scatter of the differences in the same frames gives the standard deviation of their mean.
+
+    Args:
+        ratios, others: inlier ratios by frame, at the one pose and at the other.
+        floor: added to this deviation, as fits to one pose from different starts differ by as much.
+    """
+    more = np.array([ratios[name] - others[name] for name in ratios if name in others])
+    if len(more) < 2:
+        return 0.0
+    return float(more.mean() / np.hypot(more.std(ddof=1) / np.sqrt(len(more)), floor))
+
+
+def rotation_between(X_CW: Array, other: Array) -> float:
+    """Return the angle between the rotations of two poses (4, 4) [rad]."""
+    cosine = 0.5 * (np.einsum("ij,ij", X_CW[:3, :3], other[:3, :3]) - 1.0)
+    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
 def node_places(body: RegistrationBody, values: Array) -> Array:
@@ -171,6 +211,8 @@ class PictureSearch:
         ),
         rotations: int = 1200,
         least_width: int = 0,
+        others: int = 8,
+        apart: float = 1.0,
     ) -> list[Array]:
         """Return pose hypotheses X_CW (4, 4), best first.
 
@@ -179,6 +221,9 @@ class PictureSearch:
                 hypotheses, the number of evaluations for each, and the first step's rotation [rad].
             rotations: number of rotations over the sphere, and again near upright.
             least_width: minimum width of the pictures in all rounds [pixel].
+            others: number of hypotheses after the first round, rotated from the best by `apart` or
+                more [rad], that are improved again; two of these are the last ones returned.
+            apart: as above.
         """
         level = self._level(max(rounds[0][0], least_width))
         found = level.starts(rotations)
@@ -187,10 +232,16 @@ class PictureSearch:
         for frames, fraction in (*first, (len(self.frames), 1.0)):
             found = level.best(found, frames, fraction)
         after = (*(kept for _, kept, _, _ in rounds[1:]), rounds[-1][1])
+        every = list[list[Array]]()
         for (width, kept, evaluations, turn), most in zip(rounds, after, strict=True):
             level = self._level(max(width, least_width))
-            found = level.distinct(level.improve(found[:kept], evaluations, turn)[1], most)
-        return found
+            every.append(level.improve(found[:kept], evaluations, turn)[1])
+            found = level.distinct(every[-1], most)
+        far = [one for one in every[0] if rotation_between(one, found[0]) >= apart][:others]
+        for width, _, evaluations, turn in rounds[-2:] if far else ():
+            level = self._level(max(width, least_width))
+            far = level.distinct(level.improve(far, evaluations, turn)[1], 2)
+        return [*found, *far]
 
     def with_offsets(self, joint_offsets: Array) -> "PictureSearch":
         """Return the same search with offsets (m,) [rad or m] added to all frames' values."""
@@ -328,13 +379,8 @@ class PictureSearch:
             best = tried
         return best
 
-    def coarse_fit(self, X_CW: Array) -> tuple[PinholeCamera, tuple[float, float]] | None:
-        """Fit a camera roughly from a pose X_CW (4, 4).
-
-        Returns:
-            the camera at the fitted pose, with its pictures' original size; and its scores in
-            `compared` (see ``PyramidLevel.explained``). None: the body leaves the pictures.
-        """
+    def coarse_fit(self, X_CW: Array) -> "RoughPose | None":
+        """Fit a camera roughly from a pose X_CW (4, 4); None: the body leaves the pictures."""
         frames, small = self._small
         stages = ((*(12.0,) * 4, *(8.0,) * 4, *(5.0,) * 4), (*(6.0,) * 3, *(4.0,) * 3))
         for scales in stages:
@@ -344,8 +390,14 @@ class PictureSearch:
             if posed is None:
                 return None
             fit = SharedFit([posed], [X_CW], fit_biases=False)
-            X_CW = fit.cameras(fit.fit(_stages(scales, posed)))[0].X_CW
-        return self.camera.with_pose(np.linalg.inv(X_CW)), self.compared.explained(X_CW)
+            found = fit.fit(_stages(scales, posed))
+            X_CW = fit.cameras(found)[0].X_CW
+        assert posed is not None
+        ratios = zip(posed.frames, fit.inlier_ratios(found).tolist(), strict=True)
+        return RoughPose(
+            self, self.camera.with_pose(np.linalg.inv(X_CW)), *self.compared.explained(X_CW),
+            {frame.name: ratio for frame, ratio in ratios},
+        )  # fmt: skip
 
     def fit(
         self, camera: PinholeCamera, constants: Sequence[str] = (), focal: float = 0.0

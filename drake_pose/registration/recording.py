@@ -8,13 +8,16 @@ import numpy as np
 from drake_pose.arrays import Array, Picture
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
+from drake_pose.fit.explain_kernel import Explained
 from drake_pose.registration.picture_search import (
+    PictureSearch,
     PosedPicture,
     choose_frames,
     node_places,
 )
 from drake_pose.registration.pyramid_level import PICTURES
 from drake_pose.registration.register import RegistrationBody
+from drake_pose.workers import map_ordered
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,3 +185,62 @@ def posed_pictures(
         return PosedPicture(name, values[k], picture, None if rates is None else rates[k])
 
     return [posed(k) for k in indices if np.isfinite(values[k]).all()]
+
+
+def scan_time_offsets(
+    search: PictureSearch,
+    camera: PinholeCamera,
+    recording: Recording,
+    *,
+    rates: Sequence[float] = (-0.2, -0.15, -0.1, -0.05, 0.05, 0.1, 0.15, 0.2, 0.25),
+    start_within: float = 0.3,
+    much_better: float = 1.01,
+) -> TimeOffset:
+    """Return the time offset that explains pictures best, for a camera at a known pose.
+
+    Offsets from -1 to 1 s are scanned, then drifts of the log's clock. Standard deviations are not
+    estimated (infinite).
+
+    Args:
+        search: a search in the pictures that are used.
+        camera: at its pose.
+        recording: their recording, with the same joint offsets.
+        rates: scanned drifts [s/s].
+        start_within: for a drift both clocks start together within this time [s].
+        much_better: minimum ratio of a drift's score to that of the best constant offset.
+    """
+    offsets = np.linspace(-1.0, 1.0, 81)
+    level = search.compared
+    rows = [recording.names.index(one.name) for one in search.frames]
+
+    def gains_at(clock: Recording, tried: Array) -> Array:
+        """Return log-likelihood gains (k,) at k time offsets [s]; NaN without logged joints."""
+        several = [clock.values_at(offset)[rows] for offset in tried.tolist()]
+
+        def gain(values: Array) -> float:
+            if not np.isfinite(values).all():
+                return np.nan
+            return float(level.statistics(camera.X_CW, search.nodes_at(values))[Explained.GAIN])
+
+        return np.array(map_ordered(gain, several))
+
+    scores = gains_at(recording, offsets)
+    k = int(np.nanargmax(scores))
+    offset, drift = float(offsets[k]), 0.0
+    if 0 < k < len(scores) - 1 and np.isfinite(scores[k - 1 : k + 2]).all():
+        low, middle, high = scores[k - 1 : k + 2]
+        bend = low - 2.0 * middle + high
+        if bend < 0.0:
+            offset += 0.5 * float((low - high) / bend) * float(offsets[1] - offsets[0])
+    best, most = scores[k], much_better * scores[k]
+    if recording.times is not None:
+        first, mean = float(recording.times[0]), mean_time(recording, rows)
+        starts = np.linspace(-start_within, start_within, 13)
+        for rate in rates:
+            gains = gains_at(recording.with_drift(rate, first), starts)
+            if np.isfinite(gains).any() and (gain := float(np.nanmax(gains))) > most:
+                most, drift = gain, rate
+                offset = float(starts[int(np.nanargmax(gains))]) + rate * (mean - first)
+    known = np.isfinite(scores)
+    tried = np.column_stack([offsets[known], scores[known] / max(best, 1e-9)])
+    return TimeOffset(offset, np.inf, tried, drift)

@@ -64,7 +64,9 @@ def decide(data: Path, name: str, kind: str, seed: int) -> Decision:
     names = list(ARMS)
     shown = model
     if kind == KINDS[3]:
-        other = names[(names.index(name) + 1) % len(names)]
+        after = (names * 2)[names.index(name) + 1 :]
+        # A Panda with another gripper is the same arm.
+        other = next(one for one in after if not ("Panda" in one and "Panda" in name))
         shown = load_model(data / ARMS[other].file, check=False)
         logged = _as_positions(model, logged, shown)
     body = RegistrationBody(shown.pose_tree())

@@ -23,7 +23,7 @@ def test_offsets_of_fifteen_degrees_are_found_with_the_pose(episode) -> None:
     start = search.search(((64, 40, 24, 0.25), (64, 10, 50, 0.1)), rotations=300)[0]
     found, X_CW = search.fit_offsets(NAMES, start)
     assert np.abs(found.joint_offsets - OFF).max() < np.radians(2.0)
-    camera, _ = found.coarse_fit(X_CW)
+    camera = found.coarse_fit(X_CW).camera
     shift, turn = errors(camera.X_WC, episode.camera.X_WC)
     assert shift < 0.02
     assert turn < np.radians(1.0)

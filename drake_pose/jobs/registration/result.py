@@ -31,6 +31,7 @@ from drake_pose.jobs.registration.words import describe_drift, describe_reading
 from drake_pose.registration.camera_motion import CameraPart
 from drake_pose.registration.joint_offsets import KinematicParameter
 from drake_pose.registration.picture_acceptance import PictureRegistration
+from drake_pose.registration.picture_search import rotation_between
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import RegisteredCamera, TargetPose
 from drake_pose.silhouette.outline import outline_from_mesh
@@ -121,6 +122,18 @@ def describe_pictures(one: PictureRegistration | None, found: bool = False) -> d
         "explained_by_chance": one.by_chance,
         "p_value": one.p_value,
         "contour": one.fit.contour,
+        "runner_up": one.runner_up and _describe_runner_up(one.found.camera, *one.runner_up),
+    }
+
+
+def _describe_runner_up(camera: Camera, X_CW: Array, margin: float) -> dict[str, Any]:
+    """Return the summary's entry on a runner-up, see ``PictureStart``, beside the found camera."""
+    X_WC = np.linalg.inv(X_CW)
+    return {
+        "X_WC": X_WC.tolist(),
+        "distance_mm": 1e3 * float(np.linalg.norm(X_WC[:3, 3] - camera.X_WC[:3, 3])),
+        "rotation_deg": math.degrees(rotation_between(X_CW, camera.X_CW)),
+        "margin_sd": margin,
     }
 
 

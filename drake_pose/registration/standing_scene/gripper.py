@@ -201,7 +201,7 @@ class GripperSearch:
         fits = list(known)
         for X in poses[: GRIPPER.fitted]:
             coarse = search.coarse_fit(X)
-            fit = None if coarse is None else search.fit(coarse[0], constants)
+            fit = None if coarse is None else search.fit(coarse.camera, constants)
             if (
                 fit is not None
                 and self._shown(fit.camera.X_WC, search)

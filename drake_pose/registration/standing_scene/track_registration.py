@@ -15,8 +15,7 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, listed
 from drake_pose.registration.hand_eye import rotation_spread
 from drake_pose.registration.joint_offsets import KinematicParameter
-from drake_pose.registration.picture_registration import TimeOffset, choose_pictures
-from drake_pose.registration.recording import Recording
+from drake_pose.registration.recording import Recording, TimeOffset, choose_pictures
 from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
 from drake_pose.registration.standing_scene.gripper import GripperFit, GripperSearch
 from drake_pose.registration.standing_scene.hand_eye_tracks import (

@@ -21,7 +21,7 @@ def summary(**camera):
         "modes": [{}], "mean_iou": 0.9, "seconds": 1.0, "outliers": [], "zeros": {},
         "lengths": {}, "masks": "found", "focal_px": 500.0, "focal_sd_px": None,
         "time_offset_s": None, "time_offset_sd_s": None, "time_offset_scores": [],
-        "explained": 0.42, "explained_by_chance": 0.06, "p_value": 2e-6,
+        "explained": 0.42, "explained_by_chance": 0.06, "p_value": 2e-6, "runner_up": None,
         "frames": {"0000": {"agrees": True, "E_total": 0.1, "iou": 0.9, "inlier_ratio": 0.8}},
     }  # fmt: skip
     return {
@@ -96,18 +96,30 @@ def test_parameters_are_shown_with_their_significance(tmp_path):
         assert f"<td>{row}" in page
 
 
-def test_summary_of_time_offset_and_focal_length():
+def test_summary_of_time_offset_focal_length_and_runner_up(tmp_path):
     camera, scores = arm_cameras()[0], np.array([[0.0, 0.5], [0.1, 1.0]])
     clock = TimeOffset(0.1, 0.02, scores, drift=1e-3, drift_deviation=1e-4)
     one = SimpleNamespace(
         found=SimpleNamespace(camera=camera), time_offset=clock, focal_deviation=0.01,
         fit=SimpleNamespace(explained=0.3, contour=0.2), by_chance=0.1, p_value=1e-3,
+        runner_up=None,
     )  # fmt: skip
     told = describe_pictures(one)
+    assert told["runner_up"] is None
     assert (told["time_offset_s"], told["time_offset_sd_s"]) == (0.1, 0.02)
     assert (told["time_drift"], told["time_drift_sd"]) == (1e-3, 1e-4)
     assert told["focal_sd_px"] == pytest.approx(0.01 * camera.focal_x)
     assert told["time_offset_scores"] == scores.tolist()
+    # The other camera stands as far away on the opposite side of the world's origin.
+    turned = np.diag([-1.0, -1.0, 1.0, 1.0])
+    other = describe_pictures(
+        SimpleNamespace(**{**vars(one), "runner_up": (camera.X_CW @ turned, 7.5)})
+    )["runner_up"]
+    aside = np.linalg.norm(camera.X_WC[:2, 3])
+    assert other["distance_mm"] == pytest.approx(2e3 * aside)
+    assert (other["rotation_deg"], other["margin_sd"]) == (pytest.approx(180.0, abs=1e-4), 7.5)
+    page = make_registration_report(tmp_path, summary(runner_up=other))
+    assert f"{2e3 * aside:.0f} mm and 180 degrees away; less of the contours fits there" in page
     untold = SimpleNamespace(**{**vars(one), "focal_deviation": 0.0, "time_offset": None})
     told = describe_pictures(untold)
     for name in ("time_offset_s", "time_offset_sd_s", "time_drift", "time_drift_sd", "focal_sd_px"):

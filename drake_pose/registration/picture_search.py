@@ -564,8 +564,8 @@ def segment_picture(
         )
         part = slice(max(top - by, 0), bottom + by + 1), slice(max(left - by, 0), right + by + 1)
     foreground, mask = np.zeros(covered.shape, np.float32), np.zeros(covered.shape, np.bool_)
-    as_is, foreground[part] = known.part(part).foreground(one.picture[part], gain)
-    mask[part] = mask_of_foreground(as_is, covered[part])
+    as_is, tolerant = known.part(part).foreground(one.picture[part], gain)
+    foreground[part], mask[part] = tolerant, mask_of_foreground(as_is, covered[part], tolerant)
     if not mask.any():
         return None
     return PosedFrame(one.name, one.values, mask, foreground_picture(foreground), one.rates)

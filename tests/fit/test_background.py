@@ -133,3 +133,15 @@ def test_log_odds_images_decode_to_their_values():
     assert table.shape == (2, 3, COLOURS)
     read = np.log(table[1, Colour.FOREGROUND][(red * 16 + green) * 16 + blue])
     np.testing.assert_allclose(read, np.clip(foreground, -8.0, 8.0), atol=0.01)
+
+
+def test_masks_lose_the_halo_of_an_encoder_and_keep_faint_parts():
+    body = np.zeros((60, 80), bool)
+    body[20:40, 20:60] = True
+    halo = np.pad(body, 2)[4:, 2:-2] | body
+    as_is = np.where(halo | body, 2.0, -2.0).astype(np.float32)
+    tolerant = np.where(body, 2.0, -2.0).astype(np.float32)
+    # Inside, a part that looks like the background is no halo.
+    tolerant[28:32, 30:50] = -2.0
+    np.testing.assert_array_equal(mask_of_foreground(as_is, body), halo)
+    np.testing.assert_array_equal(mask_of_foreground(as_is, body, tolerant), body)

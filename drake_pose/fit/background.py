@@ -70,6 +70,9 @@ class BackgroundModel:
 
 MODEL = BackgroundModel()
 
+Window = tuple[slice, slice]
+"""Rows and columns of a picture."""
+
 
 def estimate_gain(picture: Picture | Floats, reference: Floats, rounds: int = 4) -> Floats:
     """Return the photometric gain that maps an image's colours to those of a reference image.
@@ -362,8 +365,10 @@ class KnownBackground:
             unseen=self.unseen[part],
         )
 
-    def foreground(self, picture: Picture, gain: Floats) -> tuple[Floats, Floats]:
-        """Return (H, W) log-odds that each pixel of an image shows the body, twice.
+    def foreground(
+        self, picture: Picture, gain: Floats, window: Window = (slice(None), slice(None))
+    ) -> tuple[Floats, Floats]:
+        """Return (h, w) and (H, W) log-odds that each pixel of an image shows the body.
 
         In the first, each pixel counts as it is; it yields complete masks. The second allows for
         the noise of compressed images near large differences, which would shift contours outwards.
@@ -371,6 +376,7 @@ class KnownBackground:
         Args:
             picture: (H, W, 3) image.
             gain: (3, 4) its photometric gain.
+            window: h rows and w columns of the first log-odds.
         """
         even = apply_gain(picture, gain)
         numbers = colour_numbers(np.clip(even, 0.0, 255.0).astype(np.uint8))
@@ -378,12 +384,13 @@ class KnownBackground:
         difference = largest(np.abs(even - self.colours))
         near = np.float32(MODEL.spread) * cv2.dilate(difference, _disc(MODEL.reach))
 
-        def log_odds(deviations: Floats) -> Floats:
-            ratio = likeness(difference / deviations) * np.float32(MODEL.known_factor)
+        def log_odds(deviations: Floats, part: Window) -> Floats:
+            ratio = likeness(difference[part] / deviations[part]) * np.float32(MODEL.known_factor)
             log_visible = np.log(MODEL.visible_match * ratio + (1.0 - MODEL.visible_match))
-            return np.asarray(on - np.where(self.unseen, beside, log_visible))
+            return np.asarray(on[part] - np.where(self.unseen[part], beside[part], log_visible))
 
-        return log_odds(self.deviations), log_odds(np.hypot(self.deviations, near))
+        tolerant = np.hypot(self.deviations, near)
+        return log_odds(self.deviations, window), log_odds(tolerant, (slice(None), slice(None)))
 
 
 def foreground_picture(foreground: Floats) -> Picture:
@@ -412,13 +419,27 @@ def foreground_of_colours(nodes: int) -> Floats:
     return tables
 
 
+def window_around(covered: Mask, by: int) -> Window:
+    """Return the rows and columns that the True pixels of (H, W) span, and ``by`` more around."""
+    left, top, width, height = cv2.boundingRect(covered.view(np.uint8))
+    rows, columns = (slice(max(k - by, 0), k + n + by) for k, n in ((top, height), (left, width)))
+    return rows, columns
+
+
+def mask_reach(covered: Mask, reach: float = 0.1) -> int:
+    """Return how far masks may reach beyond an approximate silhouette (H, W) [pixel].
+
+    It is the fraction ``reach`` of the square root of its area, or MODEL.margin if that is larger.
+    """
+    return max(MODEL.margin, round(reach * float(np.sqrt(np.count_nonzero(covered)))))
+
+
 def mask_of_foreground(
     foreground: Floats,
     covered: Mask,
     tolerant: Floats | None = None,
     *,
     smooth: float = 0.7,
-    reach: float = 0.1,
     rim: int = 2,
     least: float = -1.0,
 ) -> Mask:
@@ -426,18 +447,15 @@ def mask_of_foreground(
 
     Args:
         foreground: (H, W) log-odds.
-        covered: (H, W) approximate silhouette of the body.
+        covered: (H, W) approximate silhouette of the body; the mask stays within ``mask_reach``.
         tolerant: (H, W) log-odds that allow for the noise of compressed images; they decide in the
             mask's rim. None: the same as ``foreground``.
         smooth: standard deviation of the Gaussian that smooths the log-odds [pixel].
-        reach: the mask stays within this distance of ``covered`` [square root of its area], or
-            within MODEL.margin if that is larger.
         rim: width of the rim [pixel].
         least: pixels of the rim stay whose tolerant log-odds are larger. Chosen on simulated arms:
             masks in PNG files stay as they are, those in videos lose their halo.
     """
-    limit = max(MODEL.margin, round(reach * float(np.sqrt(np.count_nonzero(covered)))))
-    near = grown(covered[None], limit)[0]
+    near = grown(covered[None], mask_reach(covered))[0]
     found = ((cv2.GaussianBlur(foreground, (0, 0), smooth) > 0.0) & near).astype(np.uint8)
     found = cv2.morphologyEx(found, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     found = cv2.morphologyEx(found, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))

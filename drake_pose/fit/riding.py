@@ -19,6 +19,7 @@ from drake_pose.arrays import Array, Floats, Mask, Picture
 from drake_pose.fit.background import (
     MODEL,
     KnownBackground,
+    Window,
     apply_gain,
     colour_deviations,
     colour_slopes,
@@ -208,14 +209,16 @@ class RidingColours(KnownBackground):
             colours, deviations, unseen, frequencies[1], frequencies[0], (rates[0], rates[1])
         )
 
-    def foreground(self, picture: Picture, gain: Floats) -> tuple[Floats, Floats]:
-        """Return (H, W) log-odds that each pixel of an image shows the body; see the base class."""
+    def foreground(
+        self, picture: Picture, gain: Floats, window: Window = (slice(None), slice(None))
+    ) -> tuple[Floats, Floats]:
+        """Return log-odds that each pixel of an image shows the body, as the base class does."""
         even = apply_gain(picture, gain)
         numbers = colour_numbers(np.clip(even, 0.0, 255.0).astype(np.uint8))
         ratio = likeness(largest(np.abs(even - self.colours)) / self.deviations)
         beside, on = (np.log(m * ratio + (1.0 - m)) for m in self.matches)
         found = np.asarray(self.on[numbers] - self.beside[numbers] + on - beside)
-        return found, found
+        return found[window], found
 
 
 def silhouette_gains(sums: PixelSums, covered: Mask, squares: int = 16) -> Array:

@@ -22,6 +22,8 @@ from drake_pose.fit.background import (
     KnownBackground,
     foreground_picture,
     mask_of_foreground,
+    mask_reach,
+    window_around,
 )
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import POSE_NAMES
@@ -558,14 +560,13 @@ def segment_picture(
         return None
     part = slice(None), slice(None)
     if around is not None:
-        by = round(around * float(np.sqrt(np.count_nonzero(covered))))
-        (top, left), (bottom, right) = (
-            [int(k(np.flatnonzero(covered.any(axis=axis)))) for axis in (1, 0)] for k in (min, max)
-        )
-        part = slice(max(top - by, 0), bottom + by + 1), slice(max(left - by, 0), right + by + 1)
+        part = window_around(covered, round(around * float(np.sqrt(np.count_nonzero(covered)))))
     foreground, mask = np.zeros(covered.shape, np.float32), np.zeros(covered.shape, np.bool_)
-    as_is, tolerant = known.part(part).foreground(one.picture[part], gain)
-    foreground[part], mask[part] = tolerant, mask_of_foreground(as_is, covered[part], tolerant)
+    # The mask is smoothed over a few pixels.
+    window = window_around(covered[part], mask_reach(covered) + 8)
+    as_is, tolerant = known.part(part).foreground(one.picture[part], gain, window)
+    foreground[part] = tolerant
+    mask[part][window] = mask_of_foreground(as_is, covered[part][window], tolerant[window])
     if not mask.any():
         return None
     return PosedFrame(one.name, one.values, mask, foreground_picture(foreground), one.rates)

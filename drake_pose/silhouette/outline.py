@@ -113,10 +113,20 @@ class PackedOutlines(NamedTuple):
 
 
 def outline_from_mesh(mesh: TriangleMesh) -> Outline:
-    """Return the outline of a mesh, with equal vertices merged and without degenerate triangles."""
-    places = np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3) + 0.0  # -0.0 becomes 0.0
+    """Return the outline of a mesh, with equal vertices merged and without degenerate triangles.
+
+    Results are cached, as outlines are immutable.
+    """
+    vertices = np.asarray(mesh.vertices, dtype=np.float64) + 0.0  # -0.0 becomes 0.0
+    return _merged_outline(vertices.tobytes(), np.asarray(mesh.triangles, dtype=np.int64).tobytes())
+
+
+@lru_cache(maxsize=64)
+def _merged_outline(points: bytes, corners: bytes) -> Outline:
+    """Return `outline_from_mesh` of bytes of (n, 3) float64 and (m, 3) int64."""
+    places = np.frombuffer(points, np.float64).reshape(-1, 3)
     vertices, renumbered = np.unique(places, axis=0, return_inverse=True)
-    triangles = renumbered.reshape(-1)[np.asarray(mesh.triangles, dtype=np.int64).reshape(-1, 3)]
+    triangles = renumbered.reshape(-1)[np.frombuffer(corners, np.int64).reshape(-1, 3)]
     a, b, c = triangles.T
     triangles = triangles[(a != b) & (b != c) & (c != a)]
     used, renumbered = np.unique(triangles, return_inverse=True)

@@ -12,6 +12,8 @@ from drake_pose.fit.background import (
     foreground_of_colours,
     foreground_picture,
     mask_of_foreground,
+    mask_reach,
+    window_around,
 )
 from drake_pose.fit.colours import COLOURS, Colour
 from drake_pose.fit.explain_kernel import Explained, explain
@@ -99,9 +101,18 @@ def test_log_odds_are_positive_on_the_body(episode):
     for picture, fitted_gain, mask in zip(
         episode.pictures, backgrounds.gains, covered, strict=True
     ):
-        foreground, _ = known.foreground(picture, fitted_gain)
+        foreground, tolerant = known.foreground(picture, fitted_gain)
         assert ((foreground > 0.0) == mask)[visible].mean() > 0.97
         found = mask_of_foreground(foreground, mask)
+        # The mask of a picture is that of the window around the body.
+        window = window_around(mask, mask_reach(mask) + 8)
+        there, tolerant_again = known.foreground(picture, fitted_gain, window)
+        np.testing.assert_array_equal(there, foreground[window])
+        np.testing.assert_array_equal(tolerant_again, tolerant)
+        whole = mask_of_foreground(foreground, mask, tolerant)
+        own = mask_of_foreground(there, mask[window], tolerant[window])
+        np.testing.assert_array_equal(own, whole[window])
+        assert own.sum() == whole.sum()
         assert (found & mask).sum() / (found | mask).sum() > 0.85
 
 

@@ -6,15 +6,13 @@ import math
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import cv2
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.body import ArticulatedModel
@@ -22,6 +20,10 @@ from drake_pose.errors import listed
 from drake_pose.files.folder import OVERLAY
 from drake_pose.files.records import SceneEstimate, measured_positions, user_units
 from drake_pose.silhouette.pictures.scenes import Scene
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 def make_report(
@@ -374,13 +376,15 @@ def overlay_picture(
     return {"camera": camera, "frame": frame, "E_total": E_total, "uri": uri, "link": quote(place)}
 
 
-def new_plot(height: float = 1.5, left: float = 0.09) -> tuple[Figure, Axes]:
+def new_plot(height: float = 1.5, left: float = 0.09) -> "tuple[Figure, Axes]":
     """Return an empty plot for a page.
 
     Args:
         height: height of the figure [inch].
         left: space left of the axes, as a fraction of the width.
     """
+    from matplotlib.figure import Figure  # Slow to import, and many pages have no plot.
+
     figure = Figure(figsize=(6.4, height), dpi=120)
     axes = figure.add_axes((left, 0.3 / height, 0.985 - left, 1.0 - 0.38 / height))
     axes.tick_params(labelsize=8, length=2, colors="#57606a")
@@ -390,13 +394,13 @@ def new_plot(height: float = 1.5, left: float = 0.09) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _restart_colours(axes: Axes) -> None:
+def _restart_colours(axes: "Axes") -> None:
     """Give the next curve of a plot the first of the colours."""
     colours = "#0072b2 #d55e00 #009e73 #b8468f #7a5c00 #2f8fc4 #666666 #8c2d04"
     axes.set_prop_cycle(color=colours.split())
 
 
-def plot_uri(figure: Figure) -> str:
+def plot_uri(figure: "Figure") -> str:
     """Return a figure as the data URI of a PNG picture."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png")
@@ -412,8 +416,8 @@ def plot_curves(
     intervals: tuple[Array, Array, Mask] | None = None,
     least: float | None = None,
     limits_within: float = 0.3,
-    onto: Figure | None = None,
-) -> Figure:
+    onto: "Figure | None" = None,
+) -> "Figure":
     """Plot curves over frames; nan leaves a gap.
 
     Args:
@@ -469,7 +473,7 @@ def plot_curves(
     return figure
 
 
-def _mark_frames(axes: Axes, frames: Sequence[str], count: int = 6) -> None:
+def _mark_frames(axes: "Axes", frames: Sequence[str], count: int = 6) -> None:
     """Label the x axis with the names of about ``count`` frames."""
     step = max(1, -(-len(frames) // count))
     names = [name[:20] for name in frames[::step]]
@@ -477,7 +481,7 @@ def _mark_frames(axes: Axes, frames: Sequence[str], count: int = 6) -> None:
     axes.set_xlim(-0.5, max(len(frames), 1) - 0.5)
 
 
-def draw_grid(frames: Sequence[str], rows: Sequence[tuple[str, Sequence[str]]]) -> Figure:
+def draw_grid(frames: Sequence[str], rows: Sequence[tuple[str, Sequence[str]]]) -> "Figure":
     """Plot states over frames: a row of bars for each name; equal neighbours are one bar.
 
     Args:

@@ -14,7 +14,6 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike, NDArray
 from pydrake.common.yaml import yaml_load_typed
-from scipy.optimize import linprog
 
 from drake_pose.arrays import Array
 from drake_pose.body import ParsedModel
@@ -242,6 +241,8 @@ def inner_point(inequalities: Inequalities) -> Array:
         return np.zeros(n)
     norms = np.linalg.norm(inequalities.phi, axis=1)
     unit_phi, unit_b = inequalities.phi / norms[:, None], inequalities.b / norms
+    from scipy.optimize import linprog  # Slow to import, and seldom needed.
+
     solution = linprog(
         c=np.r_[np.zeros(n), -1.0],
         A_ub=np.c_[unit_phi, np.ones(count)],

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import yaml
-from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
@@ -183,6 +182,8 @@ def _draw(
         for name, (unit, value, sd) in episodes[scene].get("joint_offsets", {}).items():
             curves.setdefault((f"joint offset [{unit}]", name), []).append((k, value, sd))
     titles = list(dict.fromkeys(title for title, _ in curves))
+    from matplotlib.figure import Figure  # Slow to import, and few jobs draw.
+
     figure = Figure(figsize=(8.0, 0.4 + 1.9 * len(titles)), dpi=120, layout="constrained")
     figure.suptitle("Difference from the first episode; dashed: a camera moved", fontsize=9)
     for axes, title in zip(np.atleast_1d(figure.subplots(len(titles), 1)), titles, strict=True):

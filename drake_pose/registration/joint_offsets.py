@@ -13,7 +13,6 @@ from functools import partial
 
 import numpy as np
 from scipy.special import stdtr, stdtrit
-from scipy.stats import multivariate_normal
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.body import TARGET_POSITIONS, PoseTree
@@ -382,6 +381,8 @@ def shrink_constants(
         fit, found, covariance: the fit, its values, and their covariance (u, u).
         names: of the constants.
     """
+    from scipy.stats import multivariate_normal  # Slow to import: a third of a second.
+
     kinematics, information = fit.views[0].kinematics, np.zeros(len(fit.names))
     kinds = dict(zip(kinematics.names, kinematics.is_angle.tolist(), strict=True))
     for kind in (True, False, None):

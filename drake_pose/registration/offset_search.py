@@ -8,7 +8,6 @@ own joint. Scores need no derivatives and no masks, so large errors do no harm.
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.optimize import minimize
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.body.tree_kinematics import TreeKinematics
@@ -52,6 +51,8 @@ def search_offsets(
     Returns:
         the pose X_CW (4, 4), and the offsets (m,).
     """
+    from scipy.optimize import minimize  # Slow to import, and seldom needed.
+
     offsets = start.copy()
 
     def score(X: Array, tried: Array) -> float:

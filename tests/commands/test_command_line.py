@@ -27,10 +27,19 @@ def plain(text: str) -> str:
     return " ".join(re.sub(r"\x1b\[[0-9;]*m|[│╭╮╰╯─]", " ", text).split())
 
 
-def test_help_imports_nothing_heavy() -> None:
+@pytest.mark.parametrize(
+    ("module", "heavy"),
+    [
+        ("commands.main", "numpy numba cv2 pydrake"),
+        ("jobs.estimate.scene", "matplotlib trimesh scipy.optimize scipy.stats"),
+        ("jobs.registration.audit", "matplotlib trimesh scipy.optimize scipy.stats"),
+        ("jobs.registration.register", "matplotlib trimesh scipy.optimize scipy.stats"),
+    ],
+)
+def test_help_and_jobs_import_nothing_heavy(module: str, heavy: str) -> None:
     script = (
-        "import sys; import drake_pose.commands.main; "
-        "print([m for m in ('numpy', 'numba', 'cv2', 'pydrake') if m in sys.modules])"
+        f"import sys; import drake_pose.{module}; "
+        f"print([m for m in {heavy.split()} if m in sys.modules])"
     )
     finished = subprocess.run(
         [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True

@@ -3,11 +3,10 @@
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Picture
@@ -38,6 +37,9 @@ from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.pictures.masks import encode_mask
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 from drake_pose.silhouette.scoring import draw_labels
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def describe_camera(
@@ -507,7 +509,7 @@ def compared_frames(errors: Mapping[str, float]) -> Sequence[str]:
     return tuple(dict.fromkeys([in_order[0], in_order[len(in_order) // 2]]))
 
 
-def plot_offset(camera: Mapping[str, Any]) -> Figure | None:
+def plot_offset(camera: Mapping[str, Any]) -> "Figure | None":
     """Plot the scores of scanned time offsets; None: there are none.
 
     A vertical line marks the estimated offset, in its 95 % interval.

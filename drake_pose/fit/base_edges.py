@@ -1,9 +1,9 @@
 """Turn a camera about a robot's first joint to where the base fits its edges in pictures.
 
 The first joint's offset turns all moving parts about an axis that is fixed in the world. Moving
-parts alone therefore do not separate it from a rotation of the camera about that axis; a static
-base does. No picture shows what is behind a base, so foreground log-odds hardly locate it. Its
-edges do: those of its outline, and those inside, where its surface bends.
+parts alone therefore do not separate that offset from a rotation of the camera about the axis; a
+static base does. No picture shows the background behind a base, so foreground log-odds hardly
+locate it. Its edges do: those of its outline, and those inside, where its surface bends.
 """
 
 import math
@@ -24,23 +24,22 @@ from drake_pose.silhouette.scoring import draw_mask
 
 
 class BaseSettings(NamedTuple):
-    """Parameters of a search of the base.
+    """Parameters of a search of the base; chosen on 15 simulated rooms with three arms.
 
     Args:
         within, step: bound and step of the angles at which the base is drawn [rad].
         fine_step: step of the angles that are compared [rad].
-        most_pixels: maximum side of the base's part of the pictures; larger ones are reduced
+        most_pixels: maximum side of the picture's part around the base; a larger part is reduced
             [pixel].
         most_covered: a pixel counts if moving parts cover it in at most this fraction of pictures.
-        least_points: minimum number of visible points of edges; they are a third of a pixel apart.
-        noise: strength of an edge that is as likely noise [of 255 per pixel].
-        tiles: the base's part of the pictures is divided into tiles, this many along a side. Their
+        least_points: minimum number of visible edge points; points are a third of a pixel apart.
+        noise: gradient of an edge that is as likely noise [of 255 per pixel].
+        tiles: number of tiles along each side of the picture's part around the base. The tiles'
             errors are taken as independent.
         resamples: number of bootstrap samples of the tiles.
-        shifts: by which the base may be off in the picture, along u and along v [pixel].
-        factor, floor: factor of the bootstrap's standard deviation, and what is added in
-            quadrature [rad]; errors were 0.9 standard deviations at most in 15 rooms with three
-            arms.
+        shifts: tried errors of the base's place in the picture, along u and along v [pixel].
+        factor, floor: the bootstrap's standard deviation is multiplied by the first; the second is
+            added in quadrature [rad]. Errors in the rooms are then 0.9 standard deviations at most.
         max_deviation: an angle with a larger standard deviation is not determined [rad].
         min_turn: a camera is not turned by smaller angles [rad].
     """
@@ -67,9 +66,9 @@ BASE = BaseSettings()
 class _Edges(NamedTuple):
     """Points on edges of a drawn base.
 
-    points: (n, 2) [pixel]. normals: (n, 2) across the edges. motions: (n,) by which the base's
-    rotation moves the edge along its normal [pixel/rad]. smooth: (h, w) pixels on the base and off
-    its edges.
+    points: (n, 2) places (u, v) [pixel]. normals: (n, 2) unit vectors across the edges. motions:
+    (n,) derivative of the edge's place along its normal by the base's rotation [pixel/rad]. smooth:
+    (h, w) pixels on the base and off its edges.
     """
 
     points: Array
@@ -81,8 +80,8 @@ class _Edges(NamedTuple):
 class _Slopes(NamedTuple):
     """Gradients of a base's picture.
 
-    across, along: (h, w, 3) along u and v. seen: (h, w) pixels that moving parts leave visible.
-    tiles: (h, w) index of each pixel's tile.
+    across, along: (h, w, 3) along u and along v [of 255 per pixel]. seen: (h, w) pixels that moving
+    parts leave visible in enough pictures. tiles: (h, w) index of each pixel's tile.
     """
 
     across: Floats
@@ -113,28 +112,29 @@ def locate_base(
     values: Array,
     joint: int,
 ) -> tuple[float, float]:
-    """Return by how much the world is turned about a joint's axis where the base fits its edges.
+    """Return the angle about a joint's axis by which the base is turned against the camera's pose.
 
-    The edges are those of the pictures' median, without pixels that moving parts cover. A bootstrap
-    of tiles of the picture tells how certain the angle is; it includes other angles at which the
-    base fits about as well.
+    Edges of the drawn base are compared with edges of the pictures' median, without pixels that
+    moving parts cover. A bootstrap of tiles of the picture gives the standard deviation. It
+    includes other angles at which the base fits about as well.
 
     Args:
         kinematics: of the body's pose tree.
         outlines: a surface for each node.
         camera: the camera at its pose.
         pictures: f pictures (H, W, 3).
-        values: (f, m) the tree's values in these.
+        values: (f, m) the tree's values in the pictures.
         joint: index of the first joint's value.
 
     Returns:
-        the angle by which the world turns in the camera, and its standard deviation [rad]; 0 and
-        infinite where too little of the base is visible.
+        the angle by which the world turns in the camera, see ``joint_rotation``, and its standard
+        deviation [rad]; 0 and infinity where too little of the base is visible.
     """
     motions = kinematics.motions(values[0])
     moves, twist = motions.moves[:, joint], motions.twists[joint]
-    base = [EMPTY_OUTLINE if own else one for one, own in zip(outlines, moves, strict=True)]
-    moving = [one if own else EMPTY_OUTLINE for one, own in zip(outlines, moves, strict=True)]
+    nodes = list(zip(outlines, moves, strict=True))
+    base = [EMPTY_OUTLINE if is_moved else outline for outline, is_moved in nodes]
+    moving = [outline if is_moved else EMPTY_OUTLINE for outline, is_moved in nodes]
     X_WN = kinematics.poses(values[0])
 
     def turned(angle: float) -> Array:
@@ -142,7 +142,8 @@ def locate_base(
         return np.asarray(camera.X_CW @ joint_rotation(kinematics, values[0], joint, angle))
 
     angles = np.arange(-BASE.within, BASE.within, BASE.step)
-    part = _part_with(base, [turned(one) @ X_WN for one in (angles[0], 0.0, angles[-1])], camera)
+    bounds = angles[0], 0.0, angles[-1]
+    part = _part_with(base, [turned(angle) @ X_WN for angle in bounds], camera)
     if part is None:
         return 0.0, np.inf
     camera, shown = _cropped(camera, part, pictures)
@@ -152,40 +153,40 @@ def locate_base(
         """Return the base's edges at an angle."""
         return _drawn_edges(base, turned(angle) @ X_WN, camera, turned(angle), twist)
 
-    # Edges count by how much stronger they are than the picture is on the base beside them.
+    # The score is the mean log gradient on the base's edges over that on its smooth surface.
     steepest = np.hypot(slopes.across, slopes.along).max(axis=2)
     logs, count = np.log1p(steepest / BASE.noise), BASE.tiles**2
-    beside = np.arange(-0.5 * BASE.step, 0.5 * BASE.step, 3.0 * BASE.fine_step)
-    every = (angles[:, None] + beside).ravel()
-    several = np.zeros((4, len(angles), len(beside), count))
-    for k, one in enumerate(angles.tolist()):
-        edges = drawn(one)
+    steps = np.arange(-0.5 * BASE.step, 0.5 * BASE.step, 3.0 * BASE.fine_step)
+    candidates = (angles[:, None] + steps).ravel()
+    totals = np.zeros((4, len(angles), len(steps), count))
+    for k, drawn_at in enumerate(angles.tolist()):
+        edges = drawn(drawn_at)
         smooth = edges.smooth & slopes.seen
-        several[0, k], several[1, k] = _strengths(edges, slopes, beside)
-        several[2, k] = np.bincount(slopes.tiles[smooth], logs[smooth], count)
-        several[3, k] = np.bincount(slopes.tiles[smooth], minlength=count)
-    sums = several.reshape(4, -1, count)
+        totals[0, k], totals[1, k] = _strengths(edges, slopes, steps)
+        totals[2, k] = np.bincount(slopes.tiles[smooth], logs[smooth], count)
+        totals[3, k] = np.bincount(slopes.tiles[smooth], minlength=count)
+    sums = totals.reshape(4, -1, count)
     points = sums[1].sum(axis=1)
     enough = points > max(BASE.least_points, 0.3 * points.max())
     if not enough.any():
         return 0.0, np.inf
-    drawings = np.random.default_rng(0).multinomial(
+    resampled = np.random.default_rng(0).multinomial(
         count, np.full(count, 1.0 / count), BASE.resamples
     )
-    weights = np.vstack([np.ones(count), drawings]).T
+    weights = np.vstack([np.ones(count), resampled]).T
     edge, edge_count, inner, inner_count = sums[:, enough] @ weights
     scores = edge / np.maximum(edge_count, 1.0) - inner / np.maximum(inner_count, 1.0)
-    angle, *likely = every[enough][np.argmax(scores, axis=0)].tolist()
-    off = np.array(likely) - angle
-    variance = float(np.mean(off**2 * (np.abs(off) > 2.0 * BASE.step)))
+    angle, *likely = candidates[enough][np.argmax(scores, axis=0)].tolist()
+    deviations = np.array(likely) - angle
+    variance = float(np.mean(deviations**2 * (np.abs(deviations) > 2.0 * BASE.step)))
     # Angles near the best are compared more exactly, with the base shifted a little.
-    beside = np.arange(-1.5 * BASE.step, 1.5 * BASE.step, BASE.fine_step)
+    steps = np.arange(-1.5 * BASE.step, 1.5 * BASE.step, BASE.fine_step)
     shifts = np.array([[a, b] for a in BASE.shifts for b in BASE.shifts])
     for _ in range(2):
         edges = drawn(angle)
-        shifted = (edges._replace(points=edges.points + by) for by in shifts)
-        found = [_strengths(one, slopes, beside)[0] @ weights for one in shifted]
-        best = beside[np.argmax(np.max(found, axis=0), axis=0)]
+        shifted = (edges._replace(points=edges.points + shift) for shift in shifts)
+        fine_scores = [_strengths(drawing, slopes, steps)[0] @ weights for drawing in shifted]
+        best = steps[np.argmax(np.max(fine_scores, axis=0), axis=0)]
         angle += float(best[0])
     variance += BASE.factor**2 * float(np.var(best[1:])) + BASE.floor**2
     return angle, float(np.sqrt(variance))
@@ -194,16 +195,19 @@ def locate_base(
 def _part_with(
     outlines: Sequence[Outline], poses: Sequence[Array], camera: PinholeCamera, margin: int = 8
 ) -> tuple[slice, slice] | None:
-    """Return the rows and columns of the part of a picture around surfaces.
+    """Return the rows and columns of a picture's part around surfaces; None: hardly visible.
 
-    poses: (nodes, 4, 4) of the nodes in the camera, several times. margin: around them [pixel].
-    None: they are hardly visible.
+    Args:
+        outlines: a surface for each node.
+        poses: several times the nodes' poses (nodes, 4, 4) in the camera; the part shows all.
+        camera: its intrinsics; its pose is not used.
+        margin: around the surfaces [pixel].
     """
     points = np.concatenate(
         [
-            one.vertices @ X[:3, :3].T + X[:3, 3]
+            outline.vertices @ X[:3, :3].T + X[:3, 3]
             for X_CN in poses
-            for one, X in zip(outlines, X_CN, strict=True)
+            for outline, X in zip(outlines, X_CN, strict=True)
         ]
     )
     uv, depth = camera.with_pose(np.eye(4)).project(points)
@@ -220,18 +224,18 @@ def _part_with(
 def _cropped(
     camera: PinholeCamera, part: tuple[slice, slice], pictures: Sequence[Picture]
 ) -> tuple[PinholeCamera, Floats]:
-    """Return the camera of a part of the pictures, and this part (f, h, w, 3) of each.
+    """Return the camera of a part of the pictures, and the f parts (f, h, w, 3).
 
-    part: its rows and columns. It is reduced to `BASE.most_pixels`.
+    part: its rows and columns; h and w are reduced to `BASE.most_pixels` at most.
     """
-    (top, bottom), (left, right) = ((one.start, one.stop) for one in part)
+    (top, bottom), (left, right) = ((bounds.start, bounds.stop) for bounds in part)
     width, height = right - left, bottom - top
     center = {"center_x": camera.center_x - left, "center_y": camera.center_y - top}
     scale = min(1.0, BASE.most_pixels / max(width, height))
     size = max(1, round(scale * width)), max(1, round(scale * height))
     small = replace(camera, width=width, height=height, **center).resized(*size)
-    parts = (np.asarray(one[part], np.float32) for one in pictures)
-    return small, np.array([cv2.resize(one, size, interpolation=cv2.INTER_AREA) for one in parts])
+    parts = (np.asarray(picture[part], np.float32) for picture in pictures)
+    return small, np.array([cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in parts])
 
 
 def _median_slopes(
@@ -243,18 +247,20 @@ def _median_slopes(
 ) -> _Slopes:
     """Return the gradients of the median picture.
 
-    The arguments are those of `locate_base`; pictures: (f, h, w, 3) of the camera's size.
+    The arguments are those of `locate_base`. moving: surfaces of the nodes that the joint moves,
+    empty for others. pictures: (f, h, w, 3) of the camera's size.
     """
-    near = np.ones((9, 9), np.uint8)
-    masks = (draw_mask(moving, camera.X_CW @ kinematics.poses(one), camera) for one in values)
-    covered = np.array([cv2.dilate(one.astype(np.uint8), near) for one in masks]).astype(np.bool_)
+    kernel = np.ones((9, 9), np.uint8)
+    masks = (draw_mask(moving, camera.X_CW @ kinematics.poses(row), camera) for row in values)
+    dilated = [cv2.dilate(mask.astype(np.uint8), kernel) for mask in masks]
+    covered = np.array(dilated).astype(np.bool_)
     # Where all pictures are covered any of them will do: the pixel does not count.
     seen, shown = covered.mean(axis=0) <= BASE.most_covered, pictures.copy()
     shown[covered & seen] = np.nan
     median = cv2.GaussianBlur(np.nanmedian(shown, axis=0), (0, 0), 0.7)
     across, along = (
-        np.asarray(cv2.Sobel(median, cv2.CV_32F, *by, scale=0.125), np.float32)
-        for by in ((1, 0), (0, 1))
+        np.asarray(cv2.Sobel(median, cv2.CV_32F, *orders, scale=0.125), np.float32)
+        for orders in ((1, 0), (0, 1))
     )
     rows, columns = np.mgrid[: camera.height, : camera.width]
     tiles = rows * BASE.tiles // camera.height * BASE.tiles + columns * BASE.tiles // camera.width
@@ -302,19 +308,19 @@ def _drawn_edges(
     twist: Array,
     scale: int = 3,
 ) -> _Edges:
-    """Return the edges of surfaces' drawn normals.
+    """Return edges where the normals of drawn surfaces change.
 
     Args:
         outlines: a surface for each node.
         X_CN: (nodes, 4, 4) the nodes' poses in the camera.
-        camera: the camera.
+        camera: its intrinsics; its pose is not used.
         X_CW: (4, 4) the world's pose in the camera.
-        twist: (6,) of the edges' rotation in the world.
-        scale: the drawing has this many times the picture's size.
+        twist: (6,) rotation vector and translation [m] of the world for 1 rad about the joint.
+        scale: size of the drawing over that of the picture.
     """
-    both = zip(outlines, X_CN, strict=True)
+    surfaces = zip(outlines, X_CN, strict=True)
     corners = np.concatenate(
-        [(one.vertices @ X[:3, :3].T + X[:3, 3])[one.triangles] for one, X in both]
+        [(surface.vertices @ X[:3, :3].T + X[:3, 3])[surface.triangles] for surface, X in surfaces]
     )
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)
@@ -327,17 +333,20 @@ def _drawn_edges(
     picture = np.zeros((scale * camera.height, scale * camera.width, 4), np.float32)
     draw_normals((uv + 0.5) * scale - 0.5, 1.0 / corners[..., 2], normals, picture)
     blurred = cv2.GaussianBlur(picture[..., :3], (0, 0), 0.7 * scale)
-    gu, gv = (cv2.Sobel(blurred, cv2.CV_32F, *by) for by in ((1, 0), (0, 1)))
-    a, b, c = (one.sum(axis=2) for one in (gu * gu, gu * gv, gv * gv))
+    gu, gv = (cv2.Sobel(blurred, cv2.CV_32F, *orders) for orders in ((1, 0), (0, 1)))
+    a, b, c = (product.sum(axis=2) for product in (gu * gu, gu * gv, gv * gv))
     strength = np.sqrt(0.5 * (a + c) + np.sqrt(0.25 * (a - c) ** 2 + b * b))
     angle = 0.5 * np.arctan2(2.0 * b, a - c)
     across = np.stack([np.cos(angle), np.sin(angle)], axis=-1).astype(np.float32)
     rows, columns = np.mgrid[: strength.shape[0], : strength.shape[1]].astype(np.float32)
     before, after = (
         cv2.remap(
-            strength, columns + by * across[..., 0], rows + by * across[..., 1], cv2.INTER_LINEAR
+            strength,
+            columns + step * across[..., 0],
+            rows + step * across[..., 1],
+            cv2.INTER_LINEAR,
         )
-        for by in (-1.0, 1.0)
+        for step in (-1.0, 1.0)
     )
     strong = strength[strength > 1e-3]
     least = 0.25 * float(np.percentile(strong, 95.0)) if len(strong) else np.inf
@@ -345,51 +354,53 @@ def _drawn_edges(
     smooth = cv2.resize(rough, (camera.width, camera.height), interpolation=cv2.INTER_AREA) < 0.01
     v, u = np.nonzero((strength >= after) & (strength > before) & (strength > least))
     bend = before[v, u] - 2.0 * strength[v, u] + after[v, u]
-    by = np.clip(0.5 * (before[v, u] - after[v, u]) / np.minimum(bend, -1e-9), -1.0, 1.0)
+    peak = np.clip(0.5 * (before[v, u] - after[v, u]) / np.minimum(bend, -1e-9), -1.0, 1.0)
     # At an edge the nearer surface counts.
     nearness = cv2.dilate(picture[..., 3], np.ones((3, 3), np.uint8))[v, u].astype(float)
     known = nearness > 0.0
     z, edge_normals = 1.0 / nearness[known], across[v, u][known].astype(float)
-    points = np.column_stack([u, v])[known] + by[known, None] * edge_normals
+    points = np.column_stack([u, v])[known] + peak[known, None] * edge_normals
     points = (points + 0.5) / scale - 0.5
     p_C = np.column_stack([(points - centre) / focal, np.ones(len(z))]) * z[:, None]
     p_W = (p_C - X_CW[:3, 3]) @ X_CW[:3, :3]
     speed = (np.cross(twist[:3], p_W) + twist[3:6]) @ X_CW[:3, :3].T
-    moved = (speed[:, :2] - p_C[:, :2] * (speed[:, 2] / z)[:, None]) * focal / z[:, None]
-    return _Edges(points, edge_normals, (moved * edge_normals).sum(axis=1), smooth)
+    motions = (speed[:, :2] - p_C[:, :2] * (speed[:, 2] / z)[:, None]) * focal / z[:, None]
+    return _Edges(points, edge_normals, (motions * edge_normals).sum(axis=1), smooth)
 
 
 def _strengths(
     edges: _Edges, slopes: _Slopes, beside: Array, reach: float = 4.0
 ) -> tuple[Array, Array]:
-    """Return log strengths of a picture's edges where a base's are, summed over tiles.
+    """Return log gradients of a picture at points on a base's edges, summed over tiles.
 
     Args:
         edges: the drawn edges.
         slopes: the picture's gradients.
-        beside: (n,) angles by which the edges turn further [rad].
-        reach: they move by at most this along their normals [pixel].
+        beside: (n,) angles from that of the drawing to those that are compared [rad].
+        reach: maximum motion of a point along its normal [pixel].
 
     Returns:
-        the sums (n, tiles), and the numbers of points (tiles,).
+        the sums (n, tiles), and the numbers of visible points (tiles,).
     """
     size = np.array(slopes.seen.shape[::-1])
     inside = ((edges.points > reach + 2.0) & (edges.points < size - reach - 3.0)).all(axis=1)
     if not inside.any():
         return np.zeros((len(beside), BASE.tiles**2)), np.zeros(BASE.tiles**2)
-    at, normals, motions = edges.points[inside], edges.normals[inside], edges.motions[inside]
+    points, normals, motions = edges.points[inside], edges.normals[inside], edges.motions[inside]
     offsets = np.arange(-reach, reach + 0.01, 0.25)
-    u, v = ((at[:, k, None] + offsets * normals[:, k, None]).astype(np.float32) for k in range(2))
+    u, v = (
+        (points[:, k, None] + offsets * normals[:, k, None]).astype(np.float32) for k in range(2)
+    )
     seen = cv2.remap(slopes.seen.astype(np.float32), u, v, cv2.INTER_LINEAR)
     across, along = (
-        cv2.remap(one, u, v, cv2.INTER_LINEAR) * np.float32(normals[:, None, k, None])
-        for k, one in enumerate((slopes.across, slopes.along))
+        cv2.remap(slope, u, v, cv2.INTER_LINEAR) * np.float32(normals[:, None, k, None])
+        for k, slope in enumerate((slopes.across, slopes.along))
     )
     counted = (seen > 0.9).all(axis=1)
     logs = np.log1p(np.abs(across + along).max(axis=2)[counted] / BASE.noise)
-    place = np.clip((motions[counted, None] * beside + reach) / 0.25, 0.0, len(offsets) - 1.001)
-    k, rows = place.astype(int), np.arange(len(place))[:, None]
-    own = logs[rows, k] + (place - k) * (logs[rows, k + 1] - logs[rows, k])
-    column, row = (at[counted] + 0.5).astype(int).T
+    index = np.clip((motions[counted, None] * beside + reach) / 0.25, 0.0, len(offsets) - 1.001)
+    k, rows = index.astype(int), np.arange(len(index))[:, None]
+    at_angles = logs[rows, k] + (index - k) * (logs[rows, k + 1] - logs[rows, k])
+    column, row = (points[counted] + 0.5).astype(int).T
     in_tile = np.eye(BASE.tiles**2)[slopes.tiles[row, column]]
-    return own.T @ in_tile, in_tile.sum(axis=0)
+    return at_angles.T @ in_tile, in_tile.sum(axis=0)

@@ -1,8 +1,8 @@
-"""Detect in its pictures that a camera which should stand still was nudged, drifts or shakes.
+"""Detect in a camera's pictures that it does not stand still: it was nudged, drifts or shakes.
 
-Corners of the background are tracked from one reference picture into the others. Their common
-motion is the background's shift. A body, people and shadows move fewer corners than the background
-has. A step of the shift is a nudge, a slow change a drift.
+Corners of the background are tracked from one reference picture into the others. The motion that
+most corners share is the background's shift. Robot, people and shadows move fewer corners. A step
+of the shift is a nudge, a slow change a drift, and a scatter a shake.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,28 +21,32 @@ from drake_pose.workers import map_ordered
 
 @dataclass(frozen=True)
 class MotionSettings:
-    """How the motion of a background is measured, and what counts as one.
+    """How the motion of a background is measured, and what counts as a motion of the camera.
 
-    Chosen on recordings of DROID and LeRobot, and on rooms drawn with nudges of 1 to 13 pixels.
+    Chosen on recordings of DROID and LeRobot, and on drawn rooms with nudges of 1 to 13 pixels.
 
     Args:
         width: maximum width of the pictures in which corners are tracked [pixel].
         most: number of pictures that are compared, evenly spaced, before a nudge is bracketed.
         tiles: number of tiles along a picture's width; each gives its best corner.
-        near, close: distances within which a corner follows a motion, and within which motions
-            are distinguished [pixel of the tracked pictures].
+        near: maximum distance of a corner from where the common motion puts it, for that fit [pixel
+            of the tracked pictures].
+        close: the same to count corners, and maximum motion of a corner that stands still [pixel of
+            the tracked pictures].
         least_corners: minimum number of tracked corners.
         least_share: minimum fraction of the tracked corners that follow the common motion.
-        static_share: a background is static if at least this many corners do not move, as a
-            fraction of those that follow the best common motion. An object with many corners
-            that fills a quarter of the picture leaves 0.17, a camera nudged by 1.6 pixels 0.02.
-        least_step: minimum root mean square shift of a nudge or drift, and least shake
-            [pixel of the tracked pictures].
-        noises: the same, in standard deviations of the shifts about their median.
+        static_share: minimum number of corners that stand still in a static background, over the
+            number that follow the common motion. With an object of many corners that fills a
+            quarter of the picture the ratio is 0.17, with a camera nudged by 1.6 pixels 0.02.
+        least_step: minimum root mean square shift of a nudge or drift, and minimum shake [pixel of
+            the tracked pictures].
+        noises: minimum shift of a nudge or drift [standard deviations of the shifts about their
+            median].
         abrupt: minimum fraction of a nudge's shift that happens between the pictures next to it.
         most_during: maximum number of compared pictures that are taken during a nudge.
         most_nudges: a camera that was nudged more often shakes.
-        around: number of compared pictures before and after a nudge whose medians differ.
+        around: maximum number of compared pictures on each side of a nudge whose shifts' medians
+            are compared.
     """
 
     width: int = 640
@@ -70,7 +74,8 @@ class Nudge(NamedTuple):
     Args:
         before, after: indices of the last picture before and of the first one after it.
         pixels: root mean square shift of the background [pixel].
-        rotation: (3,) rotation vector of directions in the camera's frame if it only turned [rad].
+        rotation: (3,) rotation vector of the background's directions in the camera's frame, as if
+            the camera had only turned [rad].
     """
 
     before: int
@@ -84,8 +89,8 @@ class PictureMotion(NamedTuple):
 
     Args:
         nudges: sudden motions, in order.
-        drift: largest slow motion of the background between two nudges [pixel]; 0: none.
-        shake: median distance of the background's shift from its slow course [pixel]; 0: none.
+        drift: largest slow shift of the background between two nudges [pixel]; 0: none.
+        shake: median distance of the background's shift from its running median [pixel]; 0: none.
     """
 
     nudges: tuple[Nudge, ...]
@@ -98,9 +103,9 @@ class CameraPart(NamedTuple):
 
     Args:
         of: the recorded camera's name.
-        pictures: the part's pictures in the recording.
-        rotation: (3, 3) approximate rotation of the camera in its frame in the first part.
-        since, until: times of the part's first and last picture [s]; None: they have none.
+        pictures: indices of the part's pictures in the recording.
+        rotation: (3, 3) approximate rotation of the camera, in its frame of the first part.
+        since, until: times of the part's first and last picture [s]; None: not logged.
         is_whole: whether it is the whole recording.
         drift, shake: of ``PictureMotion`` [pixel].
     """
@@ -142,12 +147,12 @@ def find_camera_motion(
     parts = [shifts[a : b + 1] for a, b in zip(begins, ends, strict=True)]
     levels = [np.median(part, axis=0) for part in parts]
     nudges = []
-    for (last, first), (one, other) in zip(steps, pairwise(levels), strict=True):
-        by = other - one
-        near = 0.3 * float(np.linalg.norm(by))
+    for (last, first), (before_level, after_level) in zip(steps, pairwise(levels), strict=True):
+        shift = after_level - before_level
+        near = 0.3 * float(np.linalg.norm(shift))
         before, after = _bracket(read, camera, int(rows[last]), int(rows[first]), near)
-        pixels = float(np.linalg.norm(by)) / tracker.scale
-        nudges.append(Nudge(before, after, pixels, tracker.rotation(by)))
+        pixels = float(np.linalg.norm(shift)) / tracker.scale
+        nudges.append(Nudge(before, after, pixels, tracker.rotation(shift)))
     drift, shake = (max(sizes) for sizes in zip(*map(_drift_and_shake, parts), strict=True))
     least = tracker.least
     return PictureMotion(
@@ -158,35 +163,40 @@ def find_camera_motion(
 
 
 def find_steps(shifts: Array, least: float) -> list[tuple[int, int]]:
-    """Return the steps in samples, in order: the last one before and the first one after each.
+    """Find steps of a sampled vector.
 
     Args:
         shifts: (n, d) samples.
-        least: minimum norm of a step.
+        least: minimum norm of a step, in the samples' unit; it must exceed their noise, too.
+
+    Returns:
+        for each step, in order, the indices of the last sample before it and the first after it.
     """
     count, around = len(shifts), MOTION.around
     for taken in range(MOTION.most_during + 1):
         # Samples that were taken during the step belong to neither side.
-        best, found = 0.0, (0, 0)
+        best, step_at = 0.0, (0, 0)
         for first in range(2 + taken, count - 1):
             last = first - taken - 1
             before, after = shifts[max(0, last - around + 1) : last + 1], shifts[first:][:around]
-            one, other = np.median(before, axis=0), np.median(after, axis=0)
-            step = float(np.linalg.norm(other - one))
-            off = np.linalg.norm(np.concatenate([before - one, after - other]), axis=1)
+            before_median, after_median = np.median(before, axis=0), np.median(after, axis=0)
+            step = float(np.linalg.norm(after_median - before_median))
+            off = np.linalg.norm(
+                np.concatenate([before - before_median, after - after_median]), axis=1
+            )
             near = max(off[len(before) - 1], off[len(before)]) < (1.0 - MOTION.abrupt) * step
             noise = 1.4826 * float(np.median(off))
             if near and step > max(best, least, MOTION.noises * noise):
-                best, found = step, (last, first)
+                best, step_at = step, (last, first)
         if best:
-            last, first = found
+            last, first = step_at
             later = [(first + a, first + b) for a, b in find_steps(shifts[first:], least)]
-            return [*find_steps(shifts[: last + 1], least), found, *later]
+            return [*find_steps(shifts[: last + 1], least), step_at, *later]
     return []
 
 
 def _drift_and_shake(shifts: Array) -> tuple[float, float]:
-    """Return the size of the slow change of samples (n, d), and the median distance from it."""
+    """Return the largest change of samples' (n, d) running median, and their median distance."""
     half = MOTION.around // 2
     smooth = np.array(
         [np.median(shifts[max(0, k - half) : k + half + 1], axis=0) for k in range(len(shifts))]
@@ -202,11 +212,12 @@ def _bracket(
 
     Args:
         read, camera: as of `find_camera_motion`.
-        low, high: indices of pictures before and after it.
-        near: maximum shift between pictures on one side of it [pixel of the tracked pictures].
+        low, high: indices of a picture before the nudge, and of one after it.
+        near: maximum shift between pictures on the same side [pixel of the tracked pictures].
     """
 
     def bisect(reference: int, low: int, high: int, from_low: bool) -> tuple[int, int]:
+        """Bracket the end of the pictures near a reference, which is low or high."""
         tracker = _Background(read, reference, camera)
         while high - low > 1:
             k = (low + high) // 2
@@ -244,7 +255,7 @@ class _Background:
         self._corners = _spread_corners(self._reference)
 
     def _even(self, picture: Picture) -> NDArray[np.uint8]:
-        """Return a picture (H, W) grey, with brightness and contrast made even everywhere."""
+        """Return a grey picture (h, w) with local brightness and contrast made equal everywhere."""
         size = self._camera.width, self._camera.height
         grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
         small: Floats = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
@@ -255,56 +266,58 @@ class _Background:
         return np.clip(128.0 + 40.0 * off / (spread + 4.0), 0.0, 255.0).astype(np.uint8)
 
     def shifts(self, rows: Sequence[int], at_once: int = 8) -> Array:
-        """Return the shifts (n, 4) of several pictures; at_once: number of these in memory."""
-        found = list[Array]()
+        """Return the shifts (n, 4) of pictures, see `_shift`; at_once: pictures in memory."""
+        shifts = list[Array]()
         for k in range(0, len(rows), at_once):
-            found += map_ordered(self._shift, map(self._read, rows[k : k + at_once]))
-        return np.array(found)
+            shifts += map_ordered(self._shift, map(self._read, rows[k : k + at_once]))
+        return np.array(shifts)
 
     def _shift(self, picture: Picture) -> Array:
-        """Return the shift (4,) of a picture's background; nan: it is not determined.
+        """Return the shift (4,) of a picture's background [pixel of the tracked pictures].
 
-        It is the motion of the picture's centre along u and v, the rotation, and the relative
-        growth times a picture's root mean square radius, all [pixel of the tracked pictures].
+        It is the motion of the picture's centre along u and along v; and the rotation and the
+        relative growth, each times a picture's root mean square radius. nan: not determined.
         """
         unknown, corners = np.full(4, np.nan), self._corners
         if len(corners) < MOTION.least_corners:
             return unknown
-        found, is_tracked = _track(self._reference, self._even(picture), corners)
-        one, other = corners[is_tracked], found[is_tracked]
-        if len(one) < MOTION.least_corners:
+        tracked, is_tracked = _track(self._reference, self._even(picture), corners)
+        points, moved = corners[is_tracked], tracked[is_tracked]
+        if len(points) < MOTION.least_corners:
             return unknown
         centre = np.array([self._camera.center_x, self._camera.center_y])
-        one, other = one - centre, other - centre
+        points, moved = points - centre, moved - centre
         matrix, follows = cv2.estimateAffinePartial2D(
-            one, other, method=cv2.RANSAC, ransacReprojThreshold=MOTION.near, maxIters=500
+            points, moved, method=cv2.RANSAC, ransacReprojThreshold=MOTION.near, maxIters=500
         )
         if matrix is None:
             return unknown
-        off = np.linalg.norm(one @ matrix[:, :2].T + matrix[:, 2] - other, axis=1)
-        still = np.count_nonzero(np.linalg.norm(other - one, axis=1) < MOTION.close)
-        follow = np.count_nonzero(off < MOTION.close)
+        misfits = np.linalg.norm(points @ matrix[:, :2].T + matrix[:, 2] - moved, axis=1)
+        still = np.count_nonzero(np.linalg.norm(moved - points, axis=1) < MOTION.close)
+        follow = np.count_nonzero(misfits < MOTION.close)
         if still >= max(MOTION.static_share * follow, MOTION.least_corners / 2):
             return np.zeros(4)
-        if np.count_nonzero(follows) < MOTION.least_share * len(one):
+        if np.count_nonzero(follows) < MOTION.least_share * len(points):
             return unknown
-        # The best pair of corners is noisy, all that follow it are less so.
-        # Of a turned camera corners farther out are shifted more (the last two columns).
-        (x, y), zero = one.T, np.zeros(len(one))
+        # RANSAC fits two corners, which are noisy: all corners that follow are fitted again. If a
+        # camera turns, corners farther out are shifted more (the last two columns).
+        (x, y), zero = points.T, np.zeros(len(points))
         fx, fy = self._camera.kernel_parameters()[1:3]
-        more = [x * x / fx**2, x * y / fy**2], [x * y / fx**2, y * y / fy**2]
-        rows = np.array([[x, -y, zero + 1.0, zero, *more[0]], [y, x, zero, zero + 1.0, *more[1]]])
+        perspective = [x * x / fx**2, x * y / fy**2], [x * y / fx**2, y * y / fy**2]
+        rows = np.array(
+            [[x, -y, zero + 1.0, zero, *perspective[0]], [y, x, zero, zero + 1.0, *perspective[1]]]
+        )
         for _ in range(3):
-            own = rows[..., off < MOTION.near].transpose(0, 2, 1).reshape(-1, len(rows[0]))
-            fit = np.linalg.lstsq(own, other[off < MOTION.near].T.ravel(), rcond=None)[0]
-            off = np.linalg.norm(np.einsum("cjn,j->nc", rows, fit) - other, axis=1)
+            used = rows[..., misfits < MOTION.near].transpose(0, 2, 1).reshape(-1, len(rows[0]))
+            fit = np.linalg.lstsq(used, moved[misfits < MOTION.near].T.ravel(), rcond=None)[0]
+            misfits = np.linalg.norm(np.einsum("cjn,j->nc", rows, fit) - moved, axis=1)
         turn, grow = np.arctan2(fit[1], fit[0]), np.hypot(*fit[:2]) - 1.0
         return np.array([*fit[2:4], self._radius * turn, self._radius * grow])
 
-    def rotation(self, by: Array) -> Array:
-        """Return the rotation vector (3,) of directions that gives a shift (4,) [rad]."""
-        (fx, fy), turn = self._camera.kernel_parameters()[1:3], by[2] / self._radius
-        return np.array([-by[1] / fy, by[0] / fx, turn])
+    def rotation(self, shift: Array) -> Array:
+        """Return the rotation vector (3,) of directions [rad] that gives a shift (4,)."""
+        (fx, fy), turn = self._camera.kernel_parameters()[1:3], shift[2] / self._radius
+        return np.array([-shift[1] / fy, shift[0] / fx, turn])
 
 
 def _spread_corners(picture: NDArray[np.uint8]) -> Floats:
@@ -323,18 +336,22 @@ def _spread_corners(picture: NDArray[np.uint8]) -> Floats:
 
 
 def _track(
-    one: NDArray[np.uint8], other: NDArray[np.uint8], corners: Floats
+    picture: NDArray[np.uint8], other: NDArray[np.uint8], corners: Floats
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return where corners (n, 2) of one picture (H, W) are in another, and which were found.
+    """Return the places (n, 2) of a picture's corners in another, and which corners were found.
 
-    A corner is found if it is tracked back to where it was.
+    A corner is found if it can be tracked back to its place.
+
+    Args:
+        picture, other: (h, w) grey pictures.
+        corners: (n, 2) places in the first one [pixel].
     """
     window, levels, start = (15, 15), 3, corners[:, None]
     found, there, _ = cv2.calcOpticalFlowPyrLK(
-        one, other, start, np.empty_like(start), winSize=window, maxLevel=levels
+        picture, other, start, np.empty_like(start), winSize=window, maxLevel=levels
     )
     again, back, _ = cv2.calcOpticalFlowPyrLK(
-        other, one, found, np.empty_like(start), winSize=window, maxLevel=levels
+        other, picture, found, np.empty_like(start), winSize=window, maxLevel=levels
     )
     is_found = np.concatenate([np.asarray(there), np.asarray(back)], axis=1).all(axis=1)
     near = np.abs(np.asarray(again) - start).max(axis=(1, 2)) < MOTION.close

@@ -1,10 +1,10 @@
 """Search a camera's pose in its pictures alone, without masks and without an initial guess.
 
-The camera is static and the body's joint positions are known in each picture. A hypothesis X_CW
-therefore implies in which frames the body covers each pixel, and the pixels' colours score it
-(``fit.background``). Starts are rotations over the whole sphere, and more near upright, with the
-body where pictures change. The best are improved coarse-to-fine on an image pyramid, and finally
-fitted on search lines across the contour in the pixels' foreground log-odds.
+The camera is static and the body's joint positions are known in each picture. A pose hypothesis
+X_CW therefore implies in which frames the body covers each pixel, and the pixels' colours score the
+hypothesis (``fit.background``). A search starts from rotations over the whole sphere, and from more
+near upright, with the body where pictures change. The best poses are improved coarse-to-fine on an
+image pyramid, and finally fitted on search lines across the contour in the foreground log-odds.
 """
 
 import copy
@@ -45,7 +45,7 @@ class PosedPicture:
     Args:
         name: of the frame.
         values: (m,) values of the body's pose tree [rad or m].
-        picture: (H, W, 3) uint8 red, green, blue.
+        picture: (H, W, 3) uint8 RGB.
         rates: (m,) velocities of the values [rad/s or m/s]; None: unknown.
     """
 
@@ -61,10 +61,10 @@ class PictureFit:
 
     Args:
         fit: the fit of frames with foreground log-odds, and masks derived from these.
-        found: the fitted values of its u shared unknowns.
+        found: the fitted values of the fit's u shared unknowns.
         background: the estimated background, which segments further pictures.
-        explained: explained fraction of the log-likelihood gain that is possible at most.
-        contour: mean strength of edges along the outlines, beyond that of random lines.
+        explained: log-likelihood gain of the pose over the largest possible gain.
+        contour: mean strength of edges along the outlines, minus that along random lines.
     """
 
     fit: SharedFit
@@ -90,7 +90,7 @@ class PictureFit:
 
     @cached_property
     def covariance(self) -> Array:
-        """Covariance (u, u) of the shared unknowns."""
+        """Covariance (u, u) of the shared unknowns, see ``SharedFit``."""
         return np.asarray(np.sum(self.fit.covariances(self.found, self.inliers), axis=0))
 
 
@@ -98,10 +98,10 @@ class RoughPose(NamedTuple):
     """A camera fitted roughly to pictures.
 
     Attributes:
-        search: the search in these pictures.
+        search: the search in the pictures.
         camera: at its pose, with the pictures' original size.
         explained, contour: as of ``PictureFit``.
-        ratios: inlier ratios by frame.
+        ratios: inlier ratios by frame name.
     """
 
     search: "PictureSearch"
@@ -114,13 +114,15 @@ class RoughPose(NamedTuple):
 def ratio_margin(
     ratios: Mapping[str, float], others: Mapping[str, float], floor: float = 0.02
 ) -> float:
-    """Return by how much more of the contours fits at one pose than at another [sd].
+    """Return how much larger the inlier ratios are at one pose than at another [sd].
 
-    The scatter of the differences in the same frames gives the standard deviation of their mean.
+    The mean of the differences is divided by its standard deviation, estimated from their scatter
+    over frames. With fewer than two common frames the result is 0.
 
     Args:
-        ratios, others: inlier ratios by frame, at the one pose and at the other.
-        floor: added to this deviation, as fits to one pose from different starts differ by as much.
+        ratios, others: inlier ratios by frame name, at the first pose and at the other.
+        floor: added in quadrature to the standard deviation; fits to one pose from different starts
+            differ by as much.
     """
     more = np.array([ratios[name] - others[name] for name in ratios if name in others])
     if len(more) < 2:
@@ -139,16 +141,14 @@ def node_places(body: RegistrationBody, values: Array) -> Array:
 
     values: (f, m) values of the body's pose tree in f frames.
     """
-    shown = [k for k, one in enumerate(body.coarse) if len(one.vertices)]
-    X_WN = np.array([body.kinematics.poses(one)[shown] for one in values])
+    shown = [k for k, outline in enumerate(body.coarse) if len(outline.vertices)]
+    X_WN = np.array([body.kinematics.poses(row)[shown] for row in values])
     middles = np.array([body.coarse[k].ball[:3] for k in shown])
     return np.asarray(np.einsum("fnij,nj->fni", X_WN[..., :3, :3], middles) + X_WN[..., :3, 3])
 
 
 def choose_frames(places: Array, count: int) -> list[int]:
-    """Return the indices of the most dissimilar frames, by farthest point sampling.
-
-    The frame farthest from the mean comes first.
+    """Return the indices of dissimilar frames, by farthest point sampling from the mean.
 
     places: (f, n, 3), see ``node_places``. count: maximum number of frames.
     """
@@ -173,10 +173,10 @@ class PictureSearch:
 
     Args:
         body: the robot's surfaces.
-        camera: the camera; its pose is not used.
+        camera: its intrinsics; its pose is not used.
         frames: f pictures, the most dissimilar first.
-        riding: whether the body rides along with the camera, which moves; the "world" is then the
-            body's root, and its colours are repeated while those around it change.
+        riding: whether the body moves with the camera (``fit.riding``). The "world" is then the
+            root of the body's pose tree.
     """
 
     def __init__(
@@ -190,11 +190,11 @@ class PictureSearch:
         self._riding = riding
         coarse, *finer = (simplify_or_hull(body.coarse, count) for count in PICTURES.triangles)
         # Small parts are invisible at the coarsest level.
-        least = 0.25 * max(one.ball[3] for one in coarse)
-        coarse = tuple(one if one.ball[3] >= least else EMPTY_OUTLINE for one in coarse)
-        # A body that rides along is near: its shape shows in small pictures, too.
+        least = 0.25 * max(node.ball[3] for node in coarse)
+        coarse = tuple(node if node.ball[3] >= least else EMPTY_OUTLINE for node in coarse)
+        # A body that moves with the camera is near: its shape shows in small pictures, too.
         self._outlines = (body.medium,) * 3 if riding else (coarse, *finer)
-        self._X_WN = self.nodes_at(np.array([one.values for one in frames]))
+        self._X_WN = self.nodes_at(np.array([frame.values for frame in frames]))
         self._levels = dict[int, PyramidLevel]()
         self.joint_offsets = np.zeros(len(body.kinematics.names))
 
@@ -220,95 +220,95 @@ class PictureSearch:
 
         Args:
             rounds: for each round of local search the width of the pictures [pixel], the number of
-                hypotheses, the number of evaluations for each, and the first step's rotation [rad].
-            rotations: number of rotations over the sphere, and again near upright.
+                hypotheses, the number of scores for each, and the first simplex's size [rad].
+            rotations: as of ``PyramidLevel.starts``.
             least_width: minimum width of the pictures in all rounds [pixel].
-            others: number of hypotheses after the first round, rotated from the best by `apart` or
-                more [rad], that are improved again; two of these are the last ones returned.
-            apart: as above.
+            others: maximum number of hypotheses of the first round, far from the best, that are
+                improved separately. The best two of them are returned last.
+            apart: minimum rotation between these and the best hypothesis [rad].
         """
         level = self._level(max(rounds[0][0], least_width))
-        found = level.starts(rotations)
+        poses = level.starts(rotations)
         # The most dissimilar frames select some of the starts.
         first = ((2, 0.12), (4, 0.3)) if self._riding else ((4, 0.25),)
         for frames, fraction in (*first, (len(self.frames), 1.0)):
-            found = level.best(found, frames, fraction)
+            poses = level.best(poses, frames, fraction)
         after = (*(kept for _, kept, _, _ in rounds[1:]), rounds[-1][1])
-        every = list[list[Array]]()
+        improved = list[list[Array]]()
         for (width, kept, evaluations, turn), most in zip(rounds, after, strict=True):
             level = self._level(max(width, least_width))
-            every.append(level.improve(found[:kept], evaluations, turn)[1])
-            found = level.distinct(every[-1], most)
-        far = [one for one in every[0] if rotation_between(one, found[0]) >= apart][:others]
+            improved.append(level.improve(poses[:kept], evaluations, turn)[1])
+            poses = level.distinct(improved[-1], most)
+        far = [X for X in improved[0] if rotation_between(X, poses[0]) >= apart][:others]
         for width, _, evaluations, turn in rounds[-2:] if far else ():
             level = self._level(max(width, least_width))
             far = level.distinct(level.improve(far, evaluations, turn)[1], 2)
-        return [*found, *far]
+        return [*poses, *far]
 
     def with_offsets(self, joint_offsets: Array) -> "PictureSearch":
         """Return the same search with offsets (m,) [rad or m] added to all frames' values."""
-        frames = tuple(replace(one, values=one.values + joint_offsets) for one in self.frames)
+        frames = tuple(replace(k, values=k.values + joint_offsets) for k in self.frames)
         other = self.with_frames(frames)
         other.joint_offsets = self.joint_offsets + joint_offsets
         return other
 
     def with_camera(self, camera: PinholeCamera) -> "PictureSearch":
-        """Return the same search with another lens of the camera; its backgrounds stay."""
+        """Return the same search, backgrounds included, with the intrinsics of `camera`."""
         return self._copy(lambda level: level.with_camera(camera), camera=camera)
 
     def mirrored(self) -> "PictureSearch":
-        """Return the search in the mirrored pictures, whose backgrounds are mirrored, too."""
+        """Return the search in the mirrored pictures, with mirrored backgrounds."""
         frames = tuple(
-            replace(one, picture=np.ascontiguousarray(one.picture[:, ::-1])) for one in self.frames
+            replace(k, picture=np.ascontiguousarray(k.picture[:, ::-1])) for k in self.frames
         )
         return self._copy(PyramidLevel.mirrored, camera=self.camera.mirrored(), frames=frames)
 
     def with_frames(self, frames: Sequence[PosedPicture]) -> "PictureSearch":
-        """Return the same search in other frames, with values without offsets.
+        """Return the same search in other frames, and with `joint_offsets` of 0.
 
-        If they are the same pictures with other values, their backgrounds stay.
+        Frames of the same names are the same pictures with other values: backgrounds are kept.
         """
-        X_WN = self.nodes_at(np.array([one.values for one in frames]))
+        X_WN = self.nodes_at(np.array([frame.values for frame in frames]))
         other = self._copy(
             lambda level: level.with_poses(X_WN[: len(level.backgrounds.pictures)]),
             frames=tuple(frames),
             _X_WN=X_WN,
             joint_offsets=np.zeros_like(self.joint_offsets),
         )
-        if [one.name for one in frames] != [one.name for one in self.frames]:
+        if [frame.name for frame in frames] != [frame.name for frame in self.frames]:
             other._levels = {}
         return other
 
     def silhouettes(self, camera: PinholeCamera, shift: int = 0) -> Mask:
-        """Return the body's silhouettes (f, H, W) in all frames, in pictures of a camera's size.
+        """Return the body's silhouettes (f, H, W) in all frames.
 
         Args:
-            camera: at its pose.
-            shift: each frame gets the values of the one this number of places ahead.
+            camera: at its pose, with pictures of H x W pixels.
+            shift: frame k gets the joint positions of frame k + shift, with wrap-around.
         """
         poses = camera.X_CW @ np.roll(self._X_WN, -shift, axis=0)
         return np.array(map_ordered(lambda X: draw_mask(self._outlines[-1], X, camera), poses))
 
     def nodes_at(self, values: Array) -> Array:
         """Return the nodes' poses X_WN (f, nodes, 4, 4) at values (f, m) of the pose tree."""
-        return np.array([self._body.kinematics.poses(one) for one in values])
+        return np.array([self._body.kinematics.poses(row) for row in values])
 
     def _copy(
         self, level: Callable[[PyramidLevel], PyramidLevel], **changes: Any
     ) -> "PictureSearch":
-        """Return the search with other attributes, and with other levels made from its own."""
+        """Return a copy with changed attributes; `level` converts each of the known levels."""
         other = copy.copy(self)
         other.__dict__.pop("_small", None)
         other.__dict__.update(changes)
-        other._levels = {width: level(one) for width, one in self._levels.items()}
+        other._levels = {width: level(known) for width, known in self._levels.items()}
         return other
 
     def with_shifted_pictures(self) -> "PictureSearch":
         """Return a search in the same pictures, shifted by half their size with wrap-around."""
         height, width = self.camera.height // 2, self.camera.width // 2
         frames = [
-            replace(one, picture=np.roll(one.picture, (height, width), axis=(0, 1)))
-            for one in self.frames
+            replace(frame, picture=np.roll(frame.picture, (height, width), axis=(0, 1)))
+            for frame in self.frames
         ]
         return PictureSearch(self._body, self.camera, frames, self._riding)
 
@@ -328,19 +328,19 @@ class PictureSearch:
         The offsets are searched by their scores (``search_offsets``), then fitted to contours.
 
         Args:
-            joints: names of the joints with an offset. Those whose offset looks like a rotation of
-                the camera, and those that slide, keep 0.
+            joints: names of the joints with an offset. Sliding joints, and joints whose offset
+                looks like a rotation of the camera, keep an offset of 0.
             X_CW: (4, 4) pose from which the search starts.
-            widths: of the pictures in which scores are compared [pixel], one search after another.
-            scales: of the fit's stages [pixel of a picture 320 wide]. Frames are segmented again
-                before each sequence.
+            widths: width of the pictures in each successive search [pixel].
+            scales: for each successive fit the scales of its stages [pixel of a picture 320 wide].
+                Frames are segmented again before each fit.
 
         Returns:
-            the same search with the offsets added to its frames' values, and the pose (4, 4).
+            the search with the offsets added to its frames' values, and the pose X_CW (4, 4).
         """
         kinematics = self._body.kinematics
-        values = np.array([one.values for one in self.frames])
-        shown = np.array([len(one.vertices) > 0 for one in self._body.coarse])
+        values = np.array([frame.values for frame in self.frames])
+        shown = np.array([len(outline.vertices) > 0 for outline in self._body.coarse])
         held = joints_like_cameras(kinematics, values, shown)
         rows = [
             k
@@ -350,14 +350,14 @@ class PictureSearch:
         sought = [kinematics.names[k] for k in rows]
         offsets = np.zeros(len(kinematics.names))
 
-        def poses(count: int, by: Array) -> Array:
-            return np.array([kinematics.poses(one + by) for one in values[:count]])
+        def poses(count: int, added: Array) -> Array:
+            return np.array([kinematics.poses(row + added) for row in values[:count]])
 
         for k, width in enumerate(widths):
             level = self._level(width)
-            some = partial(poses, len(level.backgrounds.pictures))
+            nodes = partial(poses, len(level.backgrounds.pictures))
             X_CW, offsets = search_offsets(
-                level, some, X_CW, offsets, rows, sweeps=2 if k == 0 else 0
+                level, nodes, X_CW, offsets, rows, sweeps=2 if k == 0 else 0
             )
         best = self.with_offsets(offsets), X_CW
         for sequence in scales:
@@ -370,10 +370,10 @@ class PictureSearch:
             if posed is None:
                 break
             fit = SharedFit([posed], [X], sought, fit_biases=False, expected=search._expected)
-            found = fit.fit(_stages(sequence, posed))
+            fitted = fit.fit(_stages(sequence, posed))
             offsets = offsets.copy()
-            offsets[rows] += found.shared[fit.per_camera :]
-            tried = self.with_offsets(offsets), fit.cameras(found)[0].X_CW
+            offsets[rows] += fitted.shared[fit.per_camera :]
+            tried = self.with_offsets(offsets), fit.cameras(fitted)[0].X_CW
             if evidence(*tried[0].compared.explained(tried[1])) <= evidence(
                 *best[0].compared.explained(best[1])
             ):
@@ -382,7 +382,7 @@ class PictureSearch:
         return best
 
     def coarse_fit(self, X_CW: Array) -> "RoughPose | None":
-        """Fit a camera roughly from a pose X_CW (4, 4); None: the body leaves the pictures."""
+        """Fit a camera roughly from X_CW (4, 4); None: fewer than two frames show the body."""
         frames, small = self._small
         stages = ((*(12.0,) * 4, *(8.0,) * 4, *(5.0,) * 4), (*(6.0,) * 3, *(4.0,) * 3))
         for scales in stages:
@@ -392,10 +392,10 @@ class PictureSearch:
             if posed is None:
                 return None
             fit = SharedFit([posed], [X_CW], fit_biases=False)
-            found = fit.fit(_stages(scales, posed))
-            X_CW = fit.cameras(found)[0].X_CW
+            fitted = fit.fit(_stages(scales, posed))
+            X_CW = fit.cameras(fitted)[0].X_CW
         assert posed is not None
-        ratios = zip(posed.frames, fit.inlier_ratios(found).tolist(), strict=True)
+        ratios = zip(posed.frames, fit.inlier_ratios(fitted).tolist(), strict=True)
         return RoughPose(
             self, self.camera.with_pose(np.linalg.inv(X_CW)), *self.compared.explained(X_CW),
             {frame.name: ratio for frame, ratio in ratios},
@@ -413,7 +413,7 @@ class PictureSearch:
             focal: prior standard deviation of the focal length's logarithm; 0: it is not fitted.
 
         Returns:
-            the fit; None if the body leaves the pictures.
+            the fit; None if fewer than two frames show the body.
         """
         lens: dict[str, Any] = {}
         if focal:
@@ -452,17 +452,13 @@ class PictureSearch:
 
     @cached_property
     def _small(self) -> tuple[list[PosedPicture], PinholeCamera]:
-        """The frames at the size in which backgrounds are estimated, and a camera of that size."""
+        """The frames in the size in which backgrounds are estimated, and a camera of this size."""
         camera = self._level(PICTURES.background_width).camera
         size = camera.width, camera.height
+        small = [cv2.resize(k.picture, size, interpolation=cv2.INTER_AREA) for k in self.frames]
         return [
-            replace(
-                one,
-                picture=np.asarray(
-                    cv2.resize(one.picture, size, interpolation=cv2.INTER_AREA), np.uint8
-                ),
-            )
-            for one in self.frames
+            replace(frame, picture=np.asarray(picture, np.uint8))
+            for frame, picture in zip(self.frames, small, strict=True)
         ], camera
 
     def _learn(
@@ -478,7 +474,7 @@ class PictureSearch:
         small = camera.resized(level.camera.width, level.camera.height)
         covered = self.silhouettes(camera)
         same = small.width == camera.width
-        pictures = [one.picture for one in frames]
+        pictures = [frame.picture for frame in frames]
         known = level.backgrounds.known(
             pictures, covered, covered if same else self.silhouettes(small)
         )
@@ -492,7 +488,7 @@ class PictureSearch:
         covered: Mask,
         outlines: Sequence[Outline],
     ) -> PosedFrames | None:
-        """Return the frames that show the body with masks; None if these are fewer than two.
+        """Segment all frames, and return those that show the body; None: fewer than two do.
 
         Args:
             camera: the camera, with pictures of the frames' size H x W.
@@ -506,7 +502,8 @@ class PictureSearch:
         def segment(k: int) -> PosedFrame | None:
             return segment_picture(frames[k], known, gains[k], covered[k])
 
-        posed = [one for one in map_ordered(segment, range(len(frames))) if one is not None]
+        segmented = map_ordered(segment, range(len(frames)))
+        posed = [frame for frame in segmented if frame is not None]
         if len(posed) < 2:
             return None
         return PosedFrames(self._body.kinematics, outlines, camera, posed)
@@ -516,7 +513,7 @@ class PictureSearch:
         if width not in self._levels:
             k = (width > 64) + (width > 120)
             count = PICTURES.search_frames if width < PICTURES.compare_width else len(self.frames)
-            pictures = [one.picture for one in self.frames[:count]]
+            pictures = [frame.picture for frame in self.frames[:count]]
             self._levels[width] = PyramidLevel(
                 self._outlines[k],
                 self.camera,
@@ -529,15 +526,14 @@ class PictureSearch:
 
 
 def _stages(scales: Sequence[float], posed: PosedFrames) -> list[AnnealingStage]:
-    """Return stages of single steps at scales [pixel of a picture 320 wide].
+    """Return stages of one step each, with search lines half a scale apart.
 
-    posed: the frames that are fitted, whose size converts the scales.
+    The search lines' costs are not comparable between poses: each step is taken without a test.
 
-    Search lines are half a scale apart. Their costs are not comparable between poses, so each step
-    is taken untried.
+    scales: [pixel of a picture 320 wide]. posed: the frames that are fitted.
     """
     sizes = np.array(scales) * posed.camera.width / 320.0 / posed.size
-    return [AnnealingStage(one, 0.5 * one) for one in sizes.tolist()]
+    return [AnnealingStage(scale, 0.5 * scale) for scale in sizes.tolist()]
 
 
 def segment_picture(
@@ -547,14 +543,15 @@ def segment_picture(
     covered: Mask,
     around: float | None = None,
 ) -> PosedFrame | None:
-    """Return the frame of a picture with log-odds and a mask; None where no body is visible.
+    """Segment a picture into log-odds and a mask; None: no body is visible in it.
 
     Args:
-        one: the picture, with values and rates that the frame takes over.
+        one: the picture; the returned frame has its name, values and rates.
         known: the background.
         gain: (3, 4) slopes and offset that map the picture's colours to the background's.
         covered: (H, W) the pixels that the body covers approximately.
-        around: log-odds farther from the body are 0 [square root of its area]; None: none are.
+        around: log-odds farther than this from `covered` are 0 [square root of its area]; None: all
+            log-odds are computed.
     """
     if not covered.any():
         return None

@@ -22,8 +22,8 @@ class ScoredPictures(NamedTuple):
     Attributes:
         packed, X_WN, is_static, camera, sums: as for ``explain_poses``.
         middle: (3,) the body's middle in the world [m].
-        scales: (3,) the score is the gain over the first number, plus the third times the contours'
-            strength over the outlines' length plus the second number [pixel].
+        scales: (3,) numbers a [nat], b [pixel] and c of the score: gain / a + c * contours'
+            strength / (outlines' length + b).
     """
 
     packed: PackedOutlines
@@ -37,13 +37,14 @@ class ScoredPictures(NamedTuple):
 
 @compiled
 def move_pose(X_CW: Array, middle: Array, x: Array, moved: Array) -> None:
-    """Write the pose (3, 4) that x moves X_CW (3, 4) to, in the camera's frame.
+    """Move a body in the camera's frame.
 
     Args:
+        X_CW: (3, 4) the pose.
         middle: (3,) the body's middle in the world [m].
         x: (6,) rotation vector about the middle [rad], shift of the middle in the picture along u
             and v [focal lengths], and change of the logarithm of the middle's depth.
-        moved: (3, 4) output.
+        moved: (3, 4) output, the moved pose X_CW.
     """
     angle = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
     turn = np.eye(3)
@@ -91,7 +92,7 @@ def _cost(
     scratch: Words,
     crossings: np.ndarray,
 ) -> tuple[float, np.ndarray]:
-    """Return the negative score of a moved pose, and the crossings, reallocated if need be.
+    """Return the negative score of a moved pose, and `crossings`, which may be reallocated.
 
     X_CW, x, moved: as for ``move_pose``. X_CN, totals, scratch, crossings: as for ``explain_pose``.
     """
@@ -115,9 +116,11 @@ def search_simplexes(
     by 2, contraction and shrinkage by a half.
 
     Args:
-        X_CW: (n, 3, 4) poses at which a search's coordinates, see ``move_pose``, are 0.
-        corners: (n, 7, 6) corners of each first simplex; in the end of the last one, best first.
-        costs: (n, 7) output: their negative scores, ascending.
+        pictures: in which poses are scored.
+        X_CW: (n, 3, 4) poses from which the coordinates `x` of ``move_pose`` are counted.
+        corners: (n, 7, 6) corners of each search's first simplex. Output: those of the last one,
+            best first.
+        costs: (n, 7) output: the corners' negative scores, ascending.
         evaluations: maximum number of scores for each pose, at least 7.
     """
     scratch, crossings = make_words(pictures.packed, pictures.camera)
@@ -141,21 +144,21 @@ def search_simplexes(
             cost, crossings = _cost(pictures, start, tried, moved, X_CN, totals, scratch, crossings)
             count += 1
             # Expand, keep the reflected corner, or contract outside or inside of the simplex.
-            by = 2.0 if cost < cost_of[0] else 0.0 if cost < cost_of[5] else 0.5
-            by = by if cost < cost_of[6] else -0.5
+            factor = 2.0 if cost < cost_of[0] else 0.0 if cost < cost_of[5] else 0.5
+            factor = factor if cost < cost_of[6] else -0.5
             limit = min(cost, cost_of[6])
-            if by == 0.0 or (by == 2.0 and count < evaluations):
+            if factor == 0.0 or (factor == 2.0 and count < evaluations):
                 corner[6], cost_of[6] = tried, cost
-            if by != 0.0 and count < evaluations:
+            if factor != 0.0 and count < evaluations:
                 for i in range(6):
-                    tried[i] = centre[i] + by * (tried[i] - centre[i])
+                    tried[i] = centre[i] + factor * (tried[i] - centre[i])
                 cost, crossings = _cost(
                     pictures, start, tried, moved, X_CN, totals, scratch, crossings
                 )
                 count += 1
-                if cost < limit or (cost == limit and by == 0.5):
+                if cost < limit or (cost == limit and factor == 0.5):
                     corner[6], cost_of[6] = tried, cost
-                elif by != 2.0:
+                elif factor != 2.0:
                     for k in range(1, min(7, 1 + evaluations - count)):
                         for i in range(6):
                             corner[k, i] = corner[0, i] + 0.5 * (corner[k, i] - corner[0, i])

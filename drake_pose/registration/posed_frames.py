@@ -40,8 +40,8 @@ class PosedFrame:
         values: (m,) values of the body's pose tree [rad or m].
         mask: (H, W) the silhouette.
         foreground: (H, W, 3) log-odds of each pixel to show the body, coded as colours
-            (``fit.background``). Where they are given, fits use them in place of the mask.
-        rates: (m,) velocities of the values [rad/s or m/s], where they are known.
+            (``fit.background``), which fits use in place of the mask; None: they use the mask.
+        rates: (m,) velocities of the values [rad/s or m/s]; None: unknown.
     """
 
     name: str
@@ -57,9 +57,9 @@ class PosedFrames:
     Args:
         kinematics: of the body's pose tree.
         outlines: a surface for each node.
-        camera: the camera; its pose is not used.
+        camera: its intrinsics; its pose is not used.
         frames: the frames.
-        spacing: distance of the silhouettes' edge points [square root of the silhouettes' area].
+        spacing: distance of the silhouettes' edge points [`size`].
 
     Attributes:
         X_WN: (frames, nodes, 4, 4) the nodes' poses.
@@ -100,7 +100,7 @@ class PosedFrames:
 
     @cached_property
     def some_points(self) -> Array:
-        """Corners (n, 3) of the convex hulls in at most nine frames, in the world [m]."""
+        """Corners (n, 3) of the convex hulls in at most nine of the frames, in the world [m]."""
         return np.concatenate(self._corners(self.X_WN[:: max(1, len(self.X_WN) // 5)]))
 
     def _corners(self, poses: Array) -> list[Array]:
@@ -122,16 +122,16 @@ class PosedFrames:
         return float(np.sqrt((off**2).sum(axis=1).mean()))
 
     def observations(self, camera: int, count: int) -> list[Observation]:
-        """Return the frames as observations of `count` cameras, with evidence of one of them only.
+        """Return the frames as observations by `count` cameras; only `camera` has evidence.
 
-        camera: index, from 0, of the camera that took the frames.
+        camera: index of the camera that took the frames, from 0.
         """
-        found = []
+        observations = []
         for frame, edge in zip(self.frames, self._edges, strict=True):
             edges = pack_evidence([edge if c == camera else NO_EDGE for c in range(count)])
             foreground = tuple(frame.foreground if c == camera else None for c in range(count))
-            found.append(Observation(edges, frame.values, foreground, frame.rates))
-        return found
+            observations.append(Observation(edges, frame.values, foreground, frame.rates))
+        return observations
 
     @cached_property
     def body(self) -> BodyParameters:
@@ -148,18 +148,18 @@ class PosedFrames:
         ]
 
     def downscaled(self, side: float) -> PinholeCamera:
-        """Return the camera with pictures in which the silhouettes' median area is at most side^2.
+        """Return the camera with pictures so small that `size` is at most `side` [pixel].
 
         Pictures are never enlarged, and have at least 8 x 8 pixels.
         """
         camera, scale = self.camera, min(1.0, side / self.size)
-        width, height = (max(8, round(scale * one)) for one in (camera.width, camera.height))
+        width, height = max(8, round(scale * camera.width)), max(8, round(scale * camera.height))
         return camera.resized(width, height)
 
     def sums(self, frame: int, camera: PinholeCamera) -> NDArray[np.int32]:
-        """Return prefix sums (H, W + 1), see ``reduced_sums``, of the mask of frame number `frame`.
+        """Return the prefix sums (H, W + 1) of a frame's mask, see ``reduced_sums``.
 
-        camera: the downscaled camera, with pictures of H x W pixels.
+        frame: its index. camera: the downscaled camera, with pictures of H x W pixels.
         """
         return reduced_sums(self.frames[frame].mask, camera)
 
@@ -173,19 +173,19 @@ def reduced_sums(mask: Mask, camera: Camera) -> NDArray[np.int32]:
 
 @lru_cache(maxsize=512)
 def _hull_of(outline: Outline) -> Array:
-    """Return the corners (n, 3) of a surface's convex hull in its own frame."""
+    """Return the corners (n, 3) of a surface's convex hull in the surface's frame [m]."""
     return _hull(outline.vertices)
 
 
 @lru_cache(maxsize=256)
 def _placed_hull(outlines: tuple[Outline, ...], X_WN: bytes) -> Array:
-    """Return the corners (n, 3) of a body's convex hull in the world [m].
+    """Return the corners (n, 3) of a body's convex hull in the world [m], cached for other fits.
 
-    Several fits to the same frames need them. X_WN: (nodes, 4, 4) the nodes' poses.
+    outlines: a surface for each node. X_WN: bytes of the nodes' poses (nodes, 4, 4).
     """
     poses = np.frombuffer(X_WN).reshape(-1, 4, 4)
-    own = zip(map(_hull_of, outlines), poses, strict=True)
-    return _hull(np.concatenate([p @ X[:3, :3].T + X[:3, 3] for p, X in own]))
+    hulls = zip(map(_hull_of, outlines), poses, strict=True)
+    return _hull(np.concatenate([p @ X[:3, :3].T + X[:3, 3] for p, X in hulls]))
 
 
 def _hull(points: Array) -> Array:
@@ -203,7 +203,7 @@ def placed_points(outlines: Sequence[Outline], X_WN: Array) -> Array:
         X_WN: (nodes, 4, 4) the nodes' poses.
     """
     placed = zip(outlines, X_WN, strict=True)
-    return np.concatenate([one.vertices @ X[:3, :3].T + X[:3, 3] for one, X in placed])
+    return np.concatenate([outline.vertices @ X[:3, :3].T + X[:3, 3] for outline, X in placed])
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +213,7 @@ class MultiViewFrame:
     Args:
         name: the frame's name.
         values: (m,) values of the body's pose tree [rad or m].
-        masks: silhouettes (H, W) by camera name; cameras without a mask are left out.
+        masks: silhouettes (H, W) by camera name; a camera without a mask has no entry.
         foreground: coded log-odds (H, W, 3) by camera name, see ``PosedFrame``.
         rates: (m,) velocities of the values [rad/s or m/s]; None: unknown.
     """
@@ -226,19 +226,19 @@ class MultiViewFrame:
 
     @classmethod
     def alone(cls, camera: str, frame: PosedFrame) -> "MultiViewFrame":
-        """Return a frame of one camera, given by its name."""
+        """Return the frame of a single camera, named `camera`."""
         foreground = {} if frame.foreground is None else {camera: frame.foreground}
         return cls(frame.name, frame.values, {camera: frame.mask}, foreground, frame.rates)
 
     def of(self, camera: str) -> PosedFrame:
-        """Return the frame of one camera, given by its name, which must have a mask."""
+        """Return the frame of the camera named `camera`; KeyError: it has no mask."""
         foreground = self.foreground.get(camera)
         return PosedFrame(self.name, self.values, self.masks[camera], foreground, self.rates)
 
     def edges(self, cameras: Sequence[Camera], spacing: float) -> Evidence:
-        """Return the edge points of each camera's mask; none for a camera without one.
+        """Return the edge points of each camera's mask; none for a camera without a mask.
 
-        spacing: distance of the points [pixel], rounded, at least 1.
+        spacing: distance of the points, rounded to an integer of 1 or more [pixel].
 
         Raises MaskError: a mask's size differs from its camera's.
         """
@@ -271,7 +271,7 @@ def common_size(cameras: Sequence[Camera], frames: Sequence[MultiViewFrame]) -> 
     """
     areas = []
     for frame in frames:
-        for camera in (one for one in cameras if one.name in frame.masks):
+        for camera in (camera for camera in cameras if camera.name in frame.masks):
             require_size(camera, frame.name, frame.masks[camera.name])
             areas.append(np.count_nonzero(frame.masks[camera.name]))
     if not any(areas):

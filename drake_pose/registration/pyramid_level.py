@@ -1,4 +1,4 @@
-"""Scores of a body's poses in the pictures of one camera, all of one size.
+"""Scores of camera poses in a camera's pictures of a body, all of one size.
 
 A search goes from small pictures to larger ones, and each size is a level of an image pyramid.
 """
@@ -29,10 +29,10 @@ class PictureSettings(NamedTuple):
 
     Args:
         search_frames: number of frames in a search.
-        triangles: number of triangles of a node in pyramid levels up to 64 and up to 120 pixels
-            wide, and in wider ones.
-        compare_width, background_width: width of the pictures in which poses are compared, and
-            backgrounds are estimated [pixel].
+        triangles: maximum number of triangles of a node's surface in pyramid levels up to 64 pixels
+            wide, up to 120, and in wider ones.
+        compare_width, background_width: width of the pictures in which poses are compared, and of
+            those in which backgrounds are estimated [pixel].
         contour_weight: weight of edges along the contours beside the explained fraction.
         rate_step: half the interval of the differences that estimate joint velocities [s].
     """
@@ -49,10 +49,9 @@ PICTURES = PictureSettings()
 
 
 def evidence(explained: float, contour: float) -> float:
-    """Return the score of a pose from its explained fraction and its edges' mean strength.
+    """Return the score of a pose from `explained` and `contour` of a ``PictureFit``.
 
-    Both are those of a ``PictureFit``. The mean over the contours is used: their sum would favour
-    poses with longer contours.
+    The mean over the contours is used: a sum would favour poses with longer contours.
     """
     return explained + PICTURES.contour_weight * contour
 
@@ -66,7 +65,7 @@ class PyramidLevel:
 
     Args:
         outlines: a surface for each node.
-        camera: the camera of the given pictures; its pose is not used.
+        camera: intrinsics of the given pictures; its pose is not used.
         pictures: f pictures (H, W, 3).
         X_WN: (f, nodes, 4, 4) the nodes' poses.
         width: width of this level's pictures [pixel]; at most that of the given ones.
@@ -85,7 +84,7 @@ class PyramidLevel:
         width = min(width, camera.width)
         height = max(8, round(camera.height * width / camera.width))
         self.camera, self._X_WN = camera.resized(width, height), X_WN
-        small = [cv2.resize(one, (width, height), interpolation=cv2.INTER_AREA) for one in pictures]
+        small = [cv2.resize(p, (width, height), interpolation=cv2.INTER_AREA) for p in pictures]
         self._packed = pack(tuple(outlines))
         self._parameters = self.camera.kernel_parameters()
         points = np.array([placed_points(outlines, X) for X in X_WN])
@@ -98,7 +97,8 @@ class PyramidLevel:
         else:
             self.backgrounds = Backgrounds.estimate(np.array(small))
         moves = np.linalg.norm(np.ptp(points, axis=0), axis=1)
-        owners = np.repeat(np.arange(len(outlines)), [len(one.vertices) for one in outlines])
+        counts = [len(outline.vertices) for outline in outlines]
+        owners = np.repeat(np.arange(len(outlines)), counts)
         most = np.zeros(len(outlines))
         np.maximum.at(most, owners, moves)
         # A node is static if its points move by less than 0.06 of the body's size.
@@ -110,7 +110,7 @@ class PyramidLevel:
         self._size = float(np.sqrt((off**2).sum(axis=1).mean()))
 
     def with_camera(self, camera: PinholeCamera) -> "PyramidLevel":
-        """Return the same pictures with another lens, that of a camera of any picture size."""
+        """Return the level with the intrinsics of another camera, which may have any size."""
         other = copy.copy(self)
         other.camera = camera.resized(self.camera.width, self.camera.height)
         other._parameters = other.camera.kernel_parameters()
@@ -123,15 +123,15 @@ class PyramidLevel:
         return other
 
     def with_poses(self, X_WN: Array) -> "PyramidLevel":
-        """Return the same pictures with other poses of the nodes (f, nodes, 4, 4)."""
+        """Return the level of the same pictures with other node poses X_WN (f, nodes, 4, 4)."""
         other = copy.copy(self)
         other._X_WN = X_WN
         return other
 
     def statistics(self, X_CW: Array, X_WN: Array | None = None) -> Array:
-        """Return the sums (4,), see ``Explained``, over the pictures for a pose (4, 4).
+        """Return the sums (4,) over all pictures at a pose (4, 4), see ``Explained``.
 
-        X_WN: (f, nodes, 4, 4) other poses of the nodes; None: those of the pictures' values.
+        X_WN: (f, nodes, 4, 4) poses of the nodes; None: those of the level.
         """
         X_CN = X_CW[:3] @ (self._X_WN if X_WN is None else X_WN)
         return explain(
@@ -157,22 +157,29 @@ class PyramidLevel:
 
         frames: number of frames that are used, from the first on; None: all.
         """
-        own, poses = self._scored(frames), np.asarray(X_CW)[:, :3]
+        pictures, poses = self._scored(frames), np.asarray(X_CW)[:, :3]
 
-        def sums(some: Array) -> Array:
+        def sums(chunk: Array) -> Array:
             return np.asarray(
-                explain_poses(own.packed, some, own.X_WN, own.is_static, own.camera, own.sums)
+                explain_poses(
+                    pictures.packed,
+                    chunk,
+                    pictures.X_WN,
+                    pictures.is_static,
+                    pictures.camera,
+                    pictures.sums,
+                )
             )
 
-        found = np.concatenate(
+        totals = np.concatenate(
             map_ordered(sums, (poses[k : k + 100] for k in range(0, len(poses), 100)))
         )
-        outline = found[:, Explained.OUTLINE] + own.scales[1]
-        contour = own.scales[2] * found[:, Explained.CONTOUR] / outline
-        return np.asarray(found[:, Explained.GAIN] / own.scales[0] + contour)
+        outline = totals[:, Explained.OUTLINE] + pictures.scales[1]
+        contour = pictures.scales[2] * totals[:, Explained.CONTOUR] / outline
+        return np.asarray(totals[:, Explained.GAIN] / pictures.scales[0] + contour)
 
     def _scored(self, frames: int | None = None) -> ScoredPictures:
-        """Return the first pictures, prepared for scores; frames: their number; None: all."""
+        """Return the first `frames` pictures (None: all), prepared for scores."""
         X_WN = np.ascontiguousarray(self._X_WN[:frames, :, :3])
         possible = self.backgrounds.max_gain * len(X_WN) / len(self._X_WN)
         outline, weight = self.backgrounds.contour_terms(
@@ -184,7 +191,7 @@ class PyramidLevel:
         )  # fmt: skip
 
     def best(self, X_CW: Sequence[Array], frames: int, fraction: float) -> list[Array]:
-        """Return the given fraction of the poses (4, 4), those with the best scores, best first.
+        """Return the fraction of the poses (4, 4) that has the best scores, best first.
 
         frames: number of frames that are used, from the first on.
         """
@@ -192,7 +199,7 @@ class PyramidLevel:
         return [X_CW[k] for k in order[: math.ceil(fraction * len(order))]]
 
     def tile_gains(self, X_CW: Array, squares: int = 16) -> Array:
-        """Return the log-likelihood gain of a pose (4, 4) by square image tiles.
+        """Return the log-likelihood gain of a pose (4, 4) by square image tiles [nat].
 
         The result is (squares, squares), with `squares` tiles along the picture's longer side.
         """
@@ -204,19 +211,21 @@ class PyramidLevel:
         return gains
 
     def starts(self, rotations: int = 1200) -> list[Array]:
-        """Return poses X_CW (4, 4) that show the body where pictures change.
+        """Return poses X_CW (4, 4) from which a search starts.
 
-        rotations: number of rotations over the sphere, and again near upright.
+        They show the body where pictures change. Each rotation is combined with three depths, near
+        that at which the body is as large as the changing part, and with two places in the picture:
+        the centre of the changes, and a random one. Where changes tell nothing
+        (``RidingPictures``), places and depths are random.
 
-        Each rotation is combined with three depths about that at which the body is as large as the
-        changes, and with two positions in the picture: the changes' centre, and a random one.
+        rotations: number of rotations over the whole sphere, and of further ones near upright.
         """
         changes = self.backgrounds.changed_frames()
         if changes is None:
             return self._starts_around(18 * rotations)
         v, u = np.mgrid[: changes.shape[0], : changes.shape[1]]
         total = max(float(changes.sum()), 1e-9)
-        middle = np.array([float((changes * one).sum()) / total for one in (u, v)])
+        middle = np.array([float((changes * axis).sum()) / total for axis in (u, v)])
         squares = (u - middle[0]) ** 2 + (v - middle[1]) ** 2
         spread = max(float(np.sqrt((changes * squares).sum() / total)), 2.0)
         R_CW = np.concatenate([uniform_rotations(rotations), upright_rotations(rotations)])
@@ -226,22 +235,22 @@ class PyramidLevel:
         nearest = 0.05 * self._size - 0.7 * p_C[..., 2].min(axis=1)
         rng = np.random.default_rng(0)
         focal, centre = self._parameters[1:3], self._parameters[3:5]
-        found = []
-        for times in (0.7, 1.0, 1.5):
-            depth = np.maximum(focal[0] * sizes / spread * times, nearest)
+        starts = []
+        for factor in (0.7, 1.0, 1.5):
+            depth = np.maximum(focal[0] * sizes / spread * factor, nearest)
             for aside in (np.zeros((len(R_CW), 2)), rng.normal(0.0, 0.5, (len(R_CW), 2))):
                 X = np.tile(np.eye(4), (len(R_CW), 1, 1))
                 X[:, :3, :3] = R_CW
-                place = (middle + spread * aside - centre) / focal
-                p_CM = np.column_stack([place, np.ones(len(R_CW))]) * depth[:, None]
+                directions = (middle + spread * aside - centre) / focal
+                p_CM = np.column_stack([directions, np.ones(len(R_CW))]) * depth[:, None]
                 X[:, :3, 3] = p_CM - R_CW @ self._middle
-                found += list(X)
-        return found
+                starts += list(X)
+        return starts
 
     def _starts_around(self, count: int) -> list[Array]:
-        """Return `count` poses X_CW (4, 4) near the body, whose middle is in the picture or beside.
+        """Return `count` random poses X_CW (4, 4) with the body's middle in or beside the picture.
 
-        The middle is half the body's size to four times it away.
+        The middle is 0.5 to 4 times the body's size away from the camera.
         """
         rng, size = np.random.default_rng(0), (self.camera.width, self.camera.height)
         place = rng.uniform(-0.7, 1.7, (count, 2)) * size - self._parameters[3:5]
@@ -261,8 +270,8 @@ class PyramidLevel:
         Args:
             X_CW: n poses (4, 4).
             evaluations: maximum number of scores for each pose, at least 7.
-            turn: rotation of the first simplex [rad]; its shifts [focal lengths] are 0.4 times, the
-                step of the log depth 0.6 times as large.
+            turn: size of the first simplex in rotation [rad]. In picture shift [focal lengths] it
+                is 0.4 times, in logarithm of the depth 0.6 times as large.
 
         Returns:
             the scores (n,), highest first, and the improved poses.
@@ -274,34 +283,34 @@ class PyramidLevel:
         corners = np.zeros((count, 7, 6))
         corners[:, np.arange(1, 7), np.arange(6)] = steps
         starts, costs = np.asarray(X_CW)[:, :3], np.zeros((count, 7))
-        own, step = self._scored(), max(1, min(5, count // 8))
+        pictures, step = self._scored(), max(1, min(5, count // 8))
 
         def search(k: int) -> None:
-            some = slice(k, k + step)
-            search_simplexes(own, starts[some], corners[some], costs[some], evaluations)
+            part = slice(k, k + step)
+            search_simplexes(pictures, starts[part], corners[part], costs[part], evaluations)
 
         map_ordered(search, range(0, count, step))
         order = np.argsort(costs[:, 0], kind="stable")
         return -costs[order, 0], [self.moved(X_CW[k], corners[k, 0]) for k in order]
 
     def opposite(self, X_CW: Array) -> Array:
-        """Return the pose (4, 4) of a camera on the other side of the body, as far away.
+        """Return the pose X_CW (4, 4) of a camera opposite to another, as far from the body.
 
-        It sees about the mirror image of the silhouettes from X_CW (4, 4), at the mirrored place.
+        It sees about the mirror images of the silhouettes that a camera at `X_CW` (4, 4) sees.
         """
         X = np.diag([-1.0, 1.0, -1.0, 1.0]) @ X_CW
         X[2, 3] += 2.0 * float(X_CW[2, :3] @ self._middle + X_CW[2, 3])
         return X
 
     def distinct(self, X_CW: Sequence[Array], most: int | None = None) -> list[Array]:
-        """Return the poses (4, 4) that place the body apart from every pose kept before.
+        """Return the poses (4, 4) without those that place the body about as an earlier one does.
 
-        most: maximum number of poses; None: no limit.
+        most: maximum number of returned poses; None: no limit.
         """
-        some = self._points[:: max(1, len(self._points) // 50)]
-        kept, places = list[Array](), np.zeros((0, *some.shape))
+        points = self._points[:: max(1, len(self._points) // 50)]
+        kept, places = list[Array](), np.zeros((0, *points.shape))
         for X in X_CW:
-            p_C = some @ X[:3, :3].T + X[:3, 3]
+            p_C = points @ X[:3, :3].T + X[:3, 3]
             apart = np.linalg.norm(places - p_C, axis=2).mean(axis=1)
             if (apart > 0.08 * self._size).all():
                 kept.append(X)

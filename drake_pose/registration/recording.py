@@ -26,8 +26,8 @@ class Recording:
 
     Args:
         names: names of the n pictures.
-        values_at: returns the pose tree's values (n, m) at the pictures' times plus an offset [s],
-            one for all pictures or (n,); NaN for times without a log.
+        values_at: returns the pose tree's values (n, m) [rad or m] at the pictures' times plus a
+            time offset [s], a number or (n,); NaN at times that are not logged.
         read: returns picture k (H, W, 3).
         times: (n,) times of the pictures [s]; None: the log has no times, and the values do not
             depend on the offset.
@@ -43,7 +43,7 @@ class Recording:
         if self.times is None:
             return None
         step = PICTURES.rate_step
-        ahead, behind = (self.values_at(offset + by) for by in (step, -step))
+        ahead, behind = self.values_at(offset + step), self.values_at(offset - step)
         return np.asarray(np.nan_to_num((ahead - behind) / (2.0 * step)))
 
     def picture(self, name: str) -> Picture:
@@ -59,23 +59,26 @@ class Recording:
         return replace(self, values_at=lambda offset: self.values_at(offset) + joint_offsets)
 
     def part(self, pictures: slice) -> "Recording":
-        """Return the recording of some successive pictures."""
+        """Return the recording of successive pictures; the slice needs a start."""
 
         def values_at(offset: float | Array) -> Array:
-            later = np.zeros(len(self.names))
-            later[pictures] = offset
-            return self.values_at(later)[pictures]
+            offsets = np.zeros(len(self.names))
+            offsets[pictures] = offset
+            return self.values_at(offsets)[pictures]
 
         times = None if self.times is None else self.times[pictures]
         first = pictures.start
         return Recording(self.names[pictures], values_at, lambda k: self.read(first + k), times)
 
     def at_offset(self, offset: float) -> "Recording":
-        """Return the recording without times, with the values at a known offset [s]."""
+        """Return the recording without times, with the values at a known time offset [s]."""
         return replace(self, values_at=lambda _: self.values_at(offset), times=None)
 
     def with_drift(self, drift: float, since: float) -> "Recording":
-        """Return the recording with a log clock faster by a drift [s/s], right at `since` [s]."""
+        """Return the recording with time offsets that grow by `drift` [s/s], from 0 at `since` [s].
+
+        Without times, or with a drift of 0, it is returned as it is.
+        """
         if not drift or self.times is None:
             return self
         later = drift * (self.times - since)
@@ -84,14 +87,14 @@ class Recording:
 
 @dataclass(frozen=True, eq=False)
 class TimeOffset:
-    """Time offset of a camera: how much later than the pictures' times their joints are logged.
+    """Time offset of a camera: log time minus picture time of the same joint positions.
 
     Args:
         value, deviation: the offset at the frames' mean time, and its standard deviation [s];
-            infinite if the pictures do not determine it.
-        scores: (k, 2) scanned offsets [s], and their scores over the best one's.
-        drift, drift_deviation: growth of the offset and its standard deviation [s/s]; the drift is
-            0 where it is not significant, and its deviation infinite where it was not fitted.
+            infinity: the pictures do not determine it.
+        scores: (k, 2) scanned offsets [s], and their scores over the best score.
+        drift, drift_deviation: growth of the offset with time, and its standard deviation [s/s].
+            The drift is 0 if it is not significant; the deviation is infinity if none was fitted.
     """
 
     value: float
@@ -102,12 +105,12 @@ class TimeOffset:
 
     @property
     def determined(self) -> bool:
-        """Whether the pictures determine it."""
+        """Whether the pictures determine the offset."""
         return bool(np.isfinite(self.deviation))
 
 
 NO_CLOCK = TimeOffset(0.0, np.inf, np.zeros((0, 2)))
-"""The offset of pictures without information about it."""
+"""The time offset if it is not determined."""
 
 
 def mean_time(recording: Recording, rows: Sequence[int]) -> float:
@@ -125,15 +128,19 @@ def choose_pictures(
     slow_fraction: float = 0.6,
     min_motion: float = 0.05,
 ) -> tuple[list[int], list[int]]:
-    """Choose the frames of a search, and the fastest others.
+    """Choose slow frames for a search, and fast frames, whose pictures determine the time offset.
 
     Args:
-        count, moving: maximum number of search frames, and of fast frames.
-        slow_fraction: search frames are among the slower ones, up to this quantile of the speed.
-        min_motion: minimum motion of any part [m].
+        body: the robot's surfaces.
+        camera: names the camera in messages.
+        recording: the pictures and the joint log.
+        count, moving: maximum number of slow frames, and of fast frames.
+        slow_fraction: quantile of the speed up to which a frame is slow.
+        min_motion: minimum motion of the link that moves most, over the whole recording [m].
 
     Returns:
-        the indices of both, most dissimilar frames first; no fast ones without velocities.
+        the pictures' indices of the slow and of the fast frames, the most dissimilar first. Without
+        logged times no frame counts as fast.
 
     Raises RegistrationError: too few pictures have joint positions, or the robot does not move.
     """
@@ -172,12 +179,12 @@ def posed_pictures(
     offset: float,
     known: Sequence[PosedPicture] = (),
 ) -> list[PosedPicture]:
-    """Return pictures, by their indices, that have logged values at a time offset [s].
+    """Return the pictures of `indices` that have logged values at a time offset [s].
 
-    known: some of the recording's pictures, which are not read again.
+    known: pictures of the recording that have been read before.
     """
     values, rates = recording.values_at(offset), recording.rates_at(offset)
-    pictures = {one.name: one.picture for one in known}
+    pictures = {frame.name: frame.picture for frame in known}
 
     def posed(k: int) -> PosedPicture:
         name = recording.names[k]
@@ -199,19 +206,19 @@ def scan_time_offsets(
     """Return the time offset that explains pictures best, for a camera at a known pose.
 
     Offsets from -1 to 1 s are scanned, then drifts of the log's clock. Standard deviations are not
-    estimated (infinite).
+    estimated (infinity).
 
     Args:
         search: a search in the pictures that are used.
         camera: at its pose.
-        recording: their recording, with the same joint offsets.
+        recording: the pictures' recording, with the same joint offsets as the search.
         rates: scanned drifts [s/s].
-        start_within: for a drift both clocks start together within this time [s].
-        much_better: minimum ratio of a drift's score to that of the best constant offset.
+        start_within: with a drift, maximum time offset at the recording's first picture [s].
+        much_better: minimum score of a drift over that of the best constant offset.
     """
     offsets = np.linspace(-1.0, 1.0, 81)
     level = search.compared
-    rows = [recording.names.index(one.name) for one in search.frames]
+    rows = [recording.names.index(frame.name) for frame in search.frames]
 
     def gains_at(clock: Recording, tried: Array) -> Array:
         """Return log-likelihood gains (k,) at k time offsets [s]; NaN without logged joints."""
@@ -225,22 +232,22 @@ def scan_time_offsets(
         return np.array(map_ordered(gain, several))
 
     scores = gains_at(recording, offsets)
-    k = int(np.nanargmax(scores))
-    offset, drift = float(offsets[k]), 0.0
-    if 0 < k < len(scores) - 1 and np.isfinite(scores[k - 1 : k + 2]).all():
-        low, middle, high = scores[k - 1 : k + 2]
+    peak = int(np.nanargmax(scores))
+    offset, drift = float(offsets[peak]), 0.0
+    if 0 < peak < len(scores) - 1 and np.isfinite(scores[peak - 1 : peak + 2]).all():
+        low, middle, high = scores[peak - 1 : peak + 2]
         bend = low - 2.0 * middle + high
         if bend < 0.0:
             offset += 0.5 * float((low - high) / bend) * float(offsets[1] - offsets[0])
-    best, most = scores[k], much_better * scores[k]
+    constant_score, best_score = scores[peak], much_better * scores[peak]
     if recording.times is not None:
         first, mean = float(recording.times[0]), mean_time(recording, rows)
         starts = np.linspace(-start_within, start_within, 13)
         for rate in rates:
             gains = gains_at(recording.with_drift(rate, first), starts)
-            if np.isfinite(gains).any() and (gain := float(np.nanmax(gains))) > most:
-                most, drift = gain, rate
+            if np.isfinite(gains).any() and (gain := float(np.nanmax(gains))) > best_score:
+                best_score, drift = gain, rate
                 offset = float(starts[int(np.nanargmax(gains))]) + rate * (mean - first)
     known = np.isfinite(scores)
-    tried = np.column_stack([offsets[known], scores[known] / max(best, 1e-9)])
+    tried = np.column_stack([offsets[known], scores[known] / max(constant_score, 1e-9)])
     return TimeOffset(offset, np.inf, tried, drift)

@@ -1,7 +1,8 @@
 """The pose of a camera on a robot's link, from the gripper that it sees.
 
-The gripper rides along: what its silhouettes tell about the pictures scores a pose
-(``fit.riding``). All rotations are searched, and the best poses are fitted to its contours.
+The gripper moves with the camera. A pose's score is how well the gripper's silhouettes separate the
+kinds of pixels in the pictures (``fit.riding``). All rotations are searched, and the best poses are
+fitted to the gripper's contours.
 """
 
 import math
@@ -31,19 +32,18 @@ class GripperSettings(NamedTuple):
 
     Args:
         pictures: maximum number of pictures.
-        rounds: of the search, see ``PictureSearch.search``.
-        starts: number of rotations, see there.
+        rounds, starts: `rounds` and `rotations` of ``PictureSearch.search``.
         fitted: maximum number of poses that are fitted to contours.
-        shown: minimum fraction of the pictures that the gripper covers.
-        least_ratio: minimum mean inlier ratio of its contours, and where the scene gives about the
-            same pose. Grippers of other models have 0.5 at most.
-        least_gain: a pose explains at least this many times what the best one explains in pictures
-            that are shifted by half their size.
-        least_vuong: minimum Vuong statistic of a pose that explains significantly more than others,
-            and than with the joint positions of other pictures.
-        opening: minimum motion of a finger that tells the clock [m].
-        max_sd: maximum standard deviation of a pose along any axis [rad, m].
-        clock_sd: maximum standard deviation of a time offset that is determined [s].
+        shown: minimum fraction of the pictures' pixels that the gripper covers.
+        least_ratio: minimum mean inlier ratio of its contours, without a guess and near the pose
+            that the scene gives. Grippers of other models reach 0.5 at most.
+        least_gain: minimum explained fraction over the largest one that any pose reaches in the
+            same pictures shifted by half their size.
+        least_vuong: Vuong statistic from which one pose explains significantly more than another,
+            or more than itself with the joint positions of other pictures.
+        opening: minimum motion of a finger that determines the time offset [m].
+        max_sd: maximum standard deviation of a pose along any axis [rad and m].
+        clock_sd: maximum standard deviation of a time offset that counts as determined [s].
     """
 
     pictures: int = 16
@@ -71,14 +71,14 @@ class GripperFit(NamedTuple):
     """A camera's pose from its gripper.
 
     Args:
-        X_LC: (4, 4).
-        covariance: (6, 6) of its errors, rotation vector [rad] and translation [m] along the
+        X_LC: (4, 4) the camera's pose on the link.
+        covariance: (6, 6) of the pose's errors, rotation vector [rad] and translation [m] along the
             camera's axes.
         ratio: mean inlier ratio of the contours.
-        explained, chance: what the silhouettes tell about the pictures (1: about all), and at most
-            in shifted pictures (nan: not tried).
-        time_offset: value and standard deviation of the clock's offset [s]; None: not determined.
-        silhouettes: of the gripper (H, W) at this pose, by the pictures' names.
+        explained: what the silhouettes tell about the pixels, over about the most possible.
+        chance: largest `explained` of any pose in shifted pictures; nan: not tried.
+        time_offset: value and standard deviation of the time offset [s]; None: not determined.
+        silhouettes: (H, W) of the gripper at this pose, by picture name.
     """
 
     X_LC: Array
@@ -90,10 +90,10 @@ class GripperFit(NamedTuple):
     silhouettes: dict[str, Mask]
 
     def prior(self, other: Array | None = None) -> PosePrior:
-        """Return the pose as a prior of a fit.
+        """Return the pose as a prior of a fit, or for a comparison with another pose.
 
-        other: covariance of another pose, with which it is to be compared; its first six unknowns
-            are the pose's. None: there is none.
+        other: (6 + k, 6 + k) covariance of the other pose's errors, then of k further unknowns; the
+            first part is added. None: nothing is added.
         """
         covariance = self.covariance if other is None else self.covariance + other[:6, :6]
         return PosePrior(self.X_LC, covariance)
@@ -104,9 +104,9 @@ class GripperSearch:
 
     Args:
         body: the gripper: the link and what it carries, in a pose tree that starts at the link.
-        robot: the parts that stand still, in the same tree; the pictures are chosen by how the link
-            moves between them.
-        camera: its pose is not used.
+        robot: the parts that stand still, in the same tree. Their poses on the link, and the
+            fingers', tell which pictures are most dissimilar.
+        camera: its intrinsics; its pose is not used.
         recording: the camera's pictures and the joint log.
     """
 
@@ -121,29 +121,32 @@ class GripperSearch:
         values = recording.values_at(0.0)
         known = np.flatnonzero(np.isfinite(values).all(axis=1))
         places, self._moves = [], False
-        for one in (body, robot):
-            own = node_places(one, values[known])
-            spread = float(np.linalg.norm(np.ptp(own, axis=0), axis=1).max())
-            self._moves |= one is body and spread > GRIPPER.opening
-            places.append(own / max(spread, GRIPPER.opening))
-        both = np.concatenate(places, axis=1)
-        self._rows = known[choose_frames(both, GRIPPER.pictures)].tolist()
+        for part in (body, robot):
+            origins = node_places(part, values[known])
+            spread = float(np.linalg.norm(np.ptp(origins, axis=0), axis=1).max())
+            self._moves |= part is body and spread > GRIPPER.opening
+            places.append(origins / max(spread, GRIPPER.opening))
+        features = np.concatenate(places, axis=1)
+        self._rows = known[choose_frames(features, GRIPPER.pictures)].tolist()
 
     def near(self, X_LC: Array, offset: float) -> GripperFit | None:
-        """Return the fit near a pose (4, 4) at a known time offset [s]; None: none is accepted."""
+        """Return the fit near a pose (4, 4) of the camera on the link; None: it is not accepted.
+
+        offset: the known time offset [s].
+        """
         search = self._search(offset)
         if not self._shown(X_LC, search):
             return None
-        found = search.fit(self._camera.with_pose(X_LC))
-        return None if found is None else self._accepted(found, math.nan, search)
+        fit = search.fit(self._camera.with_pose(X_LC))
+        return None if fit is None else self._accepted(fit, math.nan, search)
 
     def find(self) -> tuple[list[GripperFit], str]:
-        """Return the poses that explain the pictures, best first, without a guess.
+        """Search without a guess, and return the accepted fits, best first.
 
-        Poses are left out that explain significantly less than the best one.
+        Poses that explain significantly less than the best one are left out.
 
         Returns:
-            the fits; and, if there are none, why.
+            the fits, and the reason in words that applies if there are none.
         """
         if not self._moves:
             return [], "its fingers are not logged or do not move, and an outline may be anything's"
@@ -153,7 +156,7 @@ class GripperSearch:
         if fits:
             # Many grippers look nearly the same after half a turn about an axis of their link.
             X_LC, turns = fits[0].camera.X_WC, 1.0 - 2.0 * (1.0 - np.eye(3))
-            turned = [np.linalg.inv(np.diag([*one, 1.0]) @ X_LC) for one in turns]
+            turned = [np.linalg.inv(np.diag([*turn, 1.0]) @ X_LC) for turn in turns]
             fits = self._fits(search, turned, constants, fits)
         if not fits:
             return [], "no pose of it explains the pictures"
@@ -174,10 +177,10 @@ class GripperSearch:
         if min(exchanged) < GRIPPER.least_vuong:
             return [], "its silhouettes fit as well with openings of other moments"
         accepted = list[GripperFit]()
-        for one in fits:
-            alike = vuong_statistic(gains, self._gains(search, one)) < GRIPPER.least_vuong
-            if one is best or alike:
-                fit = self._accepted(one, chance, search)
+        for candidate in fits:
+            alike = vuong_statistic(gains, self._gains(search, candidate)) < GRIPPER.least_vuong
+            if candidate is best or alike:
+                fit = self._accepted(candidate, chance, search)
                 if fit is not None:
                     accepted.append(fit)
         ratio = float(best.ratios.mean())
@@ -187,6 +190,7 @@ class GripperSearch:
         return accepted, why
 
     def _search(self, offset: float) -> PictureSearch:
+        """Return a search in the chosen pictures, with joint positions at a time offset [s]."""
         pictures = posed_pictures(self._recording, self._rows, offset)
         return PictureSearch(self._body, self._camera, pictures, riding=True)
 
@@ -197,7 +201,14 @@ class GripperSearch:
         constants: Sequence[str],
         known: Sequence[PictureFit] = (),
     ) -> list[PictureFit]:
-        """Return distinct fits from poses X_CW (4, 4), and those that are known, best first."""
+        """Return distinct fits, the known ones among them, best first.
+
+        Args:
+            search: in the pictures that are fitted.
+            poses: starts X_CW (4, 4), where the world is the link, best first.
+            constants: further unknowns, as of ``PictureSearch.fit``.
+            known: earlier fits.
+        """
         fits = list(known)
         for X in poses[: GRIPPER.fitted]:
             coarse = search.coarse_fit(X)
@@ -208,10 +219,10 @@ class GripperSearch:
                 and all(poses_differ(fit.camera.X_WC, k.camera.X_WC) for k in fits)
             ):
                 fits.append(fit)
-        return sorted(fits, key=lambda one: -search.compared.score(one.camera.X_CW))
+        return sorted(fits, key=lambda fit: -search.compared.score(fit.camera.X_CW))
 
     def _shown(self, X_LC: Array, search: PictureSearch) -> bool:
-        """Return whether a camera at X_LC (4, 4) sees enough of the gripper."""
+        """Return whether the gripper covers enough of the pictures of a camera at X_LC (4, 4)."""
         return float(self._masks(search, X_LC).mean()) > GRIPPER.shown
 
     def _masks(self, search: PictureSearch, X_LC: Array, shift: int = 0) -> Mask:
@@ -222,12 +233,18 @@ class GripperSearch:
         return search.silhouettes(search.compared.camera.with_pose(X_LC), shift)
 
     def _gains(self, search: PictureSearch, fit: PictureFit, shift: int = 0) -> Array:
-        """Return what a fit's silhouettes tell by tiles; shift: as of `_masks`."""
+        """Return the gains of a fit's silhouettes by tiles, see ``silhouette_gains``.
+
+        shift: as of `_masks`.
+        """
         masks = self._masks(search, fit.camera.X_WC, shift)
         return silhouette_gains(search.compared.backgrounds.sums, masks)
 
     def _accepted(self, fit: PictureFit, chance: float, search: PictureSearch) -> GripperFit | None:
-        """Return a fit whose contours fit; None for others."""
+        """Return the camera's pose from a fit; None: its contours fit badly, or it is not exact.
+
+        chance: as of ``GripperFit``; nan for a fit near the pose that the scene gives.
+        """
         ratio = float(fit.ratios.mean())
         if ratio < GRIPPER.least_ratio[1 if math.isnan(chance) else 0]:
             return None
@@ -245,6 +262,6 @@ class GripperSearch:
                 clock = float(fit.found.shared[k]), deviation
         X_LC = fit.camera.X_WC
         J = np.kron(np.eye(2), X_LC[:3, :3])
-        names = (one.name for one in search.frames)
-        drawn = dict(zip(names, search.silhouettes(fit.camera), strict=True))
-        return GripperFit(X_LC, J.T @ pose @ J, ratio, fit.explained, chance, clock, drawn)
+        names = (frame.name for frame in search.frames)
+        silhouettes = dict(zip(names, search.silhouettes(fit.camera), strict=True))
+        return GripperFit(X_LC, J.T @ pose @ J, ratio, fit.explained, chance, clock, silhouettes)

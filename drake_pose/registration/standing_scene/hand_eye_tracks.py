@@ -1,10 +1,10 @@
 """The pose of a camera on a robot's link, from whatever stands still in its pictures.
 
 Points of the scene are matched between pictures. The link's poses X_WL are known, so a pose X_LC of
-the camera on the link predicts X_WC = X_WL X_LC in each picture, with its scale. All rotations R_LC
-are searched: for each, the epipolar constraints are linear in the position p_LC. The best poses are
-fitted by bundle adjustment over all points. Points that ride along with the camera, such as the
-gripper's, move otherwise than the scene and do not count.
+the camera on the link predicts X_WC = X_WL X_LC in each picture, in metres. All rotations R_LC are
+searched: for each, the epipolar constraints are linear in the position p_LC. The best poses are
+fitted by bundle adjustment over all points. Points that move with the camera, such as the
+gripper's, contradict the scene's motion and are outliers.
 """
 
 from collections.abc import Callable
@@ -29,11 +29,11 @@ class TrackSettings(NamedTuple):
         matches: maximum number of matches in the search.
         rotations: number of rotations from which the search starts.
         refined: number of poses that are refined by the epipolar constraints.
-        coarse: scales of the robust loss of the search, then of the refinements [rad].
-        fine: scales of the robust loss of the bundle adjustment [pixel].
-        last: number of steps after these, at a scale that follows the residuals.
-        inlier: sightings within this many standard deviations fit.
-        groups: number of groups of successive frames, each of which is left out once.
+        coarse: scale of the robust loss in the search, then in each refinement [rad].
+        fine: scale of the robust loss in each first step of the bundle adjustment [pixel].
+        last: number of further steps, whose scale follows from the residuals.
+        inlier: a sighting within this many standard deviations is an inlier.
+        groups: number of groups of successive frames in the jackknife.
     """
 
     matches: int = 300
@@ -53,8 +53,9 @@ class EpipolarSearch:
     """Searches X_LC by the epipolar constraints of matches, without a guess.
 
     Args:
-        camera: its pose is not used.
-        matches: between pictures; some, drawn evenly from the pairs, are used.
+        camera: its intrinsics; its pose is not used.
+        matches: between pictures; at most `TRACKS.matches` are used, as many of each pair of
+            pictures as possible.
     """
 
     def __init__(self, camera: PinholeCamera, matches: Matches) -> None:
@@ -63,18 +64,18 @@ class EpipolarSearch:
         order = order[np.argsort(pair[order], kind="stable")]
         counts = np.bincount(pair)
         rank = np.arange(len(pair)) - np.repeat(np.cumsum(counts) - counts, counts)
-        some = order[np.argsort(rank, kind="stable")[: TRACKS.matches]]
-        x = rays(camera, matches.uv[some])
-        self._pairs, self._pair, self._x, self._y = pairs, pair[some], x[:, 0], x[:, 1]
+        chosen = order[np.argsort(rank, kind="stable")[: TRACKS.matches]]
+        x = rays(camera, matches.uv[chosen])
+        self._pairs, self._pair, self._x, self._y = pairs, pair[chosen], x[:, 0], x[:, 1]
 
     def search(self, X_WL: Array, rotations: int = TRACKS.rotations) -> list[tuple[float, Array]]:
-        """Return distinct X_LC (4, 4), each after the fraction of matches that it explains.
+        """Return distinct poses, best first: the explained fraction of the matches, and X_LC.
 
-        X_WL: (frames, 4, 4) the link's poses. rotations: number of rotations. Best come first.
+        X_WL: (frames, 4, 4) the link's poses. rotations: number of rotations that are tried.
         """
         R, A = uniform_rotations(rotations), self._motions(X_WL)
         parts = [self._positions(A, part) for part in np.array_split(R, max(1, len(R) // 250))]
-        p, gain = (np.concatenate(one) for one in zip(*parts, strict=True))
+        p, gain = (np.concatenate(chunks) for chunks in zip(*parts, strict=True))
         best = np.argsort(-gain)[: TRACKS.refined]
         X = np.tile(np.eye(4), (len(best), 1, 1))
         X[:, :3, :3], X[:, :3, 3] = R[best], p[best]
@@ -87,7 +88,10 @@ class EpipolarSearch:
         return kept
 
     def refine(self, X_WL: Array, X_LC: Array) -> tuple[float, Array]:
-        """Return the fraction that a pose X_LC (4, 4), refined, explains, and the refined pose."""
+        """Refine a pose X_LC (4, 4); return the explained fraction of the matches, and the pose.
+
+        X_WL: (frames, 4, 4) the link's poses.
+        """
         A, X = self._motions(X_WL), X_LC[None]
         for scale in TRACKS.coarse[2:]:
             X = self._refined(A, X, scale)
@@ -99,7 +103,10 @@ class EpipolarSearch:
         return np.asarray(inverse_transforms(X_WL[j]) @ X_WL[i])
 
     def _positions(self, A: Array, R: Array, rounds: int = 4) -> tuple[Array, Array]:
-        """Return the best p_LC (n, 3) for rotations R_LC (n, 3, 3), and what they explain (n,)."""
+        """Return the best p_LC (n, 3) for rotations R_LC (n, 3, 3), and explained fractions (n,).
+
+        A: as of `_motions`. rounds: number of reweighted least squares.
+        """
         R_A, pair, scale = A[:, :3, :3], self._pair, TRACKS.coarse[0]
         R_B = np.einsum("nji,pjk,nkl->npil", R, R_A, R)[:, pair]
         Rx = np.einsum("nmij,mj->nmi", R_B, self._x)
@@ -117,27 +124,40 @@ class EpipolarSearch:
         return p, np.sqrt(_weights(off, scale)).mean(axis=1)
 
     def _translations(self, A: Array, R: Array, p: Array) -> Array:
-        """Return the camera's translations (n, matches, 3) at rotations R and positions p."""
+        """Return the camera's translations (n, matches, 3) between the pictures of each match [m].
+
+        A: as of `_motions`. R, p: (n, 3, 3) and (n, 3) the camera's pose on the link.
+        """
         moved = np.einsum("pij,nj->npi", A[:, :3, :3] - np.eye(3), p) + A[:, :3, 3]
         return np.asarray((moved @ R)[:, self._pair])
 
     def _residuals(self, A: Array, X: Array) -> Array:
-        """Return the epipolar distances (n, matches) [rad] at poses X_LC (n, 4, 4)."""
+        """Return the epipolar distances (n, matches) [rad] at poses X_LC (n, 4, 4).
+
+        A: as of `_motions`.
+        """
         R = X[:, :3, :3]
         R_B = np.einsum("nji,pjk,nkl->npil", R, A[:, :3, :3], R)[:, self._pair]
         Rx = np.einsum("nmij,mj->nmi", R_B, self._x)
         return _sampson(self._translations(A, R, X[:, :3, 3]), Rx, R_B, self._y)[0]
 
     def _gains(self, A: Array, X: Array, scale: float) -> Array:
-        """Return 1 minus the mean robust loss (n,) at poses X_LC (n, 4, 4)."""
+        """Return the explained fractions (n,), 1 minus the mean robust loss, at X_LC (n, 4, 4).
+
+        A: as of `_motions`. scale: of the loss [rad].
+        """
         return np.asarray(np.sqrt(_weights(self._residuals(A, X), scale)).mean(axis=1))
 
     def _refined(self, A: Array, X: Array, scale: float, steps: int = 4, h: float = 1e-5) -> Array:
-        """Return poses X (n, 4, 4) after Gauss-Newton steps, of which those that help are taken."""
+        """Return poses X_LC (n, 4, 4) after Gauss-Newton steps; steps that do not help are undone.
+
+        A: as of `_motions`. X: (n, 4, 4) X_LC at the start. scale: of the loss [rad]. h: difference
+        that estimates derivatives [rad and m].
+        """
         for _ in range(steps):
             r = self._residuals(A, X)
-            by = [self._residuals(A, X @ motion(h * one)) for one in np.eye(6)]
-            J = np.stack([(one - r) / h for one in by], axis=-1)
+            shifted = [self._residuals(A, X @ motion(h * changed)) for changed in np.eye(6)]
+            J = np.stack([(changed - r) / h for changed in shifted], axis=-1)
             wJ = _weights(r, scale)[..., None] * J
             H = np.swapaxes(wJ, 1, 2) @ J
             H += 1e-3 * np.einsum("nii->ni", H)[:, :, None] * np.eye(6) + 1e-9 * np.eye(6)
@@ -150,34 +170,35 @@ class EpipolarSearch:
 
 
 LinkPoses = Callable[[Array], Array]
-"""Returns the link's poses X_WL (frames, 4, 4) at the values (k,) of further constants."""
+"""Returns the link's poses X_WL (frames, 4, 4) at constants (k,): time offset, joint offsets."""
 
 
 def pose_difference(X_LC: Array, other: Array) -> Array:
-    """Return rotation vectors [rad] and translations [m] (..., 6) from poses to others.
+    """Return rotation vectors [rad] and translations [m] (..., 6) from one pose to another.
 
-    X_LC, other: (..., 4, 4). The result is along the axes of X_LC.
+    X_LC, other: (..., 4, 4) poses. The result is along the camera's axes at X_LC.
     """
-    by = inverse_transforms(X_LC) @ other
-    turns = Rotation.from_matrix(by[..., :3, :3].reshape(-1, 3, 3)).as_rotvec()
-    return np.concatenate([turns.reshape(*by.shape[:-2], 3), by[..., :3, 3]], axis=-1)
+    X = inverse_transforms(X_LC) @ other
+    turns = Rotation.from_matrix(X[..., :3, :3].reshape(-1, 3, 3)).as_rotvec()
+    return np.concatenate([turns.reshape(*X.shape[:-2], 3), X[..., :3, 3]], axis=-1)
 
 
 class PosePrior(NamedTuple):
     """What is known of a pose X_LC (4, 4) before a fit.
 
-    covariance: (6, 6) of its errors, rotation vector [rad] and translation [m] along its own axes.
+    covariance: (6, 6) of its errors, rotation vector [rad] and translation [m] along the camera's
+    axes at X_LC.
     """
 
     X_LC: Array
     covariance: Array
 
     def off(self, X_LC: Array) -> Array:
-        """Return by how much a pose (4, 4) differs (6,), along the axes of the known one."""
+        """Return the difference (6,) from the known pose to X_LC (4, 4), see `pose_difference`."""
         return pose_difference(self.X_LC, X_LC)
 
     def size(self, X_LC: Array) -> float:
-        """Return the root mean square of these differences, in standard deviations."""
+        """Return the root mean square difference to a pose X_LC (4, 4) [standard deviations]."""
         off = self.off(X_LC)
         return float(np.sqrt(off @ np.linalg.solve(self.covariance, off) / len(off)))
 
@@ -186,13 +207,13 @@ class TrackProblem(NamedTuple):
     """What a bundle adjustment fits.
 
     Args:
-        camera: its pose is not used.
-        link_poses: the link's poses; their constants are a time offset [s] or joint offsets [rad or
-            m], whose mean is 0.
+        camera: its intrinsics; its pose is not used.
+        link_poses: the link's poses as a function of k constants, such as a time offset [s] and
+            joint offsets [rad or m]; the prior mean of each is 0.
         seen: the sightings.
-        prior_sds: (1 + k,) prior standard deviations of the logarithm of the focal length (0: it is
-            known) and of the constants.
-        prior: of the camera's pose; None: it is not known.
+        prior_sds: (1 + k,) prior standard deviations of the logarithm of the focal length and of
+            the constants; 0: it is known and not fitted.
+        prior: of the camera's pose; None: nothing is known of it.
     """
 
     camera: PinholeCamera
@@ -202,13 +223,16 @@ class TrackProblem(NamedTuple):
     prior: PosePrior | None = None
 
     def without(self, frames: Indices) -> "TrackProblem":
-        """Return the problem without the sightings of some frames."""
+        """Return the problem without the sightings in frames of these indices.
+
+        Points that are then seen once only are left out, too.
+        """
         seen = self.seen
         kept = ~np.isin(seen.frames, frames)
-        often = np.bincount(seen.points[kept], minlength=seen.points.max() + 1) > 1
-        kept &= often[seen.points]
-        rest = Sightings(seen.frames[kept], seen.points[kept], seen.uv[kept])
-        return self._replace(seen=rest)
+        repeated = np.bincount(seen.points[kept], minlength=seen.points.max() + 1) > 1
+        kept &= repeated[seen.points]
+        sightings = Sightings(seen.frames[kept], seen.points[kept], seen.uv[kept])
+        return self._replace(seen=sightings)
 
 
 class TrackFit(NamedTuple):
@@ -216,12 +240,12 @@ class TrackFit(NamedTuple):
 
     Args:
         X_LC: (4, 4) the camera's pose on the link.
-        constants: (1 + k,) logarithm of the focal length over the given one, and the constants.
+        constants: (1 + k,) logarithm of the focal length over the camera's, and the constants.
         points: (p, 3) the points in the world [m].
         sigma: standard deviation of a coordinate of the sightings [pixel].
         covariance: (7 + k, 7 + k) of the errors of X_LC, rotation vector [rad] and translation [m]
-            along the camera's axes, and of the constants, from independent errors of sightings.
-        lengths: (n,) distances of the sightings from where they are predicted [pixel].
+            along the camera's axes, and of `constants`, as if sightings had independent errors.
+        lengths: (n,) reprojection errors of the sightings [pixel].
     """
 
     X_LC: Array
@@ -233,7 +257,7 @@ class TrackFit(NamedTuple):
 
     @property
     def inliers(self) -> NDArray[np.bool_]:
-        """Which sightings fit (n,)."""
+        """Which sightings (n,) are inliers."""
         return self.lengths < TRACKS.inlier * self.sigma
 
 
@@ -244,8 +268,8 @@ def fit_tracks(
 
     Args:
         problem: what is fitted.
-        start: a pose X_LC (4, 4); or an earlier fit, which is only brought to its end.
-        constants: (1 + k,) with a pose the start of the constants; None: 0.
+        start: a pose X_LC (4, 4); or an earlier fit, which takes a few last steps only.
+        constants: (1 + k,) start of the constants for a pose; None: 0. An earlier fit has its own.
     """
     count, last = len(problem.prior_sds), [0.0] * TRACKS.last
     if isinstance(start, TrackFit):
@@ -270,10 +294,10 @@ def fit_tracks(
         G = _twists(problem, fit.X_LC, fit.constants)
         S, g, points_step = _without_points(problem.seen, r, A, B, w, len(fit.points))
         H = (G.T @ S @ G + information)[np.ix_(unknown, unknown)]
-        off = np.zeros(6) if problem.prior is None else problem.prior.off(fit.X_LC)
-        at = np.concatenate([off, fit.constants])
+        difference = np.zeros(6) if problem.prior is None else problem.prior.off(fit.X_LC)
+        errors = np.concatenate([difference, fit.constants])
         step = np.zeros(6 + count)
-        step[unknown] = -np.linalg.solve(H, (G.T @ g + information @ at)[unknown])
+        step[unknown] = -np.linalg.solve(H, (G.T @ g + information @ errors)[unknown])
         fit = fit._replace(
             X_LC=fit.X_LC @ motion(step[:6]), constants=fit.constants + step[6:],
             points=fit.points + points_step(G @ step), sigma=sigma,
@@ -289,16 +313,16 @@ def fit_tracks(
 
 
 def jackknife(problem: TrackProblem, fit: TrackFit) -> Array:
-    """Return the covariance (7 + k, 7 + k) of a fit's errors, see `TrackFit`, from its frames.
+    """Return the covariance (7 + k, 7 + k) of a fit's errors, see `TrackFit`, by a jackknife.
 
-    Groups of successive frames are left out in turn: errors of the joint positions and of the
-    matches are alike within a frame, and the residuals do not tell how many are independent.
+    Groups of successive frames are left out in turn, because the errors of joint positions and
+    matches are correlated within a frame.
     """
     frames = np.unique(problem.seen.frames)
     groups = np.array_split(frames, min(TRACKS.groups, len(frames)))
     rows = [_moved(fit, fit_tracks(problem.without(group), fit)) for group in groups]
-    off = np.array(rows) - np.mean(rows, axis=0)
-    return np.asarray((len(rows) - 1) / len(rows) * off.T @ off)
+    differences = np.array(rows) - np.mean(rows, axis=0)
+    return np.asarray((len(rows) - 1) / len(rows) * differences.T @ differences)
 
 
 def intrinsics_effect(
@@ -307,7 +331,9 @@ def intrinsics_effect(
     """Return the covariance (7 + k, 7 + k), see `TrackFit`, from errors of the intrinsics.
 
     Args:
-        focal: relative standard deviation of a given focal length, as of usual calibrations.
+        problem, fit: what was fitted, and the result.
+        focal: relative standard deviation of a focal length that is not fitted, as of usual
+            calibrations.
         centre: standard deviation of the principal point's coordinates [pixel].
     """
     camera = problem.camera
@@ -316,10 +342,13 @@ def intrinsics_effect(
         replace(camera, center_y=camera.center_y + centre),
     ]
     if not problem.prior_sds[0]:
-        by = 1.0 + focal
-        wrong.append(replace(camera, focal_x=by * camera.focal_x, focal_y=by * camera.focal_y))
-    off = np.array([_moved(fit, fit_tracks(problem._replace(camera=one), fit)) for one in wrong])
-    return np.asarray(off.T @ off)
+        factor = 1.0 + focal
+        wrong.append(
+            replace(camera, focal_x=factor * camera.focal_x, focal_y=factor * camera.focal_y)
+        )
+    fits = [fit_tracks(problem._replace(camera=other), fit) for other in wrong]
+    differences = np.array([_moved(fit, other) for other in fits])
+    return np.asarray(differences.T @ differences)
 
 
 def prior_effect(problem: TrackProblem, fit: TrackFit) -> Array:
@@ -328,24 +357,26 @@ def prior_effect(problem: TrackProblem, fit: TrackFit) -> Array:
         return np.zeros((len(fit.covariance),) * 2)
     variances, axes = np.linalg.eigh(problem.prior.covariance)
     rows = []
-    for by in (axes * np.sqrt(variances.clip(min=0.0))).T:
-        wrong = problem.prior._replace(X_LC=problem.prior.X_LC @ motion(by))
+    for error in (axes * np.sqrt(variances.clip(min=0.0))).T:
+        wrong = problem.prior._replace(X_LC=problem.prior.X_LC @ motion(error))
         rows.append(_moved(fit, fit_tracks(problem._replace(prior=wrong), fit)))
-    off = np.array(rows)
-    return np.asarray(off.T @ off)
+    differences = np.array(rows)
+    return np.asarray(differences.T @ differences)
 
 
 def _moved(fit: TrackFit, other: TrackFit) -> Array:
-    """Return by how much another fit's unknowns (7 + k,), see `TrackFit`, differ from a fit's."""
-    by = pose_difference(fit.X_LC, other.X_LC)
-    return np.concatenate([by, other.constants - fit.constants])
+    """Return the difference (7 + k,), as of `TrackFit.covariance`, from a fit to another."""
+    difference = pose_difference(fit.X_LC, other.X_LC)
+    return np.concatenate([difference, other.constants - fit.constants])
 
 
 def gauge_constants(problem: TrackProblem, X_LC: Array, constants: Array) -> NDArray[np.bool_]:
-    """Return which of the constants (1 + k,) move all cameras as one scene or one link would.
+    """Return which of the constants (1 + k,) the pictures cannot determine, whatever the motion.
 
-    So does the offset of a first joint, which turns the whole scene, or that of a last one, which
-    turns the camera on the link.
+    The offset of a first joint only turns the whole scene with all cameras. The offset of a last
+    joint only turns the camera on the link.
+
+    X_LC, constants: (4, 4) and (1 + k,), as of `TrackFit`.
     """
     frames = int(problem.seen.frames.max()) + 1
     twists = _twists(problem, X_LC, constants)[:-1, 6:].reshape(frames, 6, -1)
@@ -353,15 +384,15 @@ def gauge_constants(problem: TrackProblem, X_LC: Array, constants: Array) -> NDA
     R, p = X_WC[:, :3, :3], X_WC[:, :3, 3]
     turn, shift = R @ twists[:, :3], R @ twists[:, 3:]
     in_world = np.concatenate([turn, shift + np.cross(p[:, :, None], turn, axis=1)], axis=1)
-    spread = np.minimum(*(np.ptp(one, axis=0).max(axis=0) for one in (twists, in_world)))
+    spread = np.minimum(*(np.ptp(rates, axis=0).max(axis=0) for rates in (twists, in_world)))
     return np.asarray((problem.prior_sds > 0.0) & (spread < 1e-3))
 
 
 def _residuals(problem: TrackProblem, fit: TrackFit) -> tuple[Array, Array, Array]:
-    """Return residuals (n, 2) [pixel], and their derivatives.
+    """Return reprojection residuals (n, 2) [pixel], and their derivatives (n, 2, 7) and (n, 2, 3).
 
-    These are by the camera's twist along its own axes and the logarithm of its focal length (n, 2,
-    7), and by the point (n, 2, 3). Points behind the camera have a large residual, no derivatives.
+    The first are by the twist along the camera's axes and the logarithm of the focal length, the
+    second by the point. Points behind the camera have a large residual and derivatives of 0.
     """
     camera, seen = problem.camera, problem.seen
     X_WC = (problem.link_poses(fit.constants[1:]) @ fit.X_LC)[seen.frames]
@@ -383,17 +414,22 @@ def _residuals(problem: TrackProblem, fit: TrackFit) -> tuple[Array, Array, Arra
 
 
 def _twists(problem: TrackProblem, X_LC: Array, constants: Array, h: float = 1e-4) -> Array:
-    """Return the derivatives (6 frames + 1, 7 + k) of all cameras' twists and the focal length.
+    """Return derivatives (6 frames + 1, 7 + k) of all frames' camera twists and log focal length.
 
-    They are by the twist of X_LC, the logarithm of the focal length, and the constants.
+    They are by the twist of X_LC, the logarithm of the focal length, and the k constants.
+
+    X_LC, constants: (4, 4) and (1 + k,), as of `TrackFit`. h: difference that estimates the
+    derivatives [unit of the constants].
     """
     count = len(problem.prior_sds)
     frames, columns = int(problem.seen.frames.max()) + 1, []
-    for sd, one in zip(problem.prior_sds[1:], h * np.eye(count - 1), strict=True):
+    for sd, change in zip(problem.prior_sds[1:], h * np.eye(count - 1), strict=True):
         if not sd:
             columns.append(np.zeros(6 * frames))
             continue
-        behind, ahead = (problem.link_poses(constants[1:] + by) @ X_LC for by in (-one, one))
+        behind, ahead = (
+            problem.link_poses(constants[1:] + step) @ X_LC for step in (-change, change)
+        )
         columns.append(pose_difference(behind, ahead).ravel() / (2.0 * h))
     G = np.zeros((6 * frames + 1, 6 + count))
     G[:-1, :6], G[-1, 6] = np.tile(np.eye(6), (frames, 1)), 1.0
@@ -414,13 +450,15 @@ def _without_points(
     """Return the normal equations of cameras and focal length, without points (Schur complement).
 
     Args:
-        seen: n sightings; r, A, B: as of `_residuals`; w: (n,) their weights.
+        seen: n sightings.
+        r, A, B: residuals and derivatives, as of `_residuals`.
+        w: (n,) weights of the sightings.
         count: number of points.
         damping: of the points' steps, relative to their information.
 
     Returns:
-        (6 frames + 1, 6 frames + 1) and (6 frames + 1,), and a function of a step of these unknowns
-        that returns the points' steps (count, 3).
+        the matrix (u, u) and the gradient (u,) for u = 6 frames + 1 unknowns, and a function that
+        returns the points' steps (count, 3) for a step (u,).
     """
     size = 6 * (int(seen.frames.max()) + 1) + 1
     rows = np.concatenate(
@@ -433,11 +471,11 @@ def _without_points(
     V, b = np.zeros((count, 3, 3)), np.zeros((count, 3))
     np.add.at(V, seen.points, np.swapaxes(wB, 1, 2) @ B)
     np.add.at(b, seen.points, np.einsum("nki,nk->ni", wB, r))
-    # Points that two parallel rays show, or none, stay where they are along these.
+    # Parallel rays, or none, leave a point's distance open: damping holds it where it is.
     V += damping * (np.einsum("nii->n", V)[:, None, None] + 1.0) * np.eye(3)
     W = np.zeros((count, 3, size))
-    each = seen.points[:, None, None], np.arange(3)[:, None], rows[:, None, :]
-    np.add.at(W, each, np.swapaxes(wB, 1, 2) @ A)
+    entries = seen.points[:, None, None], np.arange(3)[:, None], rows[:, None, :]
+    np.add.at(W, entries, np.swapaxes(wB, 1, 2) @ A)
     VW, Vb = np.linalg.solve(V, W), np.linalg.solve(V, b[..., None])[..., 0]
     W_all = W.reshape(-1, size)
     S, g = S - W_all.T @ VW.reshape(-1, size), g - W_all.T @ Vb.ravel()
@@ -445,7 +483,10 @@ def _without_points(
 
 
 def _triangulated(problem: TrackProblem, X_WC: Array, rounds: int = 4) -> Array:
-    """Return the points (p, 3) nearest to the rays of their sightings, robustly."""
+    """Return the world points (p, 3) nearest to their sightings' rays, robustly [m].
+
+    X_WC: (frames, 4, 4) the camera's poses. rounds: number of reweighted least squares.
+    """
     seen = problem.seen
     d = rays(problem.camera, seen.uv)
     d = np.einsum("nij,nj->ni", X_WC[seen.frames, :3, :3], d / np.linalg.norm(d, axis=1)[:, None])
@@ -464,7 +505,7 @@ def _triangulated(problem: TrackProblem, X_WC: Array, rounds: int = 4) -> Array:
 
 
 def _sampson(t: Array, Rx: Array, R_B: Array, y: Array) -> tuple[Array, Array]:
-    """Return signed epipolar distances (n, m) [rad], and the sizes of the constraints' gradients.
+    """Return signed epipolar distances (n, m) [rad], and the norms of the constraints' gradients.
 
     Args:
         t: (n, m, 3) translations of the camera between two pictures.
@@ -474,18 +515,18 @@ def _sampson(t: Array, Rx: Array, R_B: Array, y: Array) -> tuple[Array, Array]:
     # A camera that only turns satisfies every constraint: such a pose explains nothing.
     still = (t**2).sum(-1) < 1e-6
     line = np.cross(t, Rx)
-    back = (np.cross(y, t)[..., None, :] @ R_B)[..., 0, :]
-    size = np.sqrt((line[..., :2] ** 2).sum(-1) + (back[..., :2] ** 2).sum(-1)) + 1e-9
+    line_back = (np.cross(y, t)[..., None, :] @ R_B)[..., 0, :]
+    size = np.sqrt((line[..., :2] ** 2).sum(-1) + (line_back[..., :2] ** 2).sum(-1)) + 1e-9
     return np.where(still, 1.0, (line * y).sum(-1) / size), size
 
 
 def _weights(r: Array, scale: float) -> Array:
-    """Return the weights of Geman and McClure's loss for residuals r."""
+    """Return the weights of Geman and McClure's loss for residuals r; scale: in their unit."""
     return np.asarray((1.0 + (r / scale) ** 2) ** -2)
 
 
 def motion(twist: Array) -> Array:
-    """Return the motions (..., 4, 4) of rotation vectors and translations (..., 6)."""
+    """Return the transforms (..., 4, 4) of rotation vectors [rad] and translations [m] (..., 6)."""
     X = np.zeros((*twist.shape[:-1], 4, 4))
     turns = Rotation.from_rotvec(twist[..., :3].reshape(-1, 3)).as_matrix()
     X[..., :3, :3] = turns.reshape(*twist.shape[:-1], 3, 3)
@@ -494,6 +535,6 @@ def motion(twist: Array) -> Array:
 
 
 def poses_differ(X: Array, other: Array, turn: float = 0.05, shift: float = 0.02) -> bool:
-    """Return whether poses (4, 4) differ by more than `turn` [rad] or `shift` [m]."""
+    """Return whether two poses (4, 4) differ by more than `turn` [rad] or `shift` [m]."""
     angle = Rotation.from_matrix(X[:3, :3].T @ other[:3, :3]).magnitude()
     return bool(angle > turn or np.linalg.norm(X[:3, 3] - other[:3, 3]) > shift)

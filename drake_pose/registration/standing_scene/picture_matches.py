@@ -20,9 +20,10 @@ class MatchSettings(NamedTuple):
     Args:
         features: maximum number of features of a picture.
         contrast: minimum contrast of a feature, as of OpenCV's SIFT.
-        ratio: a match counts if its descriptor is nearer than the second one by this factor.
-        still: matches that move less ride along with the camera, or tell nothing [pixel].
-        epipolar: tolerance of the epipolar geometry of a pair of pictures [pixel].
+        ratio: maximum distance of a match's descriptors over that of the second best (Lowe's test).
+        still: minimum motion of a match [pixel]. A point that moves less is on the gripper or tells
+            nothing.
+        epipolar: maximum distance of an inlier from its epipolar line [pixel].
         least: minimum number of matches of a pair of pictures.
     """
 
@@ -38,9 +39,9 @@ MATCHING = MatchSettings()
 
 
 class Matches(NamedTuple):
-    """Points matched between two pictures.
+    """n points, each matched between two pictures.
 
-    frames: (n, 2) indices of the pictures. uv: (n, 2, 2) where the point is in each [pixel].
+    frames: (n, 2) indices of the pictures. uv: (n, 2, 2) the point's place (u, v) in each [pixel].
     """
 
     frames: Indices
@@ -50,7 +51,7 @@ class Matches(NamedTuple):
 class Sightings(NamedTuple):
     """Points of the scene seen in several pictures.
 
-    frames, points: (n,) index of the picture and of the point. uv: (n, 2) [pixel].
+    frames, points: (n,) index of the picture and of the point. uv: (n, 2) the place [pixel].
     """
 
     frames: Indices
@@ -63,23 +64,23 @@ class Sightings(NamedTuple):
 
 
 def match_pictures(pictures: Sequence[Picture]) -> tuple[Matches, Sightings]:
-    """Match points between all pairs of pictures (H, W, 3), and join them into tracks."""
+    """Match points between all pairs of RGB pictures (H, W, 3), and join the matches to tracks."""
     sift = cv2.SIFT.create(MATCHING.features, contrastThreshold=MATCHING.contrast)
-    found = [sift.detectAndCompute(cv2.cvtColor(p, cv2.COLOR_RGB2GRAY), None) for p in pictures]
-    uv = [np.array([k.pt for k in keys], np.float64).reshape(-1, 2) for keys, _ in found]
+    features = [sift.detectAndCompute(cv2.cvtColor(p, cv2.COLOR_RGB2GRAY), None) for p in pictures]
+    uv = [np.array([k.pt for k in keys], np.float64).reshape(-1, 2) for keys, _ in features]
     # RootSIFT: Hellinger's distance of the histograms.
     descriptors = [
         None if d is None else np.sqrt(d / np.maximum(d.sum(axis=1, keepdims=True), 1e-9))
-        for _, d in found
+        for _, d in features
     ]
     first = np.cumsum([0, *map(len, uv)])
     pairs, kept = [], []
     for i, j in combinations(range(len(pictures)), 2):
         rows = _mutual(descriptors[i], descriptors[j])
-        both = np.stack([uv[i][rows[:, 0]], uv[j][rows[:, 1]]], axis=1)
-        moves = np.linalg.norm(both[:, 1] - both[:, 0], axis=1) > MATCHING.still
-        rows, both = rows[moves], both[moves]
-        rows = rows[_on_epipolar_lines(both)]
+        matched = np.stack([uv[i][rows[:, 0]], uv[j][rows[:, 1]]], axis=1)
+        moves = np.linalg.norm(matched[:, 1] - matched[:, 0], axis=1) > MATCHING.still
+        rows, matched = rows[moves], matched[moves]
+        rows = rows[_on_epipolar_lines(matched)]
         pairs.append(rows + first[[i, j]])
         kept.append(np.tile([i, j], (len(rows), 1)))
     edges, frames = np.concatenate(pairs), np.concatenate(kept)
@@ -88,7 +89,10 @@ def match_pictures(pictures: Sequence[Picture]) -> tuple[Matches, Sightings]:
 
 
 def _mutual(a: Array | None, b: Array | None) -> Indices:
-    """Return (n, 2) rows of unit descriptors a and b that are each other's clearly nearest."""
+    """Return (n, 2) rows of a and b that are mutual nearest neighbours and pass Lowe's ratio test.
+
+    a, b: (., 128) unit descriptors of two pictures; None: a picture has no features.
+    """
     if a is None or b is None or min(len(a), len(b)) < 2:
         return np.zeros((0, 2), np.intp)
     alike = a @ b.T
@@ -98,7 +102,7 @@ def _mutual(a: Array | None, b: Array | None) -> Indices:
     mutual = alike.argmax(axis=0)[best] == rows
     alike[rows, best] = -1.0
     # Distances of unit vectors.
-    near, second = (np.sqrt(np.maximum(2.0 - 2.0 * one, 0.0)) for one in (first, alike.max(axis=1)))
+    near, second = (np.sqrt(np.maximum(2.0 - 2.0 * cos, 0.0)) for cos in (first, alike.max(axis=1)))
     rows = rows[mutual & (near < MATCHING.ratio * second)]
     return np.stack([rows, best[rows]], axis=1)
 
@@ -120,7 +124,13 @@ def _on_epipolar_lines(uv: Array) -> NDArray[np.bool_]:
 
 
 def _tracks(edges: Indices, picture: Indices, uv: Array) -> Sightings:
-    """Return the tracks of features, joined by edges (n, 2); at most one feature of a picture."""
+    """Return the tracks that matches join, without tracks with two features in one picture.
+
+    Args:
+        edges: (n, 2) indices of matched features.
+        picture: (features,) index of each feature's picture.
+        uv: (features, 2) their places [pixel].
+    """
     count = len(picture)
     graph = coo_array((np.ones(len(edges)), edges.T), shape=(count, count))
     _, label = connected_components(graph, directed=False)
@@ -129,14 +139,14 @@ def _tracks(edges: Indices, picture: Indices, uv: Array) -> Sightings:
     key = label[used] * (picture.max() + 1) + picture[used]
     _, inverse, times = np.unique(key, return_inverse=True, return_counts=True)
     # Two features of one picture on a track: which is right is not known.
-    bad = np.unique(label[used][times[inverse] > 1])
-    used = used[~np.isin(label[used], bad)]
+    ambiguous = np.unique(label[used][times[inverse] > 1])
+    used = used[~np.isin(label[used], ambiguous)]
     _, points = np.unique(label[used], return_inverse=True)
     return Sightings(picture[used], points, uv[used])
 
 
 def rays(camera: PinholeCamera, uv: Array) -> Array:
-    """Return rays (..., 3) with z = 1 in the camera through points uv (..., 2) [pixel]."""
+    """Return rays (..., 3) with z = 1, in the camera's frame, through uv (..., 2) [pixel]."""
     f, c = (camera.focal_x, camera.focal_y), (camera.center_x, camera.center_y)
     xy = (uv - c) / f
     return np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)

@@ -39,28 +39,29 @@ from drake_pose.registration.standing_scene.picture_matches import (
 class TrackRegistrationSettings(NamedTuple):
     """Settings of a registration from a standing scene; chosen as those of `TrackSettings`.
 
+    A "pose of the gripper" is the camera's pose on the link as found from the gripper alone.
+
     Args:
         pictures, moving: maximum numbers of slow and of fast pictures that are used.
         least: minimum number of matches in all pairs of pictures.
-        chance_rotations: number of rotations searched with joints of other moments.
-        least_gain: a pose explains at least this many times what joints of other moments explain.
+        chance_rotations: number of rotations searched with joint positions of other moments.
+        least_gain: minimum explained fraction, over that with joint positions of other moments.
         joint_sd, time_sd, focal_sd: prior standard deviations of joint offsets [rad or m], of the
             time offset [s], and of the logarithm of an unknown focal length.
-        focals: focal lengths from which the search for an unknown one starts [given one].
-        times: time offsets from which it starts [s].
-        least_turn: minimum rotation of the link about a second axis [deg].
+        focals: tried values of an unknown focal length [focal length of the camera model].
+        times: tried time offsets [s].
+        least_turn: minimum rotation of the link about a second axis, see `rotation_spread` [deg].
         least_motion: minimum standard deviation of the link's position [mm].
         determined: maximum standard deviation of a determined constant, over the prior's.
-        max_sd: maximum standard deviation of a determined pose along any axis [rad, m].
-        agrees: maximum root mean square difference of the poses from scene and gripper, over its
-            standard deviation.
-        near: rotation [rad] and distance [m] within which a pose of the gripper is refined by the
-            scene.
+        max_sd: maximum standard deviation of a determined pose along any axis [rad and m].
+        agrees: maximum root mean square difference of the poses from scene and from gripper
+            [standard deviations].
+        near: rotation [rad] and distance [m] within which the scene refines a pose of the gripper.
         deciding: minimum number of matches that decide between poses of the gripper.
-        apart: of these poses the best one explains at least this many times what the next does.
-        most_explained: minimum explained fraction with which the scene improves a pose of the
-            gripper, if it does not determine one by itself.
-        better: joint offsets that lower the residuals by this factor are likely.
+        apart: minimum explained fraction of the best of these poses, over that of the second.
+        most_explained: minimum explained fraction with which a scene improves a pose of the
+            gripper, if the scene does not determine a pose by itself.
+        better: ratio of the residuals without and with joint offsets from which these are likely.
     """
 
     pictures: int = 16
@@ -97,17 +98,17 @@ class TrackRegistration:
             inlier ratio is that of the points.
         time_offset: of the camera's clock; None: the log has no times.
         focal_deviation: relative standard deviation of the focal length; 0: it was given.
-        offsets: of the joints that were asked for.
-        likely: names of joints whose offsets explain the pictures much better, if none were asked
-            for; the camera's covariance then includes their effect.
-        explained, chance: fraction of matches that the pose explains, and the largest one that a
-            pose explains with joints of other moments.
-        seen: the points' sightings, by index of the frames of `found`.
-        inliers: (n,) which sightings fit.
-        pictures: the pictures by frame.
+        offsets: of the joints whose offsets were asked for.
+        likely: names of joints whose offsets explain the pictures much better, if no offsets were
+            asked for; the camera's covariance then includes their effect.
+        explained: fraction of matches that the pose explains; nan: the gripper alone gave it.
+        chance: the largest such fraction of any pose with joint positions of other moments.
+        seen: n sightings of points, by index of the frames of `found`.
+        inliers: (n,) which sightings are inliers.
+        pictures: (H, W, 3) by frame name.
         gripper: the pose from the gripper alone; None: it is not seen, or its contours do not fit.
-        contradiction: by how much this pose differs from the scene's, as words, if it differs
-            significantly; it was not used then. "": it does not.
+        contradiction: how far the gripper's pose is from the scene's, in words, if the difference
+            is significant; the gripper is not used then. "": it is not.
     """
 
     found: RegisteredCamera
@@ -134,7 +135,7 @@ def register_tracks(
     offset_joints: Sequence[str] = (),
     gripper: GripperSearch | None = None,
 ) -> TrackRegistration:
-    """Estimate the pose of a camera on a link from its pictures; nothing in them need be known.
+    """Estimate the pose of a camera on a link from its pictures of an unknown scene.
 
     The scene is fitted together with the gripper, if the camera sees it.
 
@@ -142,11 +143,11 @@ def register_tracks(
         body: the robot, whose pose tree starts at the link.
         link: the link's name.
         base: index of a node of this tree that stands still.
-        camera: its pose is not used.
+        camera: its intrinsics; its pose is not used.
         recording: the camera's pictures and the joint log.
         focal: whether the focal length is fitted.
-        offset_joints: joints whose offsets are fitted.
-        gripper: what rides along with the camera; None: nothing that is known.
+        offset_joints: names of the joints whose offsets are fitted.
+        gripper: fits the gripper, which moves with the camera; None: its shape is not known.
 
     Raises RegistrationError: too little is matched, no pose explains it, or the link's motion does
         not determine the pose; the message says what would help.
@@ -187,10 +188,10 @@ def register_tracks(
             if prior.size(fitted.fit.X_LC) < settings.agrees:
                 fitted = scene.fit(start, view)
             else:
-                off = prior.off(fitted.fit.X_LC)
+                difference = prior.off(fitted.fit.X_LC)
                 why = (
-                    f"{1e3 * np.linalg.norm(off[3:]):.0f} mm and "
-                    f"{np.degrees(np.linalg.norm(off[:3])):.1f} degrees"
+                    f"{1e3 * np.linalg.norm(difference[3:]):.0f} mm and "
+                    f"{np.degrees(np.linalg.norm(difference[:3])):.1f} degrees"
                 )
     problem, fit, covariance = fitted.problem, fitted.fit, fitted.covariance
     scale = float(np.exp(fit.constants[0]))
@@ -218,7 +219,7 @@ def register_tracks(
         start.chance,
         seen,
         fit.inliers,
-        dict(zip((one.frame for one in misfits), pictures, strict=True)),
+        dict(zip((misfit.frame for misfit in misfits), pictures, strict=True)),
         view,
         why,
     )
@@ -227,17 +228,18 @@ def register_tracks(
 def _link_poses(
     body: RegistrationBody, base: int, recording: Recording, rows: Sequence[int]
 ) -> Callable[[Array], Array]:
-    """Return a function of a time offset [s] and offsets of all values, (1 + m,) in all.
+    """Return a function of (1 + m,) constants: a time offset [s], and an offset for each value.
 
-    It returns the link's poses (pictures, 4, 4) with the node `base` as the world.
+    It returns the link's poses (pictures, 4, 4) at the pictures `rows`; the node `base` is the
+    world.
     """
-    at_once = recording.values_at(0.0)[rows]
+    logged_values = recording.values_at(0.0)[rows]
 
     def poses(constants: Array) -> Array:
         values = recording.values_at(float(constants[0]))[rows]
         # The log may end before the last picture's time.
-        values = np.where(np.isfinite(values), values, at_once) + constants[1:]
-        return inverse_transforms(np.array([body.kinematics.poses(one)[base] for one in values]))
+        values = np.where(np.isfinite(values), values, logged_values) + constants[1:]
+        return inverse_transforms(np.array([body.kinematics.poses(row)[base] for row in values]))
 
     return poses
 
@@ -245,8 +247,9 @@ def _link_poses(
 class _Start(NamedTuple):
     """Result of the search.
 
-    X_LC: poses (4, 4), best first; constants: (2 + m,) of the best one; explained and chance: see
-    ``TrackRegistration``; matches: number of matches.
+    X_LC: poses (4, 4), best first. constants: (2 + m,) logarithm of the focal length's ratio, time
+    offset [s] and joint offsets of the best pose. explained, chance: see ``TrackRegistration``.
+    matches: number of matches; 0: the scene does not help.
     """
 
     X_LC: list[Array]
@@ -259,8 +262,8 @@ class _Start(NamedTuple):
 class _SceneFit(NamedTuple):
     """Result of a bundle adjustment.
 
-    problem, fit: what was fitted. covariance: (7 + k, 7 + k) as of ``TrackFit``. alike: other poses
-    (4, 4) that fit as well. likely: see ``TrackRegistration``.
+    problem, fit: what was fitted, and the result. covariance: (7 + k, 7 + k) as of ``TrackFit``.
+    alike: other poses (4, 4) that fit as well. likely: see ``TrackRegistration``.
     """
 
     problem: TrackProblem
@@ -273,8 +276,8 @@ class _SceneFit(NamedTuple):
 class _Scene(NamedTuple):
     """A scene that stands still, in a camera's pictures.
 
-    body, link: the robot, and the link's name. problem: what is fitted. matches: of its pictures.
-    focal, timed: whether focal length and clock are searched.
+    body, link: the robot, and the name of the camera's link. problem: what is fitted. matches: of
+    its pictures. focal, timed: whether the focal length and the time offset are searched.
     """
 
     body: RegistrationBody
@@ -289,25 +292,25 @@ class _Scene(NamedTuple):
         settings, camera = STANDING_SCENE, self.problem.camera
         constants = np.zeros(len(self.problem.prior_sds))
         X_WL = self.problem.link_poses(constants[1:])
-        tried = []
+        searches = []
         for scale in settings.focals if self.focal else (1.0,):
             focal_x, focal_y = scale * camera.focal_x, scale * camera.focal_y
             scaled = replace(camera, focal_x=focal_x, focal_y=focal_y)
             search = EpipolarSearch(scaled, self.matches)
-            tried.append((search.search(X_WL), scale, search))
-        found, scale, search = max(tried, key=lambda one: one[0][0][0])
+            searches.append((search.search(X_WL), scale, search))
+        candidates, scale, search = max(searches, key=lambda item: item[0][0][0])
         constants[0] = math.log(scale)
-        explained, X_LC, constants = self._timed(search, *found[0], constants)
-        found = [(explained, X_LC), *found[1:]]
+        explained, X_LC, constants = self._timed(search, *candidates[0], constants)
+        candidates = [(explained, X_LC), *candidates[1:]]
         chance = max(
             search.search(np.roll(X_WL, shift, axis=0), settings.chance_rotations)[0][0]
             for shift in self._shifts()
         )
-        poses = [X for gain, X in found if gain > 0.7 * explained]
+        poses = [X for gain, X in candidates if gain > 0.7 * explained]
         return _Start(poses[:3], constants, explained, chance, len(self.matches.uv))
 
     def compare(self, X_LC: Array, offset: float) -> _Start:
-        """Return how well a pose (4, 4) explains the matches, at about a time offset [s]."""
+        """Return a pose (4, 4) and about its time offset [s] as a start, and what they explain."""
         search = EpipolarSearch(self.problem.camera, self.matches)
         constants = np.zeros(len(self.problem.prior_sds))
         constants[1] = offset
@@ -322,14 +325,14 @@ class _Scene(NamedTuple):
         return _Start([X_LC], constants, explained, chance, len(self.matches.uv))
 
     def _shifts(self) -> set[int]:
-        """Return by how many pictures joint positions are exchanged to learn what chance does."""
+        """Return shifts, in pictures, that give each picture the joint positions of another one."""
         n = int(self.problem.seen.frames.max()) + 1
         return {max(1, round(part * n)) for part in (0.25, 0.5, 0.75)}
 
     def _timed(
         self, search: EpipolarSearch, explained: float, X_LC: Array, constants: Array
     ) -> tuple[float, Array, Array]:
-        """Return what is explained, the pose and the constants at the best time offset."""
+        """Return `explained`, `X_LC` (4, 4) and `constants` at the best of the time offsets."""
         best = explained, X_LC, constants
         for time in STANDING_SCENE.times if self.timed else ():
             at = constants.copy()
@@ -340,7 +343,7 @@ class _Scene(NamedTuple):
         return best
 
     def fit(self, start: _Start, view: GripperFit | None) -> _SceneFit:
-        """Fit from a start, together with what the gripper tells (None: nothing).
+        """Fit from a start; view: the pose from the gripper, used as a prior; None: there is none.
 
         Raises RegistrationError: the pose is not determined.
         """
@@ -355,28 +358,26 @@ class _Scene(NamedTuple):
         covariance += prior_effect(problem, fit)
         self._require(problem, fit, covariance, likely)
         others = [fit_tracks(problem, X, start.constants) for X in start.X_LC[1:]]
-        alike = [
-            one.X_LC
-            for one in others
-            if one.sigma < 1.1 * fit.sigma and poses_differ(one.X_LC, fit.X_LC)
-        ]
+        as_good = (other.X_LC for other in others if other.sigma < 1.1 * fit.sigma)
+        alike = [X_LC for X_LC in as_good if poses_differ(X_LC, fit.X_LC)]
         return _SceneFit(problem, fit, covariance, alike, likely)
 
     def without(self, view: GripperFit) -> _SceneFit:
-        """Return the pose from the gripper alone."""
+        """Return the pose from the gripper alone, without the scene's points."""
         count = len(self.problem.prior_sds)
         constants, covariance = np.zeros(count), np.zeros((6 + count, 6 + count))
         covariance[:6, :6], covariance[7, 7] = view.covariance, np.inf
         if view.time_offset is not None:
             constants[1], covariance[7, 7] = view.time_offset[0], view.time_offset[1] ** 2
-        none = np.zeros(0)
-        fit = TrackFit(view.X_LC, constants, np.zeros((0, 3)), math.nan, covariance, none)
+        points, lengths = np.zeros((0, 3)), np.zeros(0)
+        fit = TrackFit(view.X_LC, constants, points, math.nan, covariance, lengths)
         problem = self.problem._replace(prior_sds=0.0 * self.problem.prior_sds)
         return _SceneFit(problem, fit, covariance)
 
     def _require(
         self, problem: TrackProblem, fit: TrackFit, covariance: Array, likely: Sequence[str] = ()
     ) -> None:
+        """Refuse a fit that is not determined, as `_require_determined` does."""
         X_WL = problem.link_poses(fit.constants[1:])
         _require_determined(problem.camera, self.link, X_WL, fit.X_LC, covariance, likely)
 
@@ -384,7 +385,7 @@ class _Scene(NamedTuple):
 def _start_at_gripper(
     gripper: GripperSearch, scene: _Scene, error: RegistrationError
 ) -> tuple[GripperFit, _Start]:
-    """Return what the gripper tells, and a start there, without matches if they do not help.
+    """Return the pose from the gripper, and a start at it; without matches if these do not help.
 
     error: why the scene alone does not determine the pose.
 
@@ -399,9 +400,9 @@ def _start_at_gripper(
         ) from error
     count, starts = len(scene.matches.uv), list[_Start]()
     if count >= STANDING_SCENE.deciding:
-        clocks = [0.0 if one.time_offset is None else one.time_offset[0] for one in views]
-        both = zip(views, clocks, strict=True)
-        starts = [scene.compare(one.X_LC, clock) for one, clock in both]
+        clocks = [0.0 if view.time_offset is None else view.time_offset[0] for view in views]
+        pairs = zip(views, clocks, strict=True)
+        starts = [scene.compare(view.X_LC, clock) for view, clock in pairs]
     order = sorted(range(len(starts)), key=lambda k: -starts[k].explained)
     best = starts[order[0]] if starts else None
     helps = best is not None and best.explained > STANDING_SCENE.least_gain * best.chance
@@ -435,7 +436,7 @@ def _require_matches(camera: PinholeCamera, matches: Matches, count: int) -> Non
 
 
 def _require_explained(camera: PinholeCamera, link: str, start: _Start) -> None:
-    """Raise RegistrationError if joints of other moments explain about as much."""
+    """Raise RegistrationError if joint positions of other moments explain about as much."""
     if start.explained < STANDING_SCENE.least_gain * start.chance:
         raise RegistrationError(
             f"camera '{camera.name}': no pose on link '{link}' explains how its pictures move: the "
@@ -476,7 +477,8 @@ def _require_determined(
 ) -> None:
     """Refuse a pose with too large standard deviations, and name the direction.
 
-    covariance: as of ``TrackFit``. likely: joints whose offsets are likely.
+    X_WL: (pictures, 4, 4) the link's poses. X_LC, covariance: (4, 4) and (7 + k, 7 + k), as of
+    ``TrackFit``. likely: names of joints whose offsets are likely.
 
     Raises RegistrationError: states direction, standard deviation, and how the link turned.
     """
@@ -511,9 +513,10 @@ def _require_determined(
 def _fit_determined(
     problem: TrackProblem, X_LC: Array, constants: Array
 ) -> tuple[TrackProblem, TrackFit]:
-    """Fit with those joint offsets that the pictures determine; the others are held at 0.
+    """Fit with the joint offsets that the pictures determine; the others are held at 0.
 
-    X_LC, constants: from which the fit starts.
+    X_LC, constants: (4, 4) and (2 + m,) the start. The returned problem has prior standard
+    deviations of 0 for the offsets that are held.
     """
     sds = problem.prior_sds.copy()
     sds[2:][gauge_constants(problem, X_LC, constants)[2:]] = 0.0
@@ -531,7 +534,7 @@ def _fit_determined(
 def _with_likely_offsets(
     body: RegistrationBody, problem: TrackProblem, fit: TrackFit
 ) -> tuple[tuple[str, ...], TrackProblem, TrackFit]:
-    """Return the joints whose offsets explain the pictures much better, with the fit of these.
+    """Return names of joints whose offsets explain the pictures much better, with their fit.
 
     Without such joints the problem and the fit are returned as they are.
     """
@@ -542,15 +545,14 @@ def _with_likely_offsets(
     if fit.sigma < STANDING_SCENE.better * other.sigma:
         return (), problem, fit
     deviations = np.sqrt(np.diag(jackknife(free, other)))[8:]
-    off = np.abs(other.constants[2:]) > 2.0 * np.maximum(deviations, 1e-9)
-    names = tuple(name for name, one in zip(body.kinematics.names, off, strict=True) if one)
-    return names, free, other
+    significant = np.abs(other.constants[2:]) > 2.0 * np.maximum(deviations, 1e-9)
+    return tuple(np.array(body.kinematics.names)[significant].tolist()), free, other
 
 
 def _misfits(
     names: Sequence[str], seen: Sightings, fit: TrackFit, least: float = 0.5
 ) -> tuple[FrameMisfit, ...]:
-    """Return how well each frame's points fit; frames with under `least` inliers are outliers."""
+    """Return how well each frame's points fit; an inlier ratio under `least` makes an outlier."""
     count = np.bincount(seen.frames, minlength=len(names))
     good = np.bincount(seen.frames[fit.inliers], minlength=len(names))
     ratios = good / np.maximum(count, 1)
@@ -561,7 +563,7 @@ def _misfits(
 
 
 def _time_offset(recording: Recording, value: float, deviation: float) -> TimeOffset | None:
-    """Return the time offset [s]; None: the log has no times."""
+    """Return the time offset from its value and deviation [s]; None: the log has no times."""
     if recording.times is None:
         return None
     known = deviation < STANDING_SCENE.determined * STANDING_SCENE.time_sd
@@ -576,21 +578,23 @@ def _describe_offsets(
     deviations: Array,
     level: float = 0.05,
 ) -> tuple[KinematicParameter, ...]:
-    """Return the offsets of the joints that were asked for, tested at a level for all of them."""
-    freedom, found = max(1, len(np.unique(problem.seen.frames)) // 2 - 1), []
-    freedom = min(freedom, 11)
+    """Return the offsets of the joints `asked`, by name, tested at a level for all of them.
+
+    names: of the pose tree's values. deviations: (7 + k,) standard deviations, as of ``TrackFit``.
+    """
+    freedom, parameters = min(11, max(1, len(np.unique(problem.seen.frames)) // 2 - 1)), []
     for name in asked:
         k = 2 + list(names).index(name)
         if not problem.prior_sds[k]:
-            ends = (-math.inf, math.inf)
-            found.append(KinematicParameter(name, 0.0, math.inf, *ends, False))
+            unknown = math.inf, -math.inf, math.inf, False
+            parameters.append(KinematicParameter(name, 0.0, *unknown))
             continue
         value, deviation = float(fit.constants[k]), float(deviations[6 + k])
         width = float(stdtrit(freedom, 1.0 - 0.5 * level)) * deviation
         p_value = 2.0 * float(stdtr(freedom, -abs(value) / deviation))
-        found.append(
+        parameters.append(
             KinematicParameter(
                 name, value, deviation, value - width, value + width, p_value < level / len(asked)
             )
         )
-    return tuple(found)
+    return tuple(parameters)

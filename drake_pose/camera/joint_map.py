@@ -37,13 +37,12 @@ class MappedJoints:
             logged.
         clipped: (n, m) whether a reading is at an end of its range, so that the joint is there or
             beyond.
-        not_logged: joints of the model without a column.
-        unused: columns without a joint.
+        not_logged: names of the model's joints without a column.
+        unused: names of columns without a joint.
         warnings: assumptions that were made, and anomalies.
-        columns: linear map from a column to each logged joint.
-        encoding: what the columns hold, if LeRobot recorded them of servos; None: they are angles
-            or lengths.
-        joints: the joints whose columns hold that.
+        columns: by name of each logged joint, the linear map from its column.
+        encoding: of columns that LeRobot recorded from servos; None: they are angles or lengths.
+        joints: the joints with such columns; empty for None.
     """
 
     log: JointLog
@@ -73,14 +72,13 @@ def map_joints(
         names: (m,) joints of the model.
         lower, upper: (m,) their limits, infinite if there are none [rad or m].
         is_angle: (m,) whether a joint is revolute.
-        units: unit of angles not in ``table``: "rad" or "deg", or how LeRobot encodes them,
-            "normalised" or "steps"; None: inferred from readings and limits.
-        table: column of some joints by the joint's name, as from `read_joint_map`; the columns of
-            other joints are found by `match_names`. None: of no joint.
+        units: of angles that are not in ``table``: "rad", "deg", or LeRobot's "normalised" or
+            "steps"; None: inferred from readings and limits.
+        table: linear maps of some joints by name, as from `read_joint_map`; the columns of other
+            joints are found by `match_names`. None: no maps are given.
 
     Returns:
-        the positions in the model's order [rad or m], nan for joints without a column. Readings
-        outside the limits are kept, with a warning.
+        the mapped log. Readings outside the joints' limits are kept, with a warning.
 
     Raises:
         SceneError: no column is a joint, or the readings fit neither radians nor degrees.
@@ -112,9 +110,9 @@ def map_joints(
     encoding, texts = servo_encoding(joints, log.servos, units)
     warnings += texts
     if encoding is not None:
-        found, texts = servo_columns(joints, servos, encoding)
-        columns, warnings = columns | found, warnings + texts
-        taken = {one.column for one in joints}
+        servo_maps, texts = servo_columns(joints, servos, encoding)
+        columns, warnings = columns | servo_maps, warnings + texts
+        taken = {joint.column for joint in joints}
         matched = {column: joint for column, joint in matched.items() if column not in taken}
     else:
         matched, texts = _without_openings(
@@ -159,9 +157,9 @@ def map_joints(
 
 
 def motors_of(mapped: MappedJoints) -> list[tuple[ServoJoint, str]]:
-    """Return the joints that are mapped and calibrated, each with the name of its motor."""
+    """Return the mapped joints that have a motor in the calibration, each with the motor's name."""
     servos = mapped.log.servos or Servos()
-    pairs = match_names([one.column for one in mapped.joints], [*servos.motors])[0]
+    pairs = match_names([joint.column for joint in mapped.joints], [*servos.motors])[0]
     used = [one for one in mapped.joints if one.column in pairs and one.name in mapped.columns]
     return [(one, pairs[one.column]) for one in used]
 
@@ -171,11 +169,14 @@ def _match(
 ) -> tuple[dict[str, str], list[str]]:
     """Match columns to joints by `match_names`, or by the order of LeRobot's arms.
 
-    If need be, an opening of a gripper is left out at the end.
+    If no column matches, a last column that can be a gripper's opening is left out.
 
     Args:
         readings: (n,) readings by column.
         wanted: names of the joints.
+
+    Returns:
+        the joint of each matched column, and warnings.
     """
     matched, warnings = match_names([*readings], wanted)
     *series, last = readings or ("",)
@@ -192,17 +193,17 @@ def _match(
 
 
 def _in_order(columns: Iterable[str], joints: Sequence[str]) -> dict[str, str]:
-    """Return the joint of each column of an SO-100, SO-101 or Koch, by their order.
+    """Return the joint of each column of an SO-100, SO-101 or Koch arm, by their order.
 
-    The mapping is empty unless the columns are those of one such arm, and the joints are as many,
-    with or without its gripper.
+    The mapping is empty unless the columns have the names of a single arm, and there are as many
+    joints, with or without the gripper.
     """
     names = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
     ends = [name.split("_") for name in names]
-    found = [[one for one in columns if _words(one)[-len(end) :] == end] for end in ends]
-    if len(joints) not in (5, 6) or any(len(own) != 1 for own in found):
+    matches = [[column for column in columns if _words(column)[-len(end) :] == end] for end in ends]
+    if len(joints) not in (5, 6) or any(len(own) != 1 for own in matches):
         return {}
-    return dict(zip((own[0] for own in found), joints, strict=False))
+    return dict(zip((own[0] for own in matches), joints, strict=False))
 
 
 def _servo_joints(
@@ -212,13 +213,13 @@ def _servo_joints(
     angular: Collection[str],
     servos: Servos,
 ) -> list[ServoJoint]:
-    """Return the matched joints that servos may move: those that turn, and those of grippers.
+    """Return the matched joints that servos may move: revolute joints, and joints of grippers.
 
     Args:
         matched: joint by column.
         readings: (n,) readings by column.
-        limits: by joint [rad or m].
-        angular: names of the joints that turn.
+        limits: lower and upper limit by joint [rad or m].
+        angular: names of the revolute joints.
         servos: the robot's motors.
     """
     motors = match_names([*readings], [*servos.motors])[0] if servos.motors else {}
@@ -247,34 +248,35 @@ def _without_openings(
     is_mapped: bool,
     slack: float = 0.1,
 ) -> tuple[dict[str, str], list[str]]:
-    """Return the matched columns, without openings of a gripper that are not its joint's position.
+    """Return the matched columns without a gripper's openings, which are not joint positions.
 
-    A column that only its place gives to a gripper's joint is kept if it leaves 0 ... 1, the range
-    of an opening, but not the joint's limits. One that has a gripper's name is left out if it is in
-    0 ... 1, and beyond these limits.
+    Readings in 0 ... 1 may be an opening. A column of a gripper's joint is left out if:
+    - its name is not a gripper's, and readings are in 0 ... 1 or beyond the joint's limits; or
+    - its name is a gripper's, and readings are in 0 ... 1 and beyond the limits.
 
     Args:
         matched: joint by column.
         readings: (n,) readings by column.
-        limits: by joint [rad or m].
+        limits: lower and upper limit by joint [rad or m].
         unit: unit of the readings [rad].
-        is_mapped: whether a joint map has the other joints; then every column beyond the limits is
-            left out.
-        slack: tolerance of the limits [rad or m, and fraction of them].
+        is_mapped: whether a joint map has other joints; then any gripper's column beyond the limits
+            is left out.
+        slack: tolerance of the limits, the smaller of this [rad or m] and this fraction of their
+            range.
 
     Returns:
-        The columns that are kept, and warnings about the others.
+        the joint of each column that is kept, and warnings about the other columns.
     """
     kept, warnings = dict(matched), list[str]()
     for column, joint in matched.items():
         is_named = column == joint or is_gripper_name(_words(column))
-        own = readings[column][np.isfinite(readings[column])]
-        least, most = own.min(initial=0.0), own.max(initial=0.0)
+        known = readings[column][np.isfinite(readings[column])]
+        least, most = known.min(initial=0.0), known.max(initial=0.0)
         low, high = limits[joint]
         room = min(slack, slack * (high - low))
         is_within = low - room <= unit * least <= unit * most <= high + room
-        is_wrong = not is_within and (_is_opening(own) or is_mapped or not is_named)
-        is_guess = _is_opening(own) and not is_named
+        is_wrong = not is_within and (_is_opening(known) or is_mapped or not is_named)
+        is_guess = _is_opening(known) and not is_named
         if is_gripper_name(_words(joint)) and (is_wrong or is_guess):
             del kept[column]
             warnings.append(
@@ -290,16 +292,16 @@ def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str,
     """Match logged names to the wanted ones, and return warnings about guesses.
 
     Names match if they differ only in case, separators, a leading k or a final "joint"; then if one
-    ends as the other one. If a log has numbered names that are not the model's, they are its joints
-    in order, provided that there are as many, or as many with numbered names
-    that begin alike.
+    name ends with the other. If a log has numbered names that are not the model's, they are matched
+    to the model's free joints in order, if there are as many of these, or as many with numbered
+    names that begin alike.
 
     Args:
         logged: names of the log's columns.
         wanted: names of the model's joints.
 
     Returns:
-        The wanted name of each matched logged name, and the warnings.
+        the wanted name of each matched logged name, and the warnings.
     """
     matched = {name: name for name in logged if name in wanted}
     guesses: dict[str, str] = {}
@@ -339,9 +341,9 @@ def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str,
 
 
 def _words(name: str) -> list[str]:
-    """Return a name's words in lower case and numbers, without affixes such as "joint".
+    """Return the words in lower case and the numbers of a name, without affixes.
 
-    These are a k before a capital letter, and the last words "joint" and "pos".
+    Affixes are a k before a capital letter, and the last words "joint" and "pos".
     """
     words = [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name)]
     if len(words) > 1 and re.match("k[A-Z]", name):
@@ -352,9 +354,9 @@ def _words(name: str) -> list[str]:
 
 
 def _is_suffix(a: Sequence[str], b: Sequence[str]) -> bool:
-    """Return whether one of two names, given by `_words`, ends with all words of the other one.
+    """Return whether one of two names, given by `_words`, ends with all words of the other.
 
-    A name of numbers only is not enough.
+    A shorter name of numbers only does not count.
     """
     short, long = sorted((a, b), key=len)
     return any(word.isalpha() for word in short) and long[-len(short) :] == short
@@ -381,12 +383,12 @@ def _find_unit(
         others: (k, rows) readings of all columns whose units are unknown, including these.
         lower, upper: (n,) limits of each column's joint [rad].
         slack: tolerance of the limits [rad].
-        full_turn: readings further beyond the limits than this [rad] are not in radians; a joint
-            without limits is assumed to stay within twice this.
+        full_turn: maximum excess over the limits of readings in radians [rad]. A joint without
+            limits is assumed to stay within plus and minus twice this.
         normalised: if the largest magnitude of ``others`` is in this range, or a column's name
             ends in ".pos", LeRobot may have normalised the readings to -100 ... 100.
-        moves: readings of a column that extend over more than this are surely radians if they may
-            be: as degrees they would be of a robot that stands still.
+        moves: range of a column's readings above which readings that may be radians are radians:
+            as degrees the robot would stand still.
 
     Raises:
         SceneError: the readings fit neither radians nor degrees, or seem to be normalised.
@@ -428,18 +430,17 @@ def _positions(
     slack: float = 0.1,
     at_end: float = 1e-6,
 ) -> tuple[Array, Mask, list[str]]:
-    """Return a joint's positions, which readings are at an end of their range, and anomalies.
+    """Return a joint's positions (rows,), whether readings are clipped (rows,), and anomalies.
 
-    The first two are (rows,); the third has the ends of warnings. Positions of a revolute joint
-    without limits are unwrapped.
+    Anomalies are the ends of warnings. Positions of a revolute joint without limits are unwrapped.
 
     Args:
         column: the column's linear map and range.
         readings: (rows,) readings [unit of the log].
         limits: lower and upper limit of the joint [rad or m]; infinite: none.
         is_angle: whether the joint is revolute.
-        slack: tolerance of the limits [rad; for lengths a fraction of the range].
-        at_end: tolerance within which a reading is at an end of its range [fraction of the range].
+        slack: tolerance of the limits [rad; for lengths the range of the limits].
+        at_end: maximum distance of a clipped reading from an end of its range [the range].
     """
     positions, anomalies = column.scale * readings + column.offset, list[str]()
     clipped = np.zeros(len(readings), dtype=np.bool_)
@@ -469,7 +470,7 @@ def _positions(
 
 
 def read_joint_map(path: Path) -> dict[str, Column]:
-    """Return the column of each joint in a joint map, a YAML file, by the joint's name.
+    """Return the linear map of each joint in a joint map, a YAML file, by the joint's name.
 
     An entry has `column` (default: the joint's name) and either `from` and `to` (two readings and
     the positions there [rad or m]), or `scale` and `offset` (position = scale * reading + offset),
@@ -481,17 +482,17 @@ def read_joint_map(path: Path) -> dict[str, Column]:
     content = read_yaml(path, SceneError)
     if not isinstance(content, dict) or not content:
         raise SceneError(f"{path}: expected a mapping from joints to their columns")
-    found = {}
+    columns = {}
     for joint, entry in content.items():
         try:
-            found[str(joint)] = _read_column(str(joint), entry, f"{path}: joint '{joint}'")
+            columns[str(joint)] = _read_column(str(joint), entry, f"{path}: joint '{joint}'")
         except CameraError as error:
             raise SceneError(str(error)) from None
-    return found
+    return columns
 
 
 def _read_column(joint: str, entry: Any, where: str) -> Column:
-    """Return the column of an entry of a joint map.
+    """Return the linear map of an entry of a joint map.
 
     Args:
         joint: name of the joint, and default name of the column.
@@ -519,11 +520,15 @@ def _read_column(joint: str, entry: Any, where: str) -> Column:
 
 
 def _pair(value: Any, field: str, where: str) -> tuple[float, float]:
-    """Return a file's list of two different numbers; CameraError if it is not one.
+    """Return a file's list of two different numbers.
 
     Args:
         value: the list, not yet checked.
-        field, where: field and start of the error message.
+        field: name of its field.
+        where: start of error messages.
+
+    Raises:
+        CameraError: it is not such a list.
     """
     low, high = value if isinstance(value, list) and len(value) == 2 else (0.0, 0.0)
     low, high = (check_number(one, field, where) for one in (low, high))

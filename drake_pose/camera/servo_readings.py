@@ -1,8 +1,9 @@
-"""Tell joint angles from the readings of servos, as LeRobot records them.
+"""Convert the readings of servos, as LeRobot records them, to joint angles.
 
-LeRobot (`_normalize` in `lerobot/motors/motors_bus.py`) records a position P [steps], homed by the
-motor, as 200 (P - low) / (high - low) - 100, for a gripper as 100 (P - low) / (high - low), or, if
-it uses degrees, as (P - middle) 360 / 4095, with the ends of the motor's calibrated range.
+A motor with a calibrated range from low to high [steps] has a position P [steps], to which its
+homing offset is applied. LeRobot (`_normalize` in `lerobot/motors/motors_bus.py`) records it as
+200 (P - low) / (high - low) - 100, for a gripper as 100 (P - low) / (high - low), or, if it uses
+degrees, as (P - (low + high) / 2) 360 / 4095.
 """
 
 import json
@@ -27,8 +28,8 @@ class Column(NamedTuple):
     Attributes:
         name: name of the column.
         scale, offset: the linear map [rad or m per unit of the readings; rad or m].
-        ends: range of the readings, if they are clipped to one; a reading at an end means that the
-            joint is there or beyond.
+        ends: range to which readings are clipped: at an end of it the joint is there or beyond;
+            None: they are not clipped.
     """
 
     name: str
@@ -44,10 +45,10 @@ class ServoJoint:
     Attributes:
         name: name of the joint.
         column: name of the column.
-        readings: (n,) readings; nan where there is none.
+        readings: (n,) readings [degrees, radians, LeRobot's -100 ... 100, or steps]; nan: missing.
         lower, upper: limits of the joint, infinite if there are none [rad or m].
-        is_angle: whether it is revolute.
-        is_gripper: whether it opens a gripper.
+        is_angle: whether the joint is revolute.
+        is_gripper: whether the joint opens a gripper.
         motor: the motor's calibration; None: unknown.
     """
 
@@ -61,7 +62,7 @@ class ServoJoint:
     motor: Motor | None
 
     def is_called(self, names: tuple[str, ...]) -> bool:
-        """Return whether the column or the joint has one of LeRobot's names, after any prefix."""
+        """Return whether the column's or the joint's name ends with one of the names."""
         return self.column.removesuffix(".pos").endswith(names) or self.name.endswith(names)
 
     @property
@@ -73,27 +74,27 @@ class ServoJoint:
 def servo_encoding(
     joints: Sequence[ServoJoint], servos: Servos | None, units: str | None, slack: float = 0.1
 ) -> tuple[Encoding | None, list[str]]:
-    """Return what columns hold if LeRobot recorded them of servos, and warnings.
+    """Return the encoding of columns that LeRobot recorded from servos, and warnings.
 
-    None: they are plain angles, or lengths.
+    None: the columns are radians or degrees that follow the model, or lengths.
 
     Args:
         joints: joints with their columns and motors.
         servos: the robot's motors; None: LeRobot did not record the log.
-        units: what the columns hold, by the user; None: not said.
-        slack: tolerance of the limits [rad].
+        units: the encoding as the user says; None: it is inferred.
+        slack: tolerance of the joints' limits [rad].
 
     Raises:
         SceneError: the readings seem to be normalised, and their ranges are not known.
     """
-    known, is_named = servos or Servos(), any(one.column.endswith(".pos") for one in joints)
-    is_arm = known.is_so or known.is_dynamixel or any(one.motor is not None for one in joints)
-    bodies = [one for one in joints if one.is_angle and not one.is_gripper]
+    known, is_named = servos or Servos(), any(joint.column.endswith(".pos") for joint in joints)
+    is_arm = known.is_so or known.is_dynamixel or any(joint.motor is not None for joint in joints)
+    bodies = [joint for joint in joints if joint.is_angle and not joint.is_gripper]
     is_radians, is_degrees = (
         all(
-            np.nanmin(scale * one.readings, initial=np.inf) >= one.lower - slack
-            and np.nanmax(scale * one.readings, initial=-np.inf) <= one.upper + slack
-            for one in bodies
+            np.nanmin(scale * joint.readings, initial=np.inf) >= joint.lower - slack
+            and np.nanmax(scale * joint.readings, initial=-np.inf) <= joint.upper + slack
+            for joint in bodies
         )
         for scale in (1.0, math.radians(1.0))
     )
@@ -134,19 +135,20 @@ def servo_encoding(
 def _find_encoding(
     joints: Sequence[ServoJoint], turn: int, full: float = 100.001, most: float = 720.0
 ) -> tuple[Encoding, str] | None:
-    """Return what servos' readings are, and the reason, for messages; None: not angles of a joint.
+    """Infer the encoding of servos' readings; return it, and the reason for messages, or None.
 
-    Encoders count in whole steps: readings that are so in one encoding only are decisive.
+    Encoders count in whole steps: an encoding is right if readings are whole steps in it alone.
+    None: there are no readings, or they are too large for steps.
 
     Args:
         joints: the joints; a gripper's readings are not regarded.
         turn: steps of a full turn.
-        full: largest magnitude of normalised readings, with the rounding of stored numbers.
-        most: larger magnitudes are steps; two turns [deg].
+        full: maximum magnitude of normalised readings, with the rounding of stored numbers.
+        most: maximum magnitude of degrees, two turns [deg]; larger readings are steps.
     """
-    body = [one for one in joints if one.is_angle and not one.is_gripper]
-    told = [(one, one.readings[np.isfinite(one.readings)]) for one in body]
-    known = [replace(one, readings=own) for one, own in told if own.size]
+    body = [joint for joint in joints if joint.is_angle and not joint.is_gripper]
+    known_readings = [(one, one.readings[np.isfinite(one.readings)]) for one in body]
+    known = [replace(one, readings=own) for one, own in known_readings if own.size]
     if not known:
         return None
     largest = max(float(np.nanmax(np.abs(one.readings))) for one in known)
@@ -176,14 +178,14 @@ def _find_encoding(
 
 
 def _are_whole(columns: Sequence[Array], near: float = 0.03, least: int = 8) -> bool | None:
-    """Return whether numbers (n,) of each column are whole; None: there are too few to tell.
+    """Return whether the numbers of all columns are whole; None: there are too few to tell.
 
     Args:
-        columns: the columns.
+        columns: numbers (n,) of each column; nan: missing.
         near: tolerance; numbers stored in 32 bits are exact to a thousandth.
-        least: a column with fewer different numbers is not regarded.
+        least: minimum number of different numbers of a column; a column with fewer is ignored.
     """
-    different = [np.unique(one[np.isfinite(one)]) for one in columns]
+    different = [np.unique(column[np.isfinite(column)]) for column in columns]
     told = [one for one in different if len(one) >= least]
     return all(bool((np.abs(one - np.round(one)) < near).all()) for one in told) if told else None
 
@@ -191,16 +193,16 @@ def _are_whole(columns: Sequence[Array], near: float = 0.03, least: int = 8) -> 
 def range_in_steps(
     joint: ServoJoint, turn: int, least: int = 300, different: int = 24
 ) -> int | None:
-    """Return the length of a motor's range [steps], by its calibration or its normalised readings.
+    """Return the length of a motor's range [steps], from calibration or normalised readings.
 
-    Without a calibration it is the least number of steps for which all readings are whole steps;
-    None: there is none.
+    Without a calibration it is the smallest length with which all readings are whole steps. None:
+    it is not known.
 
     Args:
         joint: the joint.
         turn: steps of a full turn.
         least: minimum length of a range [steps].
-        different: minimum number of different readings; fewer may share a divisor by chance.
+        different: minimum number of different readings; with fewer a length may fit by chance.
     """
     if joint.motor is not None:
         length = joint.motor.high - joint.motor.low
@@ -214,33 +216,34 @@ def range_in_steps(
 def servo_columns(
     joints: Sequence[ServoJoint], servos: Servos, encoding: Encoding
 ) -> tuple[dict[str, Column], list[str]]:
-    """Return the column of each joint by its name, and warnings; a joint may lack one.
+    """Return by joint name the linear map from its column, and warnings.
 
-    The middle of a motor's range is the middle of the joint's limits if the two are about as long;
-    else, and if the range is a full turn, it is the joint's zero, as in LeRobot. A gripper's low
-    end is its joint's lower limit. Steps without a range have their zero at half a turn.
+    If a motor's range is about as long as the joint's limits, their middles are the same position.
+    If not, or if the range is a full turn, the middle of the range is the joint's zero, as in
+    LeRobot. The low end of a gripper's range is its joint's lower limit. Steps without a range have
+    their zero at half a turn. A joint whose position does not follow has no map.
 
     Args:
-        joints: joints, one for each column.
+        joints: the joints, each with a column.
         servos: the robot's motors.
-        encoding: what the readings are.
+        encoding: of the readings.
     """
     columns, warnings, assumed = dict[str, Column](), list[str](), list[str]()
-    inner = {one.name: _as_counted(one, servos, encoding) for one in joints}
+    inner = {joint.name: _as_counted(joint, servos, encoding) for joint in joints}
     is_degrees = {
-        one.name: encoding == "deg" or (servos.has_lists and one.motor is not None)
-        for one in joints
+        joint.name: encoding == "deg" or (servos.has_lists and joint.motor is not None)
+        for joint in joints
     }
     shown = [
-        replace(one, readings=inner[one.name].scale * one.readings + inner[one.name].offset)
-        for one in joints
-        if is_degrees[one.name]
+        replace(joint, readings=inner[joint.name].scale * joint.readings + inner[joint.name].offset)
+        for joint in joints
+        if is_degrees[joint.name]
     ]
     degrees = _so_degrees(shown, servos)
     for one in joints:
         if one.is_gripper:
-            found = _gripper_column(one, servos, encoding)
-            if found is None:
+            column = _gripper_column(one, servos, encoding)
+            if column is None:
                 warnings.append(
                     f"joint '{one.name}': column '{one.column}' does not tell its position, as the "
                     "gripper's range is not known; if it must be known, give a joint map"
@@ -248,22 +251,22 @@ def servo_columns(
         elif is_degrees[one.name]:
             scale, offset = inner[one.name][1:3]
             outer = degrees.get(one.name) or _degree_column(one, servos)
-            found = Column(one.column, outer.scale * scale, outer.scale * offset + outer.offset)
+            column = Column(one.column, outer.scale * scale, outer.scale * offset + outer.offset)
         elif encoding == "steps":
-            found = _step_column(one, servos)
+            column = _step_column(one, servos)
         else:
             length = range_in_steps(one, servos.turn)
             if length is None and one.is_called(servos.full_turns):
                 length = servos.turn - 1
             if length is None:
                 assumed.append(one.name)
-                found = _between(one, -100.0, 100.0)
+                column = _between(one, -100.0, 100.0)
             else:
                 half = math.pi * length / servos.turn
                 ends = None if length >= servos.turn - 1 else (-100.0, 100.0)
-                found = Column(one.column, 0.01 * half, _zero(one, length, servos.turn), ends)
-        if found is not None:
-            columns[one.name] = found
+                column = Column(one.column, 0.01 * half, _zero(one, length, servos.turn), ends)
+        if column is not None:
+            columns[one.name] = column
     if degrees:
         warnings.append(
             f"the degrees of {', '.join(degrees)} are taken to be of LeRobot before June 2025, "
@@ -284,15 +287,15 @@ def _zero(joint: ServoJoint, length: float, turn: int, alike: float = 0.25) -> f
         joint: the joint.
         length: length of the range [steps].
         turn: steps of a full turn.
-        alike: if the range and the joint's limits differ by more than this fraction, the range is
-            not that of the joint's motion.
+        alike: maximum difference of the range from the joint's limits [the limits' length]; beyond
+            it the range tells nothing of the limits, and the result is 0.
     """
     span, travel = joint.upper - joint.lower, 2.0 * math.pi * length / turn
     return joint.middle if length < turn - 1 and abs(travel - span) <= alike * span else 0.0
 
 
 def _between(joint: ServoJoint, low: float, high: float) -> Column | None:
-    """Return the column whose readings low and high are the joint's limits; None without limits."""
+    """Return the map that takes readings low and high to the joint's limits; None: no limits."""
     span = joint.upper - joint.lower
     if not math.isfinite(span):
         return None
@@ -302,9 +305,10 @@ def _between(joint: ServoJoint, low: float, high: float) -> Column | None:
 
 
 def _as_counted(joint: ServoJoint, servos: Servos, encoding: Encoding) -> Column:
-    """Return the map from a joint's readings to degrees if they are steps homed by lists.
+    """Return the map from a joint's steps to degrees, if its motor is calibrated by lists.
 
-    Lists home and invert what the motor counts. Other readings are mapped to themselves.
+    Lists, the calibration of LeRobot before June 2025, home and invert what the motor counts. All
+    other readings are mapped to themselves.
     """
     if encoding != "steps" or not servos.has_lists or joint.motor is None:
         return Column(joint.column)
@@ -314,7 +318,7 @@ def _as_counted(joint: ServoJoint, servos: Servos, encoding: Encoding) -> Column
 
 
 def _step_column(joint: ServoJoint, servos: Servos) -> Column:
-    """Return a joint's column of encoder steps; without calibration half a turn is its zero."""
+    """Return a joint's map from encoder steps; without calibration half a turn is its zero."""
     motor, turn = joint.motor, servos.turn
     step = 2.0 * math.pi / turn
     sign = -1.0 if motor is not None and motor.is_inverted and not servos.is_dynamixel else 1.0
@@ -325,7 +329,7 @@ def _step_column(joint: ServoJoint, servos: Servos) -> Column:
 
 
 def _degree_column(joint: ServoJoint, servos: Servos) -> Column:
-    """Return a joint's column of degrees; LeRobot counts 4095 steps in 360 degrees."""
+    """Return a joint's map from degrees, of which LeRobot counts 360 to 4095 steps."""
     motor, scale = joint.motor, math.radians(1.0)
     if motor is None or not math.isfinite(motor.high):
         return Column(joint.column, scale)
@@ -334,38 +338,40 @@ def _degree_column(joint: ServoJoint, servos: Servos) -> Column:
 
 
 def _so_degrees(joints: Sequence[ServoJoint], servos: Servos) -> dict[str, Column]:
-    """Return the columns of SO arms' joints whose zero and sign changed in LeRobot's #777.
+    """Return the maps of SO arms' joints whose zero and sign changed in LeRobot's #777, June 2025.
 
-    Before, the zero of shoulder_lift and elbow_flex was the arm stretched out. They are returned if
-    the readings then leave the joints' limits less, or as much and the columns have the names of
-    that time, without ".pos".
+    Before, the zero of shoulder_lift and elbow_flex was the arm stretched out. The old maps are
+    returned if readings leave the joints' limits less with them than with the new maps; or as much,
+    if the columns have old names, without ".pos". Otherwise the result is empty.
+
+    joints: with readings in degrees. servos: the robot's motors.
     """
     changed = {"shoulder_lift": (-1.0, 90.0), "elbow_flex": (1.0, -90.0)}
-    found, excess = dict[str, Column](), np.zeros(2)
+    old_columns, excess = dict[str, Column](), np.zeros(2)
     for one in joints if servos.is_so else ():
         for name, (sign, offset) in changed.items():
             if one.is_called((name,)):
                 old = Column(one.column, math.radians(sign), math.radians(offset))
-                found[one.name] = old
+                old_columns[one.name] = old
                 for k, way in enumerate((Column("", math.radians(1.0)), old)):
                     angles = way.scale * one.readings + way.offset
                     beyond = np.maximum(one.lower - angles, angles - one.upper)
                     excess[k] += max(0.0, float(np.nanmax(beyond, initial=0.0)))
-    is_new = all(one.column.endswith(".pos") for one in joints)
-    return found if excess[1] < excess[0] or (excess[1] == excess[0] and not is_new) else {}
+    is_new = all(joint.column.endswith(".pos") for joint in joints)
+    return old_columns if excess[1] < excess[0] or (excess[1] == excess[0] and not is_new) else {}
 
 
 def _gripper_column(
     joint: ServoJoint, servos: Servos, encoding: Encoding, alike: float = 0.25
 ) -> Column | None:
-    """Return a gripper's column; None: its readings do not tell its position.
+    """Return a gripper's map; None: its readings do not determine its position.
 
     Args:
         joint: the gripper's joint.
         servos: the robot's motors.
         encoding: of the other joints.
-        alike: if the motor's range and the joint's differ by more than this fraction, a gear is
-            between them, and the range is the joint's limits.
+        alike: maximum difference of the motor's range from the joint's limits [the limits' length];
+            beyond it a gear is between them, and the range's ends are the joint's limits.
     """
     motor, turn = joint.motor, servos.turn
     length = math.nan if motor is None else motor.high - motor.low
@@ -386,8 +392,8 @@ def _gripper_column(
 
 
 def _require_ranges(joints: Sequence[ServoJoint], servos: Servos) -> None:
-    """Raise SceneError if nothing tells the ranges of normalised readings."""
-    unknown = [one.column for one in joints if range_in_steps(one, servos.turn) is None]
+    """Raise SceneError if a range of normalised readings is neither calibrated nor inferable."""
+    unknown = [joint.column for joint in joints if range_in_steps(joint, servos.turn) is None]
     if unknown and not (servos.is_so or servos.is_dynamixel):
         raise SceneError(
             f"the readings of the joint log ({', '.join(unknown)}) seem to be normalised to -100 "
@@ -399,7 +405,7 @@ def _require_ranges(joints: Sequence[ServoJoint], servos: Servos) -> None:
 
 
 def is_gripper_name(words: Sequence[str]) -> bool:
-    """Return whether a name, given by its words, is of a gripper's joint or opening."""
+    """Return whether a name, given as its words in lower case, is of a gripper's joint."""
     return not {*words}.isdisjoint({"gripper", "finger", "fingers", "jaw", "claw", "knuckle"})
 
 
@@ -410,8 +416,8 @@ class HomingCorrection:
     Attributes:
         motor: name of the motor.
         before, after: homing offset in the file, and corrected [steps].
-        shift: by how much its positions become larger [steps].
-        reason: why it is not corrected; "": it is.
+        shift: increase of the motor's positions by the correction [steps].
+        reason: why the offset is not corrected; "": it is.
     """
 
     motor: str
@@ -433,8 +439,8 @@ def correct_homing(
 ) -> HomingCorrection:
     """Return the homing offset with which LeRobot reads the model's angle of a joint.
 
-    The middle of the motor's range, where LeRobot reads 0, becomes the model's zero. The range
-    stays: its ends are the same angles to both sides of the zero.
+    The middle of the motor's range, where LeRobot reads 0, becomes the model's zero. The range's
+    numbers stay, so that its ends are the same angles on both sides of the zero.
 
     Args:
         joint: the joint; its readings are not used.
@@ -442,9 +448,9 @@ def correct_homing(
         column: the joint's column, as recorded.
         offset: the joint's offset, to be added to the recorded positions [rad].
         servos: the robot's motors.
-        encoding: what the column holds.
-        most_lost: largest correction [half the range]; beyond it the model's zero is another one
-            than the motor's, as in a model whose limits are all on one side of 0.
+        encoding: of the column's readings.
+        most_lost: maximum correction [half the range]; beyond it the model's zero is not meant to
+            be the motor's, as in a model whose limits are all on one side of 0.
     """
     motor, step = servos.motors[motor_name], 2.0 * math.pi / servos.turn
     before = motor.homing

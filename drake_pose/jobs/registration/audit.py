@@ -1,8 +1,8 @@
 """Audit a scene or an episode: find errors of joints, cameras, clocks, and outlier frames.
 
-In an episode each camera is first registered from its pictures, with its clock, which gives masks
-independent of the given camera. A given camera far from its registered pose is a finding, and
-frames are compared with the registered one; otherwise they are compared with the given one.
+In an episode each camera is first registered from its pictures, with its clock. This gives masks
+that do not depend on the given pose. If the given pose is far from the registered pose, that is a
+finding, and frames are compared with the registered pose; otherwise with the given pose.
 """
 
 import math
@@ -69,7 +69,7 @@ class SceneAudit:
     """The audit of a scene.
 
     Args:
-        audit: the diagnosis of all frames.
+        audit: the diagnosis of all frames, with the findings.
         summary: contents of summary.json.
         warnings: for the user.
         folder: the result's folder; None: nothing was written.
@@ -94,11 +94,11 @@ def audit_scene(
     on_frame: OnFrame | None = None,
     near: Path | None = None,
 ) -> SceneAudit:
-    """Return errors common to all frames, and outlier frames, in time linear in their number.
+    """Find errors common to all frames, and outlier frames; the time is linear in their number.
 
     Args:
         scene: a folder with masks and cameras.yaml; or an episode of pictures, in which the robot
-            and its masks are found without the audited cameras.
+            is found without the poses of the audited cameras.
         model: the robot's model file, with the robot placed in the world as in the file.
         joints: joint positions by frame, or by time for an episode (CSV) [rad or m]. None: the
             recording's own.
@@ -107,21 +107,21 @@ def audit_scene(
         cameras: a camera file in place of the scene's or episode's own.
         overlay: whether overlays are drawn.
         on_frame: called after each frame.
-        near: result folder of the audit of another episode, near whose poses the cameras are
-            expected; those that are not there are searched. None: all are searched.
+        near: result folder of the audit of another episode. Cameras are first sought near the poses
+            found there, then everywhere. None: all are sought everywhere.
 
     Raises:
         DrakePoseError: names the wrong file, camera, frame or joint.
     """
     settings, begin = settings or AuditSettings(), time.perf_counter()
-    table, own, folder = (None if one is None else Path(one) for one in (joints, cameras, out))
+    table, file, folder = (None if one is None else Path(one) for one in (joints, cameras, out))
     with use_workers(settings.workers):
-        inputs = split_moved_cameras(read_inputs(Path(scene), Path(model), table, own, settings))
+        inputs = split_moved_cameras(read_inputs(Path(scene), Path(model), table, file, settings))
         pictures = _Pictures()
         if inputs.recordings:
             given, (inputs, pictures) = inputs, _find_cameras(inputs, others=near)
             compared = SceneComparison(inputs, on_frame).run()
-            offset_joints = [one.name for one in compared.found.common if one.kind == "joint"]
+            offset_joints = [k.name for k in compared.found.common if k.kind == "joint"]
             if offset_joints:
                 # Masks were segmented with wrong offsets, so they are made again.
                 inputs, pictures = _find_cameras(given, pictures, offset_joints)
@@ -145,14 +145,14 @@ def audit_scene(
         "frame_count": len(found.frames),
         "agreeing_count": len(found.frames) - len(found.outliers),
         "frames": {
-            one.frame: {
-                "agrees": one.finding is None,
-                "fits": dict(one.given_ratios),
-                "fits_when_freed": dict(one.fitted_ratios),
-                "pixels": one.pixels,
-                "masks": mask_digests(inputs.scene, names, one.frame),
+            frame.frame: {
+                "agrees": frame.finding is None,
+                "fits": dict(frame.given_ratios),
+                "fits_when_freed": dict(frame.fitted_ratios),
+                "pixels": frame.pixels,
+                "masks": mask_digests(inputs.scene, names, frame.frame),
             }
-            for one in found.frames
+            for frame in found.frames
         },
         "found_cameras": {
             name: describe_pictures(one)
@@ -164,7 +164,7 @@ def audit_scene(
             for name, one in pictures.found.items()
         },
         "minimum_detectable": {
-            k: one if math.isfinite(one) else None for k, one in detectable.items()
+            name: offset if math.isfinite(offset) else None for name, offset in detectable.items()
         },
         "principal_point_px": center and dict(zip(("offset", "sd"), center, strict=True)),
         "error_sizes_px": {
@@ -185,7 +185,7 @@ class _Pictures:
     Args:
         found: registrations by camera.
         findings: errors of cameras and clocks.
-        names: by name of each audited frame, the camera, and the picture's name in its recording.
+        names: camera, and picture's name in its recording, by name of each audited frame.
     """
 
     found: Mapping[str, PictureRegistration] = field(default_factory=dict)
@@ -194,8 +194,8 @@ class _Pictures:
 
     @property
     def refused(self) -> tuple[Finding, ...]:
-        """Cameras whose pictures no pose explains."""
-        return tuple(one for one in self.findings if one.kind == "refused")
+        """Findings of cameras whose pictures no pose explains."""
+        return tuple(finding for finding in self.findings if finding.kind == "refused")
 
 
 def _find_cameras(
@@ -205,19 +205,20 @@ def _find_cameras(
     near: float = 0.08,
     others: Path | None = None,
 ) -> tuple[RegistrationInputs, _Pictures]:
-    """Register each camera of an episode from its pictures, and segment all of them.
+    """Register each camera of an episode from its pictures, and segment all pictures.
 
     Args:
         inputs: the episode, with given cameras.
         before: an earlier result, from which fits start; None: poses are searched.
         offset_joints: names of the joints whose offsets are fitted.
-        near: a given camera is used for comparisons if it shows the body at less than this distance
-            from the registered one [square root of the silhouettes' area].
+        near: frames are compared with the given camera if the body's points in its pictures are
+            nearer than this to those at the registered pose [square root of the silhouettes' area].
         others: as `near` of ``audit_scene``.
 
     Returns:
-        the inputs as a scene of masks: each picture is a frame of its camera only, compared with
-        `known_cameras`; `given_cameras` are those whose poses are a finding. And the registrations.
+        the inputs as a scene of masks, and the registrations. In the inputs each picture is a frame
+        of its camera only, `known_cameras` are those that frames are compared with, and
+        `given_cameras` are those whose given poses are a finding.
 
     Raises:
         SceneError: no camera has a pose.
@@ -234,9 +235,9 @@ def _find_cameras(
     warnings = left_out_warnings(inputs.recordings, [one.name for one in inputs.given_cameras])
     compared, findings = list[Camera](), [] if before is None else list(before.refused)
     names, frames = dict[str, tuple[str, str]](), list[MultiViewFrame]()
-    placed = {one.name for one in inputs.given_cameras} if before is None else before.found
+    placed = {camera.name for camera in inputs.given_cameras} if before is None else before.found
     refused = dict[str, RegistrationError]()
-    searched = [one for one in inputs.searched_cameras if one.name in placed]
+    searched = [camera for camera in inputs.searched_cameras if camera.name in placed]
     pictures = {
         one.found.camera.name: one
         for one in register_recordings(
@@ -255,13 +256,13 @@ def _find_cameras(
         for name, why in refused.items()
     ]
     findings += motion_findings(body, inputs, pictures)
-    for given in (one for one in inputs.given_cameras if one.name in pictures):
+    for given in (camera for camera in inputs.given_cameras if camera.name in pictures):
         name, recording, one = given.name, inputs.recordings[given.name], pictures[given.name]
         values = np.array([frame.values + one.joint_offsets for frame in one.frames])
-        off = compare_camera(body, given, one.found, values, alone)
-        is_near = off.pixels < near * one.fit.fit.views[0].size
+        difference = compare_camera(body, given, one.found, values, alone)
+        is_near = difference.pixels < near * one.fit.fit.views[0].size
         compared.append(given if is_near else one.found.camera)
-        findings += [] if is_near or off.p_value > DIAGNOSIS.significance else [off]
+        findings += [] if is_near or difference.p_value > DIAGNOSIS.significance else [difference]
         # The parts of a recording have one clock.
         findings += compare_clock(body, one, recording) if inputs.parts[name].of == name else []
         segmented, _, lost = evaluate_pictures(body, one, one.found)
@@ -271,13 +272,13 @@ def _find_cameras(
             frames.append(MultiViewFrame(known, frame.values, {name: frame.mask}))
         if lost:
             warnings.append(lost_frames_warning(name, lost, recording.names))
-    far = {one.name for one in findings if one.kind == "camera"}
+    misplaced = {finding.name for finding in findings if finding.kind == "camera"}
     updated = replace(
         inputs,
         scene=replace(inputs.scene, frames=tuple(names)),
         warnings=(*inputs.warnings, *warnings),
         known_cameras=tuple(compared),
-        given_cameras=tuple(one for one in inputs.given_cameras if one.name in far),
+        given_cameras=tuple(camera for camera in inputs.given_cameras if camera.name in misplaced),
         audited_frames=tuple(names),
         frames=tuple(frames),
     )
@@ -285,7 +286,7 @@ def _find_cameras(
 
 
 def _found_poses(folder: Path) -> dict[str, tuple[Array, float]]:
-    """Return the pose X_WC (4, 4) found by an audit and what chance explained, by camera.
+    """Return, by camera, X_WC (4, 4) as found by an audit, and the fraction explained by chance.
 
     The result is empty if the folder has no result.
     """
@@ -324,7 +325,7 @@ def _audit_warnings(
         named = frame_ranges(empty_frames, inputs.scene.frames)
         warnings.append(f"frame {named}: the masks are empty, so nothing is compared; check them")
     count, inliers = len(found.frames), len(found.frames) - len(found.outliers)
-    wrong_log = any(one.kind in ("sign", "log") for one in found.common)
+    wrong_log = any(finding.kind in ("sign", "log") for finding in found.common)
     if 2 * inliers < count and not wrong_log:
         warnings.append(
             f"only {inliers} of {count} frames agree with each other: they count as right because "
@@ -352,21 +353,23 @@ def _write_result(
         overlay: whether overlays and comparisons are drawn.
         summary: contents of summary.json.
     """
-    named, shown = found.outliers if overlay else (), {}
-    for frame in named if pictures.names else ():
+    outliers, shown = found.outliers if overlay else (), {}
+    for frame in outliers if pictures.names else ():
         camera_name, name = pictures.names[frame]
         shown[frame] = inputs.recordings[camera_name].picture(name)
-    for camera in inputs.known_cameras if named else ():
+    for camera in inputs.known_cameras if outliers else ():
         name, titled = camera.name, []
-        for one in map(inputs.read, named):
+        for one in map(inputs.read, outliers):
             if name in one.masks:
                 fits = percent(summary["frames"][one.name]["fits"][name])
                 title = f"{name}  frame {one.name}  OUTLIER  {fits} fits"
                 titled.append((PosedFrame(one.name, one.values, one.masks[name]), title))
         write_overlays(path, inputs.tree, camera, titled, inputs.visible_nodes, shown)
     for given in inputs.given_cameras if overlay else ():
-        own = pictures.found[given.name]
-        write_comparisons(path, inputs, own.frames, given, own.found, own.pictures)
+        registration = pictures.found[given.name]
+        write_comparisons(
+            path, inputs, registration.frames, given, registration.found, registration.pictures
+        )
     write_summary(path, summary)
     write_audit_page(path, inputs, found, summary, overlay)
 
@@ -374,18 +377,18 @@ def _write_result(
 def _describe_findings(found: Diagnosis) -> list[dict[str, Any]]:
     """Return all findings as ``findings`` of summary.json.
 
-    Common ones come first, then those of frames, the frame with the largest error [pixel] first.
+    Findings common to all frames come first, then those of frames, the largest error first.
     """
     rows = [(one, one.kind, one.name, describe_common_finding(one)) for one in found.common]
     rows += [
         (
-            one.finding,
+            frame.finding,
             "frame",
-            one.frame,
-            f"frame '{one.frame}': {describe_frame_finding(one, one.finding)}",
+            frame.frame,
+            f"frame '{frame.frame}': {describe_frame_finding(frame, frame.finding)}",
         )
-        for one in sorted(found.frames, key=lambda one: -one.pixels)
-        if one.finding is not None and one.finding not in found.common
+        for frame in sorted(found.frames, key=lambda frame: -frame.pixels)
+        if frame.finding is not None and frame.finding not in found.common
     ]
     described = []
     for one, what, name, text in rows:

@@ -20,7 +20,7 @@ from drake_pose.registration.findings import Diagnosis, Finding
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 
 OnePicture = tuple[str, str, list[Finding]]
-"""A frame to draw: its name, words for its title, and the findings that correct its joints."""
+"""A frame to draw: its name, whose joints are corrected in words, and the correcting findings."""
 
 
 def write_audit_page(
@@ -38,18 +38,18 @@ def write_audit_page(
         inputs: inputs of the audit.
         found: the diagnosis.
         summary: content of summary.json.
-        overlay: whether pictures are drawn; the page shows existing ones in any case.
+        overlay: whether pictures are drawn; the page shows pictures that exist in any case.
         most_pictures: maximum number of frames with pictures, for each camera.
     """
     if overlay:
         _draw_outlines(folder, inputs, found, most_pictures)
-    frames = [one.frame for one in found.frames]
+    frames = [frame.frame for frame in found.frames]
     pictures = {
         kind: [
-            one
+            picture
             for camera in inputs.scene.cameras
             for frame in sorted(frames, key=found.outliers.__contains__, reverse=True)
-            if (one := overlay_picture(folder, camera, frame, None, kind)) is not None
+            if (picture := overlay_picture(folder, camera, frame, None, kind)) is not None
         ][: most_pictures * len(inputs.scene.cameras)]
         for kind in (AS_GIVEN, OVERLAY)
     }
@@ -60,7 +60,7 @@ def write_audit_page(
         kind="audit",
         title=Path(str(summary["scene"])).resolve().name,
         model=Path(str(summary["model"])).name,
-        corrections=[correction_row(one) for one in summary["findings"]],
+        corrections=[correction_row(finding) for finding in summary["findings"]],
         cameras=[_camera_row(name, summary) for name in _cameras(summary)],
         joints=_joint_rows(inputs.tree, kinds, summary),
         pairs=pictures[AS_GIVEN],
@@ -76,14 +76,14 @@ def audit_answer(summary: Mapping[str, Any], kinds: Mapping[str, str]) -> str:
         summary: content of summary.json.
         kinds: kind of each position by name: "angle", "length" or "quaternion".
     """
-    found = summary["findings"]
-    common = [one for one in found if one["what"] != "frame"]
-    outliers = [one["name"] for one in found if one["what"] == "frame"]
+    findings = summary["findings"]
+    common = [finding for finding in findings if finding["what"] != "frame"]
+    outliers = [finding["name"] for finding in findings if finding["what"] == "frame"]
     texts = []
     if len(common) == 1:
         texts.append(f"Error found: {common[0]['text']}.")
     elif common:
-        named = listed([f"{one['what']} '{one['name']}'" for one in common])
+        named = listed([f"{finding['what']} '{finding['name']}'" for finding in common])
         texts.append(f"{len(common)} errors found: {named}.")
     if outliers:
         count, named = summary["frame_count"], frame_ranges(outliers, list(summary["frames"]))
@@ -93,8 +93,8 @@ def audit_answer(summary: Mapping[str, Any], kinds: Mapping[str, str]) -> str:
         return " ".join(texts)
     offsets, detectable = summary["minimum_detectable"], list[str]()
     for kind in ("angle", "length"):
-        own = [one for name, one in offsets.items() if one is not None and kinds[name] == kind]
-        detectable += [detectable_offset(max(own), kind)] if own else []
+        known = [x for name, x in offsets.items() if x is not None and kinds[name] == kind]
+        detectable += [detectable_offset(max(known), kind)] if known else []
     if not detectable:
         return "No error found, but no joint offset could have been detected."
     hidden = [name for name, one in offsets.items() if one is None]
@@ -114,12 +114,12 @@ def detectable_offset(offset: float, kind: str) -> str:
 
 
 def correction_row(one: Mapping[str, Any], normal: float = 1.96) -> dict[str, Any]:
-    """Return an entry of ``findings`` with ``parts`` for the page's tables.
+    """Return an entry of ``findings`` of summary.json, with ``parts`` for the page's tables.
 
-    Each part is the text of an angle or a shift with a known standard deviation, and that of its
-    95 % interval.
+    Each part has two texts: an angle or a shift with a known standard deviation, and its 95 %
+    interval.
 
-    normal: half-width of an interval in standard deviations.
+    one: the entry. normal: half-width of an interval [standard deviations].
     """
     parts = []
     for key in (key for key in one if key.startswith(("angle_deg", "shift_"))):
@@ -143,17 +143,18 @@ def _cameras(summary: Mapping[str, Any]) -> list[str]:
 
 
 def _camera_row(name: str, summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a camera's row of the page's table: number of frames, mean inlier ratios, errors.
+    """Return a camera's row of the page's table.
 
-    "given" and "freed" are the inlier ratios at the given values and with frames fitted by
-    themselves (None: unknown), "off" the camera's errors common to all frames.
+    "frames" is the number of frames, "given" the mean inlier ratio at the given values, "freed"
+    that with each frame fitted by itself (None: unknown), and "off" the camera's errors common to
+    all frames.
     """
     frames = [one for one in summary["frames"].values() if name in one["fits"]]
-    freed = [one["fits_when_freed"][name] for one in frames if name in one["fits_when_freed"]]
+    freed = [frame["fits_when_freed"][name] for frame in frames if name in frame["fits_when_freed"]]
     return {
         "name": name,
         "frames": len(frames),
-        "given": float(np.mean([one["fits"][name] for one in frames])),
+        "given": float(np.mean([frame["fits"][name] for frame in frames])),
         "freed": float(np.mean(freed)) if freed else None,
         "off": _errors_of(("camera", "clock", "rate", "moved"), name, summary),
     }
@@ -164,8 +165,8 @@ def _joint_rows(
 ) -> list[dict[str, Any]]:
     """Return the rows of the page's table of joints.
 
-    Each has the joint's errors common to all frames ("off"), or else its minimum detectable offset
-    as text.
+    In each row "off" has the joint's errors common to all frames. If there are none, "detectable"
+    is the joint's minimum detectable offset as text.
 
     Args:
         tree: the robot's pose tree; each of its joints in `kinds` has a row.
@@ -173,7 +174,7 @@ def _joint_rows(
         summary: content of summary.json.
     """
     rows = []
-    for name in (one for one in TreeKinematics(tree).names if one in kinds):
+    for name in (name for name in TreeKinematics(tree).names if name in kinds):
         off, detectable = _errors_of(("joint", "sign", "log", "link"), name, summary), "–"
         if not off and name in summary["minimum_detectable"]:
             offset = summary["minimum_detectable"][name]
@@ -185,15 +186,17 @@ def _joint_rows(
 
 
 def _errors_of(kinds: Sequence[str], name: str, summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the errors common to all frames that have one of the kinds, and the name.
+    """Return the errors common to all frames of a joint or camera, as `correction_row` does.
 
-    The result is as of `correction_row`.
-
-    kinds: some of those of ``Finding``. name: of a joint or camera. summary: of summary.json.
+    kinds: kinds of errors, see ``Finding``. name: of the joint or camera. summary: content of
+    summary.json.
     """
-    told = [one for one in summary["findings"] if one["what"] != "frame"]
     return [
-        correction_row(one) for one in told if one["cause"] in kinds and one["cause_name"] == name
+        correction_row(finding)
+        for finding in summary["findings"]
+        if finding["what"] != "frame"
+        and finding["cause"] in kinds
+        and finding["cause_name"] == name
     ]
 
 
@@ -206,16 +209,19 @@ def _draw_outlines(folder: Path, inputs: RegistrationInputs, found: Diagnosis, m
     common = [one for one in found.common if corrected(np.zeros(len(names)), names, one)]
     draw, chosen = body_drawer(inputs.tree, inputs.visible_nodes), list[OnePicture]()
     for one in sorted(found.frames, key=lambda one: -one.pixels):
-        own = [] if one.finding is None or one.finding in found.common else [one.finding]
-        told = [*common, *(x for x in own if corrected(np.zeros(len(names)), names, x))]
-        if told and len(chosen) < most:
-            chosen.append((one.frame, "of this frame" if own else "of all frames", told))
-    for frame, of, told in chosen:
+        of_frame = [] if one.finding is None or one.finding in found.common else [one.finding]
+        findings = [
+            *common,
+            *(x for x in of_frame if corrected(np.zeros(len(names)), names, x)),
+        ]
+        if findings and len(chosen) < most:
+            chosen.append((one.frame, "of this frame" if of_frame else "of all frames", findings))
+    for frame, of, findings in chosen:
         seen = inputs.read(frame)
         values = seen.values
-        for finding in told:
+        for finding in findings:
             (values,) = corrected(values, names, finding)
-        for camera in (one for one in inputs.known_cameras if one.name in seen.masks):
+        for camera in (camera for camera in inputs.known_cameras if camera.name in seen.masks):
             given = seen.of(camera.name)
             bodies = [draw(camera, replace(given, values=v)) >= 0 for v in (seen.values, values)]
             title = f"{camera.name}  frame {frame}  joints {of}"
@@ -224,7 +230,7 @@ def _draw_outlines(folder: Path, inputs: RegistrationInputs, found: Diagnosis, m
 
 
 def corrected(values: Array, names: Sequence[str], one: Finding) -> tuple[Array, ...]:
-    """Return a tuple of the joint values (m,) corrected by a finding, () if it corrects no joint.
+    """Return the joint values (m,) corrected by a finding, in a tuple; (): it corrects no joint.
 
     Args:
         values: (m,) joint values [rad or m].
@@ -239,7 +245,7 @@ def corrected(values: Array, names: Sequence[str], one: Finding) -> tuple[Array,
     known = {name: value for name, value in added.items() if name in names}
     if not known:
         return ()
-    moved = np.array(values, dtype=np.float64)
+    result = np.array(values, dtype=np.float64)
     for name, value in known.items():
-        moved[names.index(name)] += value
-    return (moved,)
+        result[names.index(name)] += value
+    return (result,)

@@ -52,9 +52,11 @@ Search = CameraSearch | TargetSearch
 def explain_misfit(found: RegisteredCamera, min_inlier_ratio: float = 0.65) -> str | None:
     """Return in words why a pose does not explain the masks; None: it does.
 
-    min_inlier_ratio: minimum mean inlier ratio of the two best frames. A correct robot has 0.83 or
-        more, even with holes and tools in the masks; mirrored masks, another robot's masks or
-        exchanged frames have 0.6 at most.
+    Args:
+        found: the registered camera.
+        min_inlier_ratio: minimum mean inlier ratio of the two best frames. A correct robot has 0.83
+            or more, even with holes and tools in the masks; mirrored masks, another robot's masks
+            or exchanged frames have 0.6 at most.
     """
     inliers = [frame for frame in found.frames if frame.is_inlier]
     left = _left(found)
@@ -86,8 +88,8 @@ def require_explained(
         search: searches again, roughly, with alternative causes of the misfit.
         found: the camera at the pose that is checked.
         frames: the frames that it was registered from.
-        much_better: an alternative cause is named if it explains the masks, and less than this
-            fraction of the inliers' median E_total remains.
+        much_better: maximum median E_total of the inlier frames with an alternative cause, over
+            that without it. Alternative causes are named in the error if they explain the masks.
 
     Raises RegistrationError: states the misfit and alternative causes, or what to check.
     """
@@ -116,14 +118,14 @@ def require_explained(
 def _alternatives(
     camera: PinholeCamera, frames: Sequence[PosedFrame], most: int = 5
 ) -> Iterator[tuple[str, PinholeCamera, list[PosedFrame]]]:
-    """Yield alternative causes: words, and the camera and some frames corrected accordingly.
+    """Yield alternative causes of a misfit: in words, the corrected camera, and corrected frames.
 
     most: maximum number of frames for each cause.
     """
-    some = evenly_spaced(frames, most)
+    sample = evenly_spaced(frames, most)
     mirrored = [
         PosedFrame(frame.name, frame.values, np.ascontiguousarray(frame.mask[:, ::-1]))
-        for frame in some
+        for frame in sample
     ]
     text = (
         "they fit when they are mirrored: turn the pictures back, or change the sign of all joint "
@@ -142,7 +144,7 @@ def _alternatives(
         text = (
             f"they fit with focal lengths near {focal_x:.0f}, {focal_y:.0f} pixels: calibrate it."
         )
-        yield text, replace(camera, focal_x=focal_x, focal_y=focal_y), some
+        yield text, replace(camera, focal_x=focal_x, focal_y=focal_y), sample
 
 
 def require_seen_by(
@@ -155,15 +157,16 @@ def require_seen_by(
     Raises CameraError: see ``require_visible``.
     """
     for camera in cameras:
-        own, refused = [one for one in frames if camera.name in one.masks], list[CameraError]()
-        for frame in own:
+        with_mask = [frame for frame in frames if camera.name in frame.masks]
+        refused = list[CameraError]()
+        for frame in with_mask:
             try:
                 require_visible(
                     body.medium, camera.X_CW @ body.kinematics.poses(frame.values), camera
                 )
             except CameraError as error:
                 refused.append(error)
-        if own and len(refused) == len(own):
+        if with_mask and len(refused) == len(with_mask):
             raise refused[0]
 
 
@@ -172,7 +175,9 @@ def known_camera_warnings(
 ) -> list[str]:
     """Return a warning if the robot is not visible where a camera with known X_WC should see it.
 
-    frames: of this camera. An empty list: the robot is visible, or there are no frames.
+    The list is empty if the robot is visible, or if there are no frames.
+
+    frames: of this camera.
     """
     if not frames:
         return []
@@ -188,7 +193,9 @@ def known_camera_warnings(
 
 
 def require_determined(found: RegisteredCamera, max_sd: float = 0.04) -> None:
-    """Refuse a pose on a link whose standard deviation along any axis exceeds `max_sd` [rad, m].
+    """Refuse a pose on a link whose standard deviation about or along any axis exceeds a limit.
+
+    max_sd: the limit, of rotation [rad] and of translation [m].
 
     Raises RegistrationError: states the standard deviations.
     """
@@ -221,40 +228,42 @@ def check_focal_length(
         body: the robot's surfaces.
         found: the registered camera, with one misfit for each of `frames`.
         frames: its frames, of which the inliers are used.
-        off_by, off_by_sds: minimum difference of the logarithms, absolute and in standard
-            deviations. Published focal lengths of recorded arms differ by 2 % at most.
-        wrong_by: with a larger difference the camera gets the estimated focal length.
+        off_by, off_by_sds: minimum difference of the focal lengths' logarithms for a warning,
+            absolute and in standard deviations. Published focal lengths of recorded arms differ by
+            2 % at most.
+        wrong_by: difference of the logarithms from which the camera gets the estimated focal
+            length.
         most: maximum number of frames in a first, quick estimate.
 
     Returns:
-        the camera; the relative standard deviation of its focal length if that is an estimate, and
-        0 if it is as given; and a warning or none. If the focal lengths differ by no more than
-        `wrong_by`, the camera stays, and the outer product of the difference between the poses with
-        itself is added to the covariance of a pose with a fitted focal length.
+        the camera; the relative standard deviation of an estimated focal length, 0 for a given one;
+        and a list of one warning or none. Between `off_by` and `wrong_by` the camera's pose and
+        focal length stay as they are. Its covariance is then that of a pose with a fitted focal
+        length, plus the squared difference between the two poses.
     """
     given = found.camera
-    counted = [frame for frame, fit in zip(frames, found.frames, strict=True) if fit.is_inlier]
-    some = evenly_spaced(counted, most)
-    if len(some) < 2:
+    inliers = [frame for frame, fit in zip(frames, found.frames, strict=True) if fit.is_inlier]
+    sample = evenly_spaced(inliers, most)
+    if len(sample) < 2:
         return found, 0.0, []
-    posed = PosedFrames(body.kinematics, body.full, given, some)
+    posed = PosedFrames(body.kinematics, body.full, given, sample)
     fit = SharedFit([posed], [given.X_CW], camera_unknowns=len(POSE_NAMES) + 1)
     camera = fit.cameras(fit.fit((*SEARCH.fine, *SEARCH.last)))[0]
     if abs(math.log(camera.focal_x / given.focal_x)) < 0.6 * off_by:
         return found, 0.0, []
-    fitted = calibrate_joints(body, [found], [counted], (), focal=True)
+    fitted = calibrate_joints(body, [found], [inliers], (), focal=True)
     camera, deviation = fitted.cameras[0], float(fitted.focal_deviations[0])
-    off = math.log(camera.focal_x / given.focal_x)
-    if abs(off) < max(off_by, off_by_sds * deviation):
+    log_ratio = math.log(camera.focal_x / given.focal_x)
+    if abs(log_ratio) < max(off_by, off_by_sds * deviation):
         return found, 0.0, []
     text = (
         f"camera '{given.name}': its pictures determine a focal length of {camera.focal_x:.0f} "
         f"pixels (standard deviation {deviation * camera.focal_x:.0f}), but {given.focal_x:.0f} is "
         "given; is it that of this camera, and of pictures of this size?"
     )
-    if abs(off) <= wrong_by:
-        by = pose_difference(camera.X_WC, given.X_WC)
-        covariance = fitted.covariances[0] + np.outer(by, by)
+    if abs(log_ratio) <= wrong_by:
+        shift = pose_difference(camera.X_WC, given.X_WC)
+        covariance = fitted.covariances[0] + np.outer(shift, shift)
         text += " A wrong focal length gives a wrong distance; calibrate it"
         return replace(found, covariance=covariance), 0.0, [text]
     posed = PosedFrames(body.kinematics, body.full, camera, frames)
@@ -279,11 +288,11 @@ def compare_camera(
         body: the robot's surfaces.
         given: the camera at its given pose.
         found: the same camera at its registered pose.
-        values: (f, m) the pose tree's values in the frames in which outlines are compared.
+        values: (f, m) the pose tree's values in the compared frames [rad or m].
         alone: whether it is the only camera, so that the base may have moved instead.
     """
-    off = pose_difference(found.camera.X_WC, given.X_WC)
-    p_value = float(chdtrc(len(off), squared_distance(off, found.covariance)))
+    difference = pose_difference(found.camera.X_WC, given.X_WC)
+    p_value = float(chdtrc(len(difference), squared_distance(difference, found.covariance)))
     middle = placed_points(body.coarse, body.kinematics.poses(values[0])).mean(axis=0)
     distance = float(np.linalg.norm(found.camera.X_WC[:3, 3] - middle))
     text, reading = "", likeliest_reading(given.X_WC, found.camera.X_WC, distance)
@@ -294,8 +303,8 @@ def compare_camera(
             f"degrees and {1e3 * shift:.1f} mm"
         )
     return Finding(
-        "camera", given.name, float(np.linalg.norm(off[:3])), float(np.linalg.norm(off[3:])),
-        found.rotation_sd, found.translation_sd,
+        "camera", given.name, float(np.linalg.norm(difference[:3])),
+        float(np.linalg.norm(difference[3:])), found.rotation_sd, found.translation_sd,
         _picture_shift(body, (given, values), (found.camera, values)), p_value,
         ("base",) if alone and not text else (), text=text,
     )  # fmt: skip
@@ -304,13 +313,13 @@ def compare_camera(
 def compare_clock(
     body: RegistrationBody, one: PictureRegistration, recording: Recording, clock_sd: float = 0.002
 ) -> list[Finding]:
-    """Return significant findings "clock" and "rate" of a camera's clock; often none.
+    """Return significant findings "clock" (time offset) and "rate" (drift) of a camera's clock.
 
     Args:
         body: the robot's surfaces.
-        one: the camera's registration; its clock's offset may be unknown.
-        recording: the recording as it is, with any drift of its clock.
-        clock_sd: standard deviation of well synchronised clocks [s].
+        one: the camera's registration; its time offset may be unknown.
+        recording: the recording as given, without a correction of its clock.
+        clock_sd: standard deviation of the offset between well synchronised clocks [s].
     """
     clock, camera = one.time_offset, one.found.camera
     if clock is None or not clock.determined:
@@ -345,13 +354,13 @@ def _picture_shift(
 
     Distances are clipped at a picture's diagonal.
 
-    one, other: a camera, and values (f, m) of the body's pose tree in f frames; f is equal in both.
+    one, other: a camera, and values (f, m) of the body's pose tree in the same f frames.
     """
-    places = []
+    pixels = []
     for camera, values in (one, other):
         points = [placed_points(body.coarse, body.kinematics.poses(row)) for row in values]
-        places.append(camera.project(np.concatenate(points))[0])
-    squares = ((places[0] - places[1]) ** 2).sum(axis=1)
+        pixels.append(camera.project(np.concatenate(points))[0])
+    squares = ((pixels[0] - pixels[1]) ** 2).sum(axis=1)
     most = math.hypot(one[0].width, one[0].height)
     return float(np.sqrt(np.fmin(squares, most**2).mean()))
 
@@ -369,18 +378,20 @@ def likely_offset_warnings(
     Returns:
         one warning, or none.
     """
-    names = {one.frame for one in found.frames if one.is_inlier}
-    some = evenly_spaced([one for one in frames if one.name in names], 24)
-    if not some:
+    names = {frame.frame for frame in found.frames if frame.is_inlier}
+    sample = evenly_spaced([frame for frame in frames if frame.name in names], 24)
+    if not sample:
         return []
-    posed = PosedFrames(body.kinematics, body.full, found.camera, some, LAST_SPACING)
+    posed = PosedFrames(body.kinematics, body.full, found.camera, sample, LAST_SPACING)
     fit = SharedFit([posed], [found.camera.X_CW])
-    every = np.ones(len(some), bool)
-    likely = fit.likely_offsets(fit.fit(SHARED.stages_with_constants[-1:], fit.start, every), every)
+    all_frames = np.ones(len(sample), bool)
+    likely = fit.likely_offsets(
+        fit.fit(SHARED.stages_with_constants[-1:], fit.start, all_frames), all_frames
+    )
     turns = dict(zip(body.kinematics.names, body.kinematics.is_angle, strict=True))
-    for name, one in likely.items():
+    for name, estimate in likely.items():
         unit, factor = ("deg", math.degrees(1.0)) if turns[name] else ("mm", 1e3)
-        reading = describe_reading(factor * one[0], factor * one[1], unit)
+        reading = describe_reading(factor * estimate[0], factor * estimate[1], unit)
         return [
             f"camera '{found.camera.name}': its frames are explained better if joint '{name}' "
             f"{reading}; while joint offsets are unknown, the camera's error may exceed its "
@@ -396,7 +407,7 @@ def lost_frames_warning(
 
     Args:
         camera: its name.
-        lost: names of these pictures.
+        lost: names of the pictures without the robot.
         names: names of all pictures, in order.
         what: what is not visible.
     """
@@ -408,14 +419,14 @@ def lost_frames_warning(
 
 
 def last_before_change(wrong: Sequence[bool], least: int = 2) -> int | None:
-    """Return the index of the last frame before a change between only inliers and only outliers.
+    """Return the index of the last frame before frames change from inliers to outliers, or back.
 
     Args:
         wrong: for each frame, whether it is an outlier.
         least: minimum numbers of outliers and of inliers.
 
     Returns:
-        None: outliers and inliers alternate more than once or never, or there are too few.
+        the index; None: there is not exactly one change, or there are too few of either.
     """
     turns = np.flatnonzero(np.diff(np.array(wrong, int)))
     if len(turns) != 1 or min(sum(wrong), len(wrong) - sum(wrong)) < least:
@@ -426,14 +437,14 @@ def last_before_change(wrong: Sequence[bool], least: int = 2) -> int | None:
 def outlier_warnings(found: RegisteredCamera, from_pictures: bool = False) -> list[str]:
     """Return warnings of a camera's outlier frames, and of alternative poses.
 
-    from_pictures: whether it was registered from pictures.
+    from_pictures: whether the camera was registered from pictures.
 
     Raises RegistrationError: half of the masks or more are outliers. In pictures this is a warning:
         the frames of the fit agree, and the others may be dark or blurred.
     """
     name, frames = found.camera.name, [frame.frame for frame in found.frames]
     wrong, texts, moved = found.outliers, [], ""
-    last = last_before_change([one in wrong for one in frames])
+    last = last_before_change([frame in wrong for frame in frames])
     if last is not None:
         moved = f" Were camera or base moved after frame '{frames[last]}'?"
     if wrong:
@@ -444,7 +455,7 @@ def outlier_warnings(found: RegisteredCamera, from_pictures: bool = False) -> li
             f"pictures?{moved}"
         )
         if 2 * right <= len(frames):
-            supporting = frame_ranges([one for one in frames if one not in wrong], frames)
+            supporting = frame_ranges([frame for frame in frames if frame not in wrong], frames)
             if not from_pictures:
                 raise RegistrationError(
                     f"camera '{name}': half of the frames or more are outliers, {len(wrong)} of "
@@ -470,11 +481,12 @@ def outlier_warnings(found: RegisteredCamera, from_pictures: bool = False) -> li
 def parameter_warnings(found: JointCalibration) -> list[str]:
     """Return warnings of joint offsets and link scales that are uncertain.
 
-    If none is significant, this is the only warning. Otherwise they are those that only static
-    parts separate from a camera, and those that are not determined.
+    If no parameter is significant, this is the only warning. Otherwise there is a warning for each
+    parameter that only static parts separate from a camera's pose, and for each that is not
+    determined.
     """
-    requested = [(f"joint '{one.name}': its offset", one) for one in found.offsets]
-    requested += [(f"link '{one.name}': its length", one) for one in found.link_scales]
+    requested = [(f"joint '{offset.name}': its offset", offset) for offset in found.offsets]
+    requested += [(f"link '{scale.name}': its length", scale) for scale in found.link_scales]
     if requested and not any(one.significant for _, one in requested):
         return [
             "none of the requested joint offsets and link lengths is significant beside other "
@@ -519,20 +531,23 @@ def common_outlier_warnings(
 ) -> list[str]:
     """Return warnings that compare several cameras' inliers.
 
-    They name frames that are outliers in all cameras, or in one but not in another, and pairs of
-    cameras with common frames but without a common inlier frame (only if registered from masks).
+    They name frames that are outliers in all cameras, or in one camera but not in another. If the
+    cameras were registered from masks, they name pairs of cameras that have common frames, but no
+    common inlier frame.
     """
     is_inlier: dict[str, dict[str, bool]] = {}
     sets, frames_of = dict[str, list[str]](), dict[str, set[str]]()
     for found in registered:
         for one in found.frames:
             is_inlier.setdefault(one.frame, {})[found.camera.name] = one.is_inlier
-        sets[found.camera.name] = [one.frame for one in found.frames if one.is_inlier]
-        frames_of[found.camera.name] = {one.frame for one in found.frames}
+        sets[found.camera.name] = [frame.frame for frame in found.frames if frame.is_inlier]
+        frames_of[found.camera.name] = {frame.frame for frame in found.frames}
     frames, masks = list(is_inlier), dict[str, list[str]]()
     positions = [k for k, own in is_inlier.items() if len(own) > 1 and not any(own.values())]
-    for frame, own in is_inlier.items():
-        for name in (name for name, right in own.items() if any(own.values()) and not right):
+    for frame, inliers in is_inlier.items():
+        for name in (
+            name for name, right in inliers.items() if any(inliers.values()) and not right
+        ):
             masks.setdefault(name, []).append(frame)
     why = "something hides the robot there" if from_pictures else "their masks are not"
     texts = [

@@ -66,24 +66,26 @@ class RegistrationInputs:
         model: the robot.
         tree: its pose tree in the world, or in the frame of the link that carries the cameras.
         positions: joint positions in each frame; none for an episode, whose log is in `recordings`.
-        joints, cameras: the table of positions and the camera file that were given; None: none.
+        joints, cameras: the joint table and the camera file that were given; None: none.
         warnings: for the user.
-        known_cameras: cameras with known poses.
+        known_cameras: cameras whose poses are held, or audited.
         searched_cameras: cameras to be registered; all cameras of an episode.
-        given_cameras: those of them with an X_WC, at that pose.
-        assumed_focal: names of cameras with an unknown focal length, which have a usual one.
+        given_cameras: the searched cameras that have an X_WC, at that pose.
+        assumed_focal: names of cameras without a given focal length, which have a usual one.
         left_out: names of cameras without X_WC that are not to be registered.
         recordings: an episode's pictures with the joint log, by camera; empty for masks.
         parts: of an episode's recordings, by the name of the camera in each part.
         audited_frames: names of the frames to be audited.
         frames: frames that have been read, with the masks of searched and known cameras.
         visible_nodes: names of the tree's nodes that masks show; None: all.
-        riding_nodes: names of nodes that ride along with cameras on a link, and whose joints are
-            logged: the link, and what it carries.
+        riding_nodes: names of nodes that move with cameras on a link: the link, and what it carries
+            by logged joints.
         target: the calibration target of cameras on a link; at the world's origin in the tree until
             its pose is estimated. None: the masks show the robot.
-        offset_joints, scaled_links: the joints and links whose offsets and scales are estimated.
-        mapped, lenses: of an episode: how columns are mapped to joints, and lenses by camera.
+        offset_joints, scaled_links: names of joints whose offsets are estimated, and of links whose
+            scales are.
+        mapped: an episode's joint log, mapped to the model's joints; None: a scene of masks.
+        lenses: of an episode's cameras, by name.
     """
 
     scene: Scene
@@ -116,7 +118,14 @@ class RegistrationInputs:
         return self.cameras or self.scene.path / CAMERA_FILE
 
     def read(self, frame: str) -> MultiViewFrame:
-        """Return a frame, by its name, with the known cameras' masks that are not empty."""
+        """Return a frame, by its name, with the masks of the known cameras.
+
+        Empty masks are left out. A frame of `frames` is returned as it is.
+
+        Raises:
+            MaskError: a mask cannot be read.
+            SceneError: the frame has no joint positions.
+        """
         if frame in self._known:
             return self._known[frame]
         names = [one.name for one in self.known_cameras if (one.name, frame) in self.scene.masks]
@@ -127,17 +136,17 @@ class RegistrationInputs:
     @cached_property
     def _known(self) -> dict[str, MultiViewFrame]:
         """Frames that have been read, by name."""
-        return {one.name: one for one in self.frames}
+        return {frame.name: frame for frame in self.frames}
 
     def of(self, camera: str) -> list[PosedFrame]:
-        """Return those of `frames` in which a camera, given by name, has a mask."""
-        return [one.of(camera) for one in self.frames if camera in one.masks]
+        """Return the frames of `frames` in which the camera named `camera` has a mask."""
+        return [frame.of(camera) for frame in self.frames if camera in frame.masks]
 
     def without(self, cameras: Collection[str]) -> "RegistrationInputs":
-        """Return the inputs with some cameras, given by name, left out, and without their masks."""
+        """Return the inputs without the masks of `cameras`, names, which join `left_out`."""
         frames = [
-            replace(one, masks={k: mask for k, mask in one.masks.items() if k not in cameras})
-            for one in self.frames
+            replace(frame, masks={k: mask for k, mask in frame.masks.items() if k not in cameras})
+            for frame in self.frames
         ]
         left_out = tuple(dict.fromkeys((*self.left_out, *cameras)))
         return replace(self, frames=tuple(k for k in frames if k.masks), left_out=left_out)
@@ -145,7 +154,7 @@ class RegistrationInputs:
     def with_values(self, values: Iterable[Array]) -> tuple[MultiViewFrame, ...]:
         """Return `frames` at other values (m,) of the tree, one array for each frame."""
         frames = zip(self.frames, values, strict=True)
-        return tuple(replace(one, values=own) for one, own in frames)
+        return tuple(replace(frame, values=row) for frame, row in frames)
 
 
 def read_robot(path: Path, settings: AuditSettings) -> ArticulatedModel:
@@ -161,7 +170,7 @@ def read_robot(path: Path, settings: AuditSettings) -> ArticulatedModel:
 
 
 def uses_pictures(path: Path, settings: AuditSettings) -> bool:
-    """Return whether a scene is used as an episode: it is one, or the settings say so."""
+    """Return whether a scene is used as an episode: it has the form of one, or settings say so."""
     return settings.pictures or is_episode(path, settings)
 
 
@@ -194,33 +203,31 @@ def read_inputs(
             f"{scene}: an audit of masks needs the positions of all joints of {model.name} that "
             f"are not held: {JOINT_TABLE} in the folder, or --joints FILE"
         )
-    own = intrinsics_of(scene / CAMERA_FILE, settings.intrinsics, settings.cameras)
-    read = list[str]()
-    given = None if cameras is None else load_cameras(cameras, own, scene, read)
-    found, frames = read_scene(
-        scene, settings.cameras, settings.frames, given, every=settings.every
-    )
-    if found.scale_unknown:
+    intrinsics = intrinsics_of(scene / CAMERA_FILE, settings.intrinsics, settings.cameras)
+    texts = list[str]()
+    given = None if cameras is None else load_cameras(cameras, intrinsics, scene, texts)
+    data, frames = read_scene(scene, settings.cameras, settings.frames, given, every=settings.every)
+    if data.scale_unknown:
         raise SceneError(
             f"{scene}: has no cameras.yaml; an audit needs the poses of the cameras: drake-pose "
             "register estimates them"
         )
-    held = tuple(found.cameras.values())
+    known = tuple(data.cameras.values())
     tree = make_tree(robot, EstimateSettings(hold=settings.hold))
     positions = read_known_positions(joints, TreeKinematics(tree), bool(settings.without))
-    warnings = [*read, *found.warnings, *robot.warnings, *positions.warnings]
-    if positions.are_one_pose(positions.of(frame, held[0].name) for frame in frames):
+    warnings = [*texts, *data.warnings, *robot.warnings, *positions.warnings]
+    if positions.are_one_pose(positions.of(frame, known[0].name) for frame in frames):
         warnings.append(
             "all frames show the robot in one pose, to a degree: common errors of joints and of "
             "cameras can hardly be distinguished; add frames with other joint positions"
         )
     return RegistrationInputs(
-        found, robot, tree, positions, joints, cameras, tuple(warnings), held, audited_frames=frames
+        data, robot, tree, positions, joints, cameras, tuple(warnings), known, audited_frames=frames
     )
 
 
 def _own_joints(scene: Path, robot: ArticulatedModel, settings: AuditSettings) -> Path | None:
-    """Return the scene's joint table; None: it has none with all joints that are not held."""
+    """Return the scene's joint table; None: it has no table with all joints that are not held."""
     path = scene / JOINT_TABLE
     if not path.is_file():
         return None
@@ -258,18 +265,18 @@ def _read_episode(
             "or m])"
         )
     chosen, placed, read = cameras_of(episode, cameras, settings)
-    known = {one.name: one.pinhole() for one in chosen}
+    known = {camera.name: camera.pinhole() for camera in chosen}
     kinematics = TreeKinematics(tree)
     default = kinematics.flatten(tree.default_values())
     inputs = RegistrationInputs(
         Scene(path, known, (), {}), robot, tree, KnownPositions(path, kinematics, {}),
         joints, cameras, (*warnings, *read), searched_cameras=tuple(known.values()),
         given_cameras=tuple(one for name, one in known.items() if name in placed),
-        assumed_focal=frozenset(one.name for one in chosen if one.camera is None),
+        assumed_focal=frozenset(camera.name for camera in chosen if camera.camera is None),
         recordings={one.name: _recording(one, mapped, default, settings) for one in chosen},
         visible_nodes=standing or (mapped.posed if mapped.unposed else None),
         target=target, mapped=mapped.mapped,
-        lenses={one.name: one.lens for one in chosen if one.lens is not None},
+        lenses={camera.name: camera.lens for camera in chosen if camera.lens is not None},
     )  # fmt: skip
     if not isinstance(settings, RegistrationSettings):
         return inputs
@@ -305,8 +312,9 @@ def _recording(
     """Return the pictures of a camera's selected frames, with the joint log.
 
     Args:
+        camera: the episode's camera.
         mapped: the joint log, with the columns of the tree's values.
-        default: (m,) values of the tree that are not logged [rad or m].
+        default: (m,) the tree's values; logged values replace theirs [rad or m].
         settings: select the frames.
     """
     kept = kept_pictures(camera, settings)
@@ -334,7 +342,10 @@ def _read_masks(
     cameras: Path | None,
     settings: RegistrationSettings,
 ) -> RegistrationInputs:
-    """Return the inputs of a scene of masks, see `read_inputs`; joints None: they are estimated."""
+    """Return the inputs of a scene of masks, see `read_inputs`.
+
+    joints: the joint table; None: positions are estimated.
+    """
     if cameras is None and not (path / CAMERA_FILE).exists():
         raise SceneError(
             f"{path}: has no {CAMERA_FILE}; a registration needs a camera file with picture size "
@@ -396,8 +407,8 @@ def _select_cameras(
 ) -> tuple[tuple[PinholeCamera, ...], tuple[PinholeCamera, ...]]:
     """Return the cameras to be registered, and the other cameras that have an X_WC.
 
-    Those set are registered; if none is set, those with masks but without X_WC. With cameras on a
-    link, no other pose is known.
+    The settings name the cameras to be registered. If they name none, cameras with masks but
+    without X_WC are registered. With cameras on a link, no other camera's pose is known.
     """
     path, wanted = scene.path / CAMERA_FILE, settings.cameras
     unplaced = {*file.unplaced, *file.links}
@@ -443,7 +454,7 @@ def _select_cameras(
 def _select_parameters(
     model: ArticulatedModel, kinematics: TreeKinematics, settings: RegistrationSettings
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names of the joints with offsets, and of the links with scales, to estimate."""
+    """Return the names of the joints whose offsets, and of the links whose scales are estimated."""
     joints, links = settings.zeros, settings.lengths
     if ALL in joints:
         free = np.flatnonzero(kinematics.lower < kinematics.upper)
@@ -472,7 +483,7 @@ def _read_frames(
     Raises DrakePoseError: a searched camera's mask is bad, or no usable frame shows the body.
     """
     scene, positions = inputs.scene, inputs.positions
-    names, estimated = [one.name for one in inputs.searched_cameras], positions.is_estimate
+    names, estimated = [camera.name for camera in inputs.searched_cameras], positions.is_estimate
     if estimated:
         candidates = select_frames(scene.frames, wanted, str(scene.path))
         known = [frame for frame in candidates if positions.has(frame)]
@@ -486,7 +497,7 @@ def _read_frames(
         chosen = np.linspace(0, len(usable) - 1, most).round().astype(int)
         wanted = tuple(dict.fromkeys(usable[k] for k in chosen))
     shown = {name: scene.of_cameras([name]).frames_with_files(wanted) for name in names}
-    found = []
+    views = []
     for frame in select_frames(scene.frames, wanted, str(scene.path)):
         masks = {}
         for camera in (name for name, frames in shown.items() if frame in frames):
@@ -502,20 +513,20 @@ def _read_frames(
         if positions.has(frame):
             masks |= inputs.read(frame).masks
         if masks:
-            found.append(MultiViewFrame(frame, positions.of(frame, next(iter(masks))), masks))
+            views.append(MultiViewFrame(frame, positions.of(frame, next(iter(masks))), masks))
     for camera in names:
-        if not any(camera in one.masks for one in found):
+        if not any(camera in one.masks for one in views):
             raise MaskError(
                 f"camera '{camera}': no mask shows the body in the frames in which its pose was "
                 f"estimated: {', '.join(wanted)}"
             )
-    if estimated and not any(c.name in one.masks for c in inputs.known_cameras for one in found):
+    if estimated and not any(c.name in one.masks for c in inputs.known_cameras for one in views):
         raise SceneError(
             f"{scene.path}: the joint positions were estimated, so they are fitted together with "
             "the cameras, but no camera with an X_WC has a mask of those frames: keep the X_WC of "
             "the cameras by which they were estimated in the camera file"
         )
-    return tuple(found)
+    return tuple(views)
 
 
 def _pose_warnings(inputs: RegistrationInputs) -> list[str]:
@@ -534,7 +545,7 @@ def _pose_warnings(inputs: RegistrationInputs) -> list[str]:
         if inputs.target is not None:
             require_rotation(camera.name, inputs.target, frames)
         # Estimated positions scatter more than measured ones.
-        rows, times = (one.values for one in frames), 5.0 if estimated else 1.0
+        rows, times = (frame.values for frame in frames), 5.0 if estimated else 1.0
         if not inputs.positions.are_one_pose(rows, times):
             continue
         what = f"all {len(frames)} frames show the robot in one pose, to a degree"

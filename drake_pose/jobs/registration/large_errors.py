@@ -46,8 +46,8 @@ class SceneFit:
     Args:
         cameras: the corrected cameras.
         corrections: the corrections, in the order in which they are applied; () for none.
-        fit: fits single frames with these cameras.
-        fits: the fitted frames, those with a mask that is not empty.
+        fit: fits single frames with `cameras`.
+        fits: the fitted frames: all frames with a mask that is not empty.
         mask_areas: by camera and frame name, excess and lack of the mask over its area, see
             ``mask_excess_and_lack``.
         empty_frames: names of frames whose masks are all empty.
@@ -71,19 +71,24 @@ class SceneFit:
         return apply_corrections(self.corrections, frame)
 
     def joint_off(self, name: str) -> Finding | None:
-        """Return a joint's finding if fits should restart from its large offset, else None."""
-        off = [one for one in self.found.common if (one.kind, one.name) == ("joint", name)]
-        return next((one for one in off if abs(one.angle) > np.radians(LARGE.restart_angle)), None)
+        """Return the finding of a large offset of a joint, by name; None: it has no large offset.
+
+        Fits are linear: they should restart from a large offset.
+        """
+        offsets = [one for one in self.found.common if (one.kind, one.name) == ("joint", name)]
+        return next(
+            (one for one in offsets if abs(one.angle) > np.radians(LARGE.restart_angle)), None
+        )
 
     @property
     def focal_off(self) -> Finding | None:
-        """The finding of a focal length from which fits should restart; None: there is none."""
-        off = [one for one in self.found.common if one.kind == "focal"]
-        return next((one for one in off if abs(one.shift) > LARGE.restart_focal), None)
+        """The finding of a large error of a focal length; None: none is large."""
+        findings = [finding for finding in self.found.common if finding.kind == "focal"]
+        return next((one for one in findings if abs(one.shift) > LARGE.restart_focal), None)
 
     @property
     def joint_inlier_ratios(self) -> dict[str, float]:
-        """By joint, the inlier ratio of the outlines of all links that it moves."""
+        """By joint, the inlier ratio of the outlines of all links that the joint moves."""
         return joint_inlier_ratios(self.fits, self.fit.joints)
 
     @property
@@ -93,8 +98,8 @@ class SceneFit:
 
     @property
     def inlier_ratio(self) -> float:
-        """Mean inlier ratio of all masks with fitted frames."""
-        return float(np.mean([v for one in self.fits for v in one.inlier_ratios[1].values()]))
+        """Mean inlier ratio of all masks, each frame fitted by itself."""
+        return float(np.mean([v for fit in self.fits for v in fit.inlier_ratios[1].values()]))
 
 
 class SceneComparison:
@@ -102,9 +107,9 @@ class SceneComparison:
 
     Args:
         inputs: the scene.
-        on_frame: called with the number of frames that are done in the first comparison.
-        sample_size: maximum number of frames, evenly spaced, for the silhouettes' size and for the
-            search of errors.
+        on_frame: called with the number of frames that are done in the first comparison; None: not.
+        sample_size: maximum number of frames, evenly spaced, that give the silhouettes' size, and
+            in which errors are searched.
     """
 
     def __init__(
@@ -117,7 +122,7 @@ class SceneComparison:
         self.body = RegistrationBody(inputs.tree, inputs.visible_nodes)
         frames = inputs.audited_frames
         sample = [inputs.read(frame) for frame in evenly_spaced(frames, sample_size)]
-        self._sample = [one for one in sample if one.masks]
+        self._sample = [frame for frame in sample if frame.masks]
         self._names = frozenset(inputs.audited_frames)
 
     def run(self, most: int = 3) -> SceneFit:
@@ -146,18 +151,19 @@ class SceneComparison:
         return self._finish(given if now.is_doubtful else now)
 
     def _search_unseen(self, why: str) -> SceneFit | None:
-        """Return the fit of a scene in which a given camera cannot show the robot.
+        """Return the fit of a scene in which a given camera cannot show the robot, or None.
 
-        Another reading of the cameras' poses is tried, then cameras are registered.
+        Another reading of the cameras' poses is tried, then cameras are registered. None: neither
+        explains most frames.
 
-        why: the reason in words. None: neither explains most frames.
+        why: why the camera cannot show the robot, in words.
         """
         given = self._inputs.known_cameras
         if (one := self._search(given, [])) is not None:
-            found = Finding("reading", one.name, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+            finding = Finding("reading", one.name, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
             reread = self._compare(one.cameras, (one,))
             if not reread.is_doubtful:
-                return replace(reread, findings=(found,), warnings=(f"as given, {why}",))
+                return replace(reread, findings=(finding,), warnings=(f"as given, {why}",))
         placed = self._register(self._sample, given)
         cameras = [placed[one.name][0].camera if one.name in placed else one for one in given]
         findings = tuple(off for _, off in placed.values())
@@ -167,7 +173,7 @@ class SceneComparison:
         return replace(now, findings=findings, warnings=(f"as given, {why}",))
 
     def _correct(self, now: SceneFit, most: int) -> SceneFit:
-        """Return the fit with up to `most` further corrections, recorded in its findings."""
+        """Return the fit with up to `most` more corrections, which its findings record."""
         for _ in range(most):
             correction = self._find_correction(now)
             if correction is None:
@@ -192,20 +198,21 @@ class SceneComparison:
         return now
 
     def _finish(self, now: SceneFit) -> SceneFit:
-        """Return the fit with all findings in its diagnosis, and warnings of masks.
+        """Return the fit with warnings of masks, and with all findings in its diagnosis.
 
-        Added are findings of corrections, of misplaced links, and of moved cameras or bases.
+        To the diagnosis are added the corrections, links with another shape, and moved cameras or
+        bases.
         """
         found = now.found
-        remaining = {(one.kind, one.name): one for one in found.common}
+        remaining = {(finding.kind, finding.name): finding for finding in found.common}
         findings = [
             _add_remaining(one, remaining.pop((one.kind, one.name), None)) for one in now.findings
         ]
         # A joint searched in each frame is known only to the search's step: drop its fitted offset.
-        by_search = {("joint", one.name) for one in now.findings if one.kind == "log"}
+        by_search = {("joint", finding.name) for finding in now.findings if finding.kind == "log"}
         common = tuple(one for key, one in remaining.items() if key not in by_search)
         found = replace(found, common=common)
-        known = {one.link for one in findings if one.link}
+        known = {finding.link for finding in findings if finding.link}
         for k, ratio in () if now.is_doubtful else mismatched_links(now.fits):
             node = self.body.tree.nodes[k].name
             if node not in known:
@@ -216,7 +223,7 @@ class SceneComparison:
                 shape = Finding("link", node, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, link=node, text=text)
                 findings.append(shape)
         moved, found = self._find_moved(now, found)
-        wrong = next((one for one in findings if one.kind in ("sign", "log")), None)
+        wrong = next((finding for finding in findings if finding.kind in ("sign", "log")), None)
         if wrong is not None:
             # With a wrong column of the log, every frame is an outlier as given.
             frames = [one if one.finding else replace(one, finding=wrong) for one in found.frames]
@@ -238,8 +245,8 @@ class SceneComparison:
     ) -> tuple[list[Finding], Diagnosis]:
         """Find cameras or a base that moved between two frames.
 
-        A motion is found if the first or the last ones of the frames of the same cameras are
-        outliers, and agree with each other except for the pose of a camera or the base.
+        A motion is found if the first or the last of the frames with the same cameras are outliers
+        that agree with each other at another pose of a camera or of the base.
 
         Args:
             now: the scene's fit.
@@ -250,19 +257,20 @@ class SceneComparison:
             the motions, of kind "moved"; and the diagnosis with them as the outliers' findings.
         """
         moved, explained = list[Finding](), dict[str, Finding]()
-        for cameras in dict.fromkeys(tuple(one.given_ratios) for one in found.frames):
+        for cameras in dict.fromkeys(tuple(frame.given_ratios) for frame in found.frames):
             rows, last = changed_after(found, cameras, least)
             if not rows:
                 continue
             again = diagnose_frames(now.fit, [now.fits[k] for k in rows], moved=True)
-            motions, names = list(again.common), [*{one.frame for one in again.frames}]
-            if again.outliers or any(one.kind not in ("camera", "base") for one in motions):
+            motions, names = list(again.common), [*{frame.frame for frame in again.frames}]
+            if again.outliers or any(motion.kind not in ("camera", "base") for motion in motions):
                 frames = [now.corrected(self._inputs.read(found.frames[k].frame)) for k in rows]
-                own = [one for one in now.cameras if one.name in cameras]
-                placed = self._register(frames, own)
+                group = [camera for camera in now.cameras if camera.name in cameras]
+                placed = self._register(frames, group)
                 motions = [off for _, off in placed.values()]
                 base = base_motion(
-                    {one.name: one for one in own}, {k: one for k, (one, _) in placed.items()}
+                    {one.name: one for one in group},
+                    {k: one for k, (one, _) in placed.items()},
                 )
                 if base is not None and len(placed) == len(cameras):
                     motions = [replace(base, pixels=motions[0].pixels)]
@@ -274,15 +282,15 @@ class SceneComparison:
                 moved.append(finding)
                 explained.update(dict.fromkeys(names, finding))
         updated = [
-            replace(one, finding=explained[one.frame]) if one.frame in explained else one
-            for one in found.frames
+            replace(frame, finding=explained[frame.frame]) if frame.frame in explained else frame
+            for frame in found.frames
         ]
         return moved, replace(found, frames=tuple(updated))
 
     def _register(
         self, frames: Sequence[MultiViewFrame], cameras: Sequence[Camera], least: int = 3
     ) -> dict[str, tuple[RegisteredCamera, Finding]]:
-        """Register cameras from frames, and return those that differ from their given poses.
+        """Register cameras from frames, and return the cameras that differ from their given poses.
 
         Args:
             frames: with masks of the cameras.
@@ -294,21 +302,21 @@ class SceneComparison:
         """
         search, placed = CameraSearch(self.body), dict[str, tuple[RegisteredCamera, Finding]]()
         for camera in cameras:
-            own = [one.of(camera.name) for one in frames if camera.name in one.masks]
-            own = evenly_spaced(own, LARGE.frame_count)
-            if not isinstance(camera, PinholeCamera) or len(own) < least:
+            posed = [frame.of(camera.name) for frame in frames if camera.name in frame.masks]
+            posed = evenly_spaced(posed, LARGE.frame_count)
+            if not isinstance(camera, PinholeCamera) or len(posed) < least:
                 continue
             try:
-                found = search.register(camera, own)
+                found = search.register(camera, posed)
             except RegistrationError:
                 continue
             inliers = len(found.frames) - len(found.outliers)
-            if explain_misfit(found) is not None or 2 * inliers <= len(own):
+            if explain_misfit(found) is not None or 2 * inliers <= len(posed):
                 continue
-            values = np.array([one.values for one in own])
-            off = compare_camera(self.body, camera, found, values, len(cameras) == 1)
-            if off.p_value <= DIAGNOSIS.significance and off.pixels >= DIAGNOSIS.min_pixels:
-                placed[camera.name] = found, off
+            values = np.array([one.values for one in posed])
+            shift = compare_camera(self.body, camera, found, values, len(cameras) == 1)
+            if shift.p_value <= DIAGNOSIS.significance and shift.pixels >= DIAGNOSIS.min_pixels:
+                placed[camera.name] = found, shift
         return placed
 
     def _mask_warnings(
@@ -317,17 +325,18 @@ class SceneComparison:
         """Return warnings of masks that show more or less than the robot in inlier frames.
 
         Args:
-            more, more_in_one, less: minimum fractions of the mask's area, for excess in half of the
-                frames or more, for excess in fewer, and for lack. Either counts only if it exceeds
-                three times the other. Real masks of arms have less than 0.02 excess, and 0.15 lack
-                at most.
+            now: the scene's fit.
+            more, more_in_one, less: minimum excess in half of the frames or more, minimum excess in
+                fewer frames, and minimum lack [the mask's area]. Excess counts only if it is more
+                than three times the lack, and the reverse. Real masks of arms have less than 0.02
+                excess, and 0.15 lack at most.
         """
         texts, names, wrong = list[str](), self._inputs.scene.frames, now.found.outliers
-        for camera in (one.name for one in now.cameras):
-            own = {frame: two for (name, frame), two in now.mask_areas.items() if name == camera}
-            black = [frame for frame, two in own.items() if two[0] == 0.0 and two[1] > less]
-            shown = {k: two for k, two in own.items() if k not in black and k not in wrong}
-            # A misplaced robot causes excess and lack alike; these frames are left out.
+        for camera in (camera.name for camera in now.cameras):
+            areas = {frame: two for (name, frame), two in now.mask_areas.items() if name == camera}
+            black = [frame for frame, two in areas.items() if two[0] == 0.0 and two[1] > less]
+            shown = {k: two for k, two in areas.items() if k not in black and k not in wrong}
+            # A misplaced robot causes excess and lack alike: its frames are left out.
             wider = [k for k, (extra, lack) in shown.items() if extra >= more and 3 * lack < extra]
             if 2 * len(wider) < len(shown):
                 wider = [k for k in wider if shown[k][0] >= more_in_one]
@@ -339,8 +348,8 @@ class SceneComparison:
                 (black, None, "are black, although the robot is in view"),
             ):  # fmt: skip
                 if frames:
-                    areas = [] if which is None else [own[k][which] for k in frames]
-                    area = percent(float(np.median(areas))) if areas else ""
+                    values = [] if which is None else [areas[k][which] for k in frames]
+                    area = percent(float(np.median(values))) if values else ""
                     named = frame_ranges(frames, names)
                     said = f"the masks of frames {named} {what.format(area)}"
                     texts.append(f"camera '{camera}': {said}")
@@ -349,14 +358,16 @@ class SceneComparison:
     def _compare(self, cameras: Sequence[Camera], corrections: tuple[Correction, ...]) -> SceneFit:
         """Return all frames fitted and diagnosed with corrections.
 
-        cameras: the corrected cameras. Raises MaskError: no mask shows the body.
+        cameras: the corrected cameras.
+
+        Raises MaskError: no mask shows the body.
         """
         inputs, fitted, empty = self._inputs, list[FrameFit](), list[str]()
         if not self._sample:
             raise MaskError(
                 f"{inputs.scene.path}: no mask shows the body; it must be white in them"
             )
-        body, sample = self.body, [apply_corrections(corrections, one) for one in self._sample]
+        body, sample = self.body, [apply_corrections(corrections, frame) for frame in self._sample]
         mask_areas = dict[tuple[str, str], tuple[float, float]]()
         fit = PerFrameFit(body.kinematics, (body.medium, body.full), cameras, sample)
         for done, name in enumerate(inputs.audited_frames, 1):
@@ -382,31 +393,31 @@ class SceneComparison:
         )
 
     def _find_correction(self, now: SceneFit) -> Correction | None:
-        """Return a correction to add to the fit's; None: nothing is doubtful, or none is found."""
-        sample = [now.corrected(one) for one in self._sample]
+        """Return one more correction for a fit; None: nothing is doubtful, or none is found."""
+        sample = [now.corrected(frame) for frame in self._sample]
         if now.is_doubtful:
             of_scene = not now.corrections
             return self._search(now.cameras, now.fit.joints, LARGE.max_remaining, sample, of_scene)
-        off = [name for name in now.fit.joints if now.joint_off(name) is not None]
+        large = [name for name in now.fit.joints if now.joint_off(name) is not None]
         ratios = now.joint_inlier_ratios.items()
         doubted = [
-            name for name, ratio in ratios if ratio < LARGE.min_joint_inlier_ratio or name in off
+            name for name, ratio in ratios if ratio < LARGE.min_joint_inlier_ratio or name in large
         ]
         if doubted:
             correction = self._search(
-                now.cameras, doubted, LARGE.max_remaining_of_joint, sample, False, off
+                now.cameras, doubted, LARGE.max_remaining_of_joint, sample, False, large
             )
             if correction is not None:
                 return correction
         # Fits are linear: they restart from a large offset or focal length that they estimated.
-        if off:
-            by = next(one.angle for one in now.found.common if one.name == off[0])
+        if large:
+            size = next(one.angle for one in now.found.common if one.name == large[0])
             search = LargeErrorSearch(self.body, now.cameras, sample)
-            return search.joint_correction("offset", off[0], 1.0, by, 0.0)
+            return search.joint_correction("offset", large[0], 1.0, size, 0.0)
         lens = now.focal_off
-        if lens is None or any(one.kind == "focal" for one in now.corrections):
+        if lens is None or any(correction.kind == "focal" for correction in now.corrections):
             return None
-        group = [one.name for one in now.cameras if f"'{one.name}'" in lens.name]
+        group = [camera.name for camera in now.cameras if f"'{camera.name}'" in lens.name]
         return focal_correction(now.cameras, group, lens.name, 1.0 + lens.shift)
 
     def _search_cameras(self, now: SceneFit) -> SceneFit | None:
@@ -416,7 +427,7 @@ class SceneComparison:
         """
         if self._inputs.recordings:
             return None
-        placed = self._register([now.corrected(one) for one in self._sample], now.cameras)
+        placed = self._register([now.corrected(frame) for frame in self._sample], now.cameras)
         if not placed:
             return None
         cameras = [placed[one.name][0].camera if one.name in placed else one for one in now.cameras]
@@ -436,9 +447,9 @@ class SceneComparison:
 
         Args:
             cameras: the cameras as corrected so far.
-            joints, left, likely: as its `joints`, `max_remaining` and `likely`.
-            sample: frames as corrected so far; None: those given.
-            scene: whether ``scene_corrections`` are tried, too; never with pictures.
+            joints, left, likely: `joints`, `max_remaining` and `likely` of that function.
+            sample: frames as corrected so far; None: as given.
+            scene: whether ``scene_corrections`` are tried, too; with pictures they never are.
         """
         inputs = self._inputs
         corrections = list[Correction]()
@@ -455,26 +466,27 @@ class SceneComparison:
 
         Args:
             before: the fit without the correction.
-            now: the fit with it.
-            fitted: the finding of fits of frames that the correction restarts from; None: it was
-                searched.
+            now: the fit with the correction.
+            correction: the correction.
+            fitted: the finding of `before` whose estimate is the correction; None: the correction
+                was searched.
         """
         kind, name = _KINDS.get(correction.kind, correction.kind), correction.name
         warnings = before.warnings
-        off = Finding(kind, name, 0.0, 0.0, 0.0, 0.0, self._pixels(before, now), 0.0)
+        finding = Finding(kind, name, 0.0, 0.0, 0.0, 0.0, self._pixels(before, now), 0.0)
         if correction.kind in _KINDS:
             size, of_focal = correction.amount, correction.kind == "focal"
             if not of_focal and self._turns(name):
-                off = replace(off, angle=size, angle_sd=float(np.radians(LARGE.fine_step)))
+                finding = replace(finding, angle=size, angle_sd=float(np.radians(LARGE.fine_step)))
                 if fitted is not None and abs(size - fitted.angle) < 1e-9:
-                    off = fitted
+                    finding = fitted
             else:
                 step = LARGE.reach_focal if of_focal else LARGE.reach_shift
-                off = replace(off, shift=size, shift_sd=step)
+                finding = replace(finding, shift=size, shift_sd=step)
                 if fitted is not None and abs(size - fitted.shift) < 1e-9:
-                    off = fitted
+                    finding = fitted
         elif kind in ("sign", "log"):
-            off = self._differing(off, before, correction)
+            finding = self._differing(finding, before, correction)
         else:
             ratio, given = percent(now.inlier_ratio), percent(before.inlier_ratio)
             warnings = (*warnings, f"{name}; so {ratio} of the contours fit, as given {given}")
@@ -484,10 +496,12 @@ class SceneComparison:
         ]
         if earlier:
             findings.remove(earlier[0])
-            off = replace(
-                off, angle=off.angle + earlier[0].angle, alternatives=earlier[0].alternatives
+            finding = replace(
+                finding,
+                angle=finding.angle + earlier[0].angle,
+                alternatives=earlier[0].alternatives,
             )
-        return replace(now, findings=(*findings, off), warnings=warnings)
+        return replace(now, findings=(*findings, finding), warnings=warnings)
 
     def _turns(self, joint: str) -> bool:
         """Return whether the positions of a joint, given by name, are angles."""
@@ -495,16 +509,17 @@ class SceneComparison:
         return bool(kinematics.is_angle[kinematics.names.index(joint)])
 
     def _differing(self, off: Finding, before: SceneFit, correction: Correction) -> Finding:
-        """Return finding `off` with a joint's largest difference from its log, and in words.
+        """Return a finding with a joint's largest difference from its log, as number and in words.
 
         Args:
+            off: the finding, without a size.
             before: the fit without the correction.
             correction: of kind "sign" or "log".
         """
         j = self.body.kinematics.names.index(correction.name)
-        frames = [before.corrected(one) for one in self._sample]
-        logged = np.array([one.values[j] for one in frames])
-        by = np.array([correction.apply(one).values[j] for one in frames]) - logged
+        frames = [before.corrected(frame) for frame in self._sample]
+        logged = np.array([frame.values[j] for frame in frames])
+        by = np.array([correction.apply(frame).values[j] for frame in frames]) - logged
         turns = self._turns(correction.name)
         unit, factor = ("degrees", 180.0 / np.pi) if turns else ("mm", 1e3)
         sizes = np.abs((by + np.pi) % (2.0 * np.pi) - np.pi if turns else by)
@@ -522,10 +537,10 @@ class SceneComparison:
         """Return the name of the first link that a joint moves; "" if it moves none."""
         tree, kinematics = self.body.tree, self.body.kinematics
         values = kinematics.flatten(tree.default_values())
-        moved = values.copy()
-        moved[kinematics.names.index(joint)] += 0.1
-        off = np.abs(kinematics.poses(moved) - kinematics.poses(values)).max(axis=(1, 2))
-        return next((tree.nodes[k].name for k in np.flatnonzero(off > 1e-9)), "")
+        other_values = values.copy()
+        other_values[kinematics.names.index(joint)] += 0.1
+        motion = np.abs(kinematics.poses(other_values) - kinematics.poses(values)).max(axis=(1, 2))
+        return next((tree.nodes[k].name for k in np.flatnonzero(motion > 1e-9)), "")
 
     def _pixels(self, before: SceneFit, now: SceneFit) -> float:
         """Return the root mean square motion between two fits [pixel]; 0: nothing moves.
@@ -540,15 +555,21 @@ class SceneComparison:
                     camera.project(placed_points(self.body.coarse, X_WN))[0]
                     for camera, X_WN in zip((one, other), X, strict=True)
                 ]
-                own = ((places[0] - places[1]) ** 2).sum(axis=1)
-                squares.append(np.minimum(own, one.width**2 + one.height**2))
-        every = np.concatenate(squares)
-        every = every[every > 0.01]
-        return float(np.sqrt(every.mean())) if len(every) else 0.0
+                squared = ((places[0] - places[1]) ** 2).sum(axis=1)
+                squares.append(np.minimum(squared, one.width**2 + one.height**2))
+        moved = np.concatenate(squares)
+        moved = moved[moved > 0.01]
+        return float(np.sqrt(moved.mean())) if len(moved) else 0.0
 
 
 def _add_remaining(one: Finding, rest: Finding | None) -> Finding:
-    """Return a correction's finding plus the error that fits found after it; None: no error."""
+    """Return a correction's finding, to which the error that remained with it is added.
+
+    Angles and shifts are added, factors of focal lengths multiplied. Standard deviations are those
+    of the remaining error.
+
+    one: the correction's finding. rest: of the same kind and name; None: no error remained.
+    """
     if rest is None:
         return one
     shift = one.shift + rest.shift

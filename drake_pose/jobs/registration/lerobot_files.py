@@ -19,10 +19,10 @@ FOLDER = "lerobot"
 
 
 def require_data_set(inputs: RegistrationInputs) -> MappedJoints:
-    """Return the joint log of the LeRobot data set that is registered.
+    """Return the mapped joint log of the LeRobot data set that is registered.
 
     Raises:
-        SettingsError: another recording is registered, or one with a joint table of its own.
+        SettingsError: the recording is no LeRobot data set, or a joint table (--joints) is used.
     """
     path = inputs.scene.path
     if inputs.mapped is None or not (path / INFO).is_file() or inputs.joints is not None:
@@ -43,12 +43,12 @@ def lerobot_files(
 
     Args:
         inputs: the registration's inputs.
-        cameras: the cameras, with poses in the world, or in the frame of the link.
-        link: the link that carries the cameras; None: none.
-        zeros: the summary's entries on joint offsets, by joint.
+        cameras: the cameras, with poses in the world, or in the link's frame.
+        link: the link that carries the cameras; None: they stand in the world.
+        zeros: the summary's entries on joint offsets, by joint, see ``describe_parameters``.
 
     Returns:
-        The files' contents by path in the result folder, and what is left out and why.
+        the files' contents by path in the result folder; and warnings of what is left out, and why.
     """
     units = {"value_deg": math.radians(1.0), "value_mm": 1e-3}
     offsets = {
@@ -65,11 +65,11 @@ def lerobot_files(
     source = mapped.log.servos.path if mapped.log.servos else None
     if corrections and source is not None:
         content = json.loads(source.read_bytes())
-        for one in corrections:
+        for entry in corrections:
             if "motor_names" in content:
-                content["homing_offset"][content["motor_names"].index(one.motor)] = one.after
+                content["homing_offset"][content["motor_names"].index(entry.motor)] = entry.after
             else:
-                content[one.motor]["homing_offset"] = one.after
+                content[entry.motor]["homing_offset"] = entry.after
         files[f"{FOLDER}/{source.name}"] = json.dumps(content, indent=4) + "\n"
     for file in sorted(one for one in (path / INFO).parent.rglob("*") if one.is_file()):
         files[f"{FOLDER}/{file.relative_to(path)}"] = file.read_bytes()
@@ -88,9 +88,9 @@ def lerobot_files(
             )
         elif isinstance(camera, PinholeCamera):
             key = camera_key(info["features"], camera.name)
-            own = info["features"][key]
+            feature = info["features"][key]
             written.add(key)
-            own["info"] = (own.get("info") or {}) | camera_fields(camera, link)
+            feature["info"] = (feature.get("info") or {}) | camera_fields(camera, link)
     for key in {*info["features"]} - written:
         named = camera_name(key)
         if named in inputs.left_out:
@@ -110,7 +110,10 @@ def lerobot_files(
 def _corrections(
     mapped: MappedJoints, offsets: Mapping[str, float]
 ) -> tuple[list[HomingCorrection], list[str]]:
-    """Return the corrections of the motors that joint offsets demand, and why there are none."""
+    """Return the motors' corrections for joint offsets, and warnings of motors left as they were.
+
+    offsets: significant joint offsets by joint [rad or m].
+    """
     servos, none = mapped.log.servos, "--export lerobot: no calibration of the motors is written: "
     if servos is None or servos.path is None:
         return [], [
@@ -125,14 +128,14 @@ def _corrections(
         ]
     if not offsets:
         return [], [f"{none}no joint offset is significant (--zeros all estimates them)"]
-    found = [
+    corrections = [
         correct_homing(joint, motor, mapped.columns[joint.name],
                        offsets.get(joint.name, 0.0), servos, mapped.encoding)
         for joint, motor in motors_of(mapped)
     ]  # fmt: skip
-    left = [f"{one.motor} ({one.reason})" for one in found if one.reason and one.motor]
-    texts = [f"--export lerobot: motors whose calibration is left as it was: {'; '.join(left)}"]
-    return [one for one in found if not one.reason], texts if left else []
+    kept = [f"{one.motor} ({one.reason})" for one in corrections if one.reason and one.motor]
+    texts = [f"--export lerobot: motors whose calibration is left as it was: {'; '.join(kept)}"]
+    return [one for one in corrections if not one.reason], texts if kept else []
 
 
 def _readme(
@@ -145,8 +148,8 @@ def _readme(
 
     Args:
         path: the data set.
-        calibration: name of the corrected calibration file; None: there is none.
-        corrections: of its motors.
+        calibration: name of the corrected calibration file; None: it is not written.
+        corrections: of the motors in that file.
         offsets: significant joint offsets [rad or m].
     """
     text = f"""Found by `drake-pose register` in {path}, which is left as it was.

@@ -1,4 +1,7 @@
-"""Split recordings where their camera was moved, and register the parts with one body and clock."""
+"""Split recordings where their camera was moved, and register the parts as separate cameras.
+
+The parts have a common clock, focal length and joint offsets.
+"""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -48,12 +51,12 @@ def split_moved_cameras(inputs: RegistrationInputs) -> RegistrationInputs:
         recording = inputs.recordings[camera.name]
         motion = find_camera_motion(recording.read, len(recording.names), camera)
         warnings += motion_warnings(camera, recording, motion)
-        own = _parts(camera.name, recording, motion, {*inputs.recordings, *parts})
-        parts |= own
-        scene |= {name: replace(camera, name=name) for name in own}
+        split = _parts(camera.name, recording, motion, {*inputs.recordings, *parts})
+        parts |= split
+        scene |= {name: replace(camera, name=name) for name in split}
         # The longest part is registered first; the others start from it.
-        lengths = {name: one.pictures.stop - one.pictures.start for name, one in own.items()}
-        searched += [replace(camera, name=k) for k in sorted(own, key=lambda k: -lengths[k])]
+        lengths = {name: one.pictures.stop - one.pictures.start for name, one in split.items()}
+        searched += [replace(camera, name=k) for k in sorted(split, key=lambda k: -lengths[k])]
     given = [
         replace(camera, name=name)
         for camera in inputs.given_cameras
@@ -72,13 +75,13 @@ def split_moved_cameras(inputs: RegistrationInputs) -> RegistrationInputs:
 def _parts(
     name: str, recording: Recording, motion: PictureMotion, taken: Collection[str]
 ) -> dict[str, CameraPart]:
-    """Return the parts of a camera's recording by name, in order.
+    """Return the parts of a camera's recording, in order, by the name of the camera in each.
 
-    taken: names that other cameras have.
+    name: of the camera. taken: names of other cameras.
     """
     free = (f"{name}_{k}" for k in count(2) if f"{name}_{k}" not in taken)
-    begins = [0, *(one.after for one in motion.nudges)]
-    ends = [*(one.before + 1 for one in motion.nudges), len(recording.names)]
+    begins = [0, *(nudge.after for nudge in motion.nudges)]
+    ends = [*(nudge.before + 1 for nudge in motion.nudges), len(recording.names)]
     R, parts = np.eye(3), dict[str, CameraPart]()
     for k, (begin, end) in enumerate(zip(begins, ends, strict=True)):
         since, until = None, None
@@ -98,6 +101,7 @@ def motion_warnings(
     """Return warnings of a camera's nudges, drift and shake; empty: it stands still."""
 
     def as_turn(pixels: float) -> str:
+        """Return a shift of the background in words, with the camera's turn that gives it."""
         degrees = np.degrees(pixels / np.mean(camera.kernel_parameters()[1:3]))
         return f"{pixels:.1f} pixels, a turn by {degrees:.2f} degrees or the like"
 
@@ -141,61 +145,63 @@ def register_recordings(
     Args:
         body: the robot's surfaces.
         inputs: the episode, with the recordings' parts.
-        cameras: some of its searched cameras.
-        warnings: gets a warning of each part that no pose explains, if another part is registered.
-        refused: gets by camera the error of those that no pose explains in any part.
-        focal: names of cameras whose focal length is fitted; unknown ones always are.
-        offset_joints: joints whose offsets are fitted.
+        cameras: those of the searched cameras that are registered.
+        warnings: output: a warning is added for each part that no pose explains, if another part of
+            the same recording is registered.
+        refused: output: by recorded camera, the error if no pose explains any of its parts.
+        focal: names of cameras whose focal length is fitted; an unknown focal length always is.
+        offset_joints: names of joints whose offsets are fitted.
         before: earlier registrations by camera, from which fits start; None: poses are searched.
-        near: by camera the pose X_WC (4, 4) found in another episode, at which fits start, and what
-            chance explained there; a camera that does not fit is searched. None: there are none.
+        near: by camera, X_WC (4, 4) as found in another episode, and the fraction explained by
+            chance there. A fit starts at the pose; if it fails, the pose is searched. None: all
+            poses are searched.
 
     Raises RegistrationError: no pose explains the pictures of any camera.
     """
     done, errors = dict[str, PictureRegistration](), dict[str, RegistrationError]()
-    of = {name: one.of for name, one in inputs.parts.items()}
+    recorded = {name: one.of for name, one in inputs.parts.items()}
     for camera in cameras:
         name, recording = camera.name, inputs.recordings[camera.name]
-        others = [other for other in done if of[other] == of[name]]
+        earlier_parts = [other for other in done if recorded[other] == recorded[name]]
         prior, guessed = SHARED.focal_deviation if name in focal else 0.0, False
         if name in inputs.assumed_focal:
             prior, guessed = SHARED.guessed_focal_deviation, True
         try:
-            if others:
-                R = inputs.parts[others[0]].rotation.T @ inputs.parts[name].rotation
-                one = _register_part(body, name, recording, done[others[0]], R)
+            if earlier_parts:
+                R = inputs.parts[earlier_parts[0]].rotation.T @ inputs.parts[name].rotation
+                result = _register_part(body, name, recording, done[earlier_parts[0]], R)
             elif before is not None:
                 start = PictureStart.of(before[name])
-                one = fit_pictures(body, start, recording, prior, offset_joints)
+                result = fit_pictures(body, start, recording, prior, offset_joints)
             elif near is not None and name in near:
                 X_WC, by_chance = near[name]
                 begun = replace(camera, X_WC=X_WC)
-                one = register_near(body, begun, recording, by_chance, prior, offset_joints)
+                result = register_near(body, begun, recording, by_chance, prior, offset_joints)
             else:
-                one = register_pictures(body, camera, recording, prior, offset_joints, guessed)
+                result = register_pictures(body, camera, recording, prior, offset_joints, guessed)
         except RegistrationError as error:
             errors[name] = error
             continue
-        done[name] = one
-        yield one
+        done[name] = result
+        yield result
     for name, why in errors.items():
         if not done:
             raise why
-        if of[name] in {of[other] for other in done}:
+        if recorded[name] in {recorded[other] for other in done}:
             warnings.append(f"this part of the recording is left out: {say_refused(why)}")
         else:
-            refused.setdefault(of[name], why)
+            refused.setdefault(recorded[name], why)
 
 
 def say_refused(why: RegistrationError) -> str:
-    """Return the message of a camera's error for a result with other cameras."""
+    """Return the message of a camera's error, for a result in which other cameras are written."""
     return str(why).replace(" Nothing was written", "")
 
 
 def motion_findings(
     body: RegistrationBody, inputs: RegistrationInputs, found: Mapping[str, PictureRegistration]
 ) -> list[Finding]:
-    """Return the motions of an episode's cameras as findings of kind "moved".
+    """Return the drifts, shakes and nudges of an episode's cameras as findings of kind "moved".
 
     found: the registered cameras by name.
     """
@@ -213,10 +219,10 @@ def motion_findings(
             before, one = found[name].found, found[other]
             after = replace(one.found, covariance=before.covariance + one.found.covariance)
             values = np.array([frame.values + one.joint_offsets for frame in one.frames])
-            off = compare_camera(body, before.camera, after, values, False)
+            difference = compare_camera(body, before.camera, after, values, False)
             when = f"after picture {inputs.recordings[name].names[-1]}"
             when = when if later.since is None else f"at {later.since:.2f} s"
-            findings.append(replace(off, kind="moved", name=part.of, text=when))
+            findings.append(replace(difference, kind="moved", name=part.of, text=when))
     return findings
 
 
@@ -227,29 +233,31 @@ def _register_part(
     first: PictureRegistration,
     R: np.ndarray,
 ) -> PictureRegistration:
-    """Register a camera from its pose in another part of its recording.
+    """Register a camera in a part of its recording, starting at its pose in another part.
 
     Clock, focal length and joint offsets are those of the other part.
 
     Args:
+        body: the robot's surfaces.
         name, recording: of the camera in this part.
-        first: the other part.
-        R: (3, 3) approximate rotation of the camera in its frame in the other part.
+        first: the registration of the other part.
+        R: (3, 3) approximate rotation of the camera from that part to this one, in its frame there.
 
-    Raises RegistrationError: no pose near that one explains the pictures.
+    Raises RegistrationError: no pose near the start explains the pictures.
     """
     before, offsets = first.recording, first.joint_offsets
     clock = first.time_offset or NO_CLOCK
-    since = mean_time(before, [before.names.index(one.name) for one in first.frames])
+    since = mean_time(before, [before.names.index(frame.name) for frame in first.frames])
     X = first.found.camera.X_WC.copy()
     X[:3, :3] @= R
     camera = replace(first.found.camera, name=name, X_WC=X)
     rows = [row for some in choose_pictures(body, camera, recording) for row in some]
-    as_now = recording.with_drift(clock.drift, since)
-    known = as_now.at_offset(clock.value).with_offsets(offsets)
-    one = fit_pictures(body, PictureStart(camera, rows, NO_CLOCK, (), first.by_chance), known)
+    with_drift = recording.with_drift(clock.drift, since)
+    known = with_drift.at_offset(clock.value).with_offsets(offsets)
+    start = PictureStart(camera, rows, NO_CLOCK, (), first.by_chance)
+    result = fit_pictures(body, start, known)
     return replace(
-        one, frames=tuple(replace(k, values=k.values - offsets) for k in one.frames),
+        result, frames=tuple(replace(k, values=k.values - offsets) for k in result.frames),
         time_offset=first.time_offset and replace(clock, scores=clock.scores[:0]),
-        focal_deviation=first.focal_deviation, recording=as_now, joint_offsets=offsets,
+        focal_deviation=first.focal_deviation, recording=with_drift, joint_offsets=offsets,
     )  # fmt: skip

@@ -12,45 +12,48 @@ from drake_pose.registration.register import RegisteredCamera
 
 
 def changed_after(found: Diagnosis, cameras: Collection[str], least: int) -> tuple[list[int], str]:
-    """Return the outlier frames before or after a change, and the last frame before the change.
+    """Return the outlier frames on one side of a change, and the last frame before the change.
 
     Args:
         found: the diagnosis.
         cameras: names; only frames with masks of exactly these cameras are used.
-        least: minimum number of frames before and after; with fewer there is no change.
+        least: minimum number of frames on each side of a change.
 
     Returns:
-        the outliers' indices in ``found.frames``, and a frame's name. ([], ""): no change.
+        the outliers' indices in ``found.frames``, and the last frame's name. ([], ""): no change.
     """
-    own = [k for k, one in enumerate(found.frames) if {*one.given_ratios} == {*cameras}]
-    wrong = [found.frames[k].finding is not None for k in own]
+    rows = [k for k, one in enumerate(found.frames) if {*one.given_ratios} == {*cameras}]
+    wrong = [found.frames[k].finding is not None for k in rows]
     last = last_before_change(wrong, least)
     if last is None:
         return [], ""
-    return [own[k] for k in np.flatnonzero(wrong)], found.frames[own[last]].frame
+    return [rows[k] for k in np.flatnonzero(wrong)], found.frames[rows[last]].frame
 
 
 def base_motion(
     given: Mapping[str, Camera], placed: Mapping[str, RegisteredCamera], sds: float = 4.0
 ) -> Finding | None:
-    """Return the motion of the base that cameras agree on; None: they differ, or there is one.
+    """Return the base's motion that explains the motions of all cameras; None: none does.
 
-    The motion is in the world, its shift that of the world's origin; pixels and p-value are 0.
+    One camera alone does not tell a motion of the base from its own. The finding's shift is that
+    of the world's origin; its pixels and p-value are 0.
 
     Args:
-        given: by name the cameras at their given poses.
-        placed: by name the registered cameras, some of these.
-        sds: maximum difference of motions in standard deviations, plus 0.25 degrees and 3 mm.
+        given: cameras at their given poses, by name.
+        placed: registered cameras, by name; each is in `given`.
+        sds: maximum difference between the cameras' motions [standard deviations], to which 0.25
+            degrees and 3 mm are added.
     """
     motions = [given[name].X_WC @ one.camera.X_CW for name, one in placed.items()]
     rotation_sd = max((one.rotation_sd for one in placed.values()), default=0.0)
     shift_sd = max((one.translation_sd for one in placed.values()), default=0.0)
-    off = [pose_difference(one, motions[0]) for one in motions[1:]]
+    differences = [pose_difference(motion, motions[0]) for motion in motions[1:]]
     most = sds * rotation_sd + np.radians(0.25), sds * shift_sd + 0.003
-    if not off or any(
-        np.linalg.norm(one[:3]) > most[0] or np.linalg.norm(one[3:]) > most[1] for one in off
+    if not differences or any(
+        np.linalg.norm(one[:3]) > most[0] or np.linalg.norm(one[3:]) > most[1]
+        for one in differences
     ):
         return None
-    by = pose_difference(motions[0], np.eye(4))
-    size = float(np.linalg.norm(by[:3])), float(np.linalg.norm(by[3:]))
+    motion = pose_difference(motions[0], np.eye(4))
+    size = float(np.linalg.norm(motion[:3])), float(np.linalg.norm(motion[3:]))
     return Finding("base", "base", *size, rotation_sd, shift_sd, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""Name links that do not look like the model's, such as another gripper."""
+"""Warn of links that look otherwise than in the model, such as another gripper."""
 
 from collections.abc import Collection, Sequence
 
@@ -21,24 +21,24 @@ def odd_link_warnings(
     min_fraction: float = 0.04,
     most: int = 24,
 ) -> list[str]:
-    """Return a warning of each link whose contours hardly fit, while the others' do.
+    """Return a warning of each link whose contour hardly fits while those of other links do.
 
     Args:
         body: the robot's surfaces.
         found: the registered camera.
-        frames: its frames; at most `most` inliers are used.
-        without: links that were left out; those that they are fixed to are not judged.
-        max_ratio: a link is named if a smaller fraction of its contour fits than this times the
-            links' median. In masks by Drake's renderer right links have 0.93 or more, one with
-            another gripper 0.61 at most, one with a box of its own size 0.64 at most.
-        min_fraction: links with a smaller fraction of all contours are not judged.
-
+        frames: its frames; at most `most` inlier frames are used.
+        without: names of links that were left out; links welded to their parents are not judged.
+        max_ratio: maximum fitting fraction of a named link's contour, over the links' median. In
+            masks by Drake's renderer links as modelled have 0.93 or more, a link with another
+            gripper 0.61 at most, with a box of its own size 0.64 at most.
+        min_fraction: minimum length of a judged link's contour [length of all contours].
+        most: maximum number of frames.
     """
-    names = {one.frame for one in found.frames if one.is_inlier}
-    some = evenly_spaced([one for one in frames if one.name in names], most)
-    if not some:
+    names = {frame.frame for frame in found.frames if frame.is_inlier}
+    sample = evenly_spaced([frame for frame in frames if frame.name in names], most)
+    if not sample:
         return []
-    posed = PosedFrames(body.kinematics, body.full, found.camera, some, LAST_SPACING)
+    posed = PosedFrames(body.kinematics, body.full, found.camera, sample, LAST_SPACING)
     fit = SharedFit([posed], [found.camera.X_CW])
     lengths, fitting = fit.matched_lengths(fit.start).T
     ratios = fitting / np.maximum(lengths, 1e-9)
@@ -50,16 +50,16 @@ def odd_link_warnings(
     elsewhere = percent(float(fitting[others].sum() / lengths[others].sum()))
     texts, model = [], body.tree.model
     joints = [model.plant.get_joint(index) for index in model.plant.GetJointIndices()]
-    cut = [one.parent_body() for one in joints if one.child_body().name() in without]
+    cut = [joint.parent_body() for joint in joints if joint.child_body().name() in without]
     for k in np.flatnonzero(is_odd):
         node = body.tree.nodes[k].name
         # The gripper is welded to the last link, as a rule.
         group = model.plant.GetBodiesWeldedTo(
             model.plant.get_body(BodyIndex(model.link_index(node)))
         )
-        if any(one.index() == other.index() for one in group for other in cut):
+        if any(body.index() == other.index() for body in group for other in cut):
             continue
-        fixed = [model.link_names[int(one.index())] for one in group]
+        fixed = [model.link_names[int(body.index())] for body in group]
         welded = [name for name in fixed if name in model.link_meshes]
         outermost = min(welded, key=lambda name: len(model.carried_by(name)), default=node)
         more = "" if outermost == node else f" (with {outermost})"

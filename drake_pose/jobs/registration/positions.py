@@ -68,7 +68,10 @@ class KnownPositions:
         return self.values[frame_key(frame)]
 
     def are_one_pose(self, rows: Iterable[Array], times: float = 1.0) -> bool:
-        """Return whether all values (m,) in rows differ by less than `times` a degree or 5 mm."""
+        """Return whether the body stands still over rows (m,) of values [rad or m].
+
+        times: factor of the maximum range of each value over all rows, 1 degree or 5 mm.
+        """
         same = times * np.where(self.kinematics.is_angle, math.radians(1.0), 0.005)
         return bool((np.ptp(np.array(list(rows)), axis=0) < same).all())
 
@@ -78,9 +81,9 @@ def put_on_base(
 ) -> tuple[ArticulatedModel, MeasuredPositions]:
     """Return a model whose base moves on BASE_JOINTS, and a table with positions of these joints.
 
-    They are 0 at the base pose of the table's first frame.
+    These positions are 0 at the base pose of the table's first frame.
 
-    table: with base poses.
+    model: the robot. table: with base poses.
 
     Raises ModelError: the model is no URDF.
     """
@@ -110,9 +113,9 @@ def read_known_positions(
         path: the table (CSV).
         kinematics: of the pose tree; its held values are added.
         unobserved: whether columns of joints that move no visible part are allowed.
-        table: the table's contents, if it has been read before; None: it is read.
-        times: returns the time [s] of each frame, by name, for a table with a column `time`, whose
-            joints may have other names and units; None: such a table is refused.
+        table: the table's contents; None: it is read.
+        times: returns the time [s] of each frame, by name, for a table with a column `time`; the
+            columns of its joints may have other names and units. None: such a table is refused.
 
     Raises:
         SceneError: the table cannot be read, lacks a joint, has an unusable column, or is not in
@@ -136,7 +139,7 @@ def read_known_positions(
         )
     # Columns of joints that move no visible part, and of followers, are ignored.
     known = {*needed, *kinematics.tree.unobserved_positions} if unobserved else set(needed)
-    known |= {model.position_names[one.follower] for one in kinematics.tree.followers}
+    known |= {model.position_names[follower.follower] for follower in kinematics.tree.followers}
     for column, name in enumerate(table.names if table.is_estimate else ()):
         # An estimate has columns of held positions, too; they must have the held values.
         index = model.position_index(name)
@@ -171,12 +174,13 @@ def estimate_positions(
 
     Args:
         scene_path: the scene of masks.
+        model: the body's model.
         kinematics: of the pose tree of `model`.
         known: the cameras with known poses.
-        settings: of the estimate, which select frames; its cameras are set here.
+        settings: of the estimate; `known` replaces its cameras.
 
     Raises:
-        SceneError: there are too few such cameras, or they see the body in no frame.
+        SceneError: there are too few cameras with known poses, or they see the body in no frame.
         DrakePoseError: see ``estimate_scene``.
     """
     names = tuple(camera.name for camera in known)

@@ -1,4 +1,4 @@
-"""Common mistakes in scenes, as corrections: conventions, exchanges, mirrors, focal lengths."""
+"""Common mistakes in scenes, as corrections: misread poses, exchanges, mirrors, focal lengths."""
 
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -51,32 +51,32 @@ def scene_corrections(
     for reading in readings():
         # A misread rotation with another mistake is compared with registered poses only.
         for group in () if reading.is_turned and reading.steps > 1 else _groups(cameras):
-            moved = [
-                one.with_pose(reading.meant(one.X_WC)) if one.name in group else one
-                for one in cameras
+            reread = [
+                camera.with_pose(reading.meant(camera.X_WC)) if camera.name in group else camera
+                for camera in cameras
             ]
             whose = "every X_WC" if len(group) > 1 else f"X_WC of camera '{group[0]}'"
             text = f"{whose} seems to be {reading.text}"
             rank = reading.steps + 1 - len(group)
-            yield Correction("reading", text, tuple(moved), unchanged, 0.0, rank)
+            yield Correction("reading", text, tuple(reread), unchanged, 0.0, rank)
     for a, b in list(combinations(range(len(cameras)), 2))[:pairs]:
-        other = list(cameras)
-        other[a] = cameras[a].with_pose(cameras[b].X_WC)
-        other[b] = cameras[b].with_pose(cameras[a].X_WC)
+        swapped = list(cameras)
+        swapped[a] = cameras[a].with_pose(cameras[b].X_WC)
+        swapped[b] = cameras[b].with_pose(cameras[a].X_WC)
         text = f"cameras '{cameras[a].name}' and '{cameras[b].name}' seem to be exchanged"
-        yield Correction("reading", text, tuple(other), unchanged)
+        yield Correction("reading", text, tuple(swapped), unchanged)
     for group in _groups(cameras):
         whose = "all cameras" if len(group) > 1 else f"camera '{group[0]}'"
         text = f"the masks of {whose} seem to be mirrored: turn the pictures back"
         yield Correction("reading", text, tuple(cameras), _mirrored(group))
-        if not all(isinstance(one, PinholeCamera) for one in cameras if one.name in group):
+        if not all(isinstance(camera, PinholeCamera) for camera in cameras if camera.name in group):
             continue
         text = "focal lengths" if len(cameras) > 1 and len(group) > 1 else "focal length of camera"
         text += "" if len(group) > 1 else f" '{group[0]}'"
         for factor in factors:
             yield focal_correction(cameras, group, text, factor)
-    for which, by in (("next", 1), ("previous", -1)) if len(frames) > 2 else ():
-        rows = dict(zip(frames, np.roll(np.array(values), -by, axis=0), strict=True))
+    for which, shift in (("next", 1), ("previous", -1)) if len(frames) > 2 else ():
+        rows = dict(zip(frames, np.roll(np.array(values), -shift, axis=0), strict=True))
         text = f"the masks fit with the joint positions of the {which} frame"
         yield Correction("reading", text, tuple(cameras), partial(_with_row, rows))
 
@@ -88,21 +88,22 @@ def focal_correction(
 
     Args:
         cameras: all cameras.
-        group: names of the cameras that are corrected; empty: all. Parallel ones stay.
+        group: names of the cameras that are corrected; empty: all. Parallel cameras stay.
         text: the correction's name.
+        factor: of the focal lengths.
     """
     changed = [
-        replace(one, focal_x=factor * one.focal_x, focal_y=factor * one.focal_y)
-        if isinstance(one, PinholeCamera) and (not group or one.name in group)
-        else one
-        for one in cameras
+        replace(camera, focal_x=factor * camera.focal_x, focal_y=factor * camera.focal_y)
+        if isinstance(camera, PinholeCamera) and (not group or camera.name in group)
+        else camera
+        for camera in cameras
     ]
     return Correction("focal", text, tuple(changed), unchanged, factor - 1.0)
 
 
 def _groups(cameras: Sequence[Camera]) -> list[tuple[str, ...]]:
-    """Return groups of cameras' names: all together first, then each if there are several."""
-    names = tuple(one.name for one in cameras)
+    """Return groups of cameras' names: all cameras, then each camera alone if there are several."""
+    names = tuple(camera.name for camera in cameras)
     return [names, *((name,) for name in names if len(names) > 1)]
 
 
@@ -120,16 +121,16 @@ def _mirrored(group: Collection[str]) -> Callable[[MultiViewFrame], MultiViewFra
 
 
 def _with_row(rows: Mapping[str, Array], frame: MultiViewFrame) -> MultiViewFrame:
-    """Return a frame with other values of the pose tree; rows: (m,) by the frame's name."""
+    """Return a frame with the values (m,) that `rows` has for its name."""
     return replace(frame, values=rows[frame.name])
 
 
 class Reading(NamedTuple):
-    """Another meaning of the X_WC that is given.
+    """What a given X_WC may mean if its numbers were written by another convention.
 
-    text: in words, after "X_WC seems to be". meant: function from the given (4, 4) to X_WC. steps:
-    number of mistakes that it takes. is_turned: whether one of them is a misread rotation.
-    of_world: whether the world is turned, not the camera.
+    text: in words, after "X_WC seems to be". meant: returns X_WC (4, 4) for the given matrix
+    (4, 4). steps: number of mistakes that the reading assumes. is_turned: whether a misread
+    rotation is among the mistakes. of_world: whether the world is turned, not the camera.
     """
 
     text: str
@@ -140,10 +141,10 @@ class Reading(NamedTuple):
 
 
 def readings() -> Iterator[Reading]:
-    """Yield other meanings of a given X_WC, one table for all commands.
+    """Yield what a given X_WC may mean, for all commands.
 
-    They are combinations of a misread rotation, another unit, the inverse and another frame of the
-    camera; and a world turned about the robot's z axis.
+    The readings are all combinations of a misread rotation, another unit, the inverse and another
+    frame of the camera; and worlds turned about the robot's z axis.
     """
     frames = {
         "": np.eye(3),
@@ -170,28 +171,33 @@ def readings() -> Iterator[Reading]:
 def _reread(
     turn: Callable[[Array], Array], unit: float, inverse: bool, R: Array, X: Array
 ) -> Array:
-    """Return X (4, 4) with its rotation reread and lengths times `unit`, perhaps inverted.
+    """Return the pose (4, 4) that a matrix X (4, 4) means.
 
-    R: (3, 3) turns the camera's axes at last.
+    Args:
+        turn: returns the rotation (3, 3) that the matrix' rotation means.
+        unit: of the matrix' lengths [m].
+        inverse: whether the result is then inverted.
+        R: (3, 3) rotation of the camera's axes, applied last.
+        X: the matrix.
     """
-    found = np.eye(4)
-    found[:3, :3], found[:3, 3] = turn(X[:3, :3]), unit * X[:3, 3]
-    found = inverse_pose(found).copy() if inverse else found
-    found[:3, :3] = found[:3, :3] @ R
-    return found
+    reread = np.eye(4)
+    reread[:3, :3], reread[:3, 3] = turn(X[:3, :3]), unit * X[:3, 3]
+    reread = inverse_pose(reread).copy() if inverse else reread
+    reread[:3, :3] = reread[:3, :3] @ R
+    return reread
 
 
 def _about_base(R: Array, X: Array) -> Array:
-    """Return X (4, 4) turned by R (3, 3) about the world's origin."""
+    """Return a pose X (4, 4) turned by R (3, 3) about the world's origin."""
     return np.vstack([R @ X[:3], X[3:]])
 
 
 def _rotations() -> dict[str, Callable[[Array], Array]]:
-    """Return other meanings of a rotation (3, 3), by words.
+    """Return functions to what a rotation (3, 3) may mean, by words.
 
-    Its numbers were read in one order or form of Euler angles, quaternions or rotation vectors, but
-    are meant in another. xyz read as fixed axes is zyx read as moving axes, so two orders as read
-    stand for four.
+    Its numbers were read as one kind or order of Euler angles, quaternions or rotation vectors, but
+    written as another. Euler angles read about fixed x, y, z axes are those about moving z, y, x
+    axes: two orders of reading stand for four.
     """
 
     def angles(order: str, R: Array) -> Array:
@@ -228,7 +234,7 @@ def _rotations() -> dict[str, Callable[[Array], Array]]:
         "xyz": "fixed x, y, z axes", "XYZ": "moving x, y, z axes",
         "zyx": "fixed z, y, x axes", "ZYX": "moving z, y, x axes",
     }  # fmt: skip
-    found: dict[str, Callable[[Array], Array]] = {
+    meanings: dict[str, Callable[[Array], Array]] = {
         "one with the inverse of its rotation": np.transpose,
         "made of a quaternion in the order w, x, y, z, read as x, y, z, w": partial(
             of_quaternion, -1
@@ -248,8 +254,8 @@ def _rotations() -> dict[str, Callable[[Array], Array]]:
             # What fixed z, y, x, read as moving x, y, z, means is among the others already.
             if meant != given and (given, meant) != ("XYZ", "zyx"):
                 text = f"made of Euler angles about {words}, read as about {orders[given]}"
-                found[text] = partial(of_euler, given, meant)
-    return found
+                meanings[text] = partial(of_euler, given, meant)
+    return meanings
 
 
 def likeliest_reading(
@@ -262,53 +268,53 @@ def likeliest_reading(
     near: float = 0.15,
     least: float = 0.05,
 ) -> tuple[str, float, float] | None:
-    """Return the reading of a given pose that brings it near to the pose that was found.
+    """Return the reading of a given pose that brings it near the pose that was found.
 
-    A reading counts if it is much nearer than the pose as given, and would hardly be as near by
-    chance: random rotations are within an angle, and random positions within a distance, with known
-    probability. Of those that count the one with the fewest mistakes is returned, unless another is
-    much nearer.
+    A reading counts if it is much nearer than the pose as given, and hardly as near by chance, that
+    is, with a random rotation or position. Of the readings that count, the one with the fewest
+    mistakes is returned, unless another reading is much nearer.
+
+    The size of a difference is the norm of its angle [rad] and of its shift over `distance`.
 
     Args:
         given, found: (4, 4) X_WC as given, and as found [m].
         distance: from the camera to the body [m].
-        significance: maximum probability that one of the readings is as near by chance.
-        much_nearer: minimum factor between the differences from the pose found.
-        near: maximum difference of a reading from the pose found, by angle [rad] and shift
-            [distance].
-        least: the same of a pose that needs no other reading.
+        significance: maximum probability that any reading is as near by chance.
+        much_nearer: minimum size of the given pose's difference, over that of the reading's.
+        near: maximum size of the reading's difference.
+        least: size of the given pose's difference below which it needs no other reading.
 
     Returns:
-        The reading in words, and its difference from the pose found: angle [rad] and shift [m];
+        the reading in words, and its difference from the pose found: angle [rad] and shift [m];
         None: no reading counts.
     """
 
-    def off(X: Array) -> tuple[float, float]:
-        by = pose_difference(found, X)
-        return float(np.linalg.norm(by[:3])), float(np.linalg.norm(by[3:]))
+    def difference_of(X: Array) -> tuple[float, float]:
+        difference = pose_difference(found, X)
+        return float(np.linalg.norm(difference[:3])), float(np.linalg.norm(difference[3:]))
 
-    def size(one: tuple[float, float]) -> float:
-        return float(np.hypot(one[0], one[1] / distance))
+    def size(angle_and_shift: tuple[float, float]) -> float:
+        return float(np.hypot(angle_and_shift[0], angle_and_shift[1] / distance))
 
-    as_given = size(off(given))
+    as_given = size(difference_of(given))
     if as_given < least:
         return None
     table = list(readings())
     counted = list[tuple[int, float, str, tuple[float, float]]]()
-    for one in table:
-        X = one.meant(given)
-        angle, shift = off(X)
+    for reading in table:
+        X = reading.meant(given)
+        angle, shift = difference_of(X)
         # The part of all rotations within an angle, and of a ball around the camera.
         chance = (angle - np.sin(angle)) / np.pi if np.abs(X - given)[:3, :3].max() > 1e-9 else 1.0
-        if one.of_world:
+        if reading.of_world:
             # Most cameras stand upright and look at the robot, so one angle decides.
             chance = angle / np.pi
         elif np.abs(X - given)[:3, 3].max() > 1e-9:
             chance *= (shift / (shift + distance)) ** 3
-        alike = sum(other.steps <= one.steps for other in table)
-        now = size((angle, shift))
-        if alike * chance < significance and now < min(near, as_given / much_nearer):
-            counted.append((one.steps, now, one.text, (angle, shift)))
+        alike = sum(other.steps <= reading.steps for other in table)
+        its_size = size((angle, shift))
+        if alike * chance < significance and its_size < min(near, as_given / much_nearer):
+            counted.append((reading.steps, its_size, reading.text, (angle, shift)))
     if not counted:
         return None
     nearest = min(size for _, size, *_ in counted)

@@ -90,12 +90,12 @@ class SceneRegistration:
     """The registered cameras of a scene.
 
     Args:
-        cameras: all cameras of the scene with a known pose, in the scene's order.
+        cameras: all cameras of the scene with a known pose, by name, in the scene's order.
         registered: the registered cameras by name, with how well they fit.
         summary: contents of summary.json.
         warnings: for the user.
         folder: the result's folder; None: nothing was written.
-        refused: the reason for each camera, by name, of which no pose was accepted.
+        refused: by camera name, why no pose of the camera was accepted.
     """
 
     cameras: Mapping[str, Camera]
@@ -139,9 +139,9 @@ def register_scene(
         DrakePoseError: names the wrong file, camera, frame or joint.
     """
     settings = settings or RegistrationSettings()
-    table, own, folder = (None if one is None else Path(one) for one in (joints, cameras, out))
+    table, file, folder = (None if one is None else Path(one) for one in (joints, cameras, out))
     with use_workers(settings.workers):
-        inputs = read_inputs(Path(scene), Path(model), table, own, settings)
+        inputs = read_inputs(Path(scene), Path(model), table, file, settings)
         if settings.on is None:
             inputs = split_moved_cameras(inputs)
         work = _Registration(inputs, settings, on_camera)
@@ -194,10 +194,10 @@ class _Registration:
     """State of a registration.
 
     Attributes:
-        inputs, body: updated after each step.
+        inputs, body: the inputs and the robot's surfaces; updated after each step.
         warnings: for the user.
         registered, seconds, suggestions: by camera the result, the duration [s], and an entry on
-            joint positions that would distinguish alternative poses (None: none).
+            joint positions that would distinguish alternative poses (None: no entry).
         parameters: the summary's part on joint offsets and link scales.
         pictures: registrations from pictures, by camera; empty for masks, and for a target.
         target_pictures: by camera and frame, pictures in which the target was found.
@@ -282,7 +282,7 @@ class _Registration:
                 one.pop(name, None)
 
     def _require_registered(self) -> None:
-        """Leave refused cameras out of the inputs; raise the first one's error if none is left."""
+        """Leave refused cameras out of the inputs; raise their first error if no camera is left."""
         if not self.registered:
             raise next(iter(self.refused.values()))
         if self.refused:
@@ -356,9 +356,9 @@ class _Registration:
             self._on_camera(len(self.registered))
 
     def _find_target(self, target: CalibrationTarget, most: int = 24) -> None:
-        """Find the target in some pictures of each camera, and register the cameras from these.
+        """Find the target in some pictures of each camera, and register the cameras from them.
 
-        most: maximum number of pictures of each camera.
+        target: the calibration target. most: maximum number of pictures of each camera.
 
         Raises CameraError: a camera's focal length is unknown.
         """
@@ -379,9 +379,9 @@ class _Registration:
             if name in self.refused:
                 continue
             self.target_pictures[name] = {
-                one.name: recording.picture(one.name) for one in segmented
+                frame.name: recording.picture(frame.name) for frame in segmented
             }
-            frames += [MultiViewFrame.alone(name, one) for one in segmented]
+            frames += [MultiViewFrame.alone(name, frame) for frame in segmented]
             found_names = self.target_pictures[name]
             lost = [recording.names[k] for k in rows if recording.names[k] not in found_names]
             if lost:
@@ -398,32 +398,33 @@ class _Registration:
     def check_focal_lengths(self) -> None:
         """Compare given focal lengths and joint zeros with the masks, and warn of errors.
 
-        A camera whose focal length is clearly wrong gets the estimated one, and its pose.
+        A camera whose focal length is clearly wrong gets the estimated focal length, and the pose
+        with it.
         """
         inputs, body = self.inputs, self.body.with_tree(self.inputs.tree)
         if inputs.positions.is_estimate or self.tracks:
             return
         for name, found in self.registered.items():
-            picture, own = self.pictures.get(name), inputs.of(name)
+            picture, posed = self.pictures.get(name), inputs.of(name)
             fitted = found
             if picture is not None:
                 fitted = replace(found, frames=picture.found.frames)
-                own = [replace(k, values=k.values + self._joint_offsets) for k in picture.frames]
+                posed = [replace(k, values=k.values + self._joint_offsets) for k in picture.frames]
             if not self._settings.zeros:
-                self.warnings += likely_offset_warnings(body, fitted, own)
+                self.warnings += likely_offset_warnings(body, fitted, posed)
             if inputs.target is None and not inputs.positions.is_estimate:
-                self.warnings += odd_link_warnings(body, fitted, own, self._settings.without)
+                self.warnings += odd_link_warnings(body, fitted, posed, self._settings.without)
             if self._settings.focal or (picture is not None and picture.focal_deviation):
                 continue
-            checked, deviation, texts = check_focal_length(body, fitted, own)
+            checked, deviation, texts = check_focal_length(body, fitted, posed)
             self.warnings += texts
             self.registered[name] = replace(
                 found, camera=checked.camera, covariance=checked.covariance,
                 frames=checked.frames if deviation else found.frames,
             )  # fmt: skip
             if picture is not None and deviation:
-                own_found = replace(picture.found, camera=checked.camera)
-                self.pictures[name] = replace(picture, found=own_found, focal_deviation=deviation)
+                corrected = replace(picture.found, camera=checked.camera)
+                self.pictures[name] = replace(picture, found=corrected, focal_deviation=deviation)
 
     def evaluate(self, shown: int = 20) -> None:
         """Evaluate all frames with the final cameras, and warn of what looks wrong.
@@ -433,7 +434,7 @@ class _Registration:
         A camera is refused if its frames do not determine its pose on its link, or half of its
         masks or more are outliers.
 
-        Raises RegistrationError: that is so, and the other cameras, if any, were fitted with it.
+        Raises RegistrationError: no camera is left, or a refused camera was fitted with others.
         """
         inputs, body, frames = self.inputs, self.body.with_tree(self.inputs.tree), []
         # All pictures of cameras that were registered from some of them.
@@ -470,7 +471,7 @@ class _Registration:
         )
 
     def describe(self, more: float) -> dict[str, dict[str, Any]]:
-        """Return by camera its part of summary.json; more: duration added to each camera's [s]."""
+        """Return each camera's part of summary.json; more: added to each camera's duration [s]."""
         on, suggestions = self._settings.on, self.suggestions
         return {
             name: self.parameters
@@ -487,7 +488,7 @@ class _Registration:
     def refit_poses(self) -> None:
         """Fit cameras, estimated positions and the body's shape together (bundle adjustment).
 
-        Cameras registered with estimated positions inherit their errors.
+        Cameras registered with estimated positions have these positions' errors, too.
 
         Raises RegistrationError: no pose of a camera explains its masks.
         """
@@ -495,8 +496,8 @@ class _Registration:
         wrong = {name: found.outliers for name, found in registered.items()}
         frames = []
         for one in inputs.frames:
-            own = {c: m for c, m in one.masks.items() if one.name not in wrong.get(c, ())}
-            frames.append(replace(one, masks=own))
+            inlier_masks = {c: m for c, m in one.masks.items() if one.name not in wrong.get(c, ())}
+            frames.append(replace(one, masks=inlier_masks))
         cameras = [*self._known_cameras, *(found.camera for found in registered.values())]
         shape: tuple[Any, ...] = (np.zeros(len(self.body.kinematics.names), np.bool_),)
         if not missing_for_person(inputs.model):
@@ -529,7 +530,7 @@ class _Registration:
         if self.tracks:
             (one, *_) = self.tracks.values()
             self.parameters = describe_parameters(one.offsets, (), self.body.kinematics)
-            significant = {each.name: each.value for each in one.offsets if each.significant}
+            significant = {k.name: k.value for k in one.offsets if k.significant}
             return corrected_urdf(inputs.model, folder, significant, {})
         start, static, turned = offsets_in_pictures(self.body, self.pictures, inputs.offset_joints)
         own = [replace(one, camera=turned.get(name, one.camera)) for name, one in cameras.items()]
@@ -541,7 +542,7 @@ class _Registration:
             found.offsets, found.link_scales, self.body.kinematics
         )
         self.warnings += parameter_warnings(found)
-        offsets = {one.name: one.value for one in found.offsets}
+        offsets = {offset.name: offset.value for offset in found.offsets}
         self._joint_offsets = np.array([offsets.get(name, 0.0) for name in names])
         model, tree, target = inputs.model, inputs.tree, inputs.target
         target_pose = next(iter(cameras.values())).target
@@ -558,7 +559,7 @@ class _Registration:
             tree = target.tree(target_pose.X_WT)
         elif shifts:
             tree, _ = make_registration_tree(model, self._settings)
-        values = [one.values + self._joint_offsets for one in inputs.frames]
+        values = [frame.values + self._joint_offsets for frame in inputs.frames]
         self.inputs = replace(inputs, model=model, tree=tree, frames=inputs.with_values(values))
         kinematics = TreeKinematics(tree)
         evaluated = zip(found.inlier_ratios, found.is_inlier, strict=True)
@@ -588,8 +589,8 @@ class _Registration:
         """
         before = self.registered[camera.name]
         frames = PosedFrames(kinematics, self.body.full, camera, self.inputs.of(camera.name))
-        found = overlap_areas(frames, camera.X_CW[None], np.inf)[0]
-        misfits = zip(before.frames, E_total(found), intersection_over_union(found), strict=True)
+        areas = overlap_areas(frames, camera.X_CW[None], np.inf)[0]
+        misfits = zip(before.frames, E_total(areas), intersection_over_union(areas), strict=True)
         again = [replace(one, E_total=float(off), iou=float(iou)) for one, off, iou in misfits]
         self.registered[camera.name] = replace(
             before, camera=camera, covariance=covariance, frames=tuple(again), target=target_pose

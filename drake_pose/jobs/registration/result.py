@@ -103,7 +103,7 @@ def describe_pictures(one: PictureRegistration | None, found: bool = False) -> d
 
     Args:
         one: the registration from pictures; None: it was registered from masks.
-        found: whether, with None, the masks were segmented from pictures.
+        found: whether those masks were segmented from pictures; used with None only.
     """
     if one is None:
         masks = "found" if found else "given"
@@ -129,7 +129,7 @@ def describe_pictures(one: PictureRegistration | None, found: bool = False) -> d
 
 
 def _describe_runner_up(camera: Camera, X_CW: Array, margin: float) -> dict[str, Any]:
-    """Return the summary's entry on a runner-up, see ``PictureStart``, beside the found camera."""
+    """Return the summary's entry on a runner-up X_CW (4, 4); margin: see ``ratio_margin`` [sd]."""
     X_WC = np.linalg.inv(X_CW)
     return {
         "X_WC": X_WC.tolist(),
@@ -140,7 +140,7 @@ def _describe_runner_up(camera: Camera, X_CW: Array, margin: float) -> dict[str,
 
 
 def describe_part(part: CameraPart | None) -> dict[str, Any]:
-    """Return a camera's part of summary.json on its motion; None, and a static one: no entries."""
+    """Return a camera's part of summary.json on its motion; empty for None or a static camera."""
     if part is None or (part.is_whole and not (part.drift or part.shake)):
         return {}
     moving = {"drift_px": part.drift, "shake_px": part.shake}
@@ -183,10 +183,10 @@ def describe_parameters(
 ) -> dict[str, dict[str, Any]]:
     """Return the summary's parts "zeros" on joint offsets and "lengths" on link scales.
 
-    Each has an entry by joint or link: whether it is determined and significant; value, standard
-    deviation and 95 % interval [deg, mm or %], None if not determined; and correlated unknowns.
+    The entry of a joint or link says whether it is determined and significant; its value, standard
+    deviation and 95 % interval [deg, mm or %] (None: not determined); and correlated unknowns.
 
-    kinematics: of the pose tree, which has the joints' kinds.
+    kinematics: of the pose tree, which tells joints that turn from joints that slide.
     """
 
     def describe(one: KinematicParameter, unit: str, factor: float) -> dict[str, Any]:
@@ -203,7 +203,7 @@ def describe_parameters(
     units = {True: ("deg", math.degrees(1.0)), False: ("mm", 1e3)}
     return {
         "zeros": {one.name: describe(one, *units[bool(turns[one.name])]) for one in offsets},
-        "lengths": {one.name: describe(one, "percent", 1e2) for one in link_scales},
+        "lengths": {scale.name: describe(scale, "percent", 1e2) for scale in link_scales},
     }
 
 
@@ -240,13 +240,12 @@ def write_result(
         path: the folder.
         inputs: with the final positions of the frames.
         cameras: cameras for the camera file, by name.
-        registered: the registered cameras, by name; each has one misfit for each of its frames.
+        registered: the registered cameras, by name, with the misfits of all their frames.
         summary: contents of summary.json.
         overlay: whether overlays are drawn.
         urdf: text of the robot with estimated joint offsets and link scales; None: no such file.
-        pictures: by camera and frame, of cameras registered from pictures. Their masks and joint
-            positions are written, so that the folder is a scene of masks. Empty or None: masks were
-            given.
+        pictures: (H, W, 3) by camera and frame name, of cameras registered from pictures, whose
+            masks and joint positions are written, too. Empty or None: masks were given.
 
     Raises:
         OutputError: the folder cannot be written.
@@ -254,9 +253,9 @@ def write_result(
     parts = summary["cameras"]
     for name, found in registered.items() if overlay else ():
         titles = [
-            f"{name}  frame {one.frame}  E_total {percent(one.E_total)}  IoU {one.iou:.2f}  "
-            f"{'agrees' if one.is_inlier else 'OUTLIER'}"
-            for one in found.frames
+            f"{name}  frame {frame.frame}  E_total {percent(frame.E_total)}  IoU {frame.iou:.2f}  "
+            f"{'agrees' if frame.is_inlier else 'OUTLIER'}"
+            for frame in found.frames
         ]
         own = pictures[name] if pictures else {}
         titled = [
@@ -265,7 +264,7 @@ def write_result(
             if not own or one[0].name in own
         ]
         write_overlays(path, inputs.tree, found.camera, titled, inputs.visible_nodes, own)
-        for given in (one for one in inputs.given_cameras if one.name == name):
+        for given in (camera for camera in inputs.given_cameras if camera.name == name):
             write_comparisons(path, inputs, inputs.of(name), given, found, own)
     names = TreeKinematics(inputs.tree).names
     names = tuple(name for name in names if name not in TARGET_POSITIONS)
@@ -349,8 +348,8 @@ def write_comparisons(
         pictures: (H, W, 3) by frame.
     """
     draw = body_drawer(inputs.tree, inputs.visible_nodes)
-    errors = {one.frame: one.E_total for one in found.frames}
-    for frame in (one for one in frames if one.name in compared_frames(errors)):
+    errors = {frame.frame: frame.E_total for frame in found.frames}
+    for frame in (frame for frame in frames if frame.name in compared_frames(errors)):
         shown: NDArray[Any] = pictures.get(frame.name, frame.mask)
         bodies = [draw(camera, frame) >= 0 for camera in (given, found.camera)]
         names = ("the camera as given", "as found")
@@ -361,10 +360,11 @@ def write_comparisons(
 def body_drawer(
     tree: PoseTree, visible_nodes: Collection[str] | None
 ) -> Callable[[Camera, PosedFrame], NDArray[np.intp]]:
-    """Return a function that draws the body, from a camera and a frame with its values.
+    """Return a function that draws the body as seen by a camera, at the values of a frame.
 
-    The drawing (H, W) holds for each pixel the index of the node that it shows, or -1. Indices
-    count the drawn nodes: those named in `visible_nodes`; None: all.
+    The drawing (H, W) has for each pixel the index of the drawn node that it shows, or -1.
+
+    visible_nodes: names of the nodes that are drawn; None: all.
     """
     kinematics, names = TreeKinematics(tree), visible_nodes
     shown = [k for k, node in enumerate(tree.nodes) if names is None or node.name in names]
@@ -387,7 +387,7 @@ PARAMETERS = (
     ("zeros", "Joint offsets, to be added to positions", "joint", "offset"),
     ("lengths", "Link scales, relative changes of length", "link", "change"),
 )
-"""Keys of parameters in the summary, each with a title, and words for its owner and itself."""
+"""Of each kind of parameter: its key in the summary, a title, who has it, and what it is."""
 
 # Half-width of a 95 % interval in standard deviations.
 _NORMAL = 1.96
@@ -420,7 +420,7 @@ def parameter_rows(parameters: Mapping[str, Mapping[str, Any]]) -> list[tuple[st
 
 
 def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
-    """Return the text of report.html, with the overlays that lie in the result folder.
+    """Return the text of report.html, with the overlays in the result folder.
 
     summary: content of summary.json.
     """
@@ -479,10 +479,10 @@ def registration_answer(
     """
     parts = list(cameras.values())
     shift, turn = (
-        max(one[key] for one in parts) for key in ("translation_sd_mm", "rotation_sd_deg")
+        max(part[key] for part in parts) for key in ("translation_sd_mm", "rotation_sd_deg")
     )
-    outliers = sum(len(one["outliers"]) for one in parts)
-    count = sum(len(one["frames"]) for one in parts)
+    outliers = sum(len(part["outliers"]) for part in parts)
+    count = sum(len(part["frames"]) for part in parts)
     what = "frame" if len(parts) == 1 else "picture" if parts[0]["masks"] == "found" else "mask"
     words = "Camera found" if len(parts) == 1 else f"{len(parts)} cameras found"
     up_to = "" if len(parts) == 1 else "up to "
@@ -582,11 +582,10 @@ def write_exports(
 def _texts(
     formats: Collection[str], cameras: list[Camera], world: str, links: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return texts of exports by path in the result folder; those for rerun are no text.
+    """Return the texts of exports by path in the result folder; an export for rerun is no text.
 
-    Args:
-        world: name of the frame of cameras on no link.
-        links: the link of each other camera, by the camera's name.
+    formats: of the exports. cameras: as of `write_exports`. world: frame of cameras on no link.
+    links: by name of each other camera, its link.
     """
     texts: dict[str, str] = {}
     if "ros" in formats:

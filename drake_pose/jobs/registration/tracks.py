@@ -19,9 +19,10 @@ SCENE = "scene"
 """The summary's `evidence` of a camera on a link that was registered from a standing scene."""
 
 GRIPPER = "gripper"
-"""That of one registered from the gripper that it sees."""
+"""The `evidence` of a camera that was registered from the gripper alone."""
 
 BOTH = "scene and gripper"
+"""The `evidence` of a camera that was registered from both."""
 
 
 def describe_tracks(one: TrackRegistration, kinematics: TreeKinematics) -> dict[str, Any]:
@@ -100,9 +101,11 @@ def track_warnings(one: TrackRegistration, assumed: bool) -> list[str]:
 
 
 def draw_tracks(folder: Path, one: TrackRegistration, most: int = 6) -> None:
-    """Draw the points of up to `most` pictures: blue where they fit, orange where they do not.
+    """Draw inlier points in blue and outliers in orange, in up to `most` pictures.
 
     The gripper's contours are orange lines.
+
+    folder: the result folder.
     """
     camera, frames = one.found.camera.name, one.found.frames
     silhouettes = {} if one.gripper is None else one.gripper.silhouettes
@@ -114,8 +117,8 @@ def draw_tracks(folder: Path, one: TrackRegistration, most: int = 6) -> None:
             shown = silhouettes[name].astype(np.uint8)
             contours, _ = cv2.findContours(shown, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
             cv2.drawContours(picture, contours, -1, EXCESS_RGB, 1)
-        own = one.seen.frames == k
-        for (u, v), fits in zip(one.seen.uv[own], one.inliers[own], strict=True):
+        in_picture = one.seen.frames == k
+        for (u, v), fits in zip(one.seen.uv[in_picture], one.inliers[in_picture], strict=True):
             colour = (0, 114, 178) if fits else EXCESS_RGB
             place = round(float(u)), round(float(v))
             cv2.circle(picture, place, 4, colour, 2, cv2.LINE_AA)

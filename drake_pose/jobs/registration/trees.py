@@ -27,9 +27,9 @@ from drake_pose.registration.standing_object import CalibrationTarget, fixed_lin
 def read_target(
     model: ArticulatedModel, settings: RegistrationSettings
 ) -> CalibrationTarget | None:
-    """Return the calibration target that a camera on the robot's link sees.
+    """Return the calibration target that cameras on a link of the robot `model` see.
 
-    None: no target is set, so the cameras see the robot `model`.
+    None: the settings have no target, so the cameras see the robot.
 
     Raises SettingsError: the target is unusable, or no link carries the cameras.
     """
@@ -51,10 +51,10 @@ def make_registration_tree(
 ) -> tuple[PoseTree, tuple[str, ...] | None]:
     """Return the pose tree, and the names of its nodes that masks show; None: all.
 
-    The tree of a camera on a link starts at this link; the masks show the robot's static base, or
-    the target. Without a link, the tree starts in the world.
+    With cameras on a link (``settings.on``) the tree starts at the link, and masks show the robot's
+    static base or the target. Otherwise the tree starts in the world.
 
-    target: None: the masks show the robot.
+    target: the calibration target; None: the masks show the robot.
 
     Raises SettingsError: no part that masks show stands still, or no joint moves the link.
     """
@@ -111,8 +111,8 @@ def corrected_urdf(
 def joint_shifts(tree: PoseTree, scales: Sequence[KinematicParameter]) -> dict[str, list[float]]:
     """Return by joint the shift (3,) of its origin in its parent link's frame [m].
 
-    scales: of links; only joints that links with another scale than 1 carry are shifted.
+    scales: relative changes of links' lengths; joints carried by unchanged links have no entry.
     """
-    longer = {one.name: one.value for one in scales if one.value}
+    longer = {scale.name: scale.value for scale in scales if scale.value}
     offsets = carried_joints(tree, longer)
-    return {one.joint: (longer[one.link] * one.p_L).tolist() for one in offsets}
+    return {offset.joint: (longer[offset.link] * offset.p_L).tolist() for offset in offsets}

@@ -10,9 +10,9 @@ from drake_pose.registration.findings import Finding, FrameDiagnosis
 
 
 def shift_unit(kind: str) -> tuple[str, float]:
-    """Return the unit of the shift of a finding of a kind in reports, and its factor.
+    """Return the unit in which reports state the shift of findings of a kind, and a factor.
 
-    The factor multiplies ``Finding.shift``, which is in m, s, pixels, or relative.
+    The factor converts ``Finding.shift``, which is in m, s or pixels, or relative.
     """
     units = {"focal": ("percent", 100.0), "center": ("px", 1.0), "clock": ("ms", 1e3)}
     return (units | {"rate": ("percent", 100.0)}).get(kind, ("mm", 1e3))
@@ -23,8 +23,8 @@ def describe_error(one: Finding, verb: str = "off") -> str:
 
     Args:
         one: of kind "joint", "camera", "base", "focal", "center", "clock" or "rate".
-        verb: "off" or "is off", before the amount of a camera, the base or a principal point; other
-            kinds have their own verbs.
+        verb: before the amount, such as "off" or "is off"; used for kinds "camera", "base" and
+            "center" only.
     """
     if one.kind == "clock":
         word = "later" if one.shift > 0.0 else "earlier"
@@ -59,7 +59,7 @@ def describe_error(one: Finding, verb: str = "off") -> str:
 
 
 def describe_common_finding(one: Finding) -> str:
-    """Return a finding common to all inlier frames in words, without a full stop."""
+    """Return a finding common to all inlier frames in words, without a final full stop."""
     pixels = f", which moves outlines by {one.pixels:.1f} pixels" if one.pixels else ""
     link = f"link '{one.link}' is not where the log says"
     if one.kind == "sign":
@@ -89,7 +89,10 @@ def describe_common_finding(one: Finding) -> str:
 
 
 def describe_frame_finding(one: FrameDiagnosis, found: Finding) -> str:
-    """Return the error of an outlier frame in words; found: the frame's finding."""
+    """Return the error of an outlier frame in words.
+
+    one: the frame's diagnosis. found: its finding.
+    """
     pixels = f"which moves outlines by {found.pixels:.1f} pixels"
     if found.kind == "unexplained":
         worst = min(one.fitted_ratios, key=lambda name: one.fitted_ratios[name])
@@ -114,7 +117,8 @@ def describe_reading(value: float, deviation: float, unit: str) -> str:
     """Return in words that a joint's encoder reads too high or too low.
 
     Args:
-        value, deviation: what must be added to its readings, and its standard deviation [unit].
+        value, deviation: the joint offset, to be added to readings, and its standard deviation
+            [`unit`].
         unit: "deg" or "mm".
     """
     word, digits = "low" if value > 0.0 else "high", 2 if unit == "deg" else 1
@@ -127,7 +131,7 @@ def describe_drift(camera: str, drift: float, deviation: float) -> str:
 
     Args:
         camera: its name.
-        drift, deviation: how much faster, and its standard deviation [s/s].
+        drift, deviation: how much faster the log's clock runs, and its standard deviation [s/s].
     """
     word = "faster" if drift > 0.0 else "slower"
     return (

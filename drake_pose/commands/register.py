@@ -44,25 +44,25 @@ def register(
     overlay: Overlay = True,
     json: Json = False,
 ) -> None:
-    r"""Find camera poses from a robot's silhouettes or a recorded episode, without a board.
+    r"""Find camera poses from a recorded episode or a robot's silhouettes, without a board.
 
-    All rotations of a camera are searched, without an initial guess, and the best poses are fitted
-    to the robot's contour; contour points that do not fit are outliers. The result is the pose with
-    the standard deviations of position and rotation, other poses that fit equally well, and the
-    frames that are outliers. Focal length and principal point of each camera must be known, and the
-    pictures must be free of distortion. The world is the model's, in most files the robot's base.
-    Five poses that differ much are enough. Cameras that have an X_WC are held, and compared with
-    the robot.
-
-    Without joint positions the body's poses are estimated from the cameras that have an X_WC (one
-    for a robot with a fixed base, two for a person), and refined together with the missing cameras.
-    --joints may also be the poses.csv of an estimate, in which the base may move.
+    The result is each camera's pose X_WC in the world [m], with the standard deviations of position
+    and rotation, other poses that fit equally well, and the frames that are outliers. The world is
+    the model's, in most files the robot's base. All rotations of a camera are searched, without an
+    initial guess, and the best poses are fitted to the robot's contour.
 
     An episode needs no masks: pictures or videos with joint positions by time or frame, a LeRobot
     data set, a raw folder of DROID, or a ROS bag. The robot must move in view of a static camera,
     or carry the camera (--on) over a scene that stands still. Without a --target the time offset
     between pictures and joints is estimated as well, and the focal length if it is unknown. A
-    static camera that was nudged meanwhile is registered as two, which have one clock.
+    static camera that was nudged meanwhile is registered as two cameras with one clock.
+
+    From masks, focal length and principal point of each camera must be known, and the masks must be
+    free of distortion. Five poses that differ much are enough. Cameras that have an X_WC keep it; a
+    warning says if the robot is not seen there. Without joint positions the body's poses are
+    estimated from the cameras that have an X_WC (one for a robot with a fixed base, two for a
+    person), and refined together with the other cameras. --joints may also be the poses.csv of
+    drake-pose estimate, in which the base may move.
 
     Files in the output folder: report.html (start here); cameras.yaml, which estimate reads;
     registration.yaml (6 x 6 covariance, other poses); summary.json; overlay/; overlay_as_given/;
@@ -83,7 +83,7 @@ def register(
             missing; or an episode, a folder or file.
         joints: Joint positions in every frame [rad or m]: CSV file with the column frame (an
             episode may have time instead) and one column for each joint. Default: the scene's
-            joint_angles.csv or the episode's joint log; without either they are estimated from the
+            joint_angles.csv or the episode's joint log; a scene without either: estimated from the
             cameras that have an X_WC.
         cameras: Camera file to use instead of the scene's or episode's own.
     """

@@ -32,8 +32,8 @@ class AuditSettings(EpisodeSettings):
     hold: Positions = field(default_factory=dict)
     """Hold this joint at a known position [deg or m]; repeat for several."""
     without: Annotated[tuple[str, ...], Parameter(metavar="LINK")] = ()
-    """Leave this link out, with all links that it carries: a gripper that is not the model's, or a
-    part that looks otherwise. It is neither drawn nor compared; repeat for several."""
+    """Leave this link and all links that it carries out of drawings and comparisons, such as a
+    gripper that is not the model's; repeat for several."""
     pictures: Annotated[bool, Parameter(negative="")] = False
     """Use the scene's pictures and joint log, even if it has masks."""
 
@@ -45,26 +45,27 @@ class RegistrationSettings(AuditSettings):
 
     cameras: Annotated[Names, Parameter("--camera")] = ()
     """Register this camera, and ignore its X_WC if it has one; repeat for several. Default: all
-    cameras without X_WC."""
+    cameras of an episode; of a scene of masks those without X_WC."""
     on: Annotated[str | None, Parameter(metavar="LINK")] = None
-    """The cameras ride on this link (eye in hand). Their pose X_LC in the link's frame is estimated
-    from pictures of whatever stands still, from masks of the robot's static base, or from masks or
-    pictures of a --target."""
+    """The cameras are mounted on this link (eye in hand). Their pose X_LC in the link's frame is
+    estimated from an episode's pictures of things that stand still, from masks of the robot's
+    static base, or from masks or pictures of a --target."""
     target: Path | None = None
     """With --on: model file (URDF, SDFormat, MJCF) of a rigid calibration target anywhere in the
     world, which the masks or pictures show; its pose is estimated, too."""
     zeros: Names = ()
-    """Estimate the offset of this joint, too: a constant added to its positions in all frames.
-    "all": of every joint; repeat for several. A URDF with the offsets is written."""
+    """Estimate the offset of this joint, too: a constant to be added to its positions in all
+    frames. "all": of every joint; repeat for several. For a URDF model, a URDF with the significant
+    offsets is written."""
     lengths: Annotated[tuple[str, ...], Parameter(metavar="LINK")] = ()
-    """Estimate the scale of this link, too: a factor of the distances of the joints that it carries
-    from its own joint. "all": of every link; repeat for several. A URDF with the scales is
-    written."""
+    """Estimate the scale of this link, too: a factor of the distances from its own joint to the
+    joints that it carries. "all": of every link; repeat for several. URDF models only: a URDF with
+    the significant scales is written."""
     focal: bool = False
     """Estimate the cameras' focal lengths, too."""
     suggest: bool = False
     """If several poses of a camera fit equally well, suggest joint positions that distinguish
-    them."""
+    these poses. For masks."""
     keep_out: Annotated[
         tuple[tuple[Corner, Corner], ...], from_text(parse_boxes, "X,Y,Z:X,Y,Z", repeated=True)
     ] = ()
@@ -73,8 +74,8 @@ class RegistrationSettings(AuditSettings):
     exports: Annotated[tuple[Export, ...], Parameter("--export")] = ()
     """Export the cameras for this program, too; repeat for several. ros: camera_info and static
     transforms; mujoco: <camera> elements; drake: CameraConfigs; rerun: a recording with robot,
-    pictures and masks; lerobot: of a LeRobot data set a joint map, the motors' calibration file,
-    both with the offsets of --zeros, and a copy of meta with the cameras."""
+    pictures and masks; lerobot, for a LeRobot data set: a joint map and the motors' calibration
+    file, corrected by the offsets of --zeros, and a copy of meta with the cameras."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

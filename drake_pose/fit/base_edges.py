@@ -38,8 +38,8 @@ class BaseSettings(NamedTuple):
             errors are taken as independent.
         resamples: number of bootstrap samples of the tiles.
         shifts: tried errors of the base's place in the picture, along u and along v [pixel].
-        factor, floor: the bootstrap's standard deviation is multiplied by the first; the second is
-            added in quadrature [rad]. Errors in the rooms are then 0.9 standard deviations at most.
+        floor: is added in quadrature to the bootstrap's standard deviation [rad]. Errors in 15
+            rooms with three arms are then 0.9 standard deviations at most.
         max_deviation: an angle with a larger standard deviation is not determined [rad].
         min_turn: a camera is not turned by smaller angles [rad].
     """
@@ -54,7 +54,6 @@ class BaseSettings(NamedTuple):
     tiles: int = 8
     resamples: int = 200
     shifts: tuple[float, ...] = (-0.6, -0.3, 0.0, 0.3, 0.6)
-    factor: float = 1.0
     floor: float = 0.0035
     max_deviation: float = 0.1
     min_turn: float = 0.0175
@@ -188,7 +187,7 @@ def locate_base(
         fine_scores = [_strengths(drawing, slopes, steps)[0] @ weights for drawing in shifted]
         best = steps[np.argmax(np.max(fine_scores, axis=0), axis=0)]
         angle += float(best[0])
-    variance += BASE.factor**2 * float(np.var(best[1:])) + BASE.floor**2
+    variance += float(np.var(best[1:])) + BASE.floor**2
     return angle, float(np.sqrt(variance))
 
 

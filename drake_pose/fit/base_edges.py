@@ -176,8 +176,9 @@ def locate_base(
     edge, edge_count, inner, inner_count = sums[:, enough] @ weights
     scores = edge / np.maximum(edge_count, 1.0) - inner / np.maximum(inner_count, 1.0)
     angle, *likely = candidates[enough][np.argmax(scores, axis=0)].tolist()
-    deviations = np.array(likely) - angle
-    variance = float(np.mean(deviations**2 * (np.abs(deviations) > 2.0 * BASE.step)))
+    # Half the width of the interval that holds 95 % of the samples, if others are among them.
+    wide = float(np.quantile(np.abs(np.array(likely) - angle), 0.95))
+    variance = (wide / 1.96) ** 2 if wide > 2.0 * BASE.step else 0.0
     # Angles near the best are compared more exactly, with the base shifted a little.
     steps = np.arange(-1.5 * BASE.step, 1.5 * BASE.step, BASE.fine_step)
     shifts = np.array([[a, b] for a in BASE.shifts for b in BASE.shifts])

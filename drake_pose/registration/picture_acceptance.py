@@ -14,6 +14,7 @@ from drake_pose.fit.background import estimate_gain
 from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.fit.problem import TIME_OFFSET
 from drake_pose.fit.surfaces import simplify_or_hull
+from drake_pose.registration.offset_search import joints_like_cameras
 from drake_pose.registration.picture_search import (
     PictureFit,
     PictureSearch,
@@ -134,8 +135,8 @@ class AcceptanceSettings(NamedTuple):
             episodes or models of other robots explain much, it is 0.38 at most.
         sufficient_ratio, min_explained: with this inlier ratio and explained fraction, the p-value
             does not matter. Wrong poses have a ratio of 0.62 at most, and then explain nothing.
-        max_sd: maximum standard deviation of the pose [distance from the body; rad]. Correct poses
-            have 0.01.
+        max_sd: maximum standard deviation of the pose [distance from the body; rad], with the
+            first joint's offset held. Correct poses have 0.01.
         max_clock_sd: a time offset with a larger standard deviation is not determined [s].
         guessed_lens_error: relative error of focal lengths that pictures alone determine, which
             enlarges the covariance. Simulated ones err by 1 %, real ones by 2 to 50 %.
@@ -187,11 +188,19 @@ def accept_fit(
         np.array([np.linalg.inv(X) for X in start.alternatives]).reshape(-1, 4, 4),
     )  # fmt: skip
     distance = float(np.linalg.norm(best.camera.X_WC[:3, 3] - posed.middle))
-    if found.translation_sd > ACCEPTANCE.max_sd * distance or found.rotation_sd > ACCEPTANCE.max_sd:
+    # An offset that turns the camera about the robot may be unknown: relative to the parts that
+    # move, the pose is known.
+    values = np.array([one.values for one in posed.frames])
+    shown = np.array([len(one.vertices) > 0 for one in posed.outlines])
+    turning = joints_like_cameras(posed.kinematics, values, shown)
+    rows, C = [fit.names.index(k) for k in turning if k in fit.names], best.covariance
+    held = C - C[:, rows] @ np.linalg.inv(C[np.ix_(rows, rows)]) @ C[rows]
+    one = replace(found, covariance=fit.camera_covariances(best.found, held)[0])
+    if one.translation_sd > ACCEPTANCE.max_sd * distance or one.rotation_sd > ACCEPTANCE.max_sd:
         raise unexplained_error(
             start.camera,
             f"the best, {distance:.1f} m away, has a standard deviation of "
-            f"{1e3 * found.translation_sd:.0f} mm and {np.degrees(found.rotation_sd):.1f} degrees",
+            f"{1e3 * one.translation_sd:.0f} mm and {np.degrees(one.rotation_sd):.1f} degrees",
         )
     focal_index = len(POSE_NAMES)
     if focal > SHARED.focal_deviation:

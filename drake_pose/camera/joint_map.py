@@ -95,7 +95,7 @@ def map_joints(
             raise UnknownNameError("column", column.name, log.names, "the joint log")
     used = {column.name for column in columns.values()}
     readings_of = dict(zip(log.names, log.positions.T, strict=True))
-    others = {name: one for name, one in readings_of.items() if name not in used}
+    others = {name: column for name, column in readings_of.items() if name not in used}
     matched, warnings = _match(others, [name for name in names if name not in columns])
     if not (matched or columns):
         raise SceneError(
@@ -397,7 +397,7 @@ def _find_unit(
     # fmin and fmax ignore missing readings (nan).
     minima, maxima = (f.reduce(list(readings.values()), axis=1) for f in (np.fmin, np.fmax))
     excess = {k: np.fmax(low - one * minima, one * maxima - high) for k, one in UNITS.items()}
-    worst = {unit: float(np.fmax.reduce(one)) for unit, one in excess.items()}
+    worst = {unit: float(np.fmax.reduce(column)) for unit, column in excess.items()}
     largest = np.fmax.reduce(np.abs(others), axis=None)
     k = int(np.argmax(np.nan_to_num(excess["rad"])))
     column = list(readings)[k]

@@ -147,32 +147,32 @@ def _find_encoding(
         most: maximum magnitude of degrees, two turns [deg]; larger readings are steps.
     """
     body = [joint for joint in joints if joint.is_angle and not joint.is_gripper]
-    known_readings = [(one, one.readings[np.isfinite(one.readings)]) for one in body]
-    known = [replace(one, readings=own) for one, own in known_readings if own.size]
+    known_readings = [(joint, joint.readings[np.isfinite(joint.readings)]) for joint in body]
+    known = [replace(joint, readings=own) for joint, own in known_readings if own.size]
     if not known:
         return None
-    largest = max(float(np.nanmax(np.abs(one.readings))) for one in known)
+    largest = max(float(np.nanmax(np.abs(joint.readings))) for joint in known)
     if largest > most:
         # Only homed motors count below 0, or beyond a turn.
-        low, high = (-turn, 2 * turn) if all(one.motor for one in known) else (0, turn)
+        low, high = (-turn, 2 * turn) if all(joint.motor for joint in known) else (0, turn)
         is_count = all(((one.readings >= low) & (one.readings <= high)).all() for one in known)
         return ("steps", f"they are up to {largest:.0f}") if is_count else None
     # The middle of a range may be half a step.
-    degrees = _are_whole([2.0 * (turn - 1) / 360.0 * one.readings for one in known])
+    degrees = _are_whole([2.0 * (turn - 1) / 360.0 * joint.readings for joint in known])
     if largest > full:
         return "deg", f"the largest is {largest:.4g}, not within -100 ... 100"
-    counts = [(one, range_in_steps(one, turn)) for one in known]
-    normalised = _are_whole([(one.readings + 100.0) * n / 200.0 for one, n in counts if n])
+    counts = [(joint, range_in_steps(joint, turn)) for joint in known]
+    normalised = _are_whole([(joint.readings + 100.0) * n / 200.0 for joint, n in counts if n])
     if degrees:
         return "deg", "only as degrees they are whole steps of an encoder"
     if normalised:
         return "normalised", "only as -100 ... 100 of its range they are whole steps of an encoder"
-    for one in known:
-        if one.motor is not None and math.isfinite(one.motor.high):
-            half = 180.0 * (one.motor.high - one.motor.low) / turn
-            if np.nanmax(np.abs(one.readings)) > half + 2.0:
-                return "normalised", f"as degrees '{one.column}' would leave its range"
-    if any((np.abs(one.readings) == 100.0).any() for one in known):
+    for joint in known:
+        if joint.motor is not None and math.isfinite(joint.motor.high):
+            half = 180.0 * (joint.motor.high - joint.motor.low) / turn
+            if np.nanmax(np.abs(joint.readings)) > half + 2.0:
+                return "normalised", f"as degrees '{joint.column}' would leave its range"
+    if any((np.abs(joint.readings) == 100.0).any() for joint in known):
         return "normalised", "some are -100 or 100 exactly"
     return "normalised", "but they could be degrees, too"
 
@@ -240,33 +240,33 @@ def servo_columns(
         if is_degrees[joint.name]
     ]
     degrees = _so_degrees(shown, servos)
-    for one in joints:
-        if one.is_gripper:
-            column = _gripper_column(one, servos, encoding)
+    for joint in joints:
+        if joint.is_gripper:
+            column = _gripper_column(joint, servos, encoding)
             if column is None:
                 warnings.append(
-                    f"joint '{one.name}': column '{one.column}' does not tell its position, as the "
-                    "gripper's range is not known; if it must be known, give a joint map"
+                    f"joint '{joint.name}': column '{joint.column}' does not tell its position, as "
+                    "the gripper's range is not known; if it must be known, give a joint map"
                 )
-        elif is_degrees[one.name]:
-            scale, offset = inner[one.name][1:3]
-            outer = degrees.get(one.name) or _degree_column(one, servos)
-            column = Column(one.column, outer.scale * scale, outer.scale * offset + outer.offset)
+        elif is_degrees[joint.name]:
+            scale, offset = inner[joint.name][1:3]
+            outer = degrees.get(joint.name) or _degree_column(joint, servos)
+            column = Column(joint.column, outer.scale * scale, outer.scale * offset + outer.offset)
         elif encoding == "steps":
-            column = _step_column(one, servos)
+            column = _step_column(joint, servos)
         else:
-            length = range_in_steps(one, servos.turn)
-            if length is None and one.is_called(servos.full_turns):
+            length = range_in_steps(joint, servos.turn)
+            if length is None and joint.is_called(servos.full_turns):
                 length = servos.turn - 1
             if length is None:
-                assumed.append(one.name)
-                column = _between(one, -100.0, 100.0)
+                assumed.append(joint.name)
+                column = _between(joint, -100.0, 100.0)
             else:
                 half = math.pi * length / servos.turn
                 ends = None if length >= servos.turn - 1 else (-100.0, 100.0)
-                column = Column(one.column, 0.01 * half, _zero(one, length, servos.turn), ends)
+                column = Column(joint.column, 0.01 * half, _zero(joint, length, servos.turn), ends)
         if column is not None:
-            columns[one.name] = column
+            columns[joint.name] = column
     if degrees:
         warnings.append(
             f"the degrees of {', '.join(degrees)} are taken to be of LeRobot before June 2025, "
@@ -348,14 +348,14 @@ def _so_degrees(joints: Sequence[ServoJoint], servos: Servos) -> dict[str, Colum
     """
     changed = {"shoulder_lift": (-1.0, 90.0), "elbow_flex": (1.0, -90.0)}
     old_columns, excess = dict[str, Column](), np.zeros(2)
-    for one in joints if servos.is_so else ():
+    for joint in joints if servos.is_so else ():
         for name, (sign, offset) in changed.items():
-            if one.is_called((name,)):
-                old = Column(one.column, math.radians(sign), math.radians(offset))
-                old_columns[one.name] = old
+            if joint.is_called((name,)):
+                old = Column(joint.column, math.radians(sign), math.radians(offset))
+                old_columns[joint.name] = old
                 for k, way in enumerate((Column("", math.radians(1.0)), old)):
-                    angles = way.scale * one.readings + way.offset
-                    beyond = np.maximum(one.lower - angles, angles - one.upper)
+                    angles = way.scale * joint.readings + way.offset
+                    beyond = np.maximum(joint.lower - angles, angles - joint.upper)
                     excess[k] += max(0.0, float(np.nanmax(beyond, initial=0.0)))
     is_new = all(joint.column.endswith(".pos") for joint in joints)
     return old_columns if excess[1] < excess[0] or (excess[1] == excess[0] and not is_new) else {}
@@ -492,6 +492,6 @@ def dump_column(joint: str, column: Column, offset: float) -> str:
     name = json.dumps(column.name)
     if column.ends is None:
         return f"{joint}: {{column: {name}, scale: {scale!r}, offset: {constant!r}}}\n"
-    ends = [float(one) for one in column.ends]
-    values = [scale * one + constant for one in ends]
+    ends = [float(end) for end in column.ends]
+    values = [scale * end + constant for end in ends]
     return f"{joint}: {{column: {name}, from: {ends}, to: {values}}}\n"

@@ -257,15 +257,15 @@ def _find_cameras(
     ]
     findings += motion_findings(body, inputs, pictures)
     for given in (camera for camera in inputs.given_cameras if camera.name in pictures):
-        name, recording, one = given.name, inputs.recordings[given.name], pictures[given.name]
-        values = np.array([frame.values + one.joint_offsets for frame in one.frames])
-        difference = compare_camera(body, given, one.found, values, alone)
-        is_near = difference.pixels < near * one.fit.fit.views[0].size
-        compared.append(given if is_near else one.found.camera)
+        name, recording, result = given.name, inputs.recordings[given.name], pictures[given.name]
+        values = np.array([frame.values + result.joint_offsets for frame in result.frames])
+        difference = compare_camera(body, given, result.found, values, alone)
+        is_near = difference.pixels < near * result.fit.fit.views[0].size
+        compared.append(given if is_near else result.found.camera)
         findings += [] if is_near or difference.p_value > DIAGNOSIS.significance else [difference]
         # The parts of a recording have one clock.
-        findings += compare_clock(body, one, recording) if inputs.parts[name].of == name else []
-        segmented, _, lost = evaluate_pictures(body, one, one.found)
+        findings += compare_clock(body, result, recording) if inputs.parts[name].of == name else []
+        segmented, _, lost = evaluate_pictures(body, result, result.found)
         for frame in segmented:
             known = frame.name if alone else f"{name}-{frame.name}"
             names[known] = name, frame.name
@@ -359,11 +359,11 @@ def _write_result(
         shown[frame] = inputs.recordings[camera_name].picture(name)
     for camera in inputs.known_cameras if outliers else ():
         name, titled = camera.name, []
-        for one in map(inputs.read, outliers):
-            if name in one.masks:
-                fits = percent(summary["frames"][one.name]["fits"][name])
-                title = f"{name}  frame {one.name}  OUTLIER  {fits} fits"
-                titled.append((PosedFrame(one.name, one.values, one.masks[name]), title))
+        for view in map(inputs.read, outliers):
+            if name in view.masks:
+                fits = percent(summary["frames"][view.name]["fits"][name])
+                title = f"{name}  frame {view.name}  OUTLIER  {fits} fits"
+                titled.append((PosedFrame(view.name, view.values, view.masks[name]), title))
         write_overlays(path, inputs.tree, camera, titled, inputs.visible_nodes, shown)
     for given in inputs.given_cameras if overlay else ():
         registration = pictures.found[given.name]
@@ -391,23 +391,23 @@ def _describe_findings(found: Diagnosis) -> list[dict[str, Any]]:
         if frame.finding is not None and frame.finding not in found.common
     ]
     described = []
-    for one, what, name, text in rows:
-        unit, factor = shift_unit(one.kind)
+    for finding, what, name, text in rows:
+        unit, factor = shift_unit(finding.kind)
         described.append(
             {
                 "what": what,
                 "name": name,
                 "text": text,
-                "cause": one.kind,
-                "cause_name": one.name,
-                "angle_deg": float(np.degrees(one.angle)),
-                "angle_sd_deg": float(np.degrees(one.angle_sd)),
-                f"shift_{unit}": factor * one.shift,
-                f"shift_sd_{unit}": factor * one.shift_sd,
-                "pixels": one.pixels,
-                "p_value": one.p_value,
-                "alternatives": list(one.alternatives),
-                "joints": dict(one.joints),
+                "cause": finding.kind,
+                "cause_name": finding.name,
+                "angle_deg": float(np.degrees(finding.angle)),
+                "angle_sd_deg": float(np.degrees(finding.angle_sd)),
+                f"shift_{unit}": factor * finding.shift,
+                f"shift_sd_{unit}": factor * finding.shift_sd,
+                "pixels": finding.pixels,
+                "p_value": finding.p_value,
+                "alternatives": list(finding.alternatives),
+                "joints": dict(finding.joints),
             }
         )
     return described

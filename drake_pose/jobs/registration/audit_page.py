@@ -97,7 +97,7 @@ def audit_answer(summary: Mapping[str, Any], kinds: Mapping[str, str]) -> str:
         detectable += [detectable_offset(max(known), kind)] if known else []
     if not detectable:
         return "No error found, but no joint offset could have been detected."
-    hidden = [name for name, one in offsets.items() if one is None]
+    hidden = [name for name, offset in offsets.items() if offset is None]
     but = f", except those of {listed(hidden)}" if hidden else ""
     return (
         f"No error found: joint offsets above {' or '.join(detectable)} would have been detected"
@@ -113,22 +113,22 @@ def detectable_offset(offset: float, kind: str) -> str:
     return f"{offset:.1f} deg" if kind == "angle" else f"{1e3 * offset:.1f} mm"
 
 
-def correction_row(one: Mapping[str, Any], normal: float = 1.96) -> dict[str, Any]:
+def correction_row(finding: Mapping[str, Any], normal: float = 1.96) -> dict[str, Any]:
     """Return an entry of ``findings`` of summary.json, with ``parts`` for the page's tables.
 
     Each part has two texts: an angle or a shift with a known standard deviation, and its 95 %
     interval.
 
-    one: the entry. normal: half-width of an interval [standard deviations].
+    finding: the entry. normal: half-width of an interval [standard deviations].
     """
     parts = []
-    for key in (key for key in one if key.startswith(("angle_deg", "shift_"))):
-        if "_sd_" in key or not (deviation := one[_sd_key(key)]) or not np.isfinite(deviation):
+    for key in (key for key in finding if key.startswith(("angle_deg", "shift_"))):
+        if "_sd_" in key or not (deviation := finding[_sd_key(key)]) or not np.isfinite(deviation):
             continue
-        value, unit = one[key], key.rpartition("_")[2].replace("percent", "%")
+        value, unit = finding[key], key.rpartition("_")[2].replace("percent", "%")
         low, high = value - normal * deviation, value + normal * deviation
         parts.append((f"{value:+z.2f} {unit}", f"{low:+z.2f} to {high:+z.2f} {unit}"))
-    return {**one, "parts": parts}
+    return {**finding, "parts": parts}
 
 
 def _sd_key(key: str) -> str:
@@ -208,40 +208,37 @@ def _draw_outlines(folder: Path, inputs: RegistrationInputs, found: Diagnosis, m
     names = TreeKinematics(inputs.tree).names
     common = [one for one in found.common if corrected(np.zeros(len(names)), names, one)]
     draw, chosen = body_drawer(inputs.tree, inputs.visible_nodes), list[OnePicture]()
-    for one in sorted(found.frames, key=lambda one: -one.pixels):
-        of_frame = [] if one.finding is None or one.finding in found.common else [one.finding]
-        findings = [
-            *common,
-            *(x for x in of_frame if corrected(np.zeros(len(names)), names, x)),
-        ]
+    for frame in sorted(found.frames, key=lambda one: -one.pixels):
+        of_frame = [] if frame.finding is None or frame.finding in found.common else [frame.finding]
+        findings = [*common, *(x for x in of_frame if corrected(np.zeros(len(names)), names, x))]
         if findings and len(chosen) < most:
-            chosen.append((one.frame, "of this frame" if of_frame else "of all frames", findings))
-    for frame, of, findings in chosen:
-        seen = inputs.read(frame)
+            chosen.append((frame.frame, "of this frame" if of_frame else "of all frames", findings))
+    for name, of, findings in chosen:
+        seen = inputs.read(name)
         values = seen.values
         for finding in findings:
             (values,) = corrected(values, names, finding)
         for camera in (camera for camera in inputs.known_cameras if camera.name in seen.masks):
             given = seen.of(camera.name)
             bodies = [draw(camera, replace(given, values=v)) >= 0 for v in (seen.values, values)]
-            title = f"{camera.name}  frame {frame}  joints {of}"
+            title = f"{camera.name}  frame {name}  joints {of}"
             picture = draw_shapes(given.mask, bodies, ("as given", "as found"), title)
-            write_file(folder, f"{AS_GIVEN}/{camera.name}/{frame}.png", encode_png(picture))
+            write_file(folder, f"{AS_GIVEN}/{camera.name}/{name}.png", encode_png(picture))
 
 
-def corrected(values: Array, names: Sequence[str], one: Finding) -> tuple[Array, ...]:
+def corrected(values: Array, names: Sequence[str], finding: Finding) -> tuple[Array, ...]:
     """Return the joint values (m,) corrected by a finding, in a tuple; (): it corrects no joint.
 
     Args:
         values: (m,) joint values [rad or m].
         names: (m,) names of the joints.
-        one: the finding.
+        finding: its kind and joints tell the correction.
     """
-    added = dict(one.joints)
-    if one.kind == "joint":
-        added = {one.name: one.angle if one.angle_sd > 0.0 else one.shift}
-    elif one.kind == "sign" and one.name in names and "to be added" not in one.text:
-        added = {one.name: -2.0 * values[names.index(one.name)]}
+    added = dict(finding.joints)
+    if finding.kind == "joint":
+        added = {finding.name: finding.angle if finding.angle_sd > 0.0 else finding.shift}
+    elif finding.kind == "sign" and finding.name in names and "to be added" not in finding.text:
+        added = {finding.name: -2.0 * values[names.index(finding.name)]}
     known = {name: value for name, value in added.items() if name in names}
     if not known:
         return ()

@@ -311,21 +311,24 @@ def compare_camera(
 
 
 def compare_clock(
-    body: RegistrationBody, one: PictureRegistration, recording: Recording, clock_sd: float = 0.002
+    body: RegistrationBody,
+    result: PictureRegistration,
+    recording: Recording,
+    clock_sd: float = 0.002,
 ) -> list[Finding]:
     """Return significant findings "clock" (time offset) and "rate" (drift) of a camera's clock.
 
     Args:
         body: the robot's surfaces.
-        one: the camera's registration; its time offset may be unknown.
+        result: the camera's registration; its time offset may be unknown.
         recording: the recording as given, without a correction of its clock.
         clock_sd: standard deviation of the offset between well synchronised clocks [s].
     """
-    clock, camera = one.time_offset, one.found.camera
+    clock, camera = result.time_offset, result.found.camera
     if clock is None or not clock.determined:
         return []
-    rows = [recording.names.index(frame.name) for frame in one.frames]
-    given, found = recording.values_at(0.0)[rows], one.recording.values_at(clock.value)[rows]
+    rows = [recording.names.index(frame.name) for frame in result.frames]
+    given, found = recording.values_at(0.0)[rows], result.recording.values_at(clock.value)[rows]
     known = np.isfinite(given).all(axis=1)
     pixels = _picture_shift(body, (camera, given[known]), (camera, found[known]))
     if pixels < DIAGNOSIS.min_joint_pixels:
@@ -487,7 +490,7 @@ def parameter_warnings(found: JointCalibration) -> list[str]:
     """
     requested = [(f"joint '{offset.name}': its offset", offset) for offset in found.offsets]
     requested += [(f"link '{scale.name}': its length", scale) for scale in found.link_scales]
-    if requested and not any(one.significant for _, one in requested):
+    if requested and not any(parameter.significant for _, parameter in requested):
         return [
             "none of the requested joint offsets and link lengths is significant beside other "
             "errors (of each other, focal length, principal point, masks): no corrected URDF is "
@@ -502,10 +505,10 @@ def parameter_warnings(found: JointCalibration) -> list[str]:
     ]
     return with_cameras + [
         f"{what} is not determined by these silhouettes and was not changed"
-        + (f" (correlated with {', '.join(one.gauge)})" if one.gauge else "")
+        + (f" (correlated with {', '.join(parameter.gauge)})" if parameter.gauge else "")
         + "; add frames with other joint positions, or a view of a part that does not move with it"
-        for what, one in requested
-        if not one.determined
+        for what, parameter in requested
+        if not parameter.determined
     ]
 
 
@@ -538,17 +541,16 @@ def common_outlier_warnings(
     is_inlier: dict[str, dict[str, bool]] = {}
     sets, frames_of = dict[str, list[str]](), dict[str, set[str]]()
     for found in registered:
-        for one in found.frames:
-            is_inlier.setdefault(one.frame, {})[found.camera.name] = one.is_inlier
+        for misfit in found.frames:
+            is_inlier.setdefault(misfit.frame, {})[found.camera.name] = misfit.is_inlier
         sets[found.camera.name] = [frame.frame for frame in found.frames if frame.is_inlier]
         frames_of[found.camera.name] = {frame.frame for frame in found.frames}
     frames, masks = list(is_inlier), dict[str, list[str]]()
     positions = [k for k, own in is_inlier.items() if len(own) > 1 and not any(own.values())]
     for frame, inliers in is_inlier.items():
-        for name in (
-            name for name, right in inliers.items() if any(inliers.values()) and not right
-        ):
-            masks.setdefault(name, []).append(frame)
+        for name, right in inliers.items() if any(inliers.values()) else ():
+            if not right:
+                masks.setdefault(name, []).append(frame)
     why = "something hides the robot there" if from_pictures else "their masks are not"
     texts = [
         f"cameras '{a}' and '{b}' rest on no common frame: '{a}' on {frame_ranges(own, frames)}, "

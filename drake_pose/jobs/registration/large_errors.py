@@ -269,7 +269,7 @@ class SceneComparison:
                 placed = self._register(frames, group)
                 motions = [off for _, off in placed.values()]
                 base = base_motion(
-                    {one.name: one for one in group},
+                    {body.name: body for body in group},
                     {k: one for k, (one, _) in placed.items()},
                 )
                 if base is not None and len(placed) == len(cameras):
@@ -411,7 +411,7 @@ class SceneComparison:
                 return correction
         # Fits are linear: they restart from a large offset or focal length that they estimated.
         if large:
-            size = next(one.angle for one in now.found.common if one.name == large[0])
+            size = next(finding.angle for finding in now.found.common if finding.name == large[0])
             search = LargeErrorSearch(self.body, now.cameras, sample)
             return search.joint_correction("offset", large[0], 1.0, size, 0.0)
         lens = now.focal_off
@@ -562,22 +562,22 @@ class SceneComparison:
         return float(np.sqrt(moved.mean())) if len(moved) else 0.0
 
 
-def _add_remaining(one: Finding, rest: Finding | None) -> Finding:
+def _add_remaining(finding: Finding, rest: Finding | None) -> Finding:
     """Return a correction's finding, to which the error that remained with it is added.
 
     Angles and shifts are added, factors of focal lengths multiplied. Standard deviations are those
     of the remaining error.
 
-    one: the correction's finding. rest: of the same kind and name; None: no error remained.
+    finding: the correction's. rest: of the same kind and name; None: no error remained.
     """
     if rest is None:
-        return one
-    shift = one.shift + rest.shift
-    if one.kind == "focal":
-        shift = (1.0 + one.shift) * (1.0 + rest.shift) - 1.0
-    angle = one.angle + rest.angle
-    total = replace(rest, angle=angle, shift=shift, pixels=one.pixels)
-    return replace(total, p_value=one.p_value, alternatives=one.alternatives)
+        return finding
+    shift = finding.shift + rest.shift
+    if finding.kind == "focal":
+        shift = (1.0 + finding.shift) * (1.0 + rest.shift) - 1.0
+    angle = finding.angle + rest.angle
+    total = replace(rest, angle=angle, shift=shift, pixels=finding.pixels)
+    return replace(total, p_value=finding.p_value, alternatives=finding.alternatives)
 
 
 _KINDS = {"offset": "joint", "focal": "focal"}

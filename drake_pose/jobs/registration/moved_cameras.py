@@ -60,11 +60,11 @@ def split_moved_cameras(inputs: RegistrationInputs) -> RegistrationInputs:
     given = [
         replace(camera, name=name)
         for camera in inputs.given_cameras
-        for name, one in parts.items()
-        if one.of == camera.name
+        for name, part in parts.items()
+        if part.of == camera.name
     ]
-    assumed = {name for name, one in parts.items() if one.of in inputs.assumed_focal}
-    recordings = {k: inputs.recordings[one.of].part(one.pictures) for k, one in parts.items()}
+    assumed = {name for name, part in parts.items() if part.of in inputs.assumed_focal}
+    recordings = {k: inputs.recordings[part.of].part(part.pictures) for k, part in parts.items()}
     return replace(
         inputs, scene=replace(inputs.scene, cameras=scene), searched_cameras=tuple(searched),
         given_cameras=tuple(given), assumed_focal=frozenset(assumed), recordings=recordings,
@@ -106,15 +106,18 @@ def motion_warnings(
         return f"{pixels:.1f} pixels, a turn by {degrees:.2f} degrees or the like"
 
     texts, who = [], f"camera '{camera.name}'"
-    for one in motion.nudges:
-        names = f"between pictures {recording.names[one.before]} and {recording.names[one.after]}"
+    for nudge in motion.nudges:
+        before, after = recording.names[nudge.before], recording.names[nudge.after]
+        names = f"between pictures {before} and {after}"
         when = (
-            names if recording.times is None else f"at {recording.times[one.after]:.2f} s, {names}"
+            names
+            if recording.times is None
+            else f"at {recording.times[nudge.after]:.2f} s, {names}"
         )
-        degrees = np.degrees(np.linalg.norm(one.rotation))
+        degrees = np.degrees(np.linalg.norm(nudge.rotation))
         texts.append(
-            f"{who} moved {when}: its background shifted by {one.pixels:.1f} pixels, as by a turn "
-            f"of {degrees:.2f} degrees; the pictures before and after are used as two cameras"
+            f"{who} moved {when}: its background shifted by {nudge.pixels:.1f} pixels, as by a "
+            f"turn of {degrees:.2f} degrees; the pictures before and after are used as two cameras"
         )
     if motion.drift:
         texts.append(
@@ -159,7 +162,7 @@ def register_recordings(
     Raises RegistrationError: no pose explains the pictures of any camera.
     """
     done, errors = dict[str, PictureRegistration](), dict[str, RegistrationError]()
-    recorded = {name: one.of for name, one in inputs.parts.items()}
+    recorded = {name: part.of for name, part in inputs.parts.items()}
     for camera in cameras:
         name, recording = camera.name, inputs.recordings[camera.name]
         earlier_parts = [other for other in done if recorded[other] == recorded[name]]
@@ -216,9 +219,9 @@ def motion_findings(
                 )
     for (name, part), (other, later) in pairwise(inputs.parts.items()):
         if part.of == later.of and name in found and other in found:
-            before, one = found[name].found, found[other]
-            after = replace(one.found, covariance=before.covariance + one.found.covariance)
-            values = np.array([frame.values + one.joint_offsets for frame in one.frames])
+            before, here = found[name].found, found[other]
+            after = replace(here.found, covariance=before.covariance + here.found.covariance)
+            values = np.array([frame.values + here.joint_offsets for frame in here.frames])
             difference = compare_camera(body, before.camera, after, values, False)
             when = f"after picture {inputs.recordings[name].names[-1]}"
             when = when if later.since is None else f"at {later.since:.2f} s"

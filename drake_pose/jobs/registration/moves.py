@@ -22,7 +22,7 @@ def changed_after(found: Diagnosis, cameras: Collection[str], least: int) -> tup
     Returns:
         the outliers' indices in ``found.frames``, and the last frame's name. ([], ""): no change.
     """
-    rows = [k for k, one in enumerate(found.frames) if {*one.given_ratios} == {*cameras}]
+    rows = [k for k, frame in enumerate(found.frames) if {*frame.given_ratios} == {*cameras}]
     wrong = [found.frames[k].finding is not None for k in rows]
     last = last_before_change(wrong, least)
     if last is None:
@@ -44,14 +44,14 @@ def base_motion(
         sds: maximum difference between the cameras' motions [standard deviations], to which 0.25
             degrees and 3 mm are added.
     """
-    motions = [given[name].X_WC @ one.camera.X_CW for name, one in placed.items()]
-    rotation_sd = max((one.rotation_sd for one in placed.values()), default=0.0)
-    shift_sd = max((one.translation_sd for one in placed.values()), default=0.0)
+    motions = [given[name].X_WC @ camera.camera.X_CW for name, camera in placed.items()]
+    rotation_sd = max((camera.rotation_sd for camera in placed.values()), default=0.0)
+    shift_sd = max((camera.translation_sd for camera in placed.values()), default=0.0)
     differences = [pose_difference(motion, motions[0]) for motion in motions[1:]]
     most = sds * rotation_sd + np.radians(0.25), sds * shift_sd + 0.003
     if not differences or any(
-        np.linalg.norm(one[:3]) > most[0] or np.linalg.norm(one[3:]) > most[1]
-        for one in differences
+        np.linalg.norm(difference[:3]) > most[0] or np.linalg.norm(difference[3:]) > most[1]
+        for difference in differences
     ):
         return None
     motion = pose_difference(motions[0], np.eye(4))

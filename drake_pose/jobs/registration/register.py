@@ -169,7 +169,7 @@ def register_scene(
             work.inputs, placed.values(), settings.on, work.parameters["zeros"]
         )
         work.warnings += texts
-    seconds = sum(one["seconds"] for one in described.values())
+    seconds = sum(entry["seconds"] for entry in described.values())
     summary = {
         # A single camera's part is also at the top level.
         **(next(iter(described.values())) if len(described) == 1 and not refused else {}),
@@ -180,8 +180,8 @@ def register_scene(
     if folder is not None:
         for name, content in files.items():
             write_file(folder, name, content)
-        for one in work.tracks.values() if overlay else ():
-            draw_tracks(folder, one)
+        for result in work.tracks.values() if overlay else ():
+            draw_tracks(folder, result)
         overlay = overlay and not work.tracks
         write_result(
             folder, work.inputs, placed, work.registered, summary, overlay, urdf, work.shown
@@ -257,15 +257,15 @@ class _Registration:
         else:
             frames, start = list[MultiViewFrame](), time.perf_counter()
             focal = [*inputs.recordings] if self._settings.focal else []
-            for one in register_recordings(
+            for result in register_recordings(
                 self.body, inputs, inputs.searched_cameras, self.warnings, self.refused, focal,
                 inputs.offset_joints,
             ):  # fmt: skip
-                name = one.found.camera.name
-                frames += [MultiViewFrame.alone(name, frame) for frame in one.frames]
-                self.pictures[name] = one
-                self.warnings += picture_warnings(one, name in inputs.assumed_focal)
-                self._note(one.found, start)
+                name = result.found.camera.name
+                frames += [MultiViewFrame.alone(name, frame) for frame in result.frames]
+                self.pictures[name] = result
+                self.warnings += picture_warnings(result, name in inputs.assumed_focal)
+                self._note(result.found, start)
                 start = time.perf_counter()
             unexplained = [name for name in inputs.recordings if name not in self.pictures]
             self.inputs = replace(inputs, frames=tuple(frames)).without(unexplained)
@@ -278,8 +278,8 @@ class _Registration:
             yield
         except RegistrationError as error:
             self.refused[name] = error
-            for one in (self.registered, self.pictures, self.target_pictures, self.tracks):
-                one.pop(name, None)
+            for results in (self.registered, self.pictures, self.target_pictures, self.tracks):
+                results.pop(name, None)
 
     def _require_registered(self) -> None:
         """Leave refused cameras out of the inputs; raise their first error if no camera is left."""
@@ -301,12 +301,12 @@ class _Registration:
                 riding = RegistrationBody(inputs.tree, inputs.riding_nodes)
                 gripper = GripperSearch(riding, self.body, camera, recording)
             with self._refusing(name):
-                one = register_tracks(
+                result = register_tracks(
                     self.body, link, base, camera, recording, focal, inputs.offset_joints, gripper
                 )
-                self.tracks[name] = one
-                self.warnings += track_warnings(one, assumed)
-                self._note(one.found, start)
+                self.tracks[name] = result
+                self.warnings += track_warnings(result, assumed)
+                self._note(result.found, start)
 
     def _find_each(self) -> None:
         """Register each camera from its masks.
@@ -438,10 +438,10 @@ class _Registration:
         """
         inputs, body, frames = self.inputs, self.body.with_tree(self.inputs.tree), []
         # All pictures of cameras that were registered from some of them.
-        for name, one in self.pictures.items():
-            recording, found = one.recording, self.registered[name]
+        for name, result in self.pictures.items():
+            recording, found = result.recording, self.registered[name]
             segmented, misfits, lost = evaluate_pictures(
-                body, replace(one, joint_offsets=self._joint_offsets), found
+                body, replace(result, joint_offsets=self._joint_offsets), found
             )
             offsets = self._joint_offsets
             frames += [
@@ -451,7 +451,7 @@ class _Registration:
             errors = {k.frame: k.E_total for k in found.frames}
             wanted = (*found.outliers[:shown], *compared_frames(errors))
             pictures = {k: recording.picture(k) for k in wanted}
-            self.pictures[name] = replace(one, pictures={**one.pictures, **pictures})
+            self.pictures[name] = replace(result, pictures={**result.pictures, **pictures})
             if lost:
                 self.warnings.append(lost_frames_warning(name, lost, recording.names))
         if frames:
@@ -475,14 +475,14 @@ class _Registration:
         on, suggestions = self._settings.on, self.suggestions
         return {
             name: self.parameters
-            | describe_camera(one, self.seconds[name] + more, suggestions[name], on)
+            | describe_camera(camera, self.seconds[name] + more, suggestions[name], on)
             | (
                 describe_tracks(self.tracks[name], self.body.kinematics)
                 if name in self.tracks
                 else describe_pictures(self.pictures.get(name), name in self.target_pictures)
             )
             | describe_part(self.inputs.parts.get(name))
-            for name, one in self.registered.items()
+            for name, camera in self.registered.items()
         }
 
     def refit_poses(self) -> None:
@@ -495,9 +495,11 @@ class _Registration:
         inputs, registered = self.inputs, self.registered
         wrong = {name: found.outliers for name, found in registered.items()}
         frames = []
-        for one in inputs.frames:
-            inlier_masks = {c: m for c, m in one.masks.items() if one.name not in wrong.get(c, ())}
-            frames.append(replace(one, masks=inlier_masks))
+        for frame in inputs.frames:
+            inlier_masks = {
+                c: m for c, m in frame.masks.items() if frame.name not in wrong.get(c, ())
+            }
+            frames.append(replace(frame, masks=inlier_masks))
         cameras = [*self._known_cameras, *(found.camera for found in registered.values())]
         shape: tuple[Any, ...] = (np.zeros(len(self.body.kinematics.names), np.bool_),)
         if not missing_for_person(inputs.model):
@@ -528,9 +530,9 @@ class _Registration:
         """
         inputs, names, cameras = self.inputs, self.body.kinematics.names, self.registered
         if self.tracks:
-            (one, *_) = self.tracks.values()
-            self.parameters = describe_parameters(one.offsets, (), self.body.kinematics)
-            significant = {k.name: k.value for k in one.offsets if k.significant}
+            (result, *_) = self.tracks.values()
+            self.parameters = describe_parameters(result.offsets, (), self.body.kinematics)
+            significant = {k.name: k.value for k in result.offsets if k.significant}
             return corrected_urdf(inputs.model, folder, significant, {})
         start, static, turned = offsets_in_pictures(self.body, self.pictures, inputs.offset_joints)
         own = [replace(one, camera=turned.get(name, one.camera)) for name, one in cameras.items()]

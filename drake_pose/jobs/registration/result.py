@@ -98,17 +98,17 @@ def describe_pose(name: str, X: Array, found: RegisteredCamera | TargetPose) -> 
     }
 
 
-def describe_pictures(one: PictureRegistration | None, found: bool = False) -> dict[str, Any]:
+def describe_pictures(result: PictureRegistration | None, found: bool = False) -> dict[str, Any]:
     """Return a camera's part of summary.json on its masks and clock.
 
     Args:
-        one: the registration from pictures; None: it was registered from masks.
+        result: the registration from pictures; None: it was registered from masks.
         found: whether those masks were segmented from pictures; used with None only.
     """
-    if one is None:
+    if result is None:
         masks = "found" if found else "given"
         return {"masks": masks, "time_offset_s": None, "time_offset_sd_s": None}
-    offset, focal = one.time_offset, one.found.camera.focal_x
+    offset, focal = result.time_offset, result.found.camera.focal_x
     determined = offset if offset is not None and offset.determined else None
     drifting = offset if offset is not None and offset.drift else None
     return {
@@ -119,12 +119,13 @@ def describe_pictures(one: PictureRegistration | None, found: bool = False) -> d
         "time_drift_sd": drifting and drifting.drift_deviation,
         "time_offset_scores": [] if offset is None else offset.scores.round(4).tolist(),
         "focal_px": focal,
-        "focal_sd_px": one.focal_deviation * focal if one.focal_deviation else None,
-        "explained": one.fit.explained,
-        "explained_by_chance": one.by_chance,
-        "p_value": one.p_value,
-        "contour": one.fit.contour,
-        "runner_up": one.runner_up and _describe_runner_up(one.found.camera, *one.runner_up),
+        "focal_sd_px": result.focal_deviation * focal if result.focal_deviation else None,
+        "explained": result.fit.explained,
+        "explained_by_chance": result.by_chance,
+        "p_value": result.p_value,
+        "contour": result.fit.contour,
+        "runner_up": result.runner_up
+        and _describe_runner_up(result.found.camera, *result.runner_up),
     }
 
 
@@ -153,22 +154,22 @@ def _describe_span(part: CameraPart) -> dict[str, Any]:
     return {"part_of": part.of} | {name: one for name, one in times.items() if one is not None}
 
 
-def picture_warnings(one: PictureRegistration, assumed: bool) -> list[str]:
+def picture_warnings(result: PictureRegistration, assumed: bool) -> list[str]:
     """Return warnings of an unknown focal length, a drifting clock and an unknown time offset.
 
     assumed: whether the focal length was not given.
     """
-    name, texts = one.found.camera.name, []
+    name, focal, texts = result.found.camera.name, result.found.camera.focal_x, []
     if assumed:
         texts.append(
             f"camera '{name}': no focal length is given: it was estimated as "
-            f"{one.found.camera.focal_x:.0f} pixels (standard deviation "
-            f"{one.focal_deviation * one.found.camera.focal_x:.0f}); give it in the camera file if "
-            "it is known"
+            f"{focal:.0f} pixels (standard deviation {result.focal_deviation * focal:.0f}); give "
+            "it in the camera file if it is known"
         )
-    if one.time_offset is not None and one.time_offset.drift:
-        texts.append(describe_drift(name, one.time_offset.drift, one.time_offset.drift_deviation))
-    if one.time_offset is not None and not one.time_offset.determined:
+    clock = result.time_offset
+    if clock is not None and clock.drift:
+        texts.append(describe_drift(name, clock.drift, clock.drift_deviation))
+    if clock is not None and not clock.determined:
         texts.append(
             f"camera '{name}': its pictures do not determine its time offset to the joint log, "
             "because the robot moves too little or too slowly; add a faster motion"
@@ -280,25 +281,25 @@ def write_result(
     if urdf is not None:
         write_file(path, f"{inputs.model.path.stem}_calibrated.urdf", urdf)
     described = {}
-    for name, one in parts.items():
+    for name, entry in parts.items():
         found = registered[name]
         described[name] = without_nan(
             {
-                **{key: one[key] for key in ("link", "X_LC", "X_WC") if key in one},
+                **{key: entry[key] for key in ("link", "X_LC", "X_WC") if key in entry},
                 "errors": ["turn_x", "turn_y", "turn_z", "x", "y", "z"],
                 "covariance": found.covariance,
                 "alternatives": found.alternatives,
                 "outliers": list(found.outliers),
-                **{key: one[key] for key in ("zeros", "lengths", "target") if one.get(key)},
+                **{key: entry[key] for key in ("zeros", "lengths", "target") if entry.get(key)},
             }
         )
     write_file(path, "registration.yaml", yaml.safe_dump(described, sort_keys=False))
     write_summary(path, summary)
     write_file(path, REPORT, make_registration_report(path, summary))
-    links = {name: one["link"] for name, one in parts.items() if "link" in one}
+    links = {name: part["link"] for name, part in parts.items() if "link" in part}
     formats = summary["settings"]["exports"]
     write_exports(path, formats, inputs, cameras.values(), links, pictures or {})
-    spans = {k: _describe_span(one) for k, one in inputs.parts.items() if not one.is_whole}
+    spans = {k: _describe_span(part) for k, part in inputs.parts.items() if not part.is_whole}
     write_file(path, CAMERA_FILE, dump_cameras(cameras, links, spans=spans))
 
 
@@ -401,20 +402,20 @@ def parameter_rows(parameters: Mapping[str, Mapping[str, Any]]) -> list[tuple[st
     A row has the name, the value with its unit, the 95 % interval, and its significance in words.
     """
     rows: list[tuple[str, ...]] = []
-    for name, one in parameters.items():
-        if not one["determined"]:
-            gauge = f", correlated with {', '.join(one['gauge'])}" if one["gauge"] else ""
+    for name, entry in parameters.items():
+        if not entry["determined"]:
+            gauge = f", correlated with {', '.join(entry['gauge'])}" if entry["gauge"] else ""
             rows.append((name, "", "", f"not determined{gauge}"))
             continue
-        key = next(key for key in one if key.startswith("value_"))
+        key = next(key for key in entry if key.startswith("value_"))
         unit = key.removeprefix("value_")
-        value = f"{one[key]:.2f} {'%' if unit == 'percent' else unit}"
-        interval = f"{one[f'low_{unit}']:.2f} to {one[f'high_{unit}']:.2f}"
-        within = one[f"low_{unit}"] <= 0.0 <= one[f"high_{unit}"]
+        value = f"{entry[key]:.2f} {'%' if unit == 'percent' else unit}"
+        interval = f"{entry[f'low_{unit}']:.2f} to {entry[f'high_{unit}']:.2f}"
+        within = entry[f"low_{unit}"] <= 0.0 <= entry[f"high_{unit}"]
         word = "0 is in its interval" if within else "not significant at 5 % over all parameters"
-        word = "significant" if one["significant"] else f"{word}: not written into the URDF"
-        if one["significant"] and unit != "percent":
-            word += f": {describe_reading(one[key], one[f'sd_{unit}'], unit)}"
+        word = "significant" if entry["significant"] else f"{word}: not written into the URDF"
+        if entry["significant"] and unit != "percent":
+            word += f": {describe_reading(entry[key], entry[f'sd_{unit}'], unit)}"
         rows.append((name, value, interval, word))
     return rows
 
@@ -427,12 +428,12 @@ def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
     # The robot's parameters are the same in the parts of all cameras.
     first = next(iter(summary["cameras"].values()))
     pictures, pairs = [], []
-    for camera, one in summary["cameras"].items():
+    for camera, entry in summary["cameras"].items():
         # Written overlays from the worst to the best.
         # Frames without a silhouette are ordered by the points that do not fit.
         errors = {
             frame: 1.0 - part["inlier_ratio"] if part["E_total"] is None else part["E_total"]
-            for frame, part in one["frames"].items()
+            for frame, part in entry["frames"].items()
         }
         shown = (
             frame for frame in errors if (folder / OVERLAY / camera / f"{frame}.png").is_file()
@@ -491,7 +492,7 @@ def registration_answer(
         texts.insert(0, f"{len(refused)} refused, see the warnings: {listed([*refused])}.")
     are = "is an outlier" if outliers == 1 else "are outliers"
     texts.append(f"{outliers} of {count} {what}s {are}.")
-    if ambiguous := [name for name, one in cameras.items() if len(one["modes"]) > 1]:
+    if ambiguous := [name for name, camera in cameras.items() if len(camera["modes"]) > 1]:
         texts.append(f"Other poses fit equally well: {listed(ambiguous)}.")
     for key, name in (("zeros", "joint offsets"), ("lengths", "link scales")):
         if found := parts[0][key]:

@@ -25,12 +25,12 @@ BOTH = "scene and gripper"
 """The `evidence` of a camera that was registered from both."""
 
 
-def describe_tracks(one: TrackRegistration, kinematics: TreeKinematics) -> dict[str, Any]:
+def describe_tracks(result: TrackRegistration, kinematics: TreeKinematics) -> dict[str, Any]:
     """Return a camera's part of summary.json on its points, clock, focal length and offsets."""
-    clock, focal = one.time_offset, one.found.camera.focal_x
+    clock, focal = result.time_offset, result.found.camera.focal_x
     known = clock if clock is not None and clock.determined else None
-    view, seen = one.gripper, len(one.seen.uv) > 0
-    used = view is not None and not one.contradiction
+    view, seen = result.gripper, len(result.seen.uv) > 0
+    used = view is not None and not result.contradiction
     return {
         "evidence": (BOTH if seen else GRIPPER) if used else SCENE,
         "gripper": view
@@ -38,61 +38,61 @@ def describe_tracks(one: TrackRegistration, kinematics: TreeKinematics) -> dict[
             "contours_that_fit": view.ratio,
             "told": view.explained,
             "told_by_chance": None if math.isnan(view.chance) else view.chance,
-            "contradicts": one.contradiction or None,
+            "contradicts": result.contradiction or None,
         },
         "masks": "none",
         "mean_iou": None,
-        "points": len(np.unique(one.seen.points)),
-        "sightings": len(one.seen.uv),
-        "sightings_that_fit": float(one.inliers.mean()) if seen else None,
-        "explained": one.explained if seen else None,
-        "explained_by_chance": one.chance if seen else None,
+        "points": len(np.unique(result.seen.points)),
+        "sightings": len(result.seen.uv),
+        "sightings_that_fit": float(result.inliers.mean()) if seen else None,
+        "explained": result.explained if seen else None,
+        "explained_by_chance": result.chance if seen else None,
         "time_offset_s": known and known.value,
         "time_offset_sd_s": known and known.deviation,
         "focal_px": focal,
-        "focal_sd_px": one.focal_deviation * focal if one.focal_deviation else None,
-        **describe_parameters(one.offsets, (), kinematics),
+        "focal_sd_px": result.focal_deviation * focal if result.focal_deviation else None,
+        **describe_parameters(result.offsets, (), kinematics),
     }
 
 
-def track_warnings(one: TrackRegistration, assumed: bool) -> list[str]:
+def track_warnings(result: TrackRegistration, assumed: bool) -> list[str]:
     """Return warnings of likely joint offsets, and of what was estimated or is not determined.
 
     assumed: whether the focal length was not given.
     """
-    found, texts = one.found, list[str]()
+    found, texts = result.found, list[str]()
     name = found.camera.name
     if assumed:
-        focal, deviation = found.camera.focal_x, one.focal_deviation * found.camera.focal_x
+        focal, deviation = found.camera.focal_x, result.focal_deviation * found.camera.focal_x
         texts.append(
             f"camera '{name}': no focal length is given: it was estimated as {focal:.0f} pixels "
             f"(standard deviation {deviation:.0f}); give it in the camera file if it is known"
         )
-    if one.likely:
+    if result.likely:
         texts.append(
-            f"camera '{name}': offsets of {listed(one.likely)} explain the pictures much better: "
-            "estimate them, too (--zeros all). The camera's pose is the one that fits with them; "
-            "the joint positions were left as they are"
+            f"camera '{name}': offsets of {listed(result.likely)} explain the pictures much "
+            "better: estimate them, too (--zeros all). The camera's pose is the one that fits with "
+            "them; the joint positions were left as they are"
         )
-    if one.contradiction:
+    if result.contradiction:
         texts.append(
-            f"camera '{name}': the gripper in its pictures places it {one.contradiction} from "
+            f"camera '{name}': the gripper in its pictures places it {result.contradiction} from "
             "where the scene does; the scene's pose was taken: is the gripper the model's, is it "
             "mounted as there, and is its opening right?"
         )
-    if one.gripper is not None and not len(one.seen.uv):
+    if result.gripper is not None and not len(result.seen.uv):
         texts.append(
             f"camera '{name}': its pose comes from the gripper in its pictures alone, as the scene "
             "does not show enough: it is right only if the gripper is the model's, and if the "
             "pictures are not mirrored, which a symmetric gripper does not show"
         )
-    loose = [offset.name for offset in one.offsets if not offset.determined]
+    loose = [offset.name for offset in result.offsets if not offset.determined]
     if loose:
         texts.append(
             f"the offsets of {listed(loose)} are not determined by what camera '{name}' sees, and "
             "were not changed: they move the whole scene, or the camera, as another pose would"
         )
-    if one.time_offset is not None and not one.time_offset.determined:
+    if result.time_offset is not None and not result.time_offset.determined:
         texts.append(
             f"camera '{name}': its pictures do not determine its time offset to the joint log, "
             "because the robot moves too little or too slowly; add a faster motion"
@@ -100,25 +100,25 @@ def track_warnings(one: TrackRegistration, assumed: bool) -> list[str]:
     return texts
 
 
-def draw_tracks(folder: Path, one: TrackRegistration, most: int = 6) -> None:
+def draw_tracks(folder: Path, result: TrackRegistration, most: int = 6) -> None:
     """Draw inlier points in blue and outliers in orange, in up to `most` pictures.
 
     The gripper's contours are orange lines.
 
     folder: the result folder.
     """
-    camera, frames = one.found.camera.name, one.found.frames
-    silhouettes = {} if one.gripper is None else one.gripper.silhouettes
+    camera, frames = result.found.camera.name, result.found.frames
+    silhouettes = {} if result.gripper is None else result.gripper.silhouettes
     worst = sorted(range(len(frames)), key=lambda k: frames[k].inlier_ratio)
     for k in evenly_spaced(worst, most):
         name = frames[k].frame
-        picture = one.pictures[name].copy()
+        picture = result.pictures[name].copy()
         if name in silhouettes:
             shown = silhouettes[name].astype(np.uint8)
             contours, _ = cv2.findContours(shown, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
             cv2.drawContours(picture, contours, -1, EXCESS_RGB, 1)
-        in_picture = one.seen.frames == k
-        for (u, v), fits in zip(one.seen.uv[in_picture], one.inliers[in_picture], strict=True):
+        rows = result.seen.frames == k
+        for (u, v), fits in zip(result.seen.uv[rows], result.inliers[rows], strict=True):
             colour = (0, 114, 178) if fits else EXCESS_RGB
             place = round(float(u)), round(float(v))
             cv2.circle(picture, place, 4, colour, 2, cv2.LINE_AA)

@@ -18,87 +18,89 @@ def shift_unit(kind: str) -> tuple[str, float]:
     return (units | {"rate": ("percent", 100.0)}).get(kind, ("mm", 1e3))
 
 
-def describe_error(one: Finding, verb: str = "off") -> str:
+def describe_error(finding: Finding, verb: str = "off") -> str:
     """Return in words what is wrong, by how much, with standard deviations, and alternatives.
 
     Args:
-        one: of kind "joint", "camera", "base", "focal", "center", "clock" or "rate".
+        finding: of kind "joint", "camera", "base", "focal", "center", "clock" or "rate".
         verb: before the amount, such as "off" or "is off"; used for kinds "camera", "base" and
             "center" only.
     """
-    if one.kind == "clock":
-        word = "later" if one.shift > 0.0 else "earlier"
+    if finding.kind == "clock":
+        word = "later" if finding.shift > 0.0 else "earlier"
         return (
-            f"camera '{one.name}': its pictures show joint positions that are logged "
-            f"{1e3 * abs(one.shift):.0f} +- {1e3 * one.shift_sd:.0f} ms {word} than their times"
+            f"camera '{finding.name}': its pictures show joint positions that are logged "
+            f"{1e3 * abs(finding.shift):.0f} +- {1e3 * finding.shift_sd:.0f} ms {word} than their "
+            "times"
         )
-    if one.kind == "rate":
-        return describe_drift(one.name, one.shift, one.shift_sd)
-    name = "the base" if one.kind == "base" else f"{one.kind} '{one.name}'"
-    name = f"the {one.name}" if one.kind in ("focal", "center") else name
-    if one.alternatives:
-        name += f" (or {', '.join(one.alternatives)}: the masks do not distinguish them)"
-    angle, angle_sd = np.degrees([one.angle, one.angle_sd]).tolist()
-    unit, factor = shift_unit(one.kind)
-    shift, shift_sd = factor * one.shift, factor * one.shift_sd
-    if one.kind == "joint":
-        reading = (angle, angle_sd, "deg") if one.angle_sd > 0.0 else (shift, shift_sd, unit)
+    if finding.kind == "rate":
+        return describe_drift(finding.name, finding.shift, finding.shift_sd)
+    name = "the base" if finding.kind == "base" else f"{finding.kind} '{finding.name}'"
+    name = f"the {finding.name}" if finding.kind in ("focal", "center") else name
+    if finding.alternatives:
+        name += f" (or {', '.join(finding.alternatives)}: the masks do not distinguish them)"
+    angle, angle_sd = np.degrees([finding.angle, finding.angle_sd]).tolist()
+    unit, factor = shift_unit(finding.kind)
+    shift, shift_sd = factor * finding.shift, factor * finding.shift_sd
+    if finding.kind == "joint":
+        reading = (angle, angle_sd, "deg") if finding.angle_sd > 0.0 else (shift, shift_sd, unit)
         return f"{name} {describe_reading(*reading)}"
-    if one.kind == "focal":
+    if finding.kind == "focal":
         # The shift is the correction, so a positive one means too short.
-        word, many = "short" if shift > 0.0 else "long", one.name.startswith("focal lengths")
+        word, many = "short" if shift > 0.0 else "long", finding.name.startswith("focal lengths")
         verb = "are" if many else "is"
         return f"{name} {verb} {abs(shift):.1f} +- {shift_sd:.1f} {unit} too {word}"
     parts = []
-    if one.angle_sd > 0.0:
+    if finding.angle_sd > 0.0:
         parts.append(f"{angle:.2f} +- {angle_sd:.2f} degrees")
-    if one.shift_sd > 0.0:
-        at = f" ({1e3 * one.at_body:.1f} mm at the robot)" if one.at_body else ""
+    if finding.shift_sd > 0.0:
+        at = f" ({1e3 * finding.at_body:.1f} mm at the robot)" if finding.at_body else ""
         parts.append(f"{shift:.1f} +- {shift_sd:.1f} {unit}{at}")
     return f"{name}{':' if verb == 'off' else ''} {verb} by {' and '.join(parts)}"
 
 
-def describe_common_finding(one: Finding) -> str:
+def describe_common_finding(finding: Finding) -> str:
     """Return a finding common to all inlier frames in words, without a final full stop."""
-    pixels = f", which moves outlines by {one.pixels:.1f} pixels" if one.pixels else ""
-    link = f"link '{one.link}' is not where the log says"
-    if one.kind == "sign":
+    pixels = f", which moves outlines by {finding.pixels:.1f} pixels" if finding.pixels else ""
+    link = f"link '{finding.link}' is not where the log says"
+    if finding.kind == "sign":
         return (
-            f"joint '{one.name}' is logged with the other sign (reverse its column): {link}, "
-            f"{one.text}{pixels}"
+            f"joint '{finding.name}' is logged with the other sign (reverse its column): {link}, "
+            f"{finding.text}{pixels}"
         )
-    if one.kind == "log":
-        return f"{link}: joint '{one.name}' differs from the log, {one.text}{pixels}"
-    if one.kind == "link":
-        return f"{link}: {one.text}"
-    if one.kind == "refused":
-        return one.text
-    if one.kind == "reading":
-        return f"{one.name}{pixels}"
-    if one.kind == "moved" and not one.link:
-        if one.shift_sd:
-            return f"{describe_error(replace(one, kind='camera'), f'moved {one.text}')}{pixels}"
-        angle = f"{math.degrees(one.angle):.2f} degrees"
-        return f"camera '{one.name}' {one.text}, as by turns of {angle}{pixels}"
-    if one.kind == "moved":
-        off = describe_error(replace(one, kind=one.link), "is off")
-        what = "the base" if one.link == "base" else f"camera '{one.name}'"
-        return f"{what} was moved {one.text}, {off}{pixels}"
+    if finding.kind == "log":
+        return f"{link}: joint '{finding.name}' differs from the log, {finding.text}{pixels}"
+    if finding.kind == "link":
+        return f"{link}: {finding.text}"
+    if finding.kind == "refused":
+        return finding.text
+    if finding.kind == "reading":
+        return f"{finding.name}{pixels}"
+    if finding.kind == "moved" and not finding.link:
+        if finding.shift_sd:
+            error = describe_error(replace(finding, kind="camera"), f"moved {finding.text}")
+            return f"{error}{pixels}"
+        angle = f"{math.degrees(finding.angle):.2f} degrees"
+        return f"camera '{finding.name}' {finding.text}, as by turns of {angle}{pixels}"
+    if finding.kind == "moved":
+        off = describe_error(replace(finding, kind=finding.link), "is off")
+        what = "the base" if finding.link == "base" else f"camera '{finding.name}'"
+        return f"{what} was moved {finding.text}, {off}{pixels}"
     # Of a camera the text names another reading of its pose.
-    return f"{describe_error(one)} in all frames that agree{pixels}{one.text}"
+    return f"{describe_error(finding)} in all frames that agree{pixels}{finding.text}"
 
 
-def describe_frame_finding(one: FrameDiagnosis, found: Finding) -> str:
+def describe_frame_finding(frame: FrameDiagnosis, found: Finding) -> str:
     """Return the error of an outlier frame in words.
 
-    one: the frame's diagnosis. found: its finding.
+    frame: its diagnosis. found: its finding.
     """
     pixels = f"which moves outlines by {found.pixels:.1f} pixels"
     if found.kind == "unexplained":
-        worst = min(one.fitted_ratios, key=lambda name: one.fitted_ratios[name])
+        worst = min(frame.fitted_ratios, key=lambda name: frame.fitted_ratios[name])
         return (
             f"no positions near the given ones explain it: in camera '{worst}' "
-            f"{percent(one.fitted_ratios[worst])} of the contours fit at best"
+            f"{percent(frame.fitted_ratios[worst])} of the contours fit at best"
         )
     most = math.radians(10.0)
     if found.kind == "joint" and abs(found.angle) > most:

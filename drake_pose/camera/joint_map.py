@@ -321,7 +321,7 @@ def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str,
     series = [name for name in logged if name in starts_of]
     starts = {starts_of[name] for name in series}
     if len(series) > 1 and len(starts) == 1 and any(name not in matched for name in series):
-        # joint_1 of joint_0 to joint_6 is not joint1 of joint1 to joint7.
+        # Names of a series count from 0 or 1: joint_1 of joint_0 to joint_6 is the model's joint2.
         matched = {a: b for a, b in matched.items() if a not in series}
         guesses = {a: b for a, b in guesses.items() if a not in series}
         free = [name for name in wanted if name not in matched.values()]
@@ -354,9 +354,9 @@ def _words(name: str) -> list[str]:
 
 
 def _is_suffix(a: Sequence[str], b: Sequence[str]) -> bool:
-    """Return whether one of two names, given by `_words`, ends with all words of the other.
+    """Return whether one of two names a, b, given by `_words`, ends with all words of the other.
 
-    A shorter name of numbers only does not count.
+    If the shorter name has numbers only, the result is False.
     """
     short, long = sorted((a, b), key=len)
     return any(word.isalpha() for word in short) and long[-len(short) :] == short
@@ -528,7 +528,7 @@ def _pair(value: Any, field: str, where: str) -> tuple[float, float]:
         where: start of error messages.
 
     Raises:
-        CameraError: it is not such a list.
+        CameraError: the value is another.
     """
     low, high = value if isinstance(value, list) and len(value) == 2 else (0.0, 0.0)
     low, high = (check_number(one, field, where) for one in (low, high))

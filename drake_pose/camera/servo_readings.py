@@ -459,7 +459,7 @@ def correct_homing(
         return HomingCorrection(motor_name, before, before, 0, reason)
     sign = -1.0 if motor.is_inverted and not servos.is_dynamixel and encoding != "deg" else 1.0
     if servos.has_lists:
-        # Lists add their offset to what the motor counts, after inverting it.
+        # Calibrations by lists invert what the motor counts, then add the offset.
         counted = sign if encoding == "steps" else 1.0
         shift = round(math.copysign(offset / step, counted * column.scale * offset))
         return HomingCorrection(motor_name, before, before + shift, shift)

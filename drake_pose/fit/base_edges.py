@@ -254,7 +254,7 @@ def _median_slopes(
     masks = (draw_mask(moving, camera.X_CW @ kinematics.poses(row), camera) for row in values)
     dilated = [cv2.dilate(mask.astype(np.uint8), kernel) for mask in masks]
     covered = np.array(dilated).astype(np.bool_)
-    # Where all pictures are covered any of them will do: the pixel does not count.
+    # A pixel that is covered too often does not count: its median may have any value.
     seen, shown = covered.mean(axis=0) <= BASE.most_covered, pictures.copy()
     shown[covered & seen] = np.nan
     median = cv2.GaussianBlur(np.nanmedian(shown, axis=0), (0, 0), 0.7)
@@ -355,7 +355,7 @@ def _drawn_edges(
     v, u = np.nonzero((strength >= after) & (strength > before) & (strength > least))
     bend = before[v, u] - 2.0 * strength[v, u] + after[v, u]
     peak = np.clip(0.5 * (before[v, u] - after[v, u]) / np.minimum(bend, -1e-9), -1.0, 1.0)
-    # At an edge the nearer surface counts.
+    # An edge belongs to the nearer of two surfaces.
     nearness = cv2.dilate(picture[..., 3], np.ones((3, 3), np.uint8))[v, u].astype(float)
     known = nearness > 0.0
     z, edge_normals = 1.0 / nearness[known], across[v, u][known].astype(float)

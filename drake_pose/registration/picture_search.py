@@ -224,12 +224,12 @@ class PictureSearch:
             rotations: as of ``PyramidLevel.starts``.
             least_width: minimum width of the pictures in all rounds [pixel].
             others: maximum number of hypotheses of the first round, far from the best, that are
-                improved separately. The best two of them are returned last.
+                improved separately. The best two far ones are returned last.
             apart: minimum rotation between these and the best hypothesis [rad].
         """
         level = self._level(max(rounds[0][0], least_width))
         poses = level.starts(rotations)
-        # The most dissimilar frames select some of the starts.
+        # A few frames, the most dissimilar, select starts for the scores in all frames.
         first = ((2, 0.12), (4, 0.3)) if self._riding else ((4, 0.25),)
         for frames, fraction in (*first, (len(self.frames), 1.0)):
             poses = level.best(poses, frames, fraction)
@@ -559,7 +559,7 @@ def segment_picture(
     if around is not None:
         part = window_around(covered, round(around * float(np.sqrt(np.count_nonzero(covered)))))
     foreground, mask = np.zeros(covered.shape, np.float32), np.zeros(covered.shape, np.bool_)
-    # The mask is smoothed over a few pixels.
+    # The window is wider than the mask's reach by the pixels over which the mask is smoothed.
     window = window_around(covered[part], mask_reach(covered) + 8)
     as_is, tolerant = known.part(part).foreground(one.picture[part], gain, window)
     foreground[part] = tolerant

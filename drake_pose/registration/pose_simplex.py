@@ -118,8 +118,8 @@ def search_simplexes(
     Args:
         pictures: in which poses are scored.
         X_CW: (n, 3, 4) poses from which the coordinates `x` of ``move_pose`` are counted.
-        corners: (n, 7, 6) corners of each search's first simplex. Output: those of the last one,
-            best first.
+        corners: (n, 7, 6) corners of each search's first simplex; output: of its last simplex, best
+            first.
         costs: (n, 7) output: the corners' negative scores, ascending.
         evaluations: maximum number of scores for each pose, at least 7.
     """

@@ -217,8 +217,8 @@ def _find_cameras(
 
     Returns:
         the inputs as a scene of masks, and the registrations. In the inputs each picture is a frame
-        of its camera only, `known_cameras` are those that frames are compared with, and
-        `given_cameras` are those whose given poses are a finding.
+        of its camera only, `known_cameras` have the poses that frames are compared with, and
+        `given_cameras` are the cameras whose given pose is a finding.
 
     Raises:
         SceneError: no camera has a pose.

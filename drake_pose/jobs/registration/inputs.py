@@ -475,8 +475,8 @@ def _read_frames(
 ) -> tuple[MultiViewFrame, ...]:
     """Return the searched cameras' frames, with the known cameras' masks of the same frames.
 
-    With estimated positions at most `most` frames are used: the model's errors are the same in all
-    of them, so more frames add little. Empty masks are left out.
+    With estimated positions at most `most` frames are used: the model's errors are common to all
+    frames, so more frames add little. Empty masks are left out.
 
     wanted: names of the frames to read; empty: all.
 

@@ -52,7 +52,7 @@ class SceneFit:
             ``mask_excess_and_lack``.
         empty_frames: names of frames whose masks are all empty.
         found: the diagnosis of the fitted frames.
-        findings: the corrections as findings; () in a final result, whose diagnosis has them.
+        findings: the corrections as findings; () in a final result, where `found` includes them.
         warnings: for the user.
     """
 

@@ -49,7 +49,7 @@ def scene_corrections(
         factors: factors of focal lengths.
     """
     for reading in readings():
-        # A misread rotation with another mistake is compared with registered poses only.
+        # Those of a misread rotation and a second mistake are for `likeliest_reading` alone.
         for group in () if reading.is_turned and reading.steps > 1 else _groups(cameras):
             reread = [
                 camera.with_pose(reading.meant(camera.X_WC)) if camera.name in group else camera
@@ -251,7 +251,7 @@ def _rotations() -> dict[str, Callable[[Array], Array]]:
     }
     for given in ("xyz", "XYZ"):
         for meant, words in orders.items():
-            # What fixed z, y, x, read as moving x, y, z, means is among the others already.
+            # Fixed z, y, x read as moving x, y, z is the same as moving z, y, x read as fixed.
             if meant != given and (given, meant) != ("XYZ", "zyx"):
                 text = f"made of Euler angles about {words}, read as about {orders[given]}"
                 meanings[text] = partial(of_euler, given, meant)
@@ -304,7 +304,7 @@ def likeliest_reading(
     for reading in table:
         X = reading.meant(given)
         angle, shift = difference_of(X)
-        # The part of all rotations within an angle, and of a ball around the camera.
+        # The fraction of all rotations within the angle, and of positions within the shift.
         chance = (angle - np.sin(angle)) / np.pi if np.abs(X - given)[:3, :3].max() > 1e-9 else 1.0
         if reading.of_world:
             # Most cameras stand upright and look at the robot, so one angle decides.

@@ -233,7 +233,7 @@ class _Registration:
     def has_constants(self) -> bool:
         """Whether constants common to all frames are to be fitted."""
         settings = self._settings
-        # Cameras that see one target are first registered separately; it has one pose.
+        # Cameras that see the target are first registered each by itself, then with one pose of it.
         several = self.inputs.target is not None and len(self.registered) > 1
         focal = settings.focal and not self.pictures
         return bool(settings.zeros or settings.lengths or focal or several)
@@ -339,7 +339,7 @@ class _Registration:
         name, settings = found.camera.name, self._settings
         self.registered[name], self.suggestions[name] = found, None
         if settings.suggest and len(found.alternatives):
-            # Suggest joint positions that distinguish its poses.
+            # Suggest joint positions that distinguish the camera's poses.
             poses = [found.camera.X_WC, *found.alternatives]
             suggested = suggest_pose(self.body, found.camera, poses, settings.keep_out)
             if suggested is None:
@@ -437,7 +437,7 @@ class _Registration:
         Raises RegistrationError: no camera is left, or a refused camera was fitted with others.
         """
         inputs, body, frames = self.inputs, self.body.with_tree(self.inputs.tree), []
-        # All pictures of cameras that were registered from some of them.
+        # Cameras were registered from some of their pictures: here all pictures are compared.
         for name, result in self.pictures.items():
             recording, found = result.recording, self.registered[name]
             segmented, misfits, lost = evaluate_pictures(

@@ -270,7 +270,7 @@ def write_result(
     names = TreeKinematics(inputs.tree).names
     names = tuple(name for name in names if name not in TARGET_POSITIONS)
     for camera in pictures or ():
-        # Masks of the camera's frames, and joint positions at their times by its own clock.
+        # Masks of the camera's frames, and joint positions corrected by its time offset.
         rows = [["frame", *names]]
         for frame in inputs.of(camera):
             write_file(path, f"masks/{camera}/{frame.name}.png", encode_mask(frame.mask))
@@ -429,8 +429,8 @@ def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
     first = next(iter(summary["cameras"].values()))
     pictures, pairs = [], []
     for camera, entry in summary["cameras"].items():
-        # Written overlays from the worst to the best.
-        # Frames without a silhouette are ordered by the points that do not fit.
+        # Overlays are shown from the worst frame to the best.
+        # Frames without a silhouette are ordered by the fraction of points that do not fit.
         errors = {
             frame: 1.0 - part["inlier_ratio"] if part["E_total"] is None else part["E_total"]
             for frame, part in entry["frames"].items()

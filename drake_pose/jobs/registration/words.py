@@ -86,7 +86,7 @@ def describe_common_finding(finding: Finding) -> str:
         off = describe_error(replace(finding, kind=finding.link), "is off")
         what = "the base" if finding.link == "base" else f"camera '{finding.name}'"
         return f"{what} was moved {finding.text}, {off}{pixels}"
-    # Of a camera the text names another reading of its pose.
+    # The text of a camera's finding names another reading of its pose.
     return f"{describe_error(finding)} in all frames that agree{pixels}{finding.text}"
 
 
@@ -104,7 +104,7 @@ def describe_frame_finding(frame: FrameDiagnosis, found: Finding) -> str:
         )
     most = math.radians(10.0)
     if found.kind == "joint" and abs(found.angle) > most:
-        # Fits of single frames reach this far; larger estimates are no measurement.
+        # Fits of single frames are good up to this angle: a larger estimate is not stated.
         word = "low" if found.angle > 0.0 else "high"
         return f"joint '{found.name}' reads more than 10 degrees too {word}, {pixels}"
     if found.kind == "joints":

@@ -223,9 +223,9 @@ class TrackProblem(NamedTuple):
     prior: PosePrior | None = None
 
     def without(self, frames: Indices) -> "TrackProblem":
-        """Return the problem without the sightings in frames of these indices.
+        """Return the problem without the frames of these indices.
 
-        Points that are then seen once only are left out, too.
+        Points that are seen in fewer than two of the other frames are left out, too.
         """
         seen = self.seen
         kept = ~np.isin(seen.frames, frames)
@@ -509,7 +509,8 @@ def _sampson(t: Array, Rx: Array, R_B: Array, y: Array) -> tuple[Array, Array]:
 
     Args:
         t: (n, m, 3) translations of the camera between two pictures.
-        Rx: (n, m, 3) rays of the first pictures, rotated into the second ones by R_B (n, m, 3, 3).
+        Rx: (n, m, 3) rays of the first pictures, rotated into the second.
+        R_B: (n, m, 3, 3) these rotations.
         y: (m, 3) rays of the second pictures.
     """
     # A camera that only turns satisfies every constraint: such a pose explains nothing.

@@ -101,7 +101,7 @@ def _mutual(a: Array | None, b: Array | None) -> Indices:
     first = alike[rows, best]
     mutual = alike.argmax(axis=0)[best] == rows
     alike[rows, best] = -1.0
-    # Distances of unit vectors.
+    # The distance of unit vectors follows from their cosine.
     near, second = (np.sqrt(np.maximum(2.0 - 2.0 * cos, 0.0)) for cos in (first, alike.max(axis=1)))
     rows = rows[mutual & (near < MATCHING.ratio * second)]
     return np.stack([rows, best[rows]], axis=1)
@@ -138,7 +138,7 @@ def _tracks(edges: Indices, picture: Indices, uv: Array) -> Sightings:
     used = np.flatnonzero(size[label] > 1)
     key = label[used] * (picture.max() + 1) + picture[used]
     _, inverse, times = np.unique(key, return_inverse=True, return_counts=True)
-    # Two features of one picture on a track: which is right is not known.
+    # A track with two features in a picture is dropped: which feature is right is not known.
     ambiguous = np.unique(label[used][times[inverse] > 1])
     used = used[~np.isin(label[used], ambiguous)]
     _, points = np.unique(label[used], return_inverse=True)

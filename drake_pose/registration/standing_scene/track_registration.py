@@ -318,7 +318,7 @@ class _Scene(NamedTuple):
         gain, X = search.refine(X_WL, X_LC)
         explained, X, constants = self._timed(search, gain, X, constants)
         if poses_differ(X, X_LC, turn=STANDING_SCENE.near[0], shift=STANDING_SCENE.near[1]):
-            explained = 0.0  # Another pose explains them, not this one.
+            explained = 0.0  # The refinement went to another pose.
         chance = max(
             search.refine(np.roll(X_WL, shift, axis=0), X_LC)[0] for shift in self._shifts()
         )
@@ -460,7 +460,7 @@ def _require_motion(camera: PinholeCamera, link: str, X_WL: Array) -> None:
         raise RegistrationError(
             f"camera '{camera.name}': between its pictures link '{link}' turns by {turns[0]:.0f} "
             f"degrees about one axis and by {turns[1]:.1f} about others, and moves by {moved:.0f} "
-            f"mm (standard deviations): its pictures do not determine "
+            f"mm (root mean squares): its pictures do not determine "
             + ("its position along that axis" if moved >= STANDING_SCENE.least_motion else "scale")
             + ". Rotate the wrist by 20 degrees or more about at least two axes, and move it by "
             "100 mm, while the camera sees the same objects. Nothing was written"

@@ -1,12 +1,16 @@
 """Benchmarks of ratios measured in one process (`make bench`)."""
 
+import os
 import resource
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import trimesh
 from rich.console import Console
@@ -15,9 +19,6 @@ from scipy.spatial.transform import Rotation
 from drake_pose.body import TriangleMesh, bundled_model, load_model
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
-from drake_pose.files.settings import EstimateSettings
-from drake_pose.jobs.estimate.inputs import bundled_person
-from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.papers.date_capture import SilhouetteTrack, Studio, one_core
 from drake_pose.papers.kameda import (
     experiment_camera,
@@ -30,7 +31,7 @@ from drake_pose.registration.picture_registration import register_pictures
 from drake_pose.registration.recording import Recording
 from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.silhouette.pictures.masks import read_mask, signed_distances, write_mask
+from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.scoring import prefix_sums, score_bodies
 from drake_pose.silhouette.segmentation import person_region
 from drake_pose.systems.images import picture_to_colour_image
@@ -161,40 +162,54 @@ def measure_pictures(size: tuple[int, int] = (640, 480), frames: int = 30) -> tu
     return alone, image, own + 0.5 * (seconds - own)
 
 
-def measure_capture(folder: Path, frames: int = 60, cameras: int = 9) -> np.ndarray:
-    """Return the CPU times (3,) of a recorded person's capture [ms]: a frame of all cameras.
+def record_person(folder: Path, frames: int, cameras: int) -> None:
+    """Write a person's motion as masks in folder/masks, and as JPEG pictures in folder/pictures.
 
-    They are those of decoding all masks with one distance transform of each, of the capture without
-    overlays, and with overlays. The capture includes the search for the person, the fit of the
-    lengths and the report.
+    The pictures have masks in the first frame.
     """
     studio = Studio.build(cameras, (640, 480), np.random.default_rng([5, 1]))
-    save_cameras(folder / "cameras.yaml", studio.cameras)
-    (folder / "scene.yaml").write_text("sequence: true")
+    for kind in ("masks", "pictures"):
+        (folder / kind).mkdir()
+        save_cameras(folder / kind / "cameras.yaml", studio.cameras)
+        (folder / kind / "scene.yaml").write_text("sequence: true")
     motion = make_motion(studio.skeleton, 4 * FEWEST_FRAMES, 5)
-    paths = []
     for k, q in enumerate(motion.q[:frames]):
         for name, picture in studio.pictures(q).items():
-            paths.append(folder / "masks" / name / f"{k:04d}.png")
-            paths[-1].parent.mkdir(parents=True, exist_ok=True)
-            write_mask(paths[-1], person_region(picture, studio.backgrounds[name]))
+            mask = person_region(picture, studio.backgrounds[name])
+            for kind in ("masks", "pictures") if k == 0 else ("masks",):
+                path = folder / kind / "masks" / name / f"{k:04d}.png"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                write_mask(path, mask)
+            path = folder / "pictures" / "images" / name / f"{k:04d}.jpg"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(path), picture[..., ::-1])
 
-    def capture(out: str, overlay: bool, wanted: tuple[str, ...] = ()) -> None:
-        settings = EstimateSettings(method="person", frames=wanted)
-        estimate_scene(folder, bundled_person(), folder / out, settings, overlay=overlay)
 
-    times = []
-    with one_core():
-        capture("warm", True, ("0:2",))
-        for work in (
-            lambda: [signed_distances(read_mask(path)) for path in paths],
-            lambda: capture("bare", False),
-            lambda: capture("drawn", True),
-        ):
-            start = time.process_time()
-            work()
-            times.append(1e3 * (time.process_time() - start) / frames)
-    return np.array(times)
+def measure_capture(scene: Path, overlay: bool, frames: int) -> tuple[float, float]:
+    """Return the CPU time of capturing a recording [s], and that of a further frame of it.
+
+    They are those of whole processes, start-up, search and report included. The second is from the
+    recording and one of twice as many frames.
+
+    scene: the recording of 2 x `frames` frames.
+    """
+
+    def capture(count: int) -> float:
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        with tempfile.TemporaryDirectory() as folder:
+            subprocess.run(
+                [sys.executable, "-m", "drake_pose.commands.main", "capture", str(scene),
+                 "--out", f"{folder}/out", "--frame", f"0000:{count - 1:04d}",
+                 "--overlay" if overlay else "--no-overlay"],
+                check=True, stdout=subprocess.DEVNULL,
+                env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+            )  # fmt: skip
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+    capture(2)
+    once, twice = capture(frames), capture(2 * frames)
+    return once, (twice - once) / frames
 
 
 def _kernel_rows() -> Iterator[tuple[str, ...]]:
@@ -228,12 +243,16 @@ def _picture_rows() -> Iterator[tuple[str, ...]]:
     yield f"{alone:.1f} s", f"{1e3 * image:.1f} ms", f"{alone / image:.0f}", f"{shared / alone:.2f}"
 
 
-def _capture_rows() -> Iterator[tuple[str, ...]]:
+def _capture_rows(frames: int = 60, cameras: int = 9) -> Iterator[tuple[str, ...]]:
     with tempfile.TemporaryDirectory() as folder:
-        decoded, *captured = measure_capture(Path(folder))
-    yield "decoding and a distance transform", f"{decoded:.1f}", "1.0"
-    for what, one in zip(("overlays left out", "overlays"), captured, strict=True):
-        yield f"capture, {what}", f"{one:.1f}", f"{one / decoded:.1f}"
+        record_person(Path(folder), 2 * frames, cameras)
+        for kind in ("masks", "pictures"):
+            for overlay in (False, True):
+                whole, further = measure_capture(Path(folder) / kind, overlay, frames)
+                name = "JPEG pictures" if kind == "pictures" else kind
+                name = f"{name}, overlays" if overlay else name
+                numbers = 1e3 * whole / frames, 1e3 * further
+                yield name, *(f"{one:.0f}" for one in numbers), f"{whole - frames * further:.1f} s"
 
 
 def main() -> None:
@@ -248,8 +267,9 @@ def main() -> None:
     headings = ("cameras", "region and edge", "pose", "all", "a camera")
     title = "Date, all silhouettes, 640 x 480, one core: milliseconds a frame"
     print_table(title, headings, _cost_rows())
-    title = "Capture of 60 recorded frames, nine views, 640 x 480, one core"
-    print_table(title, ("work", "milliseconds a frame", "ratio"), _capture_rows())
+    title = "Capture of 60 recorded frames, nine views, 640 x 480: CPU time of the process"
+    headings = ("recorded", "milliseconds a frame", "a further frame", "start, search and report")
+    print_table(title, headings, _capture_rows())
     start = time.process_time()
     result = run_experiment(experiment_search())
     seconds = time.process_time() - start

@@ -179,10 +179,16 @@ def _register(
             raise
         rest = frames, focal, offset_joints, guessed_lens, most, undecided, is_mirrored, near
         return _register(body, camera, recording, *rest)
-    if opposite is not None and advantage > -undecided:
+    rivals = [] if opposite is None else [opposite]
+    if not is_mirrored and found.fit.ratios.mean() < ACCEPTANCE.sufficient_ratio:
+        # A wrong pose in mirrored pictures need not be opposite the right one.
+        mirrored = best.search.mirrored()
+        rivals += _coarse_fits([mirrored] * most, mirrored.search(others=0)[:most])
+    rival = max(rivals, key=lambda one: ratio_margin(one.ratios, best.ratios), default=None)
+    if rival is not None and ratio_margin(rival.ratios, best.ratios) > -undecided:
         other = None
         with suppress(RegistrationError):
-            other = fit(opposite, recording.mirrored())
+            other = fit(rival, recording.mirrored())
         if other is not None and ratio_margin(other.ratios, found.ratios) > 1.96:
             raise _mirrored_error(camera)
     return found

@@ -81,6 +81,7 @@ class RidingPictures:
         reference = np.median(floats, axis=0)
 
         def changes(images: Floats) -> Floats:
+            """Return the median difference (H, W) of images (f, H, W, 3) from the reference."""
             return np.asarray(np.median(largest(np.abs(images - reference)), axis=0))
 
         first = changes(floats)
@@ -97,7 +98,7 @@ class RidingPictures:
 
     @cached_property
     def sums(self) -> PixelSums:
-        """Kinds and edges of the images, for ``explain``."""
+        """Kinds of pixels and edges of the images; other sums of ``explain`` are not used."""
         count, (height, width) = len(self.pictures), self.deviations.shape
         sample = np.ascontiguousarray(self.pictures.reshape(-1, 3)[:: max(1, count * height // 60)])
         stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 10, 1.0)
@@ -218,7 +219,7 @@ class RidingColours(KnownBackground):
     def foreground(
         self, picture: Picture, gain: Floats, window: Window = (slice(None), slice(None))
     ) -> tuple[Floats, Floats]:
-        """Return log-odds that each pixel of an image shows the body, as the base class does."""
+        """Return (h, w) and (H, W) log-odds as the base class does; only their size differs."""
         corrected = apply_gain(picture, gain)
         numbers = colour_numbers(np.clip(corrected, 0.0, 255.0).astype(np.uint8))
         ratio = likeness(largest(np.abs(corrected - self.colours)) / self.deviations)

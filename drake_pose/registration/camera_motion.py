@@ -230,11 +230,11 @@ def _bracket(
 
 
 class _Background:
-    """Shifts of the background against a reference picture.
+    """Measures the shift of the background between a reference picture and others.
 
     Attributes:
         scale: width of the tracked pictures over that of the camera's.
-        least: minimum step [pixel of the tracked pictures].
+        least: minimum size of a step that counts [pixel of the tracked pictures].
 
     Args:
         read: returns picture k (H, W, 3).
@@ -321,7 +321,7 @@ class _Background:
 
 
 def _spread_corners(picture: NDArray[np.uint8]) -> Floats:
-    """Return the best corner (n, 2) of each tile of a picture (H, W) that has one."""
+    """Return the best corners (n, 2) of a picture (h, w), at most one of each tile [pixel]."""
     side = max(4, picture.shape[1] // MOTION.tiles)
     strength = cv2.cornerMinEigenVal(picture, 7)
     corners, best = [], []

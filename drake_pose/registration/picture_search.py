@@ -447,7 +447,7 @@ class PictureSearch:
 
     @property
     def _expected(self) -> dict[str, float]:
-        """Prior means of offsets that are added to the frames' values, by name [rad or m]."""
+        """Prior means of further joint offsets, by name; they undo `joint_offsets` [rad or m]."""
         return dict(zip(self._body.kinematics.names, -self.joint_offsets, strict=True))
 
     @cached_property

@@ -251,9 +251,11 @@ class MultiViewFrame:
 
 
 def require_size(camera: Camera, frame: str, mask: Mask) -> None:
-    """Refuse (MaskError) a mask (H, W) whose size differs from the camera's picture.
+    """Refuse a mask (H, W) whose size differs from the camera's picture.
 
     frame: the frame's name, for the message.
+
+    Raises MaskError: states both sizes.
     """
     if mask.shape != (camera.height, camera.width):
         raise MaskError(

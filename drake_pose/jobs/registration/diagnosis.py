@@ -373,13 +373,12 @@ def likely_offset_warnings(
 ) -> list[str]:
     """Return a warning of the likeliest joint offset that would explain all frames' residuals.
 
+    The list is empty if no offset is likely.
+
     Args:
         body: the robot's surfaces.
         found: the registered camera.
-        frames: its frames; at most 24 inliers are used.
-
-    Returns:
-        one warning, or none.
+        frames: the camera's frames; at most 24 inlier frames are used.
     """
     names = {frame.frame for frame in found.frames if frame.is_inlier}
     sample = evenly_spaced([frame for frame in frames if frame.name in names], 24)

@@ -158,7 +158,7 @@ class RegistrationInputs:
 
 
 def read_robot(path: Path, settings: AuditSettings) -> ArticulatedModel:
-    """Return the robot of a model file, without the links that are left out and what they carry.
+    """Return the robot of a model file, without links that the settings leave out.
 
     Raises:
         ModelError: the file cannot be used, or no link with a surface is left.
@@ -320,7 +320,7 @@ def _recording(
     kept = kept_pictures(camera, settings)
 
     def values_at(offset: float | Array) -> Array:
-        """Return values (n, m) of the tree at time offsets [s], as of ``Recording``."""
+        """Return the tree's values (n, m) at a time offset [s], see ``Recording``."""
         values = np.tile(default, (len(kept), 1))
         values[:, mapped.asked] = rows_of(mapped.log, camera, kept, np.asarray(offset))
         return values

@@ -34,10 +34,10 @@ class KnownPositions:
     """Positions of all joints in each frame.
 
     Args:
-        path: the table, or the scene they were estimated from.
+        path: the table, or the scene from which positions were estimated.
         kinematics: of the pose tree.
         values: (m,) values of the pose tree by ``frame_key``, a frame's number or name [rad or m].
-        is_estimate: whether they were estimated from pictures.
+        is_estimate: whether positions were estimated from masks or pictures.
         warnings: for the user.
         radius_scales: (nodes,) estimated factors of the nodes' radii; None: not estimated.
     """

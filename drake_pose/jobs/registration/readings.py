@@ -39,14 +39,14 @@ def scene_corrections(
         2.0,
     ),
 ) -> Iterator[Correction]:
-    """Yield corrections of mistakes that users make, each to be tried by itself.
+    """Yield corrections of mistakes that users make; each is to be tried by itself.
 
     Args:
         cameras: the cameras at their given poses.
         values: for each frame (m,) values of the pose tree [rad or m].
         frames: names of the frames, in order.
         pairs: maximum number of camera pairs that are exchanged.
-        factors: factors of focal lengths.
+        factors: of focal lengths.
     """
     for reading in readings():
         # Those of a misread rotation and a second mistake are for `likeliest_reading` alone.
@@ -108,7 +108,7 @@ def _groups(cameras: Sequence[Camera]) -> list[tuple[str, ...]]:
 
 
 def _mirrored(group: Collection[str]) -> Callable[[MultiViewFrame], MultiViewFrame]:
-    """Return a function that mirrors a frame's masks of the named cameras left to right."""
+    """Return a function that mirrors a frame's masks of the cameras in `group`, names."""
 
     def change(frame: MultiViewFrame) -> MultiViewFrame:
         masks = {
@@ -213,7 +213,7 @@ def _rotations() -> dict[str, Callable[[Array], Array]]:
         return np.asarray(Rotation.from_quat(turned).as_matrix())
 
     def of_vector(is_second: bool, R: Array) -> Array:
-        """The same rotation has a second triple of angles, beyond a quarter turn about y."""
+        """Return what R means; is_second: of its two triples of angles, that beyond 90 degrees."""
         vector = angles("xyz", R)
         if is_second:
             vector = np.array([0.0, np.pi, 0.0]) + [1.0, -1.0, 1.0] * vector + [np.pi, 0.0, np.pi]
@@ -221,7 +221,7 @@ def _rotations() -> dict[str, Callable[[Array], Array]]:
         return np.asarray(Rotation.from_rotvec(vector).as_matrix())
 
     def of_small_angles(R: Array) -> Array:
-        """Radians that were read as degrees are small."""
+        """Return what R means if its angles are so small that radians were read as degrees."""
         small = angles("xyz", R)
         scale = np.degrees(1.0) if np.abs(small).max() <= np.radians(np.pi) else 1.0
         return np.asarray(Rotation.from_euler("xyz", scale * small).as_matrix())
@@ -251,7 +251,7 @@ def _rotations() -> dict[str, Callable[[Array], Array]]:
     }
     for given in ("xyz", "XYZ"):
         for meant, words in orders.items():
-            # Fixed z, y, x read as moving x, y, z is the same as moving z, y, x read as fixed.
+            # Fixed z, y, x read as moving x, y, z is moving z, y, x read as fixed x, y, z.
             if meant != given and (given, meant) != ("XYZ", "zyx"):
                 text = f"made of Euler angles about {words}, read as about {orders[given]}"
                 meanings[text] = partial(of_euler, given, meant)

@@ -226,7 +226,7 @@ class _Registration:
 
     @property
     def shown(self) -> dict[str, dict[str, Picture]]:
-        """Pictures by camera and frame, of cameras registered from pictures."""
+        """Pictures (H, W, 3) by camera and frame name, of cameras registered from pictures."""
         return self.target_pictures | {name: one.pictures for name, one in self.pictures.items()}
 
     @property
@@ -289,7 +289,7 @@ class _Registration:
             self.inputs = self.inputs.without(self.refused)
 
     def _find_in_scene(self, link: str) -> None:
-        """Register each camera on a link from whatever stands still in its pictures."""
+        """Register each camera on the link from things that stand still in its pictures."""
         inputs = self.inputs
         base = inputs.tree.node_index((inputs.visible_nodes or ())[0])
         for camera in inputs.searched_cameras:

@@ -90,7 +90,7 @@ def describe_camera(
 
 
 def describe_pose(name: str, X: Array, found: RegisteredCamera | TargetPose) -> dict[str, Any]:
-    """Return a pose X (4, 4) under its name, with the standard deviations [mm, deg] of `found`."""
+    """Return a pose X (4, 4) as entry `name`, and the standard deviations [mm, deg] of `found`."""
     return {
         name: X.tolist(),
         "translation_sd_mm": 1e3 * found.translation_sd,
@@ -149,7 +149,7 @@ def describe_part(part: CameraPart | None) -> dict[str, Any]:
 
 
 def _describe_span(part: CameraPart) -> dict[str, Any]:
-    """Return the recorded camera of a part, and its times [s] if they are known."""
+    """Return entries on a part: the recorded camera, and the times [s] if they are known."""
     times = {"from": part.since, "until": part.until}
     return {"part_of": part.of} | {name: one for name, one in times.items() if one is not None}
 
@@ -191,7 +191,7 @@ def describe_parameters(
     """
 
     def describe(one: KinematicParameter, unit: str, factor: float) -> dict[str, Any]:
-        """Return a parameter's entry, with numbers times a factor to `unit` in their keys."""
+        """Return a parameter's entry; its numbers are multiplied by `factor`, to `unit`."""
         numbers = {"value": one.value, "sd": one.deviation, "low": one.low, "high": one.high}
         return {
             "determined": one.determined,
@@ -533,7 +533,7 @@ def plot_offset(camera: Mapping[str, Any]) -> "Figure | None":
 def check_exports(formats: Collection[str], cameras: Iterable[Camera]) -> None:
     """Refuse exports that could not be written, before any work.
 
-    formats: some of "ros", "mujoco", "drake" and "rerun".
+    formats: of ``RegistrationSettings.exports``; "lerobot" is ignored here.
 
     Raises:
         CameraError: a format does not support a camera.
@@ -556,11 +556,11 @@ def write_exports(
 
     Args:
         folder: the result folder.
-        formats: some of `ros`, `mujoco`, `drake` and `rerun`.
+        formats: of ``RegistrationSettings.exports``; "lerobot" is ignored here.
         inputs: the registration's inputs.
         cameras: cameras with poses in the world, or in the frames of links.
-        links: by name of each camera on a link, the link; in its frame is the camera's pose.
-        pictures: by camera and frame, for `rerun`.
+        links: by name of each camera on a link, the link, in whose frame the camera's pose is.
+        pictures: (H, W, 3) by camera and frame name, for `rerun`.
 
     Raises:
         OutputError: an export cannot be written.

@@ -230,12 +230,12 @@ def _link_poses(
 ) -> Callable[[Array], Array]:
     """Return a function of (1 + m,) constants: a time offset [s], and an offset for each value.
 
-    It returns the link's poses (pictures, 4, 4) at the pictures `rows`; the node `base` is the
-    world.
+    It returns the link's poses (pictures, 4, 4) at pictures `rows`, in the frame of node `base`.
     """
     logged_values = recording.values_at(0.0)[rows]
 
     def poses(constants: Array) -> Array:
+
         values = recording.values_at(float(constants[0]))[rows]
         # The log may end before the last picture's time.
         values = np.where(np.isfinite(values), values, logged_values) + constants[1:]

@@ -155,13 +155,13 @@ def audit_scene(
             for frame in found.frames
         },
         "found_cameras": {
-            name: describe_pictures(one)
-            | describe_pose("X_WC", one.found.camera.X_WC, one.found)
+            name: describe_pictures(result)
+            | describe_pose("X_WC", result.found.camera.X_WC, result.found)
             | {
-                "camera": describe_camera(one.found.camera),
-                "covariance": one.found.covariance.tolist(),
+                "camera": describe_camera(result.found.camera),
+                "covariance": result.found.covariance.tolist(),
             }
-            for name, one in pictures.found.items()
+            for name, result in pictures.found.items()
         },
         "minimum_detectable": {
             name: offset if math.isfinite(offset) else None for name, offset in detectable.items()

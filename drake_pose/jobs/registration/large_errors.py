@@ -159,9 +159,9 @@ class SceneComparison:
         why: why the camera cannot show the robot, in words.
         """
         given = self._inputs.known_cameras
-        if (one := self._search(given, [])) is not None:
-            finding = Finding("reading", one.name, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-            reread = self._compare(one.cameras, (one,))
+        if (correction := self._search(given, [])) is not None:
+            finding = Finding("reading", correction.name, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+            reread = self._compare(correction.cameras, (correction,))
             if not reread.is_doubtful:
                 return replace(reread, findings=(finding,), warnings=(f"as given, {why}",))
         placed = self._register(self._sample, given)
@@ -275,9 +275,9 @@ class SceneComparison:
                 if base is not None and len(placed) == len(cameras):
                     motions = [replace(base, pixels=motions[0].pixels)]
             when = "since then" if found.frames[-1].finding is not None else "until then"
-            for one in motions:
+            for motion in motions:
                 finding = replace(
-                    one, kind="moved", text=f"after frame '{last}'; {when}", link=one.kind
+                    motion, kind="moved", text=f"after frame '{last}'; {when}", link=motion.kind
                 )
                 moved.append(finding)
                 explained.update(dict.fromkeys(names, finding))

@@ -52,10 +52,10 @@ def lerobot_files(
     """
     units = {"value_deg": math.radians(1.0), "value_mm": 1e-3}
     offsets = {
-        joint: units[key] * one[key]
-        for joint, one in zeros.items()
+        joint: units[key] * entry[key]
+        for joint, entry in zeros.items()
         for key in units
-        if one["significant"] and one.get(key) is not None
+        if entry["significant"] and entry.get(key) is not None
     }
     mapped, path = require_data_set(inputs), inputs.scene.path
     columns = mapped.columns.items()
@@ -169,8 +169,8 @@ def _readme(
 | motor | homing_offset | corrected | its positions change by [steps] |
 | --- | --- | --- | --- |
 """
-    for one in corrections:
-        text += f"| {one.motor} | {one.before} | {one.after} | {one.shift:+d} |\n"
+    for motor in corrections:
+        text += f"| {motor.motor} | {motor.before} | {motor.after} | {motor.shift:+d} |\n"
     return (
         text + "\n`range_min` and `range_max` are as they were, now about the model's zero: the "
         "range is moved by as many steps as the positions, and at one end it may lie beyond where "

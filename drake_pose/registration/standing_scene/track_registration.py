@@ -235,7 +235,6 @@ def _link_poses(
     logged_values = recording.values_at(0.0)[rows]
 
     def poses(constants: Array) -> Array:
-
         values = recording.values_at(float(constants[0]))[rows]
         # The log may end before the last picture's time.
         values = np.where(np.isfinite(values), values, logged_values) + constants[1:]

@@ -504,7 +504,11 @@ def parameter_warnings(found: JointCalibration) -> list[str]:
     ]
     return with_cameras + [
         f"{what} is not determined by these silhouettes and was not changed"
-        + (f" (correlated with {', '.join(parameter.gauge)})" if parameter.gauge else "")
+        + (
+            f" (correlated with {', '.join(parameter.gauge)}: their values hold if it is 0)"
+            if parameter.gauge
+            else ""
+        )
         + "; add frames with other joint positions, or a view of a part that does not move with it"
         for what, parameter in requested
         if not parameter.determined

@@ -140,7 +140,14 @@ def _register(
         # Other starts in larger pictures, which show thin links, may lead to a pose that the first
         # missed, as they did in 2 of 3 drawn rooms with an SO-100.
         more = begun.search(rotations=1700, least_width=150)
-        near = _in_order([*near, *_fit_near(begun, more[:most], offset_joints, guessed_lens)])
+        near += _fit_near(begun, more[:most], offset_joints, guessed_lens)
+        if not offset_joints:
+            # In mirrored pictures a pose may be found more easily; the right one is opposite.
+            mirrored = begun.mirrored()
+            seen = mirrored.search(rotations=1700, least_width=150, others=0)[:most]
+            seen_mirrored = _coarse_fits([mirrored] * len(seen), seen)
+            near += [pose for one in seen_mirrored if (pose := opposite_pose(one)) is not None]
+        near = _in_order(near)
         poses += more
         by_chance = max(by_chance, explained_by_chance(near[0].search, least_width=150))
     best = near[0]

@@ -1,4 +1,7 @@
-"""Accept a camera that was fitted to pictures, and evaluate all its pictures."""
+"""Accept a camera that was fitted to pictures, and evaluate all its pictures.
+
+The evidence is compared with what chance explains, and with what mirrored pictures explain.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,10 +22,11 @@ from drake_pose.registration.picture_search import (
     PictureFit,
     PictureSearch,
     PosedPicture,
+    RoughPose,
     segment_picture,
 )
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
-from drake_pose.registration.pyramid_level import PICTURES
+from drake_pose.registration.pyramid_level import PICTURES, evidence
 from drake_pose.registration.recording import NO_CLOCK, Recording, TimeOffset, posed_pictures
 from drake_pose.registration.register import (
     FrameMisfit,
@@ -104,6 +108,78 @@ class PictureStart(NamedTuple):
         others = [np.linalg.inv(X) for X in one.found.alternatives]
         clock = one.time_offset or NO_CLOCK
         return cls(one.found.camera, rows, clock, others, one.by_chance, one.joint_offsets)
+
+
+def coarse_fits(searches: Sequence[PictureSearch], X_CW: Sequence[Array]) -> list[RoughPose]:
+    """Return cameras roughly fitted from poses (4, 4), best first.
+
+    Poses at which the body leaves the pictures are left out.
+    """
+    fitted = map_ordered(lambda one: one[0].coarse_fit(one[1]), zip(searches, X_CW, strict=True))
+    return in_order([one for one in fitted if one is not None])
+
+
+def in_order(poses: Sequence[RoughPose]) -> list[RoughPose]:
+    """Return poses, the one with the most evidence first."""
+    return sorted(poses, key=lambda one: -evidence(one.explained, one.contour))
+
+
+def explained_by_chance(
+    search: PictureSearch,
+    *,
+    rounds: Sequence[tuple[int, int, int, float]] = (
+        (64, 80, 24, 0.25),
+        (64, 30, 30, 0.15),
+        (80, 12, 50, 0.1),
+        (160, 4, 80, 0.06),
+    ),
+    rotations: int = 600,
+    least_width: int = 0,
+) -> float:
+    """Return the fraction that a search explains with the joint positions of other pictures.
+
+    Args:
+        search: a search with the pictures' own joint positions.
+        rounds, rotations, least_width: as of ``PictureSearch.search``. With a third of the usual
+            hypotheses the fractions have the same distribution: over 15 drawn rooms their
+            logarithms differ by 0.04 in the mean, with a standard deviation of 0.17.
+    """
+    exchanged = search.with_frames(exchange_values(search.frames))
+    best = exchanged.search(rounds, rotations, least_width, others=0)[:1]
+    found = coarse_fits([exchanged] * len(best), best)
+    return max((one.explained for one in found), default=0.0)
+
+
+def exchange_values(pictures: Sequence[PosedPicture], shift: int = 5) -> list[PosedPicture]:
+    """Return pictures with the values of others: each gets those `shift` places ahead."""
+    count = len(pictures)
+    return [
+        replace(one, values=pictures[(k + min(shift, count // 2)) % count].values, rates=None)
+        for k, one in enumerate(pictures)
+    ]
+
+
+def opposite_pose(
+    best: RoughPose, *, evaluations: int = 250, turn: float = 0.25, starts: int = 6
+) -> RoughPose | None:
+    """Return the best pose on the opposite side of the body, in the mirrored pictures.
+
+    From behind, a distant body has the mirror image of its silhouette. So mirrored pictures are
+    explained by a camera on the opposite side of the body, though less well, as near parts are
+    shown larger. Fewer of the contours fit then; what both poses explain differs too little.
+
+    Args:
+        best: the pose in the pictures as they are.
+        evaluations, turn: of each local search, see ``PyramidLevel.improve``.
+        starts: number of local searches.
+
+    Returns:
+        The pose; None: the body leaves the pictures.
+    """
+    mirrored = best.search.mirrored()
+    X_CW = best.search.compared.opposite(best.camera.X_CW)
+    _, improved = mirrored.compared.improve([X_CW] * starts, evaluations, turn)
+    return mirrored.coarse_fit(improved[0])
 
 
 def p_value_of(

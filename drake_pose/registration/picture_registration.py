@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,6 +26,11 @@ from drake_pose.registration.picture_acceptance import (
     PictureRegistration,
     PictureStart,
     accept_fit,
+    coarse_fits,
+    exchange_values,
+    explained_by_chance,
+    in_order,
+    opposite_pose,
     p_value_of,
     unexplained_error,
 )
@@ -36,7 +42,6 @@ from drake_pose.registration.picture_search import (
     ratio_margin,
     rotation_between,
 )
-from drake_pose.registration.pyramid_level import evidence
 from drake_pose.registration.recording import (
     NO_CLOCK,
     Recording,
@@ -48,6 +53,9 @@ from drake_pose.registration.recording import (
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.registration.shared_fit import SHARED
 from drake_pose.workers import map_ordered
+
+MOST_FITTED = 3
+"""Maximum number of pose hypotheses that are fitted."""
 
 
 def register_pictures(
@@ -73,8 +81,10 @@ def register_pictures(
     Raises RegistrationError: there are too few pictures with joint positions, the robot does not
         move, or no pose explains the pictures; the message says so if mirrored pictures fit.
     """
-    chosen = choose_pictures(body, camera, recording)
-    return _register(body, camera, recording, chosen, focal, offset_joints, guessed_lens)
+    frames = choose_pictures(body, camera, recording)
+    return _register(
+        _Task(body, camera, recording, frames, focal, tuple(offset_joints), guessed_lens)
+    )
 
 
 def register_near(
@@ -103,102 +113,153 @@ def register_near(
         return register_pictures(body, camera, recording, focal, offset_joints)
 
 
-def _register(
-    body: RegistrationBody,
-    camera: PinholeCamera,
-    recording: Recording,
-    frames: tuple[list[int], list[int]],
-    focal: float,
-    offset_joints: Sequence[str],
-    guessed_lens: bool = False,
-    most: int = 3,
-    undecided: float = 3.0,
-    is_mirrored: bool = False,
-    before: Sequence[RoughPose] = (),
-) -> PictureRegistration:
-    """As register_pictures.
+class _Task(NamedTuple):
+    """Arguments of ``register_pictures``, and frames: indices as of ``choose_pictures``.
+
+    is_mirrored: whether these are pictures that were mirrored for a second search.
+    """
+
+    body: RegistrationBody
+    camera: PinholeCamera
+    recording: Recording
+    frames: tuple[list[int], list[int]]
+    focal: float
+    offset_joints: tuple[str, ...]
+    guessed_lens: bool
+    is_mirrored: bool = False
+
+    def mirrored(self) -> "_Task":
+        """Return the same task in the mirrored pictures."""
+        camera, recording = self.camera.mirrored(), self.recording.mirrored()
+        return self._replace(camera=camera, recording=recording, is_mirrored=True)
+
+
+def _register(task: _Task) -> PictureRegistration:
+    """As register_pictures. Where no pose is accepted, the search is repeated from other starts."""
+    begun = PictureSearch(
+        task.body, task.camera, posed_pictures(task.recording, task.frames[0], 0.0)
+    )
+    poses = begun.search()
+    near = _fit_near(begun, poses, task)
+    if not near:
+        raise unexplained_error(task.camera, "no pose shows the body in two pictures")
+    by_chance, found = explained_by_chance(near[0].search), None
+    if p_value_of(near[0].explained, by_chance) <= ACCEPTANCE.max_p_value:
+        opposite = _require_unmirrored(task, near[0])
+        with suppress(RegistrationError):
+            found = _fit(task, near[0], by_chance, *_other_poses(near, poses))
+    if found is None:
+        more, near = _search_again(task, begun, near)
+        by_chance = max(by_chance, explained_by_chance(near[0].search, least_width=150))
+        opposite = _require_unmirrored(task, near[0])
+        found = _fit(task, near[0], by_chance, *_other_poses(near, [*poses, *more]))
+    _require_better_than_mirrored(task, near[0], opposite, found)
+    return found
+
+
+def _search_again(
+    task: _Task, begun: PictureSearch, near: Sequence[RoughPose]
+) -> tuple[list[Array], list[RoughPose]]:
+    """Search from other starts in larger pictures, which show thin links.
+
+    This finds poses that a first search missed, as it did in 2 of 3 drawn rooms with an SO-100.
 
     Args:
-        frames: indices as of choose_pictures.
-        most: maximum number of pose hypotheses that are fitted.
-        undecided: mirrored pictures are fitted, too, unless the rough fit in the pictures as they
-            are is better by this margin (``ratio_margin``). Where poses were right it was 6 to 15.
-        is_mirrored: whether these are pictures that were mirrored for a second search.
-        before: what a first search found, none of which was accepted; empty: this is the first.
+        begun: the first search.
+        near: its roughly fitted poses.
+
+    Returns:
+        The poses X_CW (4, 4) of this search, and all roughly fitted poses, the best first.
     """
-    chosen, moving = frames
-    begun = PictureSearch(body, camera, posed_pictures(recording, chosen, 0.0))
-    near, poses = [*before], list[Array]()
-    if not near:
-        poses = begun.search()
-        near = _fit_near(begun, poses[:most], offset_joints, guessed_lens)
-    if not near:
-        raise unexplained_error(camera, "no pose shows the body in two pictures")
-    by_chance = explained_by_chance(near[0].search)
-    again = bool(before) or p_value_of(near[0].explained, by_chance) > ACCEPTANCE.max_p_value
-    if again:
-        # Other starts in larger pictures, which show thin links, may lead to a pose that the first
-        # missed, as they did in 2 of 3 drawn rooms with an SO-100.
-        more = begun.search(rotations=1700, least_width=150)
-        near += _fit_near(begun, more[:most], offset_joints, guessed_lens)
-        if not offset_joints:
-            # In mirrored pictures a pose may be found more easily; the right one is opposite.
-            mirrored = begun.mirrored()
-            seen = mirrored.search(rotations=1700, least_width=150, others=0)[:most]
-            seen_mirrored = _coarse_fits([mirrored] * len(seen), seen)
-            near += [pose for one in seen_mirrored if (pose := opposite_pose(one)) is not None]
-        near = _in_order(near)
-        poses += more
-        by_chance = max(by_chance, explained_by_chance(near[0].search, least_width=150))
-    best = near[0]
+    again = partial(PictureSearch.search, rotations=1700, least_width=150)
+    more, opposite = again(begun), list[RoughPose | None]()
+    if not task.offset_joints:
+        # In mirrored pictures a pose may be found more easily; the right one is opposite.
+        mirrored = begun.mirrored()
+        seen = again(mirrored, others=0)[:MOST_FITTED]
+        opposite = [opposite_pose(pose) for pose in coarse_fits([mirrored] * len(seen), seen)]
+    fitted = [*near, *_fit_near(begun, more, task), *(one for one in opposite if one is not None)]
+    return more, in_order(fitted)
+
+
+def _fit(
+    task: _Task,
+    pose: RoughPose,
+    by_chance: float,
+    alternatives: Sequence[Array] = (),
+    runner_up: tuple[Array, float] | None = None,
+) -> PictureRegistration:
+    """Return the registration from a roughly fitted pose.
+
+    by_chance, alternatives, runner_up: as of ``PictureStart``.
+
+    Raises RegistrationError: the pose does not explain the pictures.
+    """
+    rows, offsets, clock = [*task.frames[0], *task.frames[1]], pose.search.joint_offsets, NO_CLOCK
+    corrected = task.recording.with_offsets(offsets)
+    fitted = pose.search.with_frames(posed_pictures(corrected, rows, 0.0, pose.search.frames))
+    if task.recording.times is not None:
+        clock = scan_time_offsets(fitted, pose.camera, corrected)
+    start = PictureStart(
+        pose.camera, rows, clock, alternatives, by_chance, offsets, fitted, runner_up
+    )
+    return fit_pictures(task.body, start, task.recording, task.focal, task.offset_joints)
+
+
+def _require_unmirrored(task: _Task, best: RoughPose) -> RoughPose | None:
+    """Raise a RegistrationError if more of the contours fits in mirrored pictures.
+
+    best: the roughly fitted pose in the pictures as they are.
+
+    Returns:
+        its `opposite_pose`.
+    """
     opposite = opposite_pose(best)
-    advantage = -np.inf if opposite is None else ratio_margin(opposite.ratios, best.ratios)
-    if advantage > 1.96:
-        error = unexplained_error(
-            camera,
-            f"at the best one {np.mean([*best.ratios.values()]):.0%} of the contours fit, and in "
-            "mirrored pictures more",
-        )
-        if is_mirrored:
-            raise error
-        both = camera.mirrored(), recording.mirrored()
+    if opposite is None or ratio_margin(opposite.ratios, best.ratios) <= 1.96:
+        return opposite
+    error = unexplained_error(
+        task.camera,
+        f"at the best one {np.mean([*best.ratios.values()]):.0%} of the contours fit, and in "
+        "mirrored pictures more",
+    )
+    if not task.is_mirrored:
         with suppress(RegistrationError):
-            _register(body, *both, frames, focal, offset_joints, guessed_lens, is_mirrored=True)
-            error = _mirrored_error(camera)
-        raise error
-    alternatives, runner_up = _other_poses(near, poses)
+            _register(task.mirrored())
+            error = _mirrored_error(task.camera)
+    raise error
 
-    def fit(pose: RoughPose, recording: Recording) -> PictureRegistration:
-        rows, offsets, clock = [*chosen, *moving], pose.search.joint_offsets, NO_CLOCK
-        corrected = recording.with_offsets(offsets)
-        fitted = pose.search.with_frames(posed_pictures(corrected, rows, 0.0, pose.search.frames))
-        if recording.times is not None:
-            clock = scan_time_offsets(fitted, pose.camera, corrected)
-        start = PictureStart(
-            pose.camera, rows, clock, alternatives, by_chance, offsets, fitted, runner_up
-        )
-        return fit_pictures(body, start, recording, focal, offset_joints)
 
-    try:
-        found = fit(best, recording)
-    except RegistrationError:
-        if again:
-            raise
-        rest = frames, focal, offset_joints, guessed_lens, most, undecided, is_mirrored, near
-        return _register(body, camera, recording, *rest)
+def _require_better_than_mirrored(
+    task: _Task,
+    best: RoughPose,
+    opposite: RoughPose | None,
+    found: PictureRegistration,
+    *,
+    undecided: float = 3.0,
+) -> None:
+    """Raise a RegistrationError if a fit in mirrored pictures is better than the one that is found.
+
+    Args:
+        best, opposite: roughly fitted poses in the pictures as they are, and in mirrored ones.
+        found: the registration from `best`.
+        undecided: mirrored pictures are fitted unless `best` is better than any pose in them by
+            this margin (``ratio_margin``). Where poses were right it was 5 to 20.
+    """
     rivals = [] if opposite is None else [opposite]
-    if not is_mirrored and found.fit.ratios.mean() < ACCEPTANCE.sufficient_ratio:
+    if not task.is_mirrored and found.fit.ratios.mean() < ACCEPTANCE.sufficient_ratio:
         # A wrong pose in mirrored pictures need not be opposite the right one.
         mirrored = best.search.mirrored()
-        rivals += _coarse_fits([mirrored] * most, mirrored.search(others=0)[:most])
+        seen = mirrored.search(others=0)[:MOST_FITTED]
+        rivals += coarse_fits([mirrored] * len(seen), seen)
     rival = max(rivals, key=lambda one: ratio_margin(one.ratios, best.ratios), default=None)
-    if rival is not None and ratio_margin(rival.ratios, best.ratios) > -undecided:
-        other = None
-        with suppress(RegistrationError):
-            other = fit(rival, recording.mirrored())
-        if other is not None and ratio_margin(other.ratios, found.ratios) > 1.96:
-            raise _mirrored_error(camera)
-    return found
+    if rival is None or ratio_margin(rival.ratios, best.ratios) <= -undecided:
+        return
+    try:
+        other = _fit(task.mirrored(), rival, found.by_chance)
+    except RegistrationError:
+        return
+    if ratio_margin(other.ratios, found.ratios) > 1.96:
+        raise _mirrored_error(task.camera)
 
 
 def _other_poses(
@@ -224,9 +285,9 @@ def _other_poses(
         for one in near[1:]
         if vuong_statistic(gains, one.search.compared.tile_gains(one.camera.X_CW)) <= 1.96
     ]
-    again = _coarse_fits([one.search for one in close], [one.camera.X_CW for one in close])
+    again = coarse_fits([one.search for one in close], [one.camera.X_CW for one in close])
     far = [one for one in poses if rotation_between(one, X_CW) > 8.0 * apart][:2]
-    others = _in_order([*again, *near[1:], *_coarse_fits([best.search] * len(far), far)])
+    others = in_order([*again, *near[1:], *coarse_fits([best.search] * len(far), far)])
     others = [one for one in others if rotation_between(one.camera.X_CW, X_CW) > apart]
     margins = [
         (one.camera.X_CW, ratio_margin(best.ratios, one.ratios)) for one in [*again, *others]
@@ -244,98 +305,19 @@ def _mirrored_error(camera: PinholeCamera) -> RegistrationError:
     )
 
 
-def _fit_near(
-    search: PictureSearch,
-    poses: list[Array],
-    offset_joints: Sequence[str],
-    guessed_lens: bool,
-) -> list[RoughPose]:
-    """Return roughly fitted cameras, best first.
+def _fit_near(search: PictureSearch, poses: Sequence[Array], task: _Task) -> list[RoughPose]:
+    """Return cameras roughly fitted from the first MOST_FITTED poses X_CW (4, 4), best first.
 
-    Args:
-        search: the search; those returned have joint offsets added, or another lens.
-        poses: X_CW (4, 4) from which the fits start.
-        offset_joints, guessed_lens: as of `_register`.
+    search: the search; those returned have joint offsets added, or another lens.
     """
-    if guessed_lens:
+    poses = poses[:MOST_FITTED]
+    if task.guessed_lens:
         search, poses = _scan_lenses(search, poses)
     searches = [search] * len(poses)
-    if offset_joints:
-        both = map_ordered(partial(search.fit_offsets, offset_joints), poses)
+    if task.offset_joints:
+        both = map_ordered(partial(search.fit_offsets, task.offset_joints), poses)
         searches, poses = [one for one, _ in both], [X_CW for _, X_CW in both]
-    return _coarse_fits(searches, poses)
-
-
-def _coarse_fits(searches: Sequence[PictureSearch], X_CW: Sequence[Array]) -> list[RoughPose]:
-    """Return cameras roughly fitted from poses (4, 4), best first.
-
-    Poses at which the body leaves the pictures are left out.
-    """
-    fitted = map_ordered(lambda one: one[0].coarse_fit(one[1]), zip(searches, X_CW, strict=True))
-    return _in_order([one for one in fitted if one is not None])
-
-
-def _in_order(poses: Sequence[RoughPose]) -> list[RoughPose]:
-    """Return poses, the one with the most evidence first."""
-    return sorted(poses, key=lambda one: -evidence(one.explained, one.contour))
-
-
-def explained_by_chance(
-    search: PictureSearch,
-    *,
-    rounds: Sequence[tuple[int, int, int, float]] = (
-        (64, 80, 24, 0.25),
-        (64, 30, 30, 0.15),
-        (80, 12, 50, 0.1),
-        (160, 4, 80, 0.06),
-    ),
-    rotations: int = 600,
-    least_width: int = 0,
-) -> float:
-    """Return the fraction that a search explains with the joint positions of other pictures.
-
-    Args:
-        search: a search with the pictures' own joint positions.
-        rounds, rotations, least_width: as of ``PictureSearch.search``. With a third of the usual
-            hypotheses the fractions have the same distribution: over 15 drawn rooms their
-            logarithms differ by 0.04 in the mean, with a standard deviation of 0.17.
-    """
-    exchanged = search.with_frames(exchange_values(search.frames))
-    best = exchanged.search(rounds, rotations, least_width, others=0)[:1]
-    found = _coarse_fits([exchanged] * len(best), best)
-    return max((one.explained for one in found), default=0.0)
-
-
-def exchange_values(pictures: Sequence[PosedPicture], shift: int = 5) -> list[PosedPicture]:
-    """Return pictures with the values of others: each gets those `shift` places ahead."""
-    count = len(pictures)
-    return [
-        replace(one, values=pictures[(k + min(shift, count // 2)) % count].values, rates=None)
-        for k, one in enumerate(pictures)
-    ]
-
-
-def opposite_pose(
-    best: RoughPose, *, evaluations: int = 250, turn: float = 0.25, starts: int = 6
-) -> RoughPose | None:
-    """Return the best pose on the opposite side of the body, in the mirrored pictures.
-
-    From behind, a distant body has the mirror image of its silhouette. So mirrored pictures are
-    explained by a camera on the opposite side of the body, though less well, as near parts are
-    shown larger. Fewer of the contours fit then; what both poses explain differs too little.
-
-    Args:
-        best: the pose in the pictures as they are.
-        evaluations, turn: of each local search, see ``PyramidLevel.improve``.
-        starts: number of local searches.
-
-    Returns:
-        The pose; None: the body leaves the pictures.
-    """
-    mirrored = best.search.mirrored()
-    X_CW = best.search.compared.opposite(best.camera.X_CW)
-    _, improved = mirrored.compared.improve([X_CW] * starts, evaluations, turn)
-    return mirrored.coarse_fit(improved[0])
+    return coarse_fits(searches, poses)
 
 
 def _scan_lenses(

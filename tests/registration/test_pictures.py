@@ -19,12 +19,12 @@ from drake_pose.registration.picture_acceptance import (
     PictureStart,
     accept_fit,
     evaluate_pictures,
+    exchange_values,
+    opposite_pose,
     p_value_of,
 )
 from drake_pose.registration.picture_registration import (
-    exchange_values,
     fit_pictures,
-    opposite_pose,
     register_pictures,
     squeezed_cameras,
 )

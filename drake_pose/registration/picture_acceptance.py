@@ -260,7 +260,7 @@ def accept_fit(
             f"the best one explains {max(best.explained, 0.0):.0%} of all changes, and one fitted "
             f"with the joint positions of other pictures {max(start.by_chance, 0.0):.0%} (p-value "
             f"{p_value:.2g}, at most {ACCEPTANCE.max_p_value:g}); {ratio:.0%} of the contours fit "
-            f"(minimum {least:.0%} where so much is explained; less is usual for the model of "
+            f"(minimum {least:.0%} at this explained fraction; less is usual for the model of "
             "another robot)",
         )
     deviations = np.sqrt(np.diag(best.covariance))

@@ -42,6 +42,7 @@ from drake_pose.registration.picture_search import (
     ratio_margin,
     rotation_between,
 )
+from drake_pose.registration.pyramid_level import PICTURES
 from drake_pose.registration.recording import (
     NO_CLOCK,
     Recording,
@@ -53,9 +54,6 @@ from drake_pose.registration.recording import (
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.registration.shared_fit import SHARED
 from drake_pose.workers import map_ordered
-
-MOST_FITTED = 3
-"""Maximum number of pose hypotheses that are fitted."""
 
 
 def register_pictures(
@@ -176,7 +174,7 @@ def _search_again(
     if not task.offset_joints:
         # In mirrored pictures a pose may be found more easily; the right one is opposite.
         mirrored = begun.mirrored()
-        seen = again(mirrored, others=0)[:MOST_FITTED]
+        seen = again(mirrored, others=0)[: PICTURES.fitted]
         opposite = [opposite_pose(pose) for pose in coarse_fits([mirrored] * len(seen), seen)]
     fitted = [*near, *_fit_near(begun, more, task), *(one for one in opposite if one is not None)]
     return more, in_order(fitted)
@@ -249,7 +247,7 @@ def _require_better_than_mirrored(
     if not task.is_mirrored and found.fit.ratios.mean() < ACCEPTANCE.sufficient_ratio:
         # A wrong pose in mirrored pictures need not be opposite the right one.
         mirrored = best.search.mirrored()
-        seen = mirrored.search(others=0)[:MOST_FITTED]
+        seen = mirrored.search(others=0)[: PICTURES.fitted]
         rivals += coarse_fits([mirrored] * len(seen), seen)
     rival = max(rivals, key=lambda one: ratio_margin(one.ratios, best.ratios), default=None)
     if rival is None or ratio_margin(rival.ratios, best.ratios) <= -undecided:
@@ -306,11 +304,11 @@ def _mirrored_error(camera: PinholeCamera) -> RegistrationError:
 
 
 def _fit_near(search: PictureSearch, poses: Sequence[Array], task: _Task) -> list[RoughPose]:
-    """Return cameras roughly fitted from the first MOST_FITTED poses X_CW (4, 4), best first.
+    """Return cameras roughly fitted from the first PICTURES.fitted poses X_CW (4, 4), best first.
 
     search: the search; those returned have joint offsets added, or another lens.
     """
-    poses = poses[:MOST_FITTED]
+    poses = poses[: PICTURES.fitted]
     if task.guessed_lens:
         search, poses = _scan_lenses(search, poses)
     searches = [search] * len(poses)

@@ -33,6 +33,7 @@ class PictureSettings(NamedTuple):
             wide, up to 120, and in wider ones.
         compare_width, background_width: width of the pictures in which poses are compared, and of
             those in which backgrounds are estimated [pixel].
+        fitted: maximum number of a search's pose hypotheses that are fitted to contours.
         contour_weight: weight of edges along the contours beside the explained fraction.
         rate_step: half the interval of the differences that estimate joint velocities [s].
     """
@@ -41,6 +42,7 @@ class PictureSettings(NamedTuple):
     triangles: tuple[int, int, int] = (12, 40, 100)
     compare_width: int = 160
     background_width: int = 320
+    fitted: int = 3
     contour_weight: float = 4.0
     rate_step: float = 0.05
 

@@ -112,10 +112,7 @@ def register_near(
 
 
 class _Task(NamedTuple):
-    """Arguments of ``register_pictures``, and frames: indices as of ``choose_pictures``.
-
-    is_mirrored: whether these are pictures that were mirrored for a second search.
-    """
+    """Arguments of ``register_pictures``, and frames: indices as of ``choose_pictures``."""
 
     body: RegistrationBody
     camera: PinholeCamera
@@ -124,12 +121,6 @@ class _Task(NamedTuple):
     focal: float
     offset_joints: tuple[str, ...]
     guessed_lens: bool
-    is_mirrored: bool = False
-
-    def mirrored(self) -> "_Task":
-        """Return the same task in the mirrored pictures."""
-        camera, recording = self.camera.mirrored(), self.recording.mirrored()
-        return self._replace(camera=camera, recording=recording, is_mirrored=True)
 
 
 def _register(task: _Task) -> PictureRegistration:
@@ -142,22 +133,31 @@ def _register(task: _Task) -> PictureRegistration:
     if not near:
         raise unexplained_error(task.camera, "no pose shows the body in two pictures")
     by_chance, found = explained_by_chance(near[0].search), None
+    mirrored = [opposite_pose(near[0])]
     if p_value_of(near[0].explained, by_chance) <= ACCEPTANCE.max_p_value:
-        opposite = _require_unmirrored(task, near[0])
         with suppress(RegistrationError):
             found = _fit(task, near[0], by_chance, *_other_poses(near, poses))
     if found is None:
-        more, near = _search_again(task, begun, near)
+        _require_unmirrored(task, near[0], mirrored, by_chance, least=1.96)
+        more, near, others = _search_again(task, begun, near)
+        mirrored = [opposite_pose(near[0]), *others]
         by_chance = max(by_chance, explained_by_chance(near[0].search, least_width=150))
-        opposite = _require_unmirrored(task, near[0])
-        found = _fit(task, near[0], by_chance, *_other_poses(near, [*poses, *more]))
-    _require_better_than_mirrored(task, near[0], opposite, found)
+        try:
+            found = _fit(task, near[0], by_chance, *_other_poses(near, [*poses, *more]))
+        except RegistrationError:
+            _require_unmirrored(task, near[0], mirrored, by_chance)
+            raise
+    elif found.fit.ratios.mean() < ACCEPTANCE.sufficient_ratio:
+        # A wrong pose in mirrored pictures need not be opposite the right one.
+        search = near[0].search.mirrored()
+        mirrored += _rough_fits(search, search.search(others=0))
+    _require_unmirrored(task, near[0], mirrored, by_chance, found)
     return found
 
 
 def _search_again(
     task: _Task, begun: PictureSearch, near: Sequence[RoughPose]
-) -> tuple[list[Array], list[RoughPose]]:
+) -> tuple[list[Array], list[RoughPose], list[RoughPose]]:
     """Search from other starts in larger pictures, which show thin links.
 
     This finds poses that a first search missed, as it did in 2 of 3 drawn rooms with an SO-100.
@@ -167,17 +167,17 @@ def _search_again(
         near: its roughly fitted poses.
 
     Returns:
-        The poses X_CW (4, 4) of this search, and all roughly fitted poses, the best first.
+        The poses X_CW (4, 4) of this search; all roughly fitted poses, the best first; and those in
+        mirrored pictures, none if joint offsets are fitted.
     """
     again = partial(PictureSearch.search, rotations=1700, least_width=150)
-    more, opposite = again(begun), list[RoughPose | None]()
+    more, seen = again(begun), list[RoughPose]()
     if not task.offset_joints:
-        # In mirrored pictures a pose may be found more easily; the right one is opposite.
-        mirrored = begun.mirrored()
-        seen = again(mirrored, others=0)[: PICTURES.fitted]
-        opposite = [opposite_pose(pose) for pose in coarse_fits([mirrored] * len(seen), seen)]
-    fitted = [*near, *_fit_near(begun, more, task), *(one for one in opposite if one is not None)]
-    return more, in_order(fitted)
+        search = begun.mirrored()
+        seen = _rough_fits(search, again(search, others=0))
+    # In mirrored pictures a pose may be found more easily; the right one is opposite.
+    opposite = [pose for one in seen if (pose := opposite_pose(one)) is not None]
+    return more, in_order([*near, *_fit_near(begun, more, task), *opposite]), seen
 
 
 def _fit(
@@ -204,60 +204,40 @@ def _fit(
     return fit_pictures(task.body, start, task.recording, task.focal, task.offset_joints)
 
 
-def _require_unmirrored(task: _Task, best: RoughPose) -> RoughPose | None:
-    """Raise a RegistrationError if more of the contours fits in mirrored pictures.
-
-    best: the roughly fitted pose in the pictures as they are.
-
-    Returns:
-        its `opposite_pose`.
-    """
-    opposite = opposite_pose(best)
-    if opposite is None or ratio_margin(opposite.ratios, best.ratios) <= 1.96:
-        return opposite
-    error = unexplained_error(
-        task.camera,
-        f"at the best one {np.mean([*best.ratios.values()]):.0%} of the contours fit, and in "
-        "mirrored pictures more",
-    )
-    if not task.is_mirrored:
-        with suppress(RegistrationError):
-            _register(task.mirrored())
-            error = _mirrored_error(task.camera)
-    raise error
-
-
-def _require_better_than_mirrored(
+def _require_unmirrored(
     task: _Task,
     best: RoughPose,
-    opposite: RoughPose | None,
-    found: PictureRegistration,
+    mirrored: Sequence[RoughPose | None],
+    by_chance: float,
+    found: PictureRegistration | None = None,
     *,
-    undecided: float = 3.0,
+    least: float = -3.0,
 ) -> None:
-    """Raise a RegistrationError if a fit in mirrored pictures is better than the one that is found.
+    """Raise a RegistrationError if a pose in mirrored pictures is accepted, and fits better.
 
     Args:
-        best, opposite: roughly fitted poses in the pictures as they are, and in mirrored ones.
-        found: the registration from `best`.
-        undecided: mirrored pictures are fitted unless `best` is better than any pose in them by
-            this margin (``ratio_margin``). Where poses were right it was 5 to 20.
+        best: the roughly fitted pose in the pictures as they are.
+        mirrored: those in mirrored pictures.
+        by_chance: as of ``PictureStart``.
+        found: the registration from `best`; None: it was refused.
+        least: the best of `mirrored` is fitted to the end if it is better than `best` by more than
+            this margin (``ratio_margin``). Where `best` was right the margin was -5 to -20; while
+            the time offset is unknown it says little.
     """
-    rivals = [] if opposite is None else [opposite]
-    if not task.is_mirrored and found.fit.ratios.mean() < ACCEPTANCE.sufficient_ratio:
-        # A wrong pose in mirrored pictures need not be opposite the right one.
-        mirrored = best.search.mirrored()
-        seen = mirrored.search(others=0)[: PICTURES.fitted]
-        rivals += coarse_fits([mirrored] * len(seen), seen)
-    rival = max(rivals, key=lambda one: ratio_margin(one.ratios, best.ratios), default=None)
-    if rival is None or ratio_margin(rival.ratios, best.ratios) <= -undecided:
+    rivals = [(ratio_margin(one.ratios, best.ratios), one) for one in mirrored if one is not None]
+    margin, rival = max(rivals, key=lambda one: one[0], default=(-np.inf, best))
+    if margin <= least:
         return
+    recording, camera = task.recording.mirrored(), task.camera.mirrored()
     try:
-        other = _fit(task.mirrored(), rival, found.by_chance)
+        other = _fit(task._replace(recording=recording, camera=camera), rival, by_chance)
     except RegistrationError:
         return
-    if ratio_margin(other.ratios, found.ratios) > 1.96:
-        raise _mirrored_error(task.camera)
+    if found is None or ratio_margin(other.ratios, found.ratios) > 1.96:
+        raise RegistrationError(
+            f"camera '{task.camera.name}': its pictures are mirrored: a pose explains them only "
+            "with left and right exchanged. Mirror them again. Nothing was written"
+        )
 
 
 def _other_poses(
@@ -295,12 +275,10 @@ def _other_poses(
     return level.distinct([X_CW, *alike])[1:], runner_up
 
 
-def _mirrored_error(camera: PinholeCamera) -> RegistrationError:
-    """Return the error for mirrored pictures."""
-    return RegistrationError(
-        f"camera '{camera.name}': its pictures are mirrored: a pose explains them only with left "
-        "and right exchanged. Mirror them again. Nothing was written"
-    )
+def _rough_fits(search: PictureSearch, poses: Sequence[Array]) -> list[RoughPose]:
+    """Return cameras fitted roughly from the first PICTURES.fitted poses (4, 4), best first."""
+    poses = poses[: PICTURES.fitted]
+    return coarse_fits([search] * len(poses), poses)
 
 
 def _fit_near(search: PictureSearch, poses: Sequence[Array], task: _Task) -> list[RoughPose]:

@@ -2,7 +2,6 @@
 
 from contextlib import nullcontext
 from dataclasses import replace
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -17,7 +16,6 @@ from drake_pose.fit.problem import TIME_OFFSET
 from drake_pose.registration.picture_acceptance import (
     PictureRegistration,
     PictureStart,
-    accept_fit,
     evaluate_pictures,
     exchange_values,
     opposite_pose,
@@ -584,31 +582,3 @@ def test_unknown_lens_of_squeezed_pictures_is_found(episode, recording):
     assert found.camera.focal_y == pytest.approx(camera.focal_y * side / camera.height, rel=0.05)
     error = pose_error(found.camera.X_WC, camera.X_WC)
     assert np.linalg.norm(error[3:]) < 3.0 * found.translation_sd
-
-
-@pytest.mark.parametrize(
-    ("ratio", "explained", "by_chance", "why"),
-    [
-        # Ratio and explained fraction must be sufficient together.
-        (0.46, 0.27, 0.05, r"46% .*minimum 48%"),
-        (0.46, 0.30, 0.05, None),
-        # Neither replaces the other one.
-        (0.39, 0.60, 0.05, r"minimum 40%"),
-        (0.60, 0.30, 0.20, r"p-value 0\.2"),
-        (0.74, 0.005, 0.0, r"p-value 0\.4"),
-        # So many contours fit in no wrong pose that explains something.
-        (0.76, 0.13, 0.20, None),
-        (0.76, 0.11, 0.20, r"p-value"),
-    ],
-)
-def test_poses_are_accepted_by_two_numbers_together(
-    episode: PaintedEpisode, ratio: float, explained: float, by_chance: float, why: str | None
-) -> None:
-    ratios = np.array([ratio - 0.1, ratio + 0.1])
-    fit = SimpleNamespace(views=(None,))
-    best = SimpleNamespace(fit=fit, ratios=ratios, explained=explained)
-    start = PictureStart(episode.camera, (), TimeOffset(0.0, 0.0, NO_SCORES), (), by_chance)
-    # An accepted fit is asked for its covariance next.
-    error, words = (AttributeError, "covariance") if why is None else (RegistrationError, why)
-    with pytest.raises(error, match=words):
-        accept_fit(best, None, start, np.zeros(5), 0.0)

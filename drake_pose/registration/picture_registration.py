@@ -138,9 +138,12 @@ def _register(task: _Task) -> PictureRegistration:
         with suppress(RegistrationError):
             found = _fit(task, near[0], by_chance, *_other_poses(near, poses))
     if found is None:
-        _require_unmirrored(task, near[0], mirrored, by_chance, least=1.96)
+        first = near[0]
+        _require_unmirrored(task, first, mirrored, by_chance, least=1.96)
         more, near, others = _search_again(task, begun, near)
-        mirrored = [opposite_pose(near[0]), *others]
+        if near[0] is not first:
+            mirrored = [opposite_pose(near[0])]
+        mirrored += others
         by_chance = max(by_chance, explained_by_chance(near[0].search, least_width=150))
         try:
             found = _fit(task, near[0], by_chance, *_other_poses(near, [*poses, *more]))

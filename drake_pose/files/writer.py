@@ -159,11 +159,21 @@ class ResultWriter:
 
     def add(self, record: FrameRecord) -> None:
         """Append a frame's row to poses.csv, which marks it as finished; renew an old summary."""
+        self.records[record.frame] = replace(record, masks=self._digests(record.frame))
         if self._table is not None:
             self._table.append(record)
-        self.records[record.frame] = replace(record, masks=self._digests(record.frame))
         if time.monotonic() > self._next_summary:
             self.write_summary()
+
+    def end(self) -> None:
+        """Write poses.csv and the summary of the finished frames, also after an interruption.
+
+        Ctrl-C may come while a row is appended. The table is therefore written again, so that both
+        files have the same frames.
+        """
+        if self._table is not None:
+            self._table.write(self._in_order().values())
+        self.write_summary()
 
     def write(self, name: str, content: bytes | str) -> None:
         """Write another file, ``name`` relative to the result folder; nothing without a folder."""
@@ -171,7 +181,7 @@ class ResultWriter:
             write_file(self.folder, name, content)
 
     def finish(self, replay: bool) -> None:
-        """Write the files about all frames; `write_summary` then marks the result as complete.
+        """Write the files about all frames; `end` then marks the result as complete.
 
         ``replay``: whether replay.html is written, too. Without a folder no file is written.
         """
@@ -180,8 +190,7 @@ class ResultWriter:
         self.warnings += camera_warnings(records, self.warnings)
         held = self._job.get("settings", {}).get("hold", {})
         self.warnings += poor_fit_warnings(records, self.model, held)
-        if self._table is not None and self.folder is not None:
-            self._table.write(records.values())
+        if self.folder is not None:
             rate_hz = self.scene.frame_rate_hz or USUAL_RATE_HZ
             rate = rate_hz if self.scene.sequence else None
             self.warnings += write_motion(
@@ -219,8 +228,13 @@ class ResultWriter:
         return make_replay(self.model, q, X_WB, cameras, period, ghost)
 
     def _in_order(self) -> dict[str, FrameRecord]:
-        """Return the finished frames by name, in the scene's order."""
-        return {f: self.records[f] for f in self.scene.frames if f in self.records}
+        """Return the finished frames by name, in the scene's order.
+
+        Frames that the scene does not name yet, as in a running capture, come last.
+        """
+        order = {frame: index for index, frame in enumerate(self.scene.frames)}
+        names = sorted(self.records, key=lambda frame: order.get(frame, len(order)))
+        return {frame: self.records[frame] for frame in names}
 
     def result(self) -> SceneEstimate:
         """Return the estimate so far, in the scene's order, including frames of an earlier job."""

@@ -198,6 +198,31 @@ def test_finished_frames_with_changed_masks_are_estimated_again(own_scene, tmp_p
     assert again.warnings[0].startswith("frame 0001: estimated again")
 
 
+@pytest.mark.parametrize("row_is_written", [False, True])
+def test_ctrl_c_while_a_row_is_appended_leaves_files_that_agree(
+    own_scene, tmp_path, monkeypatch, row_is_written
+):
+    scene, model = load_scene(own_scene.folder), load_model(own_scene.model)
+    result = ResultWriter(scene, model, {"scene": "s", "settings": {}}, tmp_path)
+    result.begin()
+    (first, q), (second, p), *_ = own_scene.truth.items()
+    result.add(FrameRecord(first, q, None, 0.01, 1.0))
+    append = PoseTable.append
+
+    def interrupted(table, record):
+        if row_is_written:
+            append(table, record)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(PoseTable, "append", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        result.add(FrameRecord(second, p, None, 0.01, 1.0))
+    result.end()
+    rows = (tmp_path / "poses.csv").read_text().splitlines()[1:]
+    assert [one.split(",")[0] for one in rows] == list(read_summary(tmp_path)["frames"])
+    assert [one.split(",")[0] for one in rows] == [first, second]
+
+
 @pytest.mark.parametrize("text", [None, "{", "[]"])
 def test_a_damaged_summary_is_named(tmp_path, text):
     if text is not None:

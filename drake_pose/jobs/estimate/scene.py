@@ -107,7 +107,7 @@ def estimate_scene(
                 result.warnings += compare_cameras(inputs, search, result.records, on_stage)
         result.finish(replay)
     finally:
-        result.write_summary()
+        result.end()
     return result.result()
 
 

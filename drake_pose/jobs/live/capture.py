@@ -144,7 +144,7 @@ def capture_live(
             interrupted = run_live(diagram, sensors, settings.seconds, report, monitor=frames.watch)
             frames.finish(sensors, settings.replay)
         finally:
-            writer.write_summary()
+            writer.end()
     estimate = writer.result()
     unreported = tuple(text for text in estimate.warnings if text not in reported)
     return LiveResult(estimate, interrupted, unreported)

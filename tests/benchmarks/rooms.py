@@ -219,6 +219,9 @@ def simulate(
     def at(times: Array) -> Array:
         q = np.tile(model.default_positions, (len(times), 1))
         q[:, moving] = centre + amplitude * np.sin(phase * 4.0 + rate * times[:, None])
+        # Drake does not enforce <mimic> on positions that are set.
+        for follower, leader, multiplier, offset in model.couplings:
+            q[:, follower] = multiplier * q[:, leader] + offset
         return q
 
     away = rng.uniform(*distance) * _around(rng, rng.uniform(-0.1, 0.8))

@@ -8,9 +8,11 @@ import pytest
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from drake_pose.body import load_model
 from drake_pose.commands.main import app
-from tests.benchmarks import figures, memory, registration
+from tests.benchmarks import figures, memory, registration, rooms
 from tests.benchmarks.tables import print_table
+from tests.body.models import joint, link, urdf, write
 
 MIB = 2**20
 
@@ -96,3 +98,19 @@ def test_no_table_of_figures_is_typed_by_hand():
         (k,) = (k for k, text in enumerate(texts) if figures.markers(name)[0] in text)
         texts[k] = figures.replaced(texts[k], name, "")
     assert not any("\n|" in text for text in texts)
+
+
+def test_followers_are_drawn_where_their_model_has_them(tmp_path, monkeypatch):
+    monkeypatch.setattr(rooms, "_PICTURES", 2)
+    finger = {"limits": 'lower="0" upper="0.8"'}
+    text = urdf(
+        link("world", ""), *map(link, ("one", "two")),
+        joint("lead", "revolute", "world", "one", **finger),
+        joint("other", "revolute", "world", "two", **finger,
+              more='<mimic joint="lead" multiplier="0.5" offset="0.1"/>'),
+    )  # fmt: skip
+    model = load_model(write(tmp_path, text), check=False)
+    drawn = rooms.simulate(model, tmp_path, 1).positions
+    lead, other = (drawn[:, model.position_index(name)] for name in ("lead", "other"))
+    assert np.ptp(lead) > 0.1
+    np.testing.assert_allclose(other, 0.5 * lead + 0.1)

@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -154,6 +154,61 @@ def map_joints(
     return MappedJoints(
         mapped, clipped, missing, unused, tuple(warnings), columns, encoding, tuple(joints)
     )
+
+
+def without_followers(
+    log: JointLog, followers: Mapping[str, Column], mapped: Collection[str] = ()
+) -> JointLog:
+    """Return a joint log without columns of followers of joints that have a column, too.
+
+    followers: see `follower_warnings`. mapped: columns that a joint map names; they stay.
+    """
+    gone = {name for name, one in followers.items() if one.name in log.names}.difference(mapped)
+    kept = [k for k, name in enumerate(log.names) if name not in gone]
+    names = tuple(log.names[k] for k in kept)
+    return replace(log, names=names, positions=log.positions[:, kept])
+
+
+def follower_warnings(
+    log: JointLog,
+    columns: Mapping[str, Column],
+    followers: Mapping[str, Column],
+    ranges: Mapping[str, float],
+    *,
+    slack: float = 0.1,
+) -> list[str]:
+    """Return a warning of columns that contradict those of the joints that they follow.
+
+    Args:
+        log: the joint log.
+        columns: by joint the linear map from its column. A column with the joint's own name, and
+            without offset, is in the unit of its followers' columns; with others nothing is
+            compared.
+        followers: by a follower's name the linear map from its joint's position.
+        ranges: upper minus lower limit of each joint [rad or m].
+        slack: tolerance, the smaller of this [rad or m] and this fraction of the joint's range.
+    """
+    readings_of, off = dict(zip(log.names, log.positions.T, strict=True)), dict[str, float]()
+    for name, one in followers.items():
+        column = columns.get(one.name, Column(""))
+        if name not in readings_of or (column.name, column.offset) != (one.name, 0.0):
+            continue
+        implied = one.scale * column.scale * readings_of[one.name] + one.offset
+        differences = np.abs(column.scale * readings_of[name] - implied)
+        worst = float(np.fmax.reduce(differences, initial=0.0))
+        if worst > abs(one.scale) * min(slack, slack * ranges[one.name]):
+            off[name] = worst
+    if not off:
+        return []
+    name = max(off, key=lambda name: off[name])
+    one, more = followers[name], [other for other in off if other != name]
+    beside = f" (so do: {', '.join(more)})" if more else ""
+    return [
+        f"column '{name}' differs by up to {off[name]:.3g} [rad or m] from {one.scale:g} x "
+        f"'{one.name}' {one.offset:+g}, which it follows in the model (<mimic>){beside}: parts are "
+        "posed by the <mimic>, not by this column; if the column is right, poses and joint offsets "
+        "are wrong: correct the model"
+    ]
 
 
 def motors_of(mapped: MappedJoints) -> list[tuple[ServoJoint, str]]:

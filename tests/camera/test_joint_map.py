@@ -10,9 +10,11 @@ from drake_pose.camera.episode import JointLog
 from drake_pose.camera.episode_files import open_episode
 from drake_pose.camera.joint_map import (
     Column,
+    follower_warnings,
     map_joints,
     match_names,
     read_joint_map,
+    without_followers,
 )
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 
@@ -177,6 +179,29 @@ def test_joint_maps_are_read_and_applied(tmp_path):
     ):
         with pytest.raises(UnknownNameError, match=message):
             map_log(ARM["names"], POSES, ARM, table=table)
+
+
+@pytest.mark.parametrize(("units", "unit"), [("rad", 1.0), ("deg", math.pi / 180.0)])
+def test_columns_of_followers_are_compared_with_the_joint_s(units, unit):
+    model = {"names": ("lead",), "lower": np.array([-1.0]), "upper": np.array([1.0])}
+    followers = {"same": Column("lead"), "mirror": Column("lead", -0.5, 0.2)}
+    lead = np.array([0.1, 0.6, 0.3])
+    columns = {"same": lead, "mirror": 0.2 - 0.5 * lead, "lead": lead}
+
+    def warnings(names=("same", "mirror", "lead"), **changed):
+        readings = np.column_stack([(columns | changed)[name] for name in names]) / unit
+        log = JointLog(names, 0.1 * np.arange(3), readings)
+        alone = without_followers(log, followers)
+        assert alone.names == ("lead",)
+        found = map_log(alone.names, alone.positions, model, units=units)
+        assert found.warnings == ()
+        return follower_warnings(log, found.columns, followers, {"lead": 2.0})
+
+    assert warnings() == []
+    assert warnings(("lead", "mirror"), mirror=columns["mirror"] + 0.04) == []
+    (one,) = warnings(mirror=-columns["mirror"], same=lead + 0.15)
+    assert "column 'mirror' differs by up to 0.3 [rad or m] from -0.5 x 'lead' +0.2" in one
+    assert "so do: same" in one
 
 
 def joints_of(urdf):

@@ -22,9 +22,16 @@ from drake_pose.camera.episode_files import (
     recorded_intrinsics,
     recording_format,
 )
-from drake_pose.camera.joint_map import MappedJoints, map_joints, read_joint_map
+from drake_pose.camera.joint_map import (
+    MappedJoints,
+    follower_warnings,
+    map_joints,
+    read_joint_map,
+    without_followers,
+)
 from drake_pose.camera.motor_calibration import Servos, read_motors
 from drake_pose.camera.picture_files import VIDEOS, frame_key
+from drake_pose.camera.servo_readings import Column
 from drake_pose.camera.sources import TIME_STAMPS
 from drake_pose.csv_files import read_csv, read_number
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
@@ -389,8 +396,10 @@ def map_log(path: Path, joints: JointLog, tree: PoseTree, settings: EpisodeSetti
         given = read_motors(settings.joint_map, servos.robot)
         joints = joints if given is None else replace(joints, servos=given)
         table = read_joint_map(settings.joint_map) if given is None else None
+    followers, in_map = followers_of(tree), [one.name for one in (table or {}).values()]
+    alone = without_followers(joints, followers, in_map)
     mapped = map_joints(
-        joints, names, kinematics.lower[asked], kinematics.upper[asked],
+        alone, names, kinematics.lower[asked], kinematics.upper[asked],
         kinematics.is_angle[asked], units=settings.units, table=table,
     )  # fmt: skip
     # A node is posed if its parent is, and its own joints are logged or held.
@@ -403,6 +412,8 @@ def map_log(path: Path, joints: JointLog, tree: PoseTree, settings: EpisodeSetti
     posed = tuple(node.name for node, known in nodes if known)
     unposed = tuple(node.name for node, known in nodes if not known)
     warnings, positions = list(mapped.warnings), mapped.log.positions
+    ranges = dict(zip(kinematics.names, kinematics.upper - kinematics.lower, strict=True))
+    warnings += follower_warnings(joints, mapped.columns, followers, ranges)
     if not posed:
         raise SceneError(
             f"{path}: every part of {tree.model.path.name} is moved by a joint that is not logged; "
@@ -421,6 +432,12 @@ def map_log(path: Path, joints: JointLog, tree: PoseTree, settings: EpisodeSetti
     log = replace(mapped.log, positions=np.where(missing, default, positions))
     logged = tuple(name for name in names if name not in mapped.not_logged)
     return TreeLog(log, asked, logged, posed, unposed, warnings, mapped)
+
+
+def followers_of(tree: PoseTree) -> dict[str, Column]:
+    """Return by name of each position that follows another one (<mimic>) the map from the other."""
+    names = tree.model.position_names
+    return {names[a]: Column(names[b], scale, offset) for a, b, scale, offset in tree.followers}
 
 
 def frames_of(camera: EpisodeCamera) -> tuple[str, ...]:

@@ -11,9 +11,12 @@ from scipy.spatial.transform import Rotation
 from drake_pose.arrays import Array
 from drake_pose.body import BASE_JOINTS, ArticulatedModel
 from drake_pose.body.tree_kinematics import TreeKinematics
+from drake_pose.camera.episode import JointLog
 from drake_pose.camera.episode_files import JOINT_TABLE
+from drake_pose.camera.joint_map import follower_warnings
 from drake_pose.camera.models import Camera
 from drake_pose.camera.picture_files import frame_key
+from drake_pose.camera.servo_readings import Column
 from drake_pose.errors import SceneError
 from drake_pose.files.records import base_pose
 from drake_pose.files.settings import EpisodeSettings, EstimateSettings
@@ -21,6 +24,7 @@ from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.estimate.measurements import (
     MeasuredPositions,
     check_units,
+    followers_of,
     has_times,
     read_measured_positions,
     timed_positions,
@@ -139,7 +143,8 @@ def read_known_positions(
         )
     # Columns of joints that move no visible part, and of followers, are ignored.
     known = {*needed, *kinematics.tree.unobserved_positions} if unobserved else set(needed)
-    known |= {model.position_names[follower.follower] for follower in kinematics.tree.followers}
+    followers = followers_of(kinematics.tree)
+    known |= {*followers}
     for column, name in enumerate(table.names if table.is_estimate else ()):
         # An estimate has columns of held positions, too; they must have the held values.
         index = model.position_index(name)
@@ -158,6 +163,11 @@ def read_known_positions(
     rows = table.values.items()
     values = {k: np.where(is_held, kinematics.lower, row[columns]) for k, row in rows}
     warnings += check_units(path, model, kinematics.names, values)
+    columns_of = {name: Column(name) for name in needed}
+    rows_of_table = np.array([*table.values.values()]).reshape(-1, len(table.names))
+    log = JointLog(table.names, None, rows_of_table)
+    ranges = dict(zip(kinematics.names, kinematics.upper - kinematics.lower, strict=True))
+    warnings += tuple(follower_warnings(log, columns_of, followers, ranges))
     return KnownPositions(path, kinematics, values, table.is_estimate, warnings)
 
 

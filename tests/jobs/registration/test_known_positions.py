@@ -15,6 +15,7 @@ from drake_pose.jobs.registration.positions import (
     put_on_base,
     read_known_positions,
 )
+from tests.body.models import joint, link, urdf, write
 
 URDF = """<robot name="slide"><link name="world"/>
   <link name="cart"><visual><geometry><box size="0.2 0.1 0.1"/></geometry></visual></link>
@@ -50,6 +51,19 @@ def test_columns_are_sorted_into_the_tree_s_order(tmp_path: Path) -> None:
     assert found.of("3", "left").tolist() == [0.0, 0.0]
     with pytest.raises(SceneError, match=r"joints\.csv: has no row of frame '0008'.*'left'"):
         found.of("0008", "left")
+
+
+def test_columns_of_followers_are_compared(tmp_path: Path) -> None:
+    mimic = '<mimic joint="lead" multiplier="-1"/>'
+    parts = [joint("lead", "revolute", "world", "one"),
+             joint("other", "revolute", "world", "two", more=mimic)]  # fmt: skip
+    path = write(tmp_path, urdf(link("world", ""), *map(link, ("one", "two")), *parts))
+    kinematics = TreeKinematics(load_model(path).pose_tree())
+    for value, count in (("-0.4", 0), ("0.4", 1)):
+        (tmp_path / "joints.csv").write_text(f"frame,lead,other\n0,0,0\n1,0.4,{value}\n")
+        found = read_known_positions(tmp_path / "joints.csv", kinematics)
+        assert found.of("1", "left").tolist() == [0.4]
+        assert sum("'other' differs by up to 0.8" in one for one in found.warnings) == count
 
 
 def test_poses_of_an_estimate_are_read(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from drake_pose.registration.picture_search import (
     segment_picture,
 )
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
-from drake_pose.registration.pyramid_level import PICTURES, evidence
+from drake_pose.registration.pyramid_level import PICTURES
 from drake_pose.registration.recording import NO_CLOCK, Recording, TimeOffset, posed_pictures
 from drake_pose.registration.register import (
     FrameMisfit,
@@ -116,12 +116,12 @@ def coarse_fits(searches: Sequence[PictureSearch], X_CW: Sequence[Array]) -> lis
     Poses at which the body leaves the pictures are left out.
     """
     fitted = map_ordered(lambda one: one[0].coarse_fit(one[1]), zip(searches, X_CW, strict=True))
-    return in_order([one for one in fitted if one is not None])
+    return best_first([one for one in fitted if one is not None])
 
 
-def in_order(poses: Sequence[RoughPose]) -> list[RoughPose]:
-    """Return poses, the one with the most evidence first."""
-    return sorted(poses, key=lambda one: -evidence(one.explained, one.contour))
+def best_first(poses: Sequence[RoughPose]) -> list[RoughPose]:
+    """Return poses sorted by their agreement with the pictures, see ``RoughPose``."""
+    return sorted(poses, key=lambda one: -one.agreement)
 
 
 def explained_by_chance(

@@ -26,10 +26,10 @@ from drake_pose.registration.picture_acceptance import (
     PictureRegistration,
     PictureStart,
     accept_fit,
+    best_first,
     coarse_fits,
     exchange_values,
     explained_by_chance,
-    in_order,
     opposite_pose,
     p_value_of,
     unexplained_error,
@@ -180,7 +180,7 @@ def _search_again(
         seen = _rough_fits(search, again(search, others=0))
     # In mirrored pictures a pose may be found more easily; the right one is opposite.
     opposite = [pose for one in seen if (pose := opposite_pose(one)) is not None]
-    return more, in_order([*near, *_fit_near(begun, more, task), *opposite]), seen
+    return more, best_first([*near, *_fit_near(begun, more, task), *opposite]), seen
 
 
 def _fit(
@@ -268,7 +268,7 @@ def _other_poses(
     ]
     again = coarse_fits([one.search for one in close], [one.camera.X_CW for one in close])
     far = [one for one in poses if rotation_between(one, X_CW) > 8.0 * apart][:2]
-    others = in_order([*again, *near[1:], *coarse_fits([best.search] * len(far), far)])
+    others = best_first([*again, *near[1:], *coarse_fits([best.search] * len(far), far)])
     others = [one for one in others if rotation_between(one.camera.X_CW, X_CW) > apart]
     margins = [
         (one.camera.X_CW, ratio_margin(best.ratios, one.ratios)) for one in [*again, *others]

@@ -110,6 +110,16 @@ class RoughPose(NamedTuple):
     contour: float
     ratios: Mapping[str, float]
 
+    @property
+    def agreement(self) -> float:
+        """The explained fraction plus the mean inlier ratio.
+
+        A wrong pose may explain more than the right one, or lie along stronger edges; then fewer of
+        its contours fit. In 25 drawn rooms and DROID's episodes the agreement of right poses was
+        0.85 to 1.5, and that of wrong ones beside them lower by 0.14 to 1.
+        """
+        return self.explained + float(np.mean([*self.ratios.values()]))
+
 
 def ratio_margin(
     ratios: Mapping[str, float], others: Mapping[str, float], floor: float = 0.02

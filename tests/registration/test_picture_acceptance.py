@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import RegistrationError
-from drake_pose.registration.picture_acceptance import PictureStart, accept_fit
+from drake_pose.fit.background import COLOURS, KnownBackground, foreground_picture
+from drake_pose.registration.picture_acceptance import PictureStart, accept_fit, best_first
+from drake_pose.registration.picture_search import PosedPicture, RoughPose, segment_picture
 from drake_pose.registration.recording import NO_CLOCK
 from tests.registration.episodes import PaintedEpisode
 
@@ -37,3 +39,34 @@ def test_poses_are_accepted_by_two_numbers_together(
     error, words = (AttributeError, "covariance") if why is None else (RegistrationError, why)
     with pytest.raises(error, match=words):
         accept_fit(best, None, start, np.zeros(5), 0.0)
+
+
+def test_poses_are_ranked_by_what_they_explain_and_by_their_contours() -> None:
+    """A wrong pose may explain more, or lie along stronger edges."""
+    right, strong, wide, blind = (
+        RoughPose(None, None, explained, contour, ratios)
+        for explained, contour, ratios in (
+            (0.10, 0.3, {"a": 0.6, "b": 0.8}),
+            (0.05, 0.9, {"a": 0.2, "b": 0.4}),
+            (0.40, 0.3, {"a": 0.1, "b": 0.3}),
+            (0.00, 0.0, {"a": 0.1}),
+        )
+    )
+    assert right.agreement == pytest.approx(0.8)
+    ranked = best_first([blind, strong, right, wide])
+    assert ranked == [right, wide, strong, blind]
+
+
+def test_pictures_are_segmented_up_to_a_distance_from_the_body() -> None:
+    """The distance is a fraction of the square root of the body's area, here 0.5 times 20."""
+    covered = np.zeros((80, 80), bool)
+    covered[30:50, 30:50] = True
+    colours, deviations = np.full((80, 80, 3), 60.0, np.float32), np.ones((80, 80), np.float32)
+    alike = np.zeros(COLOURS)
+    known = KnownBackground(colours, deviations, np.zeros((80, 80), bool), alike, alike)
+    posed = PosedPicture("a", np.zeros(1), np.full((80, 80, 3), 200, np.uint8))
+    frame = segment_picture(posed, known, np.eye(3, 4, dtype=np.float32), covered, around=0.5)
+    unknown = foreground_picture(np.zeros((1, 1), np.float32))[0, 0]
+    known_rows, known_columns = np.nonzero((frame.foreground != unknown).any(axis=2))
+    for places in (known_rows, known_columns):
+        assert (places.min(), places.max()) == (20, 59)

@@ -292,12 +292,7 @@ def _kalibr(
 
 
 def _lens(
-    size: Any,
-    matrix: Any,
-    distortion: Any,
-    fisheye: bool,
-    where: str,
-    largest_skew: float = 1e-3,
+    size: Any, matrix: Any, distortion: Any, fisheye: bool, where: str, largest_skew: float = 1e-3
 ) -> Lens:
     """Return a lens from a size [pixel], a camera matrix (3, 3) [pixel] and OpenCV's coefficients.
 

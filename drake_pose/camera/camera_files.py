@@ -8,11 +8,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from drake_pose.camera.calibration_files import (
-    FORMATS,
-    calibrated_cameras,
-    read_camera_content,
-)
+from drake_pose.camera.calibration_files import FORMATS, calibrated_cameras, read_camera_content
 from drake_pose.camera.models import (
     HALF_PIXEL,
     Camera,
@@ -24,12 +20,7 @@ from drake_pose.camera.models import (
     check_pose,
     write_file,
 )
-from drake_pose.camera.pose_files import (
-    RecordedPose,
-    recorded_poses,
-    recording_names,
-    same_camera,
-)
+from drake_pose.camera.pose_files import RecordedPose, recorded_poses, recording_names, same_camera
 from drake_pose.errors import CameraError, listed
 
 _SPAN = ("part_of", "from", "until")

@@ -297,12 +297,7 @@ def _choose_episode(path: Path, info: Mapping[str, Any], rows: _Rows, wanted: in
 
 
 def _read_table(
-    path: Path,
-    info: Mapping[str, Any],
-    rows: _Rows,
-    number: int,
-    parquet: Any,
-    warnings: list[str],
+    path: Path, info: Mapping[str, Any], rows: _Rows, number: int, parquet: Any, warnings: list[str]
 ) -> tuple[Any, Path]:
     """Return the table (pyarrow.Table) of an episode, and its file.
 

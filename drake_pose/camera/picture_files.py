@@ -229,12 +229,7 @@ def _read(path: Path, error_type: type[DrakePoseError]) -> bytes:
 
 
 def _decode(
-    data: bytes,
-    how: int,
-    path: Path,
-    error_type: type[DrakePoseError],
-    *,
-    only_png: bool = False,
+    data: bytes, how: int, path: Path, error_type: type[DrakePoseError], *, only_png: bool = False
 ) -> Picture:
     """Return a complete PNG or JPEG image as OpenCV decodes it: blue, green, red, or grey values.
 

@@ -99,9 +99,7 @@ def estimate(
 
 
 def demo(
-    *,
-    out: Annotated[Path, Parameter(alias="-o")] = Path("results/demo"),
-    json: Json = False,
+    *, out: Annotated[Path, Parameter(alias="-o")] = Path("results/demo"), json: Json = False
 ) -> None:
     """Estimate a man's pose from one silhouette that comes with the program.
 

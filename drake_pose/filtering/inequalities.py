@@ -104,11 +104,7 @@ def make_inequalities(
 
 
 def two_sided(
-    columns: Sequence[str],
-    name: str,
-    phi: ArrayLike,
-    lower: float,
-    upper: float,
+    columns: Sequence[str], name: str, phi: ArrayLike, lower: float, upper: float
 ) -> Inequalities:
     """Return lower <= phi^T x <= upper as two inequalities; infinite bounds are left out.
 

@@ -81,10 +81,7 @@ class FunctionMotion:
 
 
 def constant_velocity(
-    layout: StateLayout,
-    rate_changes: Mapping[str, float],
-    period: float,
-    memory: float = math.inf,
+    layout: StateLayout, rate_changes: Mapping[str, float], period: float, memory: float = math.inf
 ) -> LinearMotion:
     """Return a constant-velocity model whose rates are driven by white noise.
 

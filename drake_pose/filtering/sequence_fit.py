@@ -125,9 +125,7 @@ def tilted(observation: ContourObservation, x: Array, tilt: Sequence[float]) -> 
 
 
 def find_start(
-    tracker: ContourTracker,
-    x: Array,
-    masks: Sequence[Sequence[Mask | None]],
+    tracker: ContourTracker, x: Array, masks: Sequence[Sequence[Mask | None]]
 ) -> list[TrackedStart]:
     """Return tracked starts for a sequence fit, sorted by cost, ascending.
 
@@ -220,10 +218,7 @@ class FittedSequence:
 
 
 def fit_sequence(
-    tracker: ContourTracker,
-    masks: Sequence[Mask],
-    starts: Sequence[Sequence[Array]],
-    period: float,
+    tracker: ContourTracker, masks: Sequence[Mask], starts: Sequence[Sequence[Array]], period: float
 ) -> list[FittedSequence]:
     """Return the explanations of one camera's masks, sorted by cost, ascending.
 
@@ -280,9 +275,7 @@ def fit_sequence(
 
 
 def pose_set(
-    explanations: Sequence[FittedSequence],
-    poses: Sequence[tuple[Array, Array, float]],
-    frame: int,
+    explanations: Sequence[FittedSequence], poses: Sequence[tuple[Array, Array, float]], frame: int
 ) -> PoseSet:
     """Return the pose set of a frame: one mode per explanation, and joint intervals.
 

@@ -17,11 +17,7 @@ import numpy as np
 from drake_pose.arrays import Array, Indices, Mask
 from drake_pose.compiled import compiled
 from drake_pose.fit.kernel import accumulate_residuals, add_residual, poses_in_camera
-from drake_pose.silhouette.contour_points import (
-    find_crossings,
-    find_line_spans,
-    find_segments,
-)
+from drake_pose.silhouette.contour_points import find_crossings, find_line_spans, find_segments
 from drake_pose.silhouette.outline import PackedOutlines
 
 

@@ -34,10 +34,7 @@ def has_dask() -> bool:
 
 @contextmanager
 def open_cluster(
-    workers: int | None = None,
-    scheduler: str | None = None,
-    tries: int = 3,
-    timeout: float = 5.0,
+    workers: int | None = None, scheduler: str | None = None, tries: int = 3, timeout: float = 5.0
 ) -> Iterator[Client]:
     """Open a Dask client and, without ``scheduler``, workers on this machine; yields the client.
 

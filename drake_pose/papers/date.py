@@ -16,10 +16,7 @@ from drake_pose.body import landmarks_of_nodes, load_landmarks
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.papers.date_capture import PaperTrack, SilhouetteTrack, Studio, one_core
 from drake_pose.papers.tables import Count, figure_table, require_choice, uncounted
-from drake_pose.person.date.features import (
-    Features,
-    PersonView,
-)
+from drake_pose.person.date.features import Features, PersonView
 from drake_pose.person.date.skeleton import LIMBS
 from drake_pose.person.date.walking import REGISTERED, UPRIGHT, Motion, make_motion
 from drake_pose.systems.images import picture_to_colour_image

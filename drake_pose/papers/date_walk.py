@@ -68,10 +68,7 @@ class WalkThrough(NamedTuple):
 
 
 def run_walk_through(
-    cameras: int = 9,
-    seed: int = 0,
-    count: Count = uncounted,
-    size: tuple[int, int] = (640, 480),
+    cameras: int = 9, seed: int = 0, count: Count = uncounted, size: tuple[int, int] = (640, 480)
 ) -> WalkThrough:
     """Capture table 1's gestures by the paper's method, and walk by them.
 

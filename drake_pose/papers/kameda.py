@@ -213,11 +213,7 @@ def draw_values(
 
 
 def run_experiment(
-    search: PoseSearch,
-    images: int = 219,
-    seed: int = 0,
-    count: Count = uncounted,
-    views: int = 1,
+    search: PoseSearch, images: int = 219, seed: int = 0, count: Count = uncounted, views: int = 1
 ) -> RandomPoses:
     """Draw random poses and search them in their silhouettes.
 

@@ -8,12 +8,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Array
-from drake_pose.filtering.hand import (
-    FLEXIONS,
-    HAND_STATE,
-    SPREADS,
-    HandObservation,
-)
+from drake_pose.filtering.hand import FLEXIONS, HAND_STATE, SPREADS, HandObservation
 from drake_pose.filtering.hand_model import QUATERNION, TWO_FINGERS, HandModel
 from drake_pose.papers.shimada import (
     CASES,

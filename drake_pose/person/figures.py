@@ -59,11 +59,7 @@ class Person:
 
 
 def find_figures(
-    mask: Mask,
-    *,
-    speck: float = 0.05,
-    least_pixels: float = 16.0,
-    least_fraction: float = 2e-4,
+    mask: Mask, *, speck: float = 0.05, least_pixels: float = 16.0, least_fraction: float = 2e-4
 ) -> tuple[Figure, ...]:
     """Return the figures of a mask (H, W), the largest first, without specks.
 

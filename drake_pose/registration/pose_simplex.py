@@ -6,13 +6,7 @@ import numpy as np
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.compiled import compiled
-from drake_pose.fit.explain_kernel import (
-    Explained,
-    PixelSums,
-    Words,
-    explain_pose,
-    make_words,
-)
+from drake_pose.fit.explain_kernel import Explained, PixelSums, Words, explain_pose, make_words
 from drake_pose.silhouette.outline import PackedOutlines
 
 

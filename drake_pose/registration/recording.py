@@ -174,10 +174,7 @@ def choose_pictures(
 
 
 def posed_pictures(
-    recording: Recording,
-    indices: Sequence[int],
-    offset: float,
-    known: Sequence[PosedPicture] = (),
+    recording: Recording, indices: Sequence[int], offset: float, known: Sequence[PosedPicture] = ()
 ) -> list[PosedPicture]:
     """Return the pictures of `indices` that have logged values at a time offset [s].
 

@@ -444,12 +444,7 @@ class SharedFit:
         included = np.ones(len(self.rows), bool) if included is None else included
         own = self._own(at)[included]
         observations = [self._observations[k] for k in np.flatnonzero(included)]
-        return (
-            observations,
-            (own, at.shared),
-            (np.zeros_like(own), self._expected),
-            included,
-        )
+        return (observations, (own, at.shared), (np.zeros_like(own), self._expected), included)
 
     def _own(self, at: SharedValues) -> Array:
         """Return the own unknowns (rows, cameras): each mask's bias in its camera's column.

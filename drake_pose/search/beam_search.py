@@ -21,12 +21,7 @@ import numpy as np
 from drake_pose.body import PoseTree
 from drake_pose.search.branch_and_bound import PosesWithin, branch_and_bound
 from drake_pose.search.estimates import PoseEstimate, View, require_views
-from drake_pose.search.partial_poses import (
-    PartialPoses,
-    PoseStore,
-    SilhouetteBits,
-    coarsen,
-)
+from drake_pose.search.partial_poses import PartialPoses, PoseStore, SilhouetteBits, coarsen
 from drake_pose.search.pose_modes import ExaminationSettings, examine, renderer_tolerance
 from drake_pose.search.sampled_body import SampledBody, Scoring
 from drake_pose.search.settings import BeamSearchSettings, BoundLimits, Stage

@@ -15,11 +15,7 @@ from drake_pose.body import PoseTree
 from drake_pose.search.beam_search import BeamSearch
 from drake_pose.search.estimates import PoseSet
 from drake_pose.search.parts import NeighbourhoodSearch, PartSearch
-from drake_pose.search.refinement import (
-    RefinementBody,
-    RefinementProblem,
-    descend,
-)
+from drake_pose.search.refinement import RefinementBody, RefinementProblem, descend
 from drake_pose.search.settings import PASSES, ExactSearchSettings
 from drake_pose.search.views_fit import FittedPose, describe_modes
 

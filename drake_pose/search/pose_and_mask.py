@@ -29,11 +29,7 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import VERY_FEW, simplify_surfaces
 from drake_pose.silhouette.outline import TreeSurfaces
 from drake_pose.silhouette.pictures.masks import intersection_over_union
-from drake_pose.silhouette.scoring import (
-    draw_mask,
-    prefix_sums,
-    score_bodies,
-)
+from drake_pose.silhouette.scoring import draw_mask, prefix_sums, score_bodies
 from drake_pose.silhouette.segmentation import foreground_log_ratios, grab_cut
 from drake_pose.workers import map_ordered
 

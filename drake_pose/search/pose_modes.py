@@ -19,11 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from drake_pose.errors import SettingsError
-from drake_pose.search.branch_and_bound import (
-    PartialPoseGraph,
-    PosesWithin,
-    branch_and_bound,
-)
+from drake_pose.search.branch_and_bound import PartialPoseGraph, PosesWithin, branch_and_bound
 from drake_pose.search.estimates import JointEstimate, PoseEstimate, PoseMode, PoseSet, View
 from drake_pose.search.partial_poses import expand_groups
 from drake_pose.search.sampled_body import SampledBody, SampledTree

@@ -20,12 +20,7 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.fit.kernel import assemble_normal_equations
 from drake_pose.fit.levenberg_marquardt import Equations, StepSettings, damped_step
 from drake_pose.fit.parameters import BodyParameters, Placement
-from drake_pose.fit.raster_lines import (
-    Border,
-    compare_raster,
-    find_body_border,
-    find_border,
-)
+from drake_pose.fit.raster_lines import Border, compare_raster, find_body_border, find_border
 from drake_pose.search.estimates import View, require_views
 from drake_pose.search.settings import Pass
 from drake_pose.silhouette.outline import PackedSurfaces, TreeSurfaces

@@ -20,13 +20,7 @@ from scipy.special import stdtrit
 
 from drake_pose.body import PoseTree, nearest_turn
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.fit.contour_fit import (
-    FINEST_SCALE,
-    ContourFit,
-    Noise,
-    Views,
-    pack_views,
-)
+from drake_pose.fit.contour_fit import FINEST_SCALE, ContourFit, Noise, Views, pack_views
 from drake_pose.fit.covariance import (
     Distances,
     ErrorSizes,
@@ -289,9 +283,7 @@ def covariance_pose_set(
     )
     lower, upper = kinematics.local_limits(values)
     mode = FittedPose(
-        values,
-        low=np.maximum(values - widths, lower),
-        high=np.minimum(values + widths, upper),
+        values, low=np.maximum(values - widths, lower), high=np.minimum(values + widths, upper)
     )
     described = describe_modes(kinematics, tree, [mode], [pose.J], 0.0, True)
     # Keep the pose's own root, which may differ from the tree's.

@@ -286,11 +286,7 @@ def grab_cut_box(picture: Picture, box: Sequence[float]) -> Mask:
 
 
 def grab_cut(
-    picture: Picture,
-    labels: NDArray[np.uint8],
-    iterations: int = 6,
-    stride: int = 1,
-    seed: int = 1,
+    picture: Picture, labels: NDArray[np.uint8], iterations: int = 6, stride: int = 1, seed: int = 1
 ) -> Mask:
     """Segment an object by GrabCut (Rother et al., 2004).
 

@@ -9,14 +9,7 @@ from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import (
-    Context,
-    DiagramBuilder,
-    EventStatus,
-    InputPort,
-    State,
-    System,
-)
+from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, InputPort, State, System
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
 from drake_pose.arrays import Mask, Picture

@@ -10,15 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.camera.episode_files import open_episode
 from drake_pose.errors import SceneError
-from tests.camera.recordings import (
-    GRID,
-    SIDE,
-    K,
-    distorted,
-    number_of,
-    numbered,
-    shade,
-)
+from tests.camera.recordings import GRID, SIDE, K, distorted, number_of, numbered, shade
 
 COUNT, START = 12, 1_700_000_000 * 10**9
 PLUMB = (-0.2, 0.05, 1e-3, -2e-3, 0.0)

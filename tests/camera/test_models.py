@@ -10,12 +10,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.sensors import CameraInfo
 
 from drake_pose.camera.drake import camera_from_drake, camera_to_drake
-from drake_pose.camera.models import (
-    FACE_CAMERA,
-    ParallelCamera,
-    PinholeCamera,
-    circle_of_cameras,
-)
+from drake_pose.camera.models import FACE_CAMERA, ParallelCamera, PinholeCamera, circle_of_cameras
 from drake_pose.errors import CameraError
 
 

@@ -11,13 +11,7 @@ import pytest
 from drake_pose import audit_scene, estimate_scene, make_masks, register_scene
 from drake_pose.body import load_model
 from drake_pose.errors import OutputError, SceneError, SettingsError
-from drake_pose.files.folder import (
-    claimed,
-    read_summary,
-    write_file,
-    write_summary,
-    writes_folder,
-)
+from drake_pose.files.folder import claimed, read_summary, write_file, write_summary, writes_folder
 from drake_pose.files.records import FrameRecord, PoseTable, read_earlier_summary
 from drake_pose.files.writer import ResultWriter
 from drake_pose.jobs.batch import run_batch

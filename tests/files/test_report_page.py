@@ -18,12 +18,7 @@ from drake_pose.camera.models import ParallelCamera, PinholeCamera, look_at
 from drake_pose.files import report_page
 from drake_pose.files.records import FrameRecord, SceneEstimate, summarize
 from drake_pose.files.replay import make_replay
-from drake_pose.files.report_page import (
-    draw_grid,
-    make_report,
-    plot_curves,
-    plot_uri,
-)
+from drake_pose.files.report_page import draw_grid, make_report, plot_curves, plot_uri
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.silhouette.pictures.scenes import Scene

@@ -26,10 +26,7 @@ class PersonScene:
 
 
 def record_person(
-    folder: Path,
-    frames: int = 3,
-    sequence: bool = True,
-    size: tuple[int, int] = (160, 120),
+    folder: Path, frames: int = 3, sequence: bool = True, size: tuple[int, int] = (160, 120)
 ) -> PersonScene:
     """Write a recording of a person who raises an arm."""
     folder.mkdir(parents=True, exist_ok=True)

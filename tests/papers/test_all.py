@@ -10,12 +10,7 @@ from drake_pose.commands.main import app
 from drake_pose.errors import OutputError, SettingsError
 from drake_pose.papers import all_experiments
 from drake_pose.papers.all_experiments import EXPERIMENTS, Experiment, reproduce_all
-from drake_pose.papers.tables import (
-    figure_table,
-    require_choice,
-    require_counts,
-    spread_over_seeds,
-)
+from drake_pose.papers.tables import figure_table, require_choice, require_counts, spread_over_seeds
 from tests.cli import CliRunner
 
 

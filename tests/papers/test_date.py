@@ -120,11 +120,7 @@ class TestWalkThrough:
 
 
 @pytest.mark.parametrize(
-    ("bad", "word"),
-    [
-        ({"method": "magic"}, "silhouette, paper"),
-        ({"cameras": 2}, "3 or more"),
-    ],
+    ("bad", "word"), [({"method": "magic"}, "silhouette, paper"), ({"cameras": 2}, "3 or more")]
 )
 def test_arguments_are_checked(bad, word):
     with pytest.raises(SettingsError, match=word):

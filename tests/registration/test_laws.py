@@ -40,12 +40,7 @@ from drake_pose.registration.register import (
     positions_from_bounds,
     uniform_rotations,
 )
-from drake_pose.registration.shared_fit import (
-    SHARED,
-    SharedFit,
-    SharedValues,
-    scatter_factor,
-)
+from drake_pose.registration.shared_fit import SHARED, SharedFit, SharedValues, scatter_factor
 from drake_pose.registration.standing_object import (
     CalibrationTarget,
     TargetSearch,
@@ -396,9 +391,7 @@ def shared(*values: float) -> SharedValues:
 
 
 @pytest.mark.parametrize("share", [0.99, 1.01])
-def test_significance_matches_the_interval_and_scales_have_log_intervals(
-    share: float,
-) -> None:
+def test_significance_matches_the_interval_and_scales_have_log_intervals(share: float) -> None:
     covariance = np.diag([1.0, 0.01**2, 0.01**2])
     value = share * 0.01 * float(scipy_t.ppf(0.975, 20))
     told = describe_constants(NAMED, shared(0, value, value), 20, 0.05, covariance, NAMED.names[1:])

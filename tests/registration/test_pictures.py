@@ -360,10 +360,7 @@ def test_pictures_are_evaluated_with_the_registered_camera(registered, episode) 
     one = replace(registered, recording=shown, joint_offsets=zeros)
     frames, misfits, lost = evaluate_pictures(episode.body, one, registered.found)
     told = {one.frame: one for one in misfits}
-    assert {name for name, one in told.items() if not one.is_inlier} | {*lost} == {
-        "0005",
-        "0009",
-    }
+    assert {name for name, one in told.items() if not one.is_inlier} | {*lost} == {"0005", "0009"}
     assert min(one.iou for one in told.values() if one.is_inlier) > 0.9
     expected = {f"{k:04d}": row - zeros for k, row in enumerate(episode.values)}
     for frame in frames:

@@ -95,11 +95,7 @@ def test_search_equals_a_naive_implementation_of_the_paper(tmp_path, body, K):
     """Pose, J, first J and runs of step 3 equal those of the naive implementation."""
     model = forked_body(tmp_path) if body == "fork" else swinging_chain(tmp_path, int(body[-1]))
     r = 12.0
-    settings = PaperSearchSettings(
-        outside_limit=r,
-        candidate_limit=K,
-        interval=math.radians(30),
-    )
+    settings = PaperSearchSettings(outside_limit=r, candidate_limit=K, interval=math.radians(30))
     search = PaperSearch(model.pose_tree(), settings)
     camera = front_camera(shift=0.1234)
     generator = np.random.default_rng(K)

@@ -9,12 +9,7 @@ from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.search import View
 from drake_pose.search.exact_search import find_intervals
-from drake_pose.search.parts import (
-    NeighbourhoodSearch,
-    PartSearch,
-    find_parts,
-    find_reflections,
-)
+from drake_pose.search.parts import NeighbourhoodSearch, PartSearch, find_parts, find_reflections
 from drake_pose.search.refinement import Pass, RefinementBody, RefinementProblem, descend
 from drake_pose.search.settings import PASSES
 from drake_pose.silhouette.outline import TreeSurfaces

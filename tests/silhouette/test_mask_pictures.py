@@ -11,11 +11,7 @@ from pycocotools import mask as coco
 
 from drake_pose.camera.picture_files import read_binary_mask, read_picture, threshold_mask
 from drake_pose.errors import MaskError, SceneError
-from drake_pose.silhouette.mask_pictures import (
-    decode_run_lengths,
-    fill_polygon,
-    read_coco,
-)
+from drake_pose.silhouette.mask_pictures import decode_run_lengths, fill_polygon, read_coco
 
 HEIGHT, WIDTH = 40, 60
 

@@ -17,12 +17,7 @@ from drake_pose.camera.sources import TIME_STAMPS
 from drake_pose.csv_files import csv_text
 from drake_pose.errors import CameraError, OutputError, SceneError, SettingsError, UnknownNameError
 from drake_pose.files.folder import read_summary, writes_folder
-from drake_pose.files.records import (
-    FrameRecord,
-    SceneEstimate,
-    describe_job,
-    record_deviations,
-)
+from drake_pose.files.records import FrameRecord, SceneEstimate, describe_job, record_deviations
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.writer import ResultWriter
 from drake_pose.jobs.estimate.inputs import bundled_person

@@ -219,10 +219,7 @@ class _WalkLog:
     """
 
     def __init__(
-        self,
-        diagram: Diagram,
-        on_command: Callable[[str], None],
-        on_report: Callable[[str], None],
+        self, diagram: Diagram, on_command: Callable[[str], None], on_report: Callable[[str], None]
     ) -> None:
         self._command, self._pose = map(diagram.GetOutputPort, ("command", "walker_pose"))
         self._seconds = dict.fromkeys(COMMANDS, 0.0)

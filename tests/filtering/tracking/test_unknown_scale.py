@@ -14,12 +14,7 @@ from drake_pose.filtering.contour_tracker import (
     TrackingSettings,
 )
 from drake_pose.filtering.match_and_track import MatchAndTrack, TrackerState
-from drake_pose.filtering.sequence_fit import (
-    find_start,
-    fit_sequence,
-    pose_set,
-    tilted,
-)
+from drake_pose.filtering.sequence_fit import find_start, fit_sequence, pose_set, tilted
 from drake_pose.search import TRACKED, View
 from tests.filtering.tracking.test_match_and_track import PERIOD, KnownPoses, swings
 from tests.search.bodies import front_camera

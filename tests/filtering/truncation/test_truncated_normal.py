@@ -6,12 +6,7 @@ from scipy.integrate import quad
 from scipy.stats import truncnorm
 
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.inequalities import (
-    from_bounds,
-    make_inequalities,
-    stack,
-    two_sided,
-)
+from drake_pose.filtering.inequalities import from_bounds, make_inequalities, stack, two_sided
 from drake_pose.filtering.state import make_belief
 from drake_pose.filtering.truncated_normal import (
     clip,
@@ -210,10 +205,7 @@ def test_joint_truncation_counts_duplicated_rows_once():
         np.r_[rows.phi, 3 * rows.phi[:1]],
         np.r_[rows.b, 3 * rows.b[0]],
     )
-    one, other = (
-        truncate_joint(belief, rows),
-        truncate_joint(belief, doubled),
-    )
+    one, other = (truncate_joint(belief, rows), truncate_joint(belief, doubled))
     np.testing.assert_array_equal(one.mean, other.mean)
     np.testing.assert_array_equal(one.covariance, other.covariance)
 

@@ -26,11 +26,7 @@ from drake_pose.systems.diagrams import (
     build_simulated_matching,
 )
 from drake_pose.systems.images import MaskPlayer
-from drake_pose.systems.silhouette_matcher import (
-    STATISTICS,
-    SilhouetteMatcher,
-    SilhouetteTracker,
-)
+from drake_pose.systems.silhouette_matcher import STATISTICS, SilhouetteMatcher, SilhouetteTracker
 from tests.search.bodies import box_link, front_camera, joint, load_body, swinging_chain
 from tests.systems.bench import Bench
 

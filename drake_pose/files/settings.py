@@ -371,7 +371,11 @@ class EstimateSettings(CaptureSettings, EpisodeSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_choices(self)
+        for name, hint in get_type_hints(type(self)).items():
+            value = getattr(self, name)
+            if get_origin(hint) is Literal and value not in get_args(hint):
+                choices = ", ".join(get_args(hint))
+                raise SettingsError(f"there is no {name} '{value}'; there is: {choices}")
         if self.time_limit is not None and not self.time_limit >= 0.0:
             raise SettingsError(f"time_limit must be 0 or more, not {self.time_limit}")
         if self.method == "person" and self.search_settings:
@@ -463,15 +467,6 @@ def changed(settings: Any) -> tuple[str, ...]:
         for one in fields(settings)
         if getattr(settings, one.name) != ({} if one.default is MISSING else one.default)
     )
-
-
-def require_choices(settings: Any) -> None:
-    """Raise a SettingsError that lists the choices if a setting is none of them."""
-    for name, hint in get_type_hints(type(settings)).items():
-        value = getattr(settings, name)
-        if get_origin(hint) is Literal and value not in get_args(hint):
-            choices = ", ".join(get_args(hint))
-            raise SettingsError(f"there is no {name} '{value}'; there is: {choices}")
 
 
 def plain(value: Any) -> Any:

@@ -156,13 +156,6 @@ class ContourObservation(BodyState):
             )
         return ContourEvidence(pack_views(self.cameras, edges), tuple(compared), colours)
 
-    def is_finest(self, iteration: int) -> bool:
-        """Return whether search lines in pictures have their finest spacing at this iteration.
-
-        ``iteration``: number of measurements of the frame made before.
-        """
-        return search_line_step(iteration) == search_line_step(iteration + 9)
-
     def uninformed_histograms(self) -> Floats:
         """Return the colour histograms of a body without observations."""
         return uninformed_histograms(len(self.cameras), len(self._body.outlines))
@@ -546,7 +539,9 @@ class ContourTracker:
             # With masks the last comparison is made at the final state. With pictures the number of
             # comparisons is limited, and the finest search lines must have been reached.
             if evidence.has_pictures:
-                still = k + 1 == rounds or (still and observation.is_finest(k))
+                still = k + 1 == rounds or (
+                    still and (search_line_step(k) == search_line_step(k + 9))
+                )
             if still:
                 break
             measurement = observation.measure(

@@ -49,7 +49,12 @@ def load_or_make(
         if time.perf_counter() - start >= least_time:
             with suppress(OSError):  # The disk is full or the folder is not writable.
                 _write(path, outline)
-                _remove_oldest(path.parent, most_files)
+                ages = sorted(
+                    (one.stat().st_mtime, one) for one in path.parent.iterdir() if one.is_file()
+                )
+                for _, one in ages[: max(0, len(ages) - most_files)]:
+                    with suppress(OSError):
+                        one.unlink()
     return outline
 
 
@@ -86,14 +91,3 @@ def _write(path: Path, outline: Outline) -> None:
         with suppress(OSError):
             part.unlink()
         raise
-
-
-def _remove_oldest(folder: Path, most: int) -> None:
-    """Remove a folder's least recently used files until at most ``most`` are left.
-
-    Leftovers of killed processes are removed likewise.
-    """
-    ages = sorted((one.stat().st_mtime, one) for one in folder.iterdir() if one.is_file())
-    for _, one in ages[: max(0, len(ages) - most)]:
-        with suppress(OSError):
-            one.unlink()

@@ -38,10 +38,7 @@ class _TaggedLoader(_UniqueKeyLoader):
 
 
 def _construct_tagged(loader: _TaggedLoader, suffix: str, node: yaml.Node) -> Any:
-    """Return the value of a node with a local tag ``!suffix``, such as Drake's ``!Rpy``.
-
-    A mapping gets the tag under the key ``_tag``; sequences and scalars lose it.
-    """
+    """Return a node with a tag ``!suffix``, the key ``_tag`` of a mapping; others lose it."""
     if isinstance(node, yaml.MappingNode):
         return {"_tag": f"!{suffix}", **loader.construct_mapping(node, deep=True)}
     if isinstance(node, yaml.SequenceNode):

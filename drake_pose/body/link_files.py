@@ -207,10 +207,7 @@ def _check_urdf_joint(joint: ElementTree.Element) -> None:
 
 
 def _inline_colours(root: ElementTree.Element) -> None:
-    """Replace each visual's material in a <robot> by an unnamed colour, in place.
-
-    Drake needs unique names of materials.
-    """
+    """Replace visuals' materials in a <robot> by unnamed colours: Drake needs unique names."""
     shared = root.findall("material")
     per_visual = root.findall("link/visual/material")
     colours: dict[str, str] = {}
@@ -344,10 +341,7 @@ def _model_of_folder(folder: Path, name: str) -> Path:
 
 
 def _check_poses(element: ElementTree.Element, where: str) -> None:
-    """Raise ModelError unless an element's Euler-angle <pose> holds six finite numbers.
-
-    Messages begin with ``where``.
-    """
+    """Raise ModelError, begun by ``where``, unless an Euler-angle <pose> has six finite numbers."""
     for pose in element.iterfind("pose"):
         if (pose.text or "").strip() and pose.get("rotation_format", "euler_rpy") == "euler_rpy":
             read_numbers(pose.text, 6, f"{where}: its <pose>")

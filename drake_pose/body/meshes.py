@@ -199,10 +199,7 @@ def _read_gltf(path: Path) -> TriangleMesh:
 
 
 def _read_stl(path: Path) -> TriangleMesh:
-    """Read a binary STL file, whatever its header says, or a text STL file of any encoding.
-
-    Raises ModelError: the file is truncated or damaged.
-    """
+    """Read a binary STL file, whatever its header says, or a text one; ModelError if damaged."""
     data = path.read_bytes()
     count = int.from_bytes(data[80:84], "little")
     if len(data) == 84 + 50 * count and count > 0:
@@ -366,10 +363,7 @@ def _write_with_normals(mesh: TriangleMesh, path: Path) -> None:
 
 
 def _write_lines(file: TextIO, line: str, rows: NDArray[Any]) -> None:
-    """Write one line per row (n, k), in large chunks for speed.
-
-    ``line``: a %-format of k numbers that ends in a line break.
-    """
+    """Write one line per row (n, k), in large chunks, by ``line``, a %-format of k numbers."""
     for start in range(0, len(rows), 65536):
         chunk = rows[start : start + 65536]
         file.write((line * len(chunk)) % tuple(chunk.ravel().tolist()))

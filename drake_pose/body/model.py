@@ -47,10 +47,7 @@ TARGET_POSITIONS = tuple(f"{TARGET}_{move}_{axis}" for move in ("shift", "turn")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ArticulatedModel(ParsedModel):
-    """An articulated object, with methods that build pose trees and models of another shape.
-
-    The attributes are those of ``ParsedModel``. A model is immutable.
-    """
+    """An immutable object with the attributes of ``ParsedModel``, and methods that build trees."""
 
     def pose_tree(
         self,

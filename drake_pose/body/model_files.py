@@ -69,10 +69,7 @@ def xml_text(root: ElementTree.Element) -> str:
 
 
 def read_numbers(text: str | None, count: int, where: str) -> list[float]:
-    """Return the ``count`` finite numbers in a text.
-
-    Raises ModelError: the text holds anything else; the message begins with ``where``.
-    """
+    """Return the ``count`` finite numbers in a text; ModelError, begun by ``where``, otherwise."""
     words = (text or "").split()
     try:
         numbers = [float(word) for word in words]
@@ -379,10 +376,7 @@ def _folders_at(folder: Path, name: str) -> list[Path]:
 
 
 def bundled_model(name: str) -> Path:
-    """Return the file of a bundled model, for example "woman".
-
-    Raises UnknownNameError, which lists the bundled models.
-    """
+    """Return the file of a bundled model, for example "woman"; UnknownNameError lists all."""
     folder = package_folder()
     known = {path.parent.name: path for path in sorted(folder.glob("*/*.urdf"))}
     named = {key: folder / key / f"{key}.urdf" for key in known}

@@ -181,10 +181,7 @@ class ModelSkin:
 def _chain(
     model: ParsedModel, graph: LinkGraph, band: SkinBand
 ) -> tuple[tuple[JointMap, ...], tuple[int, ...]]:
-    """Return the joints outwards from a band's parent to its child, and their indices in q.
-
-    Raises ModelError: no joints lead from the parent outwards to the child.
-    """
+    """Return a band's joints outwards from parent to child, and indices in q; ModelError: none."""
     inner, outer = graph.group_of(band.parent), graph.group_of(band.child)
     steps: list[JointMap] = []
     positions: list[int] = []

@@ -424,10 +424,7 @@ def _run_check(
 
 
 def _check_in_subprocess(path: str, packages: str, limits: str) -> str:
-    """As ``_check_in_fork``, with ``read_model``, in a new process, which takes longer.
-
-    The meshes that the new process reads are not kept.
-    """
+    """As ``_check_in_fork``, in a new process: it takes longer, and meshes are not kept."""
     # os._exit skips clean-up, which may crash after a broken file.
     program = (
         "import json, os, sys\n"

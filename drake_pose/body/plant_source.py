@@ -101,10 +101,7 @@ def read_couplings(plant: MultibodyPlant) -> list[Coupling]:
 def add_coupler(
     plant: MultibodyPlant, follower: Joint, leader: Joint, multiplier: float, offset: float
 ) -> None:
-    """Add the constraint q_follower = multiplier * q_leader + offset [rad or m] to a plant.
-
-    A plant whose contact solver does not support such constraints stays as it is.
-    """
+    """Add q_follower = multiplier * q_leader + offset [rad or m], if the plant supports it."""
     if plant.get_discrete_contact_solver() == DiscreteContactSolver.kSap:
         plant.AddCouplerConstraint(follower, leader, multiplier, offset)
 

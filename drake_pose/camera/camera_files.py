@@ -322,10 +322,7 @@ def _find_configs(content: dict[Any, Any], path: Path) -> dict[str, Any] | None:
 
 
 def _is_scenario(entry: Any) -> bool:
-    """Return whether an entry of a YAML file is a Drake Scenario: a mapping with `cameras`.
-
-    A file of ours with a camera named `cameras` is not one.
-    """
+    """Return whether an entry is a Drake Scenario: a mapping with `cameras`, no camera of ours."""
     if not isinstance(entry, dict) or "cameras" not in entry:
         return False
     cameras = entry["cameras"]

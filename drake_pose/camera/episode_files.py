@@ -330,10 +330,7 @@ def recording_format(path: Path) -> Literal["lerobot", "droid", "bag", "folder",
 
 
 def require_recording(path: Path) -> None:
-    """Raise SceneError if a folder has no ``masks`` and is no recording of any format.
-
-    The message names subfolders that have masks or are recordings.
-    """
+    """Raise SceneError, naming subfolders, if a folder has no masks and is no recording."""
     inside = sorted(one for one in path.iterdir() if one.is_dir()) if path.is_dir() else []
     found = [
         one.name for one in (path, *inside) if (one / "masks").is_dir() or recording_format(one)

@@ -305,10 +305,7 @@ def _numbers(value: Any, keys: Sequence[str] = ()) -> Array | None:
 
 
 def finite_numbers(value: Any) -> Array | None:
-    """Return the numbers (n,), by rows, of an array or of small nested lists.
-
-    The result is None for anything else, and if an entry is not a finite number.
-    """
+    """Return the finite numbers (n,), by rows, of an array or of small nested lists; or None."""
     if not isinstance(value, list | tuple | np.ndarray) or not _is_small(value):
         return None
     try:

@@ -11,10 +11,7 @@ Item = TypeVar("Item")
 
 
 class SynchronisedFrames(NamedTuple, Generic[Item]):
-    """Synchronised frames: their earliest time stamp [s], and the items by camera.
-
-    Cameras without an image at that time are missing.
-    """
+    """Items of one time by camera, some may be missing; and their earliest time stamp [s]."""
 
     time: float
     items: Mapping[str, Item]

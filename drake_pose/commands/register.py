@@ -229,10 +229,7 @@ def _print_registration(result: SceneRegistration) -> None:
 
 
 def _say_clock(one: Mapping[str, Any]) -> str:
-    """Return a text of a camera's evidence, time offset and focal length, as far as estimated.
-
-    ``one`` is the camera's entry of summary.json.
-    """
+    """Return a text of evidence, time offset and focal length in an entry of summary.json."""
     if "points" in one:
         texts = [
             f"from {one['points']} points of the scene: {percent(one['sightings_that_fit'])} of "

@@ -297,10 +297,7 @@ def motion_as_bvh(
 
 
 def _smooth_angles(R: Array) -> Array:
-    """Return Euler angles (n, 3) about Z, X, Y [deg] of rotations (n, 3, 3) of successive frames.
-
-    Of the equivalent angles those nearest to the frame before are chosen.
-    """
+    """Return Euler angles (n, 3) Z, X, Y [deg] of R (n, 3, 3), each nearest to the frame before."""
     with warnings.catch_warnings():
         # At 90 degrees about X only the sum of the other angles is determined.
         warnings.filterwarnings("ignore", message="Gimbal lock", category=UserWarning)

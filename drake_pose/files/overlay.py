@@ -50,10 +50,7 @@ def paint_agreement(
 def _number_agreement(
     mask: np.ndarray, body: np.ndarray, segments: np.ndarray | None
 ) -> np.ndarray:
-    """Return the picture of `paint_agreement`, of the same arguments, as indices (H, W) uint8.
-
-    The indices are those of PALETTE.
-    """
+    """Return `paint_agreement`'s picture, of the same arguments, as indices (H, W) of PALETTE."""
     picture = _FIRST + mask.view(np.uint8) + 2 * body.view(np.uint8)
     _draw_borders(picture, body, segments, _OUTLINE)
     return picture

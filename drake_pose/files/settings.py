@@ -160,10 +160,7 @@ def parse_root_position(text: str) -> Corner | tuple[Path, str] | Literal["unkno
 
 
 def parse_root_rotation(text: str) -> RootTurns:
-    """Return "fixed", "free", or (lower, upper) limits [deg] by axis, in the order of rotation.
-
-    The text is ``fixed``, ``free``, or limits like ``y=-180:180,z=-10:10``.
-    """
+    """Return "fixed", "free", or limits [deg] by axis of a text like ``y=-180:180,z=-10:10``."""
     if text == "fixed":
         return "fixed"
     if text == "free":

@@ -181,10 +181,7 @@ class ResultWriter:
             write_file(self.folder, name, content)
 
     def finish(self, replay: bool) -> None:
-        """Write the files about all frames; `end` then marks the result as complete.
-
-        ``replay``: whether replay.html is written, too. Without a folder no file is written.
-        """
+        """Write files about all frames, replay.html if ``replay``; `end` marks them as complete."""
         records = self._in_order()
         self.warnings += frame_warnings(records)
         self.warnings += camera_warnings(records, self.warnings)

@@ -437,10 +437,7 @@ class ContourTracker:
         self._period = period
 
     def acceleration(self, name: str) -> float:
-        """Return the standard deviation of the acceleration of the moving element ``name``.
-
-        The unit is rad/s^2, m/s^2 or, for the log scale, 1/s^2.
-        """
+        """Return the acceleration's standard deviation of ``name``, in its unit or 1 per s^2."""
         s = self.settings
         return self._of_kind(
             name, s.log_scale_acceleration, s.angle_acceleration, s.length_acceleration
@@ -518,10 +515,7 @@ class ContourTracker:
     def _fit(
         self, observation: ContourObservation, evidence: ContourEvidence, prediction: FilterState
     ) -> tuple[FilterState, ContourMeasurement | None]:
-        """Return a frame's state and the measurement there; None if no edge is near the contour.
-
-        ``prediction``: the state before the frame's evidence is used.
-        """
+        """Return state and measurement in a frame after ``prediction``; None: no edge is near."""
         moving, state = len(observation.layout.moving), prediction
         measurement = observation.measure(evidence, state.best.mean)
         rounds = self.settings.rounds

@@ -205,10 +205,7 @@ TWO_FINGERS = _two_fingers()
 
 
 def palm_rotation(R_CL: Array) -> Array:
-    """Return the rotation R_CP (3, 3) of the palm's frame in a camera.
-
-    ``R_CL``: (3, 3) rotation of the palm's link L, of a model for ``read_hand``, in the camera.
-    """
+    """Return R_CP (3, 3) of the palm in a camera, given that of its link, see ``read_hand``."""
     return np.asarray(R_CL @ _FROM_LINK.T)
 
 

@@ -206,10 +206,7 @@ def _match(
 
 
 def _is_empty(drawn: NDArray[np.uint8] | Mask, uv: Array) -> Mask:
-    """Return (...,) bool, whether an image (H, W) is 0 at points uv (..., 2) [pixel].
-
-    Points outside the image are moved to its border.
-    """
+    """Return (...,) bool, whether an image (H, W) is 0 at uv (..., 2) [pixel], moved inside it."""
     size = (drawn.shape[1] - 1, drawn.shape[0] - 1)
     u, v = np.moveaxis(np.clip(np.rint(uv).astype(np.intp), 0, size), -1, 0)
     return np.asarray(drawn[v, u] == 0)
@@ -341,10 +338,7 @@ class HandSilhouette:
     unmatched: float = 0.25
 
     def draw(self, x: Array, zoom: float = 1.0) -> NDArray[np.uint8]:
-        """Return the silhouette (zoom H, zoom W) of the hand at a state x (n,): 1 inside, else 0.
-
-        The palm is a convex hull, fingers are rods with round ends.
-        """
+        """Return (zoom H, zoom W), 1 in the hand at x (n,): a convex palm and round-ended rods."""
         picture = np.zeros((round(zoom * self.height), round(zoom * self.width)), dtype=np.uint8)
         palm, points, radii = self._outline(x)
         # OpenCV takes sixteenths of pixels, and draws a quarter of a pixel too much.

@@ -190,10 +190,7 @@ def from_model(model: ParsedModel) -> Inequalities:
 
 
 def warn_if_unlimited(inequalities: Inequalities, where: str) -> Inequalities:
-    """Return the inequalities unchanged; warn (UserWarning) if there are none.
-
-    ``where``: the model file, which begins the warning.
-    """
+    """Return the inequalities; if there are none, warn (UserWarning) with the file ``where``."""
     if not len(inequalities):
         warnings.warn(
             f"{where}: no joint has a limit, so that nothing is truncated",

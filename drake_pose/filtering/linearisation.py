@@ -39,10 +39,7 @@ class Linear(NamedTuple):
 
 
 def wrapped_difference(values: Array, expected: Array, is_angle: Mask) -> Array:
-    """Return values (..., m) - expected (..., m), angles wrapped to [-pi, pi).
-
-    ``is_angle``: (m,) which components are angles [rad].
-    """
+    """Return values - expected (..., m), wrapped to [-pi, pi) where ``is_angle`` (m,) [rad]."""
     residual = values - expected
     residual[..., is_angle] = np.remainder(residual[..., is_angle] + np.pi, 2 * np.pi) - np.pi
     return residual

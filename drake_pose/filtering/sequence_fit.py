@@ -335,8 +335,5 @@ def _limits(observation: ContourObservation) -> tuple[Array, Array]:
 
 
 def _interpolated(every: Indices, picked: Indices, parameters: Array) -> Array:
-    """Interpolate parameters (p, n) of the p ``picked`` frames linearly at ``every`` frame's index.
-
-    Beyond the last picked frame its parameters are repeated.
-    """
+    """Interpolate ``picked`` frames' parameters (p, n) at ``every`` frame, constant beyond them."""
     return np.column_stack([np.interp(every, picked, column) for column in parameters.T])

@@ -71,10 +71,7 @@ def interval_moments(lower: float, upper: float) -> tuple[float, float, float]:
 
 @compiled
 def project(mean: Array, factor: Array, direction: Array) -> tuple[float, Array]:
-    """Return direction^T mean, and direction^T L (k,), whose squared norm is the variance.
-
-    ``mean`` (n,) and ``factor`` L (n, k) are those of a belief; ``direction`` is (n,).
-    """
+    """Return direction^T mean and direction^T L (k,), for a belief's mean (n,), factor L (n, k)."""
     n, k = factor.shape
     projected = np.zeros(k)
     value = 0.0

@@ -427,10 +427,7 @@ def window_around(covered: Mask, by: int) -> Window:
 
 
 def mask_reach(covered: Mask, reach: float = 0.1) -> int:
-    """Return how far masks may reach beyond an approximate silhouette (H, W) [pixel].
-
-    It is the fraction ``reach`` of the square root of its area, or MODEL.margin if that is larger.
-    """
+    """Return how far masks may exceed a silhouette (H, W) [pixel], by its size or MODEL.margin."""
     return max(MODEL.margin, round(reach * float(np.sqrt(np.count_nonzero(covered)))))
 
 
@@ -514,10 +511,7 @@ def grown(masks: Mask, by: int) -> Mask:
 
 
 def likeness(deviations: Floats) -> Floats:
-    """Return likelihood ratios of colours under a background to any colour.
-
-    deviations: of the colours from the background's, in standard deviations.
-    """
+    """Return likelihood ratios background to any colour, of deviations in standard deviations."""
     beyond = np.maximum(deviations - MODEL.core_deviations, 0.0)
     return np.asarray(np.exp(MODEL.log_peak - 0.5 * beyond**2), np.float32)
 

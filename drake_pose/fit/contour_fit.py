@@ -54,10 +54,7 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Independent normal priors of the tree values: mean (m,) [rad or m] and information (m,).
-
-    The information is the inverse variance; 0: no prior.
-    """
+    """Independent normal priors: mean (m,) [rad or m] and inverse variances (m,), 0 for none."""
 
     mean: Array
     information: Array

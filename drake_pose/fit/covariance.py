@@ -455,10 +455,7 @@ def score_nuisances(residuals: Distances, sizes: ErrorSizes) -> tuple[Array, Arr
 
 
 def _prior_information(is_angle: Mask) -> Array:
-    """Return the information (m, m) of uniform distributions of the values.
-
-    Angles, where ``is_angle`` (m,), cover a full turn, and lengths ten metres.
-    """
+    """Return the information (m, m) of uniform priors: a full turn of angles, ten metres else."""
     return np.diag(12.0 / np.where(is_angle, 2.0 * np.pi, 10.0) ** 2)
 
 

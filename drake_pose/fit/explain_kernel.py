@@ -312,10 +312,7 @@ def explain_poses(
     camera: Array,
     sums: PixelSums,
 ) -> Array:
-    """Return the sums (n, 4) of ``explain`` for n poses X_CW (n, 3, 4) of the camera.
-
-    The other arguments are those of ``explain_pose``.
-    """
+    """Return the sums (n, 4) of ``explain`` for poses X_CW (n, 3, 4), see ``explain_pose``."""
     totals, X_CN = np.zeros((X_CW.shape[0], 4)), np.empty_like(X_WN)
     scratch, crossings = make_words(packed, camera)
     for n in range(X_CW.shape[0]):

@@ -62,10 +62,7 @@ class Placement(NamedTuple):
     parameters: Indices
 
     def dense(self, size: int) -> Array:
-        """Return (nodes, size, 12) affine motion of each node caused by each of size parameters.
-
-        It is 0 for a node that a parameter does not move.
-        """
+        """Return affine motions (nodes, size, 12) of nodes by all parameters, 0 if not moved."""
         motions = np.zeros((len(self.X_WN), size, 12))
         nodes = np.repeat(np.arange(len(self.X_WN)), np.diff(self.starts))
         # np.add.at is slow; only mimic joints and scales have several motions per parameter.

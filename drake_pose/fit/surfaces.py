@@ -24,18 +24,12 @@ _SIMPLIFIER = Lock()
 
 
 def simplify_rigid_parts(surfaces: TreeSurfaces, count: int) -> TreeSurfaces:
-    """Return a tree's surfaces with rigid parts simplified to about ``count`` triangles each.
-
-    Parts with fewer triangles stay. Skin bands stay, too, and bend.
-    """
+    """Return surfaces whose rigid parts have at most about ``count`` triangles; skin bands bend."""
     return surfaces.with_rigid([_simplify(rigid, count) for rigid in surfaces.rigid])
 
 
 def simplify_surfaces(surfaces: TreeSurfaces, count: int = FEW) -> tuple[Outline, ...]:
-    """Return the surface of each node of a tree, with skin at rest, of about ``count`` triangles.
-
-    A surface with fewer triangles stays.
-    """
+    """Return each node's surface, skin at rest, with at most about ``count`` triangles."""
     outlines = []
     for node, rigid in enumerate(surfaces.rigid):
         bending = surfaces.bending[node]
@@ -44,10 +38,7 @@ def simplify_surfaces(surfaces: TreeSurfaces, count: int = FEW) -> tuple[Outline
 
 
 def simplify_outlines(outlines: Sequence[Outline], count: int = 160) -> tuple[Outline, ...]:
-    """Return simplified surfaces simplified further, to about ``count`` triangles each.
-
-    This is much faster than simplifying the originals.
-    """
+    """Simplify simplified surfaces to about ``count`` triangles, faster than the originals."""
     return tuple(_simplify(outline, count) for outline in outlines)
 
 

@@ -170,10 +170,7 @@ def _joints(job: SceneJob) -> Path | None:
 
 
 def _require_same_masks(task: Task) -> None:
-    """Raise an OutputError if masks of a finished whole scene have changed since.
-
-    Chunks are checked when they are joined, and episodes have no masks.
-    """
+    """Raise OutputError if the masks of a finished whole scene changed; episodes have none."""
     settings = task.job.settings
     is_episode = isinstance(settings, AuditSettings) and uses_pictures(task.job.scene, settings)
     if task.index is not None or is_episode:
@@ -223,10 +220,7 @@ def _make(task: Task) -> None:
 
 
 def _join_chunks(task: Task, settings: EstimateSettings, part: Path) -> None:
-    """Join a task's chunks to an unfinished result with all frames in the new folder ``part``.
-
-    Resuming the estimate with these ``settings`` in ``part`` writes the other files.
-    """
+    """Join a task's chunks in the new folder ``part``, and resume there with ``settings``."""
 
     def link(source: str, target: str) -> None:
         try:

@@ -144,10 +144,7 @@ def address_of(client: Client) -> str:
 
 
 def worker_facts(file: Path | None = None) -> tuple[str, str, bool]:
-    """Return this process's version, the SHA-256 of its source code, and whether a file exists.
-
-    The last is True for None.
-    """
+    """Return this process's version, its code's SHA-256, and whether a file (or None) exists."""
     digest = hashlib.sha256()
     package = Path(version.__file__).parent
     for path in sorted(package.rglob("*.py")):

@@ -239,10 +239,7 @@ class _CombinedPose:
         return X_WC, np.asarray(self._count * inverse)
 
     def compare(self, one: FoundCamera) -> tuple[float, float, float]:
-        """Return distance [mm] and angle [deg] of a pose from the combined one, and its p-value.
-
-        The p-value is the probability of a distance as large by chance.
-        """
+        """Return a pose's distance [mm] and angle [deg] from the combined one, and its p-value."""
         X_WC, covariance = self.pose()
         off = pose_difference(np.array(one["X_WC"]), X_WC)
         distance = squared_distance(off, covariance + np.array(one["covariance"]))

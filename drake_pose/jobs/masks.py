@@ -232,10 +232,7 @@ def _draw_outline(picture: Picture, mask: Mask, refused: bool) -> bytes:
 
 
 def refuse_mask(mask: Mask, max_fraction: float = 0.98) -> str:
-    """Return why a mask (H, W) is rejected: it is empty or full; "" if it is accepted.
-
-    ``max_fraction``: maximum fraction of the picture that a mask covers.
-    """
+    """Return why a mask (H, W) is rejected: it is empty, or over ``max_fraction`` full; or ""."""
     if not mask.any():
         return "the object is not found: the mask is empty"
     if mask.mean() >= max_fraction:

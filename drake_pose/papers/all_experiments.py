@@ -76,20 +76,14 @@ def _kameda(short: bool, folder: Path, count: Count) -> Outcome:
 
 
 def _kameda_continuous(short: bool, _folder: Path, count: Count) -> Outcome:
-    """Run Kameda's experiment A with continuous angles, one pose if `short`, otherwise 30.
-
-    Progress is reported to `count`.
-    """
+    """Run Kameda's experiment A with continuous angles, one pose if `short`, otherwise 30."""
     search = MultiStartSearch(kameda.experiment_tree(), exact_masks=True)
     result = kameda.run_experiment(search, 1 if short else 30, 77, count)
     return kameda.continuous_figures(result), [kameda.continuous_table(result)], ()
 
 
 def _kameda_pictures(experiment: str, short: bool, folder: Path, count: Count) -> Outcome:
-    """Run Kameda's experiment "B" or "C", only its first picture if `short`.
-
-    Pictures are written to `folder`, progress is reported to `count`.
-    """
+    """Run Kameda's experiment "B" or "C", one picture if `short`; pictures go to `folder`."""
     figures = kameda.run_real_experiment(experiment, 1 if short else None, folder, count)
     paper, beam = figures["paper"], figures["beam"]
     said = "{paper_mean_e_total:.1%} ({paper_images} pictures)".format(**paper)
@@ -149,10 +143,7 @@ def _shimada(observed: str, runs: int, short: bool, folder: Path, count: Count) 
 
 
 def _shimada_hypotheses(short: bool, folder: Path, count: Count) -> Outcome:
-    """Run Shimada's experiment with several hypotheses by both filters, 2 runs if `short`, or 50.
-
-    Pictures are written to `folder`, progress is reported to `count`.
-    """
+    """Run Shimada's hypotheses by both filters, 2 runs if `short`, or 50; pictures: `folder`."""
     figures, shown = {}, []
     for name, truncation, iterations in _filters():
         runs = 2 if short else 50
@@ -173,10 +164,7 @@ def _shimada_hypotheses(short: bool, folder: Path, count: Count) -> Outcome:
 
 
 def _date(short: bool, folder: Path, count: Count) -> Outcome:
-    """Run Date's experiment, with few cameras, frames and pixels if `short`.
-
-    Pictures are written to `folder`, progress is reported to `count`.
-    """
+    """Run Date's experiment, a small one if `short`; pictures go to `folder`."""
     cameras, frames, size = (4, 40, (320, 240)) if short else (9, 240, (640, 480))
     result = date.run_experiment(cameras, frames, 0, "silhouette", count, size)
     date_walk.save_pictures(result, folder)
@@ -198,10 +186,7 @@ def _date(short: bool, folder: Path, count: Count) -> Outcome:
 
 
 def _date_walk(short: bool, folder: Path, count: Count) -> Outcome:
-    """Run Date's walk through a virtual place, with few cameras and pixels if `short`.
-
-    Pictures are written to `folder`, progress is reported to `count`.
-    """
+    """Run Date's walk through a virtual place, a small one if `short`; pictures go to `folder`."""
     cameras, size = (4, (320, 240)) if short else (9, (640, 480))
     walk = date_walk.run_walk_through(cameras, 0, count, size)
     walk.save(folder)
@@ -315,10 +300,7 @@ def reproduce_all(out: Path, short: bool, count: Count, say: Callable[[str], Non
 
 
 def _write_outcome(folder: Path, outcome: Outcome, cpu_seconds: float) -> None:
-    """Write figures.json, tables.txt, and paper.json with the rows that compare the figures.
-
-    `cpu_seconds` is the experiment's processor time [s], which paper.json has, too.
-    """
+    """Write figures.json, tables.txt, and paper.json: compared figures and processor time [s]."""
     figures, shown, rows = outcome
     beside = [
         {"what": what}
@@ -347,10 +329,7 @@ def _write(path: Path, text: str) -> None:
 
 
 def _page(out: Path, short: bool) -> str:
-    """Return the HTML page of the finished experiments in a folder, compared figures first.
-
-    `short` as of `reproduce_all`; the page says so.
-    """
+    """Return the HTML page of a folder's finished experiments; it says if they are `short`."""
     finished = []
     for one in EXPERIMENTS:
         folder = out / one.name

@@ -135,10 +135,7 @@ class Studio:
 
 
 def noisy(picture: Picture, generator: np.random.Generator, deviation: float = 3.0) -> Picture:
-    """Add Gaussian noise to every channel of a picture (H, W, 3).
-
-    `deviation` is its standard deviation [grey levels]; `generator` draws the seed of the noise.
-    """
+    """Add Gaussian noise of standard deviation `deviation` [grey levels] to a picture (H, W, 3)."""
     # OpenCV's 16-bit noise is precise enough, and four times as fast as doubles.
     noise = np.empty(picture.shape, dtype=np.int16)
     cv2.setRNGSeed(int(generator.integers(1 << 31)))
@@ -222,10 +219,7 @@ class PaperTrack(_StagedRun):
         return q
 
     def middle_joints(self) -> Array:
-        """Return elbows and knees (4, 3) of the last frame, in the order of LIMBS [m].
-
-        nan where the registered pose was recognised.
-        """
+        """Return elbows and knees (4, 3) [m] of the last frame, as LIMBS; nan: registered pose."""
         port = self._capture.diagram.GetOutputPort("limb_points")
         return np.array(port.Eval(self.context)).reshape(len(LIMBS), 3, 3)[:, 1]
 
@@ -256,10 +250,7 @@ class PaperTrack(_StagedRun):
         return views, found, (face, template)
 
     def perturbed(self, q: Array, generator: np.random.Generator) -> "PaperTrack":
-        """Return a track at q (nq,) turned around, with each feature in another one's place.
-
-        `generator` is not used.
-        """
+        """Return a track at q (nq,) turned around, features exchanged; `generator` is not used."""
         estimator = self._capture.estimator
         skeleton = estimator.setup.skeleton
         wrong = np.array(q)

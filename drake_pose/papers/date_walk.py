@@ -117,10 +117,7 @@ def run_walk_through(
 
 
 def active_frames(commands: Array) -> dict[str, Mask]:
-    """Return by name of COMMANDS in which of n frames it is active.
-
-    `commands` (n, 2) are turning and walking, as of `recognise_command`.
-    """
+    """Return by name of COMMANDS in which rows (n, 2) of `recognise_command` it is active."""
     turn, walk = commands.T
     return dict(zip(COMMANDS, (turn > 0, turn < 0, walk > 0, walk < 0), strict=True))
 
@@ -168,10 +165,7 @@ def draw_walk(model: ArticulatedModel, q: Array, pose: Array, rest: Array) -> Pi
 
 
 def save_pictures(result: DateResult, folder: Path) -> list[Path]:
-    """Draw a frame of each motion (figures 2, 3, 4, 7), and errors over time.
-
-    PNG files are written to the folder; their paths are returned.
-    """
+    """Write PNG files of each motion's figures 2, 3, 4, 7 and of all errors; return the paths."""
     files = []
     for motion, sample in result.samples.items():
         files.append(save_picture(sample.compared, folder / f"figure_07_{motion}.png"))

@@ -172,10 +172,7 @@ def experiment_search(
 
 
 def beam_experiment_search(interval_deg: float = 20.0) -> BeamSearch:
-    """Return the beam search of the same body, which needs no threshold r.
-
-    `interval_deg` is the sampling interval of the angles [deg].
-    """
+    """Return the beam search of the same body at an interval [deg]; it needs no threshold r."""
     settings = BeamSearchSettings(interval=math.radians(interval_deg))
     return BeamSearch(experiment_tree(), settings)
 
@@ -385,10 +382,7 @@ def _grid_figures(result: RandomPoses) -> dict[str, Any]:
 
 
 def grid_table(columns: Sequence[Sequence[RandomPoses]]) -> Table:
-    """Tabulate the paper's printed figures beside those of searches.
-
-    `columns` has the runs of each search, one per seed.
-    """
+    """Tabulate the paper's printed figures beside those of searches, each with a run per seed."""
     rows = {
         "images": ("silhouettes", "{}"),
         "tolerance": ("  equal within [pixel]", "{:.0f}"),
@@ -575,10 +569,7 @@ def run_real_experiment(
 
 
 def real_table(figures: Mapping[str, Figures]) -> Table:
-    """Tabulate the paper's figures beside those of each method, with every picture's E_total.
-
-    `figures` are those of `run_real_experiment`.
-    """
+    """Tabulate the paper's figures beside those of `run_real_experiment`, with every E_total."""
     first = next(iter(figures.values()))
     rows = {
         "images": ("silhouettes", "{}"),

@@ -112,19 +112,13 @@ def _draw_examples(title: str, trials: list[RandomPose], result: RandomPoses) ->
 
 
 def _coloured(segments: NDArray[Any], order: Sequence[int]) -> NDArray[np.float64]:
-    """Return the picture (H, W, 3), 0 to 1, of segments (H, W), each in its own colour.
-
-    Segment i gets the colour with number order[i]; -1: no segment, white.
-    """
+    """Return the picture (H, W, 3) of segments (H, W): i in colour number order[i], -1 white."""
     colours = matplotlib.colormaps["tab20"](np.array(order) % 20)[:, :3]
     return np.where(segments[..., None] >= 0, colours[segments], 1.0)
 
 
 def _crop(pictures: list[np.ndarray], margin: int = 20) -> list[np.ndarray]:
-    """Cut pictures of segments (H, W), -1 for none, to one square around all that they show.
-
-    `margin` is added to the square's side [pixel].
-    """
+    """Cut segments (H, W), -1 for none, to a square around all they show, plus `margin` [pixel]."""
     rows, columns = np.nonzero(np.logical_or.reduce([picture >= 0 for picture in pictures]))
     side = margin + max(np.ptp(rows), np.ptp(columns))
     square = []
@@ -150,10 +144,7 @@ def _draw_histogram(values: np.ndarray, end: int, label: str) -> Figure:
 
 
 def _draw_chest_ranks(result: RandomPoses, limit: int) -> Figure:
-    """Draw the fraction of images whose true chest is among its first K candidates, over K.
-
-    `limit` is the search's K, which is marked.
-    """
+    """Draw the fraction of images with the true chest in the first K, over K; `limit` is marked."""
     ranks, lengths = chest_ranks(result)
     Ks = range(1, max(2, int(lengths.max())) + 1)
     figure = Figure(figsize=(6, 4))
@@ -208,10 +199,7 @@ def chest_ranks(result: RandomPoses) -> tuple[NDArray[np.int64], NDArray[np.int6
 
 
 def ratio_within(ranks: NDArray[np.int64], limit: int) -> float:
-    """Return the fraction of images whose true chest has a rank of 1 to `limit`.
-
-    `ranks` (images,) are those of `chest_ranks`.
-    """
+    """Return the fraction of images whose `chest_ranks` (images,) are from 1 to `limit`."""
     return float(((ranks > 0) & (ranks <= limit)).mean())
 
 

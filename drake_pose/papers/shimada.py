@@ -233,10 +233,7 @@ def angle_error(means: Array, truths: Array) -> Array:
 
 
 def _filter_sequence(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> FilteredHand:
-    """Filter a sequence's measurements, also without limits and linearised at the truth.
-
-    After a failure the last belief of `hand_filter` is kept.
-    """
+    """Filter a sequence, also without limits and at the truth; a failure keeps the last belief."""
     states, times, broken = [], [], False
     state = hand_filter.start(sequence.guess)
     for t, y in enumerate(sequence.measurements):

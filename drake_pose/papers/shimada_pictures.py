@@ -118,10 +118,7 @@ def save_hypotheses(result: HypothesesResult, folder: Path) -> list[Path]:
 def _draw_hand(
     axes: Axes, state: Array, colour: str, observation: HandObservation = _OBSERVATION
 ) -> None:
-    """Draw axes and joints of the fingers and the palm's outline for a state (n,).
-
-    `observation` projects the state into the picture [pixel].
-    """
+    """Draw the fingers' axes and joints and the palm's outline for a state (n,) [pixel]."""
     points, shape = observation.drawing(state), observation.hand.radii.shape
     for finger in points[: shape[0] * shape[1]].reshape(*shape, 2):
         axes.plot(finger[:, 0], finger[:, 1], "-o", color=colour, markersize=3, linewidth=2)
@@ -146,10 +143,7 @@ def _draw_sequence(trial: FilteredHand) -> Figure:
 
 
 def _draw_matches(track: HandTrack, observation: HandObservation = _OBSERVATION) -> Figure:
-    """Draw figure 17: silhouettes, matched rough poses, measured axes and tips, and estimates.
-
-    The frames are those kept by the track; `observation` projects states into the picture.
-    """
+    """Draw figure 17: silhouettes, matched rough poses, measured axes and tips, and estimates."""
     kept = track.kept
     figure = Figure(figsize=(3.6 * len(kept), 11))
     grid = figure.subplots(4, len(kept))
@@ -182,10 +176,7 @@ def _draw_matches(track: HandTrack, observation: HandObservation = _OBSERVATION)
 
 
 def _rows_of(observation: HandObservation, first: str, second: str) -> NDArray[np.intp]:
-    """Return the indices (2, k) of two kinds of measurements in the vector of all.
-
-    The names of each kind contain the text `first` or `second`.
-    """
+    """Return the indices (2, k) of measurements whose names contain `first`, and `second`."""
     names = list(enumerate(observation.names))
     kinds = [[k for k, name in names if part in name] for part in (first, second)]
     return np.array(kinds, dtype=np.intp)
@@ -210,10 +201,7 @@ def save_sequence(result: SequenceResult, folder: Path) -> list[Path]:
 
 
 def _draw_shapes(first: dict[str, FilteredHand]) -> Figure:
-    """Draw the hand laid flat: first guess, estimates and true shapes.
-
-    `first` has the first run of each case, by the keys of CASES.
-    """
+    """Draw the hand laid flat: first guess, estimates and true shapes of each case's first run."""
     figure = Figure(figsize=(12, 4))
     grid = figure.subplots(1, 3, sharex=True, sharey=True)
     sequence = first["r13_35"].sequence
@@ -240,10 +228,7 @@ def _flat(state: Array, hand: HandModel = TWO_FINGERS) -> Array:
 
 
 def _draw_curve(label: str, true: Array, estimate: Array, deviation: Array) -> Figure:
-    """Draw a true value and its estimate with 2 standard deviations over the frames.
-
-    `true`, `estimate` and `deviation` are (frames,), in the unit that `label` names.
-    """
+    """Draw true and estimated values (frames,) with 2 deviations, in the unit of `label`."""
     figure = Figure(figsize=(6, 4))
     axes = figure.subplots()
     frames = np.arange(1, len(true) + 1)

@@ -92,10 +92,7 @@ def figure_table(
 
 
 def _cell(values: Sequence[Any], form: str) -> str:
-    """Format a figure by `form`; of several different values, mean, minimum and maximum.
-
-    "-" if any of them is None or nan.
-    """
+    """Format a figure; different values by mean, minimum, maximum; "-" if any is None or nan."""
     if any(value is None or (isinstance(value, float) and math.isnan(value)) for value in values):
         return "-"
     if len(set(values)) == 1:

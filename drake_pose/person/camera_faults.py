@@ -136,10 +136,7 @@ class CameraComparison:
         return found.values, found.inlier_ratio
 
     def inlier_ratio(self, camera: Camera, edge: EdgePoints, values: Array) -> float:
-        """Return the inlier ratio of a camera's edge points at values (m,), 0 to 1.
-
-        It is the fraction of silhouette and body contour with a residual below 5 cm.
-        """
+        """Return the fraction of a camera's edges and contours with a residual below 5 cm."""
         return self._fit.compare(
             pack_views([camera], [edge]), values, AnnealingStage(0.05, 0.05)
         ).inlier_ratio
@@ -310,10 +307,7 @@ def _shift_to_regions(camera: Camera, edges: Sequence[EdgePoints], places: Array
 
 
 def is_explained(motion: CameraMotion, others_inlier_ratio: float) -> bool:
-    """Return whether a camera's silhouettes fit after its motion nearly as well as the others'.
-
-    The inlier ratio after the motion must exceed 0.9 of the others' inlier ratio.
-    """
+    """Return whether a camera fits, after its motion, with over 0.9 of the others' inlier ratio."""
     return motion.inlier_ratio_after > FAULT.explained_ratio * others_inlier_ratio
 
 

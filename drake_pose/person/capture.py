@@ -247,10 +247,7 @@ class _Capture:
         return found
 
     def _with_shape(self, frame: int, values: Array) -> "_Explanation":
-        """Refine a frame's pose and search its limbs with the shape that fits them best.
-
-        `values` (m,) is the pose from which the shape is fitted [rad, m].
-        """
+        """Refine a frame's pose and search its limbs, with the shape fitted at `values` (m,)."""
         seen = self._see(frame)
         shape, shaped = self._fit_shape([frame], [values])
         refined = shaped.search.refine(shape.poses[0], seen)

@@ -167,10 +167,7 @@ def find_persons(
 def _person(
     cameras: Sequence[Camera], figures: Sequence[Sequence[Figure]], taken: dict[int, int]
 ) -> Person:
-    """Return the person seen as some figures: `taken` has a figure's index by the camera's index.
-
-    `figures` are those of each camera's mask.
-    """
+    """Return the person seen as some of the `figures`: `taken` has their indices by camera."""
     chosen = [figures[k][i] for k, i in taken.items()]
     areas = sorted(figure.area for figure in chosen)
     position = triangulate([cameras[k] for k in taken], [figure.middle for figure in chosen])

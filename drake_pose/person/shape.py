@@ -80,10 +80,7 @@ def shape_values(tree: PoseTree) -> Mask:
 
 
 def shape_parts(tree: PoseTree) -> tuple[list[str], list[int]]:
-    """Return the names of parts with a radius scale, and the index of each node's part.
-
-    Left and right nodes, and the ends of a segment, share a part.
-    """
+    """Return the names of parts with a radius scale, both sides one, and each node's part."""
     names = [
         node.name.removeprefix("left_").removeprefix("right_").removesuffix("_end")
         for node in tree.nodes

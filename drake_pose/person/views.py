@@ -277,10 +277,7 @@ def _coarser(camera: Camera, stride: int) -> Camera:
 
 
 def viewing_rays(camera: Camera, uv: Array) -> tuple[Array, Array]:
-    """Return origins (n, 3) [m] and unit directions (n, 3) in the world of the rays of pixels.
-
-    `uv` (n, 2) are the pixels. A pinhole camera's rays all begin at the camera.
-    """
+    """Return origins (n, 3) [m] and unit directions (n, 3), in the world, of pixels uv (n, 2)."""
     pixels = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
     R, p = camera.X_WC[:3, :3], camera.X_WC[:3, 3]
     off = pixels - [camera.center_x, camera.center_y]
@@ -339,10 +336,7 @@ def meeting_points(
 
 
 def triangulate(cameras: Sequence[Camera], pixels: Sequence[Array]) -> Array:
-    """Return the point (3,) [m] nearest to the rays of one pixel (2,) in each camera; skip nan.
-
-    At least two cameras must have a pixel.
-    """
+    """Return the point (3,) [m] nearest to the rays of a pixel (2,) in two or more cameras."""
     seen = [k for k, uv in enumerate(pixels) if not np.isnan(uv).any()]
     rays = [viewing_rays(cameras[k], pixels[k]) for k in seen]
     origins, directions = np.array(rays).reshape(-1, 2, 3).transpose(1, 0, 2)

@@ -593,8 +593,5 @@ def _statistic(r: Array, Q: Array, N: Array | None = None) -> tuple[float, int]:
 
 
 def _p_value(T: float, rank: int, freedom: float) -> float:
-    """Return the probability that T, see `_statistic`, is exceeded by chance; rank 0: 1.
-
-    T / rank has an F distribution with `rank` and `freedom` degrees of freedom.
-    """
+    """Return the p-value of T, see `_statistic`: T / rank has an F distribution; rank 0: 1."""
     return float(fdtrc(rank, freedom, max(T, 0.0) / rank)) if rank else 1.0

@@ -91,10 +91,7 @@ def scalable_links(tree: PoseTree) -> tuple[str, ...]:
 
 
 def require_parameters(tree: PoseTree, joints: Sequence[str], links: Sequence[str]) -> None:
-    """Refuse `joints` that are no positions of the tree, and `links` that are not scalable.
-
-    Raises UnknownNameError: lists the known names.
-    """
+    """Raise UnknownNameError for `joints` that are no positions, and `links` not scalable."""
     own = [name for node in tree.nodes for name in node.value_names]
     positions = [name for name in own if name not in TARGET_POSITIONS]
     for what, names, known in (
@@ -248,10 +245,7 @@ def _with_significance(
     covariance: Array,
     values: Mapping[str, KinematicParameter],
 ) -> dict[str, KinematicParameter]:
-    """Return descriptions by name, with the significance of the determined ones tested jointly.
-
-    The other arguments are those of `describe_constants`.
-    """
+    """Return descriptions by name, determined ones tested jointly; see `describe_constants`."""
     most = float(stdtrit(freedom, 1.0 - 0.5 * level))
     tested = [name for name, one in values.items() if one.determined]
     beside = significant_constants(fit, found, covariance, tested, most)

@@ -178,10 +178,7 @@ class LargeErrorSearch:
     def _compare(
         self, frame: MultiViewFrame, values: Array, cameras: Sequence[Camera] | None = None
     ) -> Array:
-        """Return the misfits (n,), see `misfits`, of a frame at values (n, m) of the pose tree.
-
-        cameras: the corrected cameras; None: those given.
-        """
+        """Return the misfits (n,) at values (n, m), by corrected cameras; None: those given."""
         kinematics, left = self._body.kinematics, np.zeros(len(values))
         X_WN = np.array([kinematics.poses(one) for one in values])
         for camera in self._cameras if cameras is None else cameras:
@@ -269,10 +266,7 @@ class LargeErrorSearch:
     def joint_correction(
         self, kind: str, name: str, sign: float, by: float, rank: float
     ) -> Correction:
-        """Return a correction to sign * q + by of the positions q of joint `name`.
-
-        kind and rank are the ``Correction``'s; `by` [rad or m] is its amount.
-        """
+        """Return a ``Correction`` of a kind and rank to sign * q + by [rad or m] of a joint's q."""
         j = self._body.kinematics.names.index(name)
 
         def changed(frame: MultiViewFrame) -> MultiViewFrame:
@@ -303,10 +297,7 @@ class LargeErrorSearch:
 
 
 def downscaled(camera: Camera, scale: float) -> Camera:
-    """Return a camera with pictures scaled by a factor, of at least 8 x 8 pixels.
-
-    A parallel camera is returned unchanged.
-    """
+    """Return a camera with pictures scaled, to 8 x 8 pixels at least; a parallel one unchanged."""
     if not isinstance(camera, PinholeCamera):
         return camera
     width, height = (max(8, round(scale * side)) for side in (camera.width, camera.height))

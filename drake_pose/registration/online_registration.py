@@ -129,10 +129,7 @@ class OnlineRegistration:
         self._search = search or CameraSearch(body)
 
     def status(self, state: OnlineState) -> CameraStatus:
-        """Return the status of the camera's pose in a state.
-
-        It is CONTRADICTED after `newest` outlier frames in a row.
-        """
+        """Return the status of the camera's pose: CONTRADICTED after `newest` outliers in a row."""
         if state.registered is None:
             return CameraStatus.NOT_REGISTERED
         if state.outlier_count >= self.settings.newest:

@@ -151,10 +151,7 @@ class PerFrameFit:
         )
 
     def _inlier_ratios(self, compared: Comparison, frame: MultiViewFrame) -> dict[str, float]:
-        """Return the inlier ratio by name of each camera that has a mask in the frame.
-
-        compared: the frame's contours compared with the masks of all cameras.
-        """
+        """Return the inlier ratio of a compared frame, by name of each camera with a mask."""
         sums = zip(self.camera_names, compared.sums, strict=True)
         return {name: inlier_ratio_of(one) for name, one in sums if name in frame.masks}
 

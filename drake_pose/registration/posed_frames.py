@@ -104,10 +104,7 @@ class PosedFrames:
         return np.concatenate(self._corners(self.X_WN[:: max(1, len(self.X_WN) // 5)]))
 
     def _corners(self, poses: Array) -> list[Array]:
-        """Return for each frame the corners (n, 3) of the body's convex hull in the world [m].
-
-        poses: (frames, nodes, 4, 4) X_WN of the nodes.
-        """
+        """Return each frame's corners (n, 3) of the body's hull in the world [m], of X_WN poses."""
         return map_ordered(lambda X_WN: _placed_hull(self.outlines, X_WN.tobytes()), poses)
 
     @cached_property
@@ -179,10 +176,7 @@ def _hull_of(outline: Outline) -> Array:
 
 @lru_cache(maxsize=256)
 def _placed_hull(outlines: tuple[Outline, ...], X_WN: bytes) -> Array:
-    """Return the corners (n, 3) of a body's convex hull in the world [m], cached for other fits.
-
-    outlines: a surface for each node. X_WN: bytes of the nodes' poses (nodes, 4, 4).
-    """
+    """Return a body's convex hull (n, 3) in the world [m]; X_WN: bytes of (nodes, 4, 4). Cached."""
     poses = np.frombuffer(X_WN).reshape(-1, 4, 4)
     hulls = zip(map(_hull_of, outlines), poses, strict=True)
     return _hull(np.concatenate([p @ X[:3, :3].T + X[:3, 3] for p, X in hulls]))
@@ -282,9 +276,6 @@ def common_size(cameras: Sequence[Camera], frames: Sequence[MultiViewFrame]) -> 
 
 
 def middle_of(kinematics: TreeKinematics, frames: Sequence[MultiViewFrame]) -> Array:
-    """Return the mean position (3,) of the nodes' origins in all frames, in the world [m].
-
-    kinematics: of the pose tree that the frames' values belong to.
-    """
+    """Return the mean position (3,) of the nodes' origins in all frames, in the world [m]."""
     places = [kinematics.poses(frame.values)[:, :3, 3].mean(axis=0) for frame in frames]
     return np.asarray(np.mean(places, axis=0))

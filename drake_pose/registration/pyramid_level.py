@@ -201,10 +201,7 @@ class PyramidLevel:
         return [X_CW[k] for k in order[: math.ceil(fraction * len(order))]]
 
     def tile_gains(self, X_CW: Array, squares: int = 16) -> Array:
-        """Return the log-likelihood gain of a pose (4, 4) by square image tiles [nat].
-
-        The result is (squares, squares), with `squares` tiles along the picture's longer side.
-        """
+        """Return a pose's log-likelihood gain [nat] by square image tiles (squares, squares)."""
         side = max(self.camera.width, self.camera.height) / squares
         _, gains = explain(
             self._packed, X_CW[:3] @ self._X_WN, self._static, self._parameters,
@@ -305,10 +302,7 @@ class PyramidLevel:
         return X
 
     def distinct(self, X_CW: Sequence[Array], most: int | None = None) -> list[Array]:
-        """Return the poses (4, 4) without those that place the body about as an earlier one does.
-
-        most: maximum number of returned poses; None: no limit.
-        """
+        """Return at most `most` poses (4, 4), those unlike all earlier ones; None: no maximum."""
         points = self._points[:: max(1, len(self._points) // 50)]
         kept, places = list[Array](), np.zeros((0, *points.shape))
         for X in X_CW:

@@ -461,10 +461,7 @@ def suggest_pose(
 
 
 def keep_distinct(items: Iterable[T], differ: Callable[[T, T], bool]) -> list[T]:
-    """Return the items that differ from every item kept before them; the first is kept.
-
-    differ: returns whether an item differs from a kept one.
-    """
+    """Return the items that `differ` from every item kept before them; the first is kept."""
     kept: list[T] = []
     for item in items:
         if all(differ(item, one) for one in kept):

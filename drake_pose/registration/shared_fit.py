@@ -528,10 +528,7 @@ class SharedFit:
 
 
 def fit_pose(view: PosedFrames, X_CW: Array, rounds: Sequence[AnnealingStage]) -> Array:
-    """Return a camera's pose X_CW (4, 4) fitted to all its frames from a start X_CW (4, 4).
-
-    Masks are taken to have no boundary bias. `rounds` are the stages of the fit.
-    """
+    """Return X_CW (4, 4) fitted from a start to all frames in `rounds`, without boundary biases."""
     fit = SharedFit([view], [X_CW], fit_biases=False)
     return fit.cameras(fit.fit(rounds))[0].X_CW
 

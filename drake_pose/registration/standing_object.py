@@ -157,10 +157,7 @@ class CalibrationTarget:
         return J @ covariance @ J.T
 
     def moved_pose(self, pose: TargetPose, by: Array, covariance: Array) -> TargetPose:
-        """Return pose and alternatives moved by TARGET_POSITIONS `by` (6,).
-
-        covariance: (6, 6) of TARGET_POSITIONS.
-        """
+        """Return pose and alternatives moved by TARGET_POSITIONS (6,) of a covariance (6, 6)."""
         X_WT = self.moved(pose.X_WT, by)
         others = X_WT @ np.linalg.inv(pose.X_WT) @ pose.alternatives
         covariance = self.pose_covariance(X_WT, covariance)
@@ -210,10 +207,7 @@ class CalibrationTarget:
 
 
 def distinct_motions(turns: Array, axes: Array) -> Array:
-    """Return the motions (n, 4, 4) that differ by more than a rotation about axes (k, 3).
-
-    turns: (t, 4, 4) motions, see ``CalibrationTarget.symmetry``; of alike ones the first is kept.
-    """
+    """Return those of motions (t, 4, 4) that differ by more than a rotation about axes (k, 3)."""
     if not len(axes):
         return turns
     points = axes @ np.swapaxes(turns[:, :3, :3], 1, 2)
@@ -511,10 +505,7 @@ class TargetSearch:
         return [pose for pose, X in zip(poses, X_CT, strict=True) if any(X is one for one in kept)]
 
     def _apart(self, poses: Sequence[Array], turns: Array) -> list[Array]:
-        """Return the items of `poses`, each (n, 4, 4), that differ from all kept before.
-
-        turns: (t, 4, 4) symmetries; items that one of them maps to each other do not differ.
-        """
+        """Return items (n, 4, 4) that differ from all kept before, up to symmetries (t, 4, 4)."""
         return keep_distinct(
             poses, lambda X, other: all(self._differ(X, other @ turn) for turn in turns)
         )

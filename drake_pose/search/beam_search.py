@@ -491,11 +491,7 @@ class _BeamRun:
         return PoseEstimate.of_values(sampled.tree, values, self._J, area, **statistics)
 
     def distinct(self, count: int, overlap: float) -> np.ndarray:
-        """Return samples (m, nodes) of the best collected poses that differ, best first.
-
-        Samples are indices in the nodes' grids. ``count`` and ``overlap`` as in
-        ``BeamSearch.best_poses``.
-        """
+        """Return samples (m, nodes) of the best different poses, see ``BeamSearch.best_poses``."""
         if not self._collected:
             return np.empty((0, len(self._body.sampled.values)), dtype=np.int32)
         samples, errors = (np.concatenate(both) for both in zip(*self._collected, strict=True))

@@ -89,10 +89,7 @@ class PartialPoseGraph:
 
     @classmethod
     def of_pose(cls, samples: np.ndarray, J: float) -> "PartialPoseGraph":
-        """Make the set of one pose with objective J [pixel].
-
-        ``samples``: (nodes,) index of each node's sample in its grid.
-        """
+        """Make the set of one pose, of samples (nodes,) in the grids, with objective J [pixel]."""
         zero = np.zeros(1, dtype=np.int64)
         layers = [Layer(node, zero, np.array([t]), zero) for node, t in enumerate(samples)]
         return cls(layers, np.array([J]))
@@ -108,10 +105,7 @@ class PartialPoseGraph:
         return float(self.Js.min(initial=np.inf))
 
     def objective(self, samples: np.ndarray) -> float | None:
-        """Return J of a pose [pixel]; None if the pose is not in the set.
-
-        ``samples``: (nodes,) index of each node's sample in its grid.
-        """
+        """Return J [pixel] of a pose with samples (nodes,); None if the pose is not in the set."""
         state = 0
         for layer in self.layers:
             begin, end = np.searchsorted(layer.origins, [state, state + 1])
@@ -134,10 +128,7 @@ class PartialPoseGraph:
         return used
 
     def restricted(self, allowed: Sequence[np.ndarray]) -> "PartialPoseGraph":
-        """Return the poses all of whose samples are allowed.
-
-        ``allowed``: for each node (samples,) bool whether each of its samples is.
-        """
+        """Return the poses all of whose samples are allowed, by (samples,) bool for each node."""
         layers = [layer.chosen(allowed[layer.node][layer.samples]) for layer in self.layers]
         return PartialPoseGraph(layers, self.Js)
 

@@ -243,10 +243,7 @@ def score_samples(
 
 @dataclass(frozen=True)
 class CoarseSettings:
-    """Parameters of the coarse search.
-
-    Lengths are fractions of the size: the square root of the silhouettes' mean area.
-    """
+    """Parameters of the coarse search; lengths are fractions of the mean area's square root."""
 
     hypotheses: int = 2500  # Hypotheses kept after each node,
     hypotheses_again: int = 300  # and when a limb of a pose is searched again.

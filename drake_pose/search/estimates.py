@@ -91,10 +91,7 @@ class JointEstimate:
     covers_full_turn: bool = False
 
     def holds(self, value: float, margin: float = 1e-9) -> bool:
-        """Return whether a value [rad or m] lies in the interval, up to full turns of an angle.
-
-        ``margin``: the interval is widened by this on both sides [rad or m].
-        """
+        """Return whether a value is in the interval and ``margin`` [rad or m], up to full turns."""
         if self.covers_full_turn:
             value -= 2.0 * math.pi * round((value - 0.5 * (self.low + self.high)) / (2.0 * math.pi))
         return self.low - margin <= value <= self.high + margin
@@ -138,10 +135,7 @@ def joint_estimates(
 
 
 def mimic_joints(tree: PoseTree, joints: Sequence[JointEstimate]) -> tuple[JointEstimate, ...]:
-    """Return the estimates of mimic joints, computed from those of the joints they follow.
-
-    ``joints``: estimates of the pose tree's values.
-    """
+    """Return the estimates of mimic joints, from ``joints``, those of the pose tree's values."""
     known, names = {joint.name: joint for joint in joints}, tree.model.position_names
     found = []
     for follower, leader, multiplier, offset in tree.followers:

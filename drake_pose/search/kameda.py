@@ -322,10 +322,7 @@ class PaperRun:
     # Poses and answers
 
     def _adopted(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the adopted samples (nodes,) and X_WN (nodes, 4, 4).
-
-        A node that is not placed has sample 0 and the identity.
-        """
+        """Return samples (nodes,) and X_WN (nodes, 4, 4), 0 and the identity where not placed."""
         samples = np.zeros(len(self.nodes), dtype=np.int64)
         poses = np.tile(np.eye(4), (len(self.nodes), 1, 1))
         for node, current in self.lists.items():

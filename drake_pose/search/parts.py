@@ -526,10 +526,7 @@ class NeighbourhoodSearch:
         return [pose for _, pose in kept]
 
     def _errors_near(self, parameters: np.ndarray, J: float) -> np.ndarray:
-        """Return (parts,) the error at parameters (m + 4,) near each part; J for reflections.
-
-        Errors are areas of the mismatch [pixel]. ``J``: the objective at the parameters [pixel].
-        """
+        """Return (parts,) the mismatch [pixel] near each part, or ``J`` for reflections."""
         errors = self.search.errors_near(self.problem, parameters)
         return np.append(errors, np.full(len(self._parts) - len(errors), J))
 

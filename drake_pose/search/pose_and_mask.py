@@ -89,10 +89,7 @@ class FoundPose:
 
 
 class PictureLevel(NamedTuple):
-    """A pyramid level: cameras, and for each frame each camera's image (H, W, 3).
-
-    An image is None where the camera has none of the frame.
-    """
+    """A pyramid level: cameras, and for each frame each camera's image (H, W, 3) or None."""
 
     cameras: tuple[Camera, ...]
     pictures: Sequence[Sequence[Picture | None]]
@@ -273,20 +270,14 @@ class PoseAndMask:
         map_ordered(improve, moving)
 
     def _draw(self, values: Array, camera: Camera, few: bool = False) -> Mask:
-        """Return the body's silhouette (H, W) in a camera at values (m,) [rad or m].
-
-        ``few``: whether surfaces of very few triangles, without skin, are drawn.
-        """
+        """Return the silhouette (H, W) at values (m,); ``few``: of few triangles, without skin."""
         X_CN = camera.X_CW @ self._kinematics.poses(values)
         if few:
             return draw_mask(self._few, X_CN, camera)
         return draw_mask(self._surfaces.at(self._kinematics.split(values)), X_CN, camera)
 
     def _sample(self, rng: np.random.Generator, values: Array, spread: Array, count: int) -> Array:
-        """Draw (count, m) random values from normal distributions, clipped to their limits.
-
-        ``values``: (m,) their means; ``spread``: (m,) their standard deviations [rad or m].
-        """
+        """Draw (count, m) normal values of means and deviations (m,) [rad or m], within limits."""
         drawn = values + spread * rng.standard_normal((count, len(values)))
         return np.clip(drawn, self._kinematics.lower, self._kinematics.upper)
 
@@ -361,10 +352,7 @@ class PoseAndMask:
         return best
 
     def _refine(self, level: PictureLevel, frame: _Progress) -> Array:
-        """Return values (m,) fitted to the edges of a frame's masks by colours, ``frame.cuts``.
-
-        Without a mask that shows the body, the frame's values are returned.
-        """
+        """Return values (m,) fitted to a frame's ``cuts``; its own if no mask shows the body."""
         masks, settings = frame.cuts, self._settings
         areas = [np.count_nonzero(mask) for mask in masks if mask is not None and mask.any()]
         if not areas:

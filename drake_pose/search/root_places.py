@@ -222,10 +222,7 @@ def _near(view: View, places: np.ndarray) -> np.ndarray:
 
 
 def _lift(camera: Camera, places: np.ndarray, depth: float) -> np.ndarray:
-    """Return points (n, 3) in the world [m] that a camera sees at places (n, 2) [pixel].
-
-    ``depth``: the points' z in the camera's frame [m].
-    """
+    """Return points (n, 3) [m] at depth z_C [m] that a camera sees at places (n, 2) [pixel]."""
     if isinstance(camera, ParallelCamera):
         scale = np.full(2, 1.0 / camera.pixels_per_metre)
     else:

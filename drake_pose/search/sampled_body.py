@@ -240,10 +240,7 @@ class Scoring:
         return draw_mask(outlines, self.X_CW[view] @ X_WN, self.views[view].camera)
 
     def mean_node_areas(self, X_WN: np.ndarray) -> list[float]:
-        """Return for each view the mean area of the nodes that have geometry [pixel].
-
-        ``X_WN``: (nodes, 4, 4) poses at the first sample of each node.
-        """
+        """Return by view the mean area [pixel] of nodes with geometry, at X_WN (nodes, 4, 4)."""
         first = np.zeros((1, 1), dtype=np.int64)
         solid = [i for i, node in enumerate(self.sampled.tree.nodes) if len(node.mesh.triangles)]
         means = []

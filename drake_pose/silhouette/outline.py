@@ -113,10 +113,7 @@ class PackedOutlines(NamedTuple):
 
 
 def outline_from_mesh(mesh: TriangleMesh) -> Outline:
-    """Return the outline of a mesh, with equal vertices merged and without degenerate triangles.
-
-    Results are cached, as outlines are immutable.
-    """
+    """Return a mesh's outline, of merged vertices, without degenerate triangles; cached."""
     vertices = np.asarray(mesh.vertices, dtype=np.float64) + 0.0  # -0.0 becomes 0.0
     return _merged_outline(vertices.tobytes(), np.asarray(mesh.triangles, dtype=np.int64).tobytes())
 
@@ -169,10 +166,7 @@ def edge_records(triangles: np.ndarray) -> np.ndarray:
 
 
 def _position_in_run(*keys: np.ndarray) -> np.ndarray:
-    """Return (n,) each entry's position, from 0, in its run of entries that are equal in all keys.
-
-    ``keys``: arrays (n,), sorted together.
-    """
+    """Return (n,) each entry's position, from 0, in its run of equal and sorted ``keys`` (n,)."""
     index = np.arange(len(keys[0]))
     begins = np.ones(len(index), dtype=bool)
     begins[1:] = np.any([key[1:] != key[:-1] for key in keys], axis=0)
@@ -184,10 +178,7 @@ EMPTY_OUTLINE = outline_of_triangles(np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 def pack(outlines: tuple[Outline, ...]) -> PackedOutlines:
-    """Return outlines, one per node, in the kernel's arrays.
-
-    Results are cached, as outlines are immutable.
-    """
+    """Return outlines, one per node, in the kernel's arrays; cached, as they are immutable."""
     packed = _pack_rest(tuple(outline.rest or outline for outline in outlines))
     if all(outline.rest is None for outline in outlines):
         return packed

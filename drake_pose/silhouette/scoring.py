@@ -24,10 +24,7 @@ from drake_pose.silhouette.span_kernel import paint, paint_labels, score
 
 
 def prefix_sums(weights: np.ndarray) -> np.ndarray:
-    """Return (H, W + 1) int32 row-wise sums of a mask or of integers (H, W) left of each pixel.
-
-    The last column is the sum of the whole row.
-    """
+    """Return (H, W + 1) int32 row-wise sums left of each pixel (H, W), then of the whole row."""
     prefix = np.zeros((weights.shape[0], weights.shape[1] + 1), dtype=np.int32)
     np.cumsum(weights, axis=1, dtype=np.int32, out=prefix[:, 1:])
     return prefix

@@ -89,10 +89,7 @@ def _require_one_size(pictures: Sequence[Picture], min_count: int, message: str)
 
 
 def background_support(pictures: Sequence[Picture], background: Background) -> Floats:
-    """Return (H, W) the fraction of pictures (H, W, 3) in which each pixel shows the background.
-
-    A pixel shows it if no channel differs from the mean by more than ``Background.tolerance``.
-    """
+    """Return (H, W) the fraction of pictures within ``Background.tolerance`` of the background."""
     shown = np.zeros(background.deviation.shape, dtype=np.float32)
     for picture in pictures:
         shown += _differs(picture, background.mean, background.tolerance) == 0

@@ -272,10 +272,7 @@ def add_meshcat_skin(
 
 
 def held_positions(q: Array, period: float) -> Trajectory:
-    """Return positions q (n, nq) as a zero-order hold: row k from k - 1/2 to k + 1/2 periods.
-
-    ``period``: time between two rows [s].
-    """
+    """Return q (n, nq) as a zero-order hold: row k from k - 1/2 to k + 1/2 periods [s]."""
     times = period * (np.arange(len(q) + 1) - 0.5)
     return PiecewisePolynomial.ZeroOrderHold(times, np.vstack([q, q[-1:]]).T)
 

@@ -215,10 +215,7 @@ class MatchingDiagram:
         return tracks and bool(self.matcher.GetOutputPort("track").Eval(own)[0])
 
     def with_intervals(self, context: Context) -> PoseEstimate:
-        """Return the last update's tracked pose with intervals from its contours.
-
-        ``context`` is the diagram's. The matcher must be a SilhouetteTracker.
-        """
+        """Return the SilhouetteTracker's pose with intervals, by the diagram's context."""
         assert isinstance(self.matcher, SilhouetteTracker)
         return self.matcher.with_intervals(self.matcher.GetMyContextFromRoot(context))
 
@@ -429,10 +426,7 @@ def show_estimate(
 def _finish(
     builder: DiagramBuilder, matcher: SilhouetteMatcher, period: float, player: MaskPlayer | None
 ) -> MatchingDiagram:
-    """Add logs of a matcher's outputs, with one sample each ``period`` [s], and build the diagram.
-
-    ``player``: source of recorded masks; None: the cameras are simulated.
-    """
+    """Log a matcher's outputs each ``period`` [s], and build; ``player``: of recorded masks."""
     # A log samples before the update at the same time: sample k + 1 has the estimate of frame k.
     positions_log = LogVectorOutput(
         matcher.GetOutputPort("estimated_positions"), builder, publish_period=period

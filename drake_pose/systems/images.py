@@ -21,10 +21,7 @@ from drake_pose.systems.ports import PortedSystem, camera_port
 
 
 def picture_to_colour_image(picture: Picture | None) -> ImageRgba8U:
-    """Return a picture (H, W, 3), red, green, blue, as an ImageRgba8U.
-
-    None gives an image without pixels.
-    """
+    """Return a picture (H, W, 3), red, green, blue, as ImageRgba8U; None: one without pixels."""
     if picture is None:
         return ImageRgba8U()
     image = ImageRgba8U()

@@ -147,19 +147,13 @@ class PersonTracker(MemorySystem):
         return _person(self.vectors(context), 0.0)
 
     def set_person(self, context: Context, person: TrackState) -> None:
-        """Set the tracked person's state in a context.
-
-        The next pictures are expected within a period.
-        """
+        """Set the tracked person's state; the next pictures are expected within a period."""
         fresh = {"watched": np.zeros(1), "time": np.full(1, np.nan), "elapsed": np.zeros(1)}
         state = context.get_mutable_discrete_state()
         self.set_vectors(state, self._packed(person) | fresh)
 
     def next_vectors(self, context: Context, known: dict[str, Array]) -> Mapping[str, Array]:
-        """Return the state vectors that the context's pictures change, by name.
-
-        ``known``: copies of all state vectors by name. Empty if there are no new pictures.
-        """
+        """Return the state vectors that new pictures change, by name; ``known``: copies of all."""
         before, time = float(known["time"][0]), context.get_time()
         stamp = self.eval_input(context, "time")
         if stamp is not None:
@@ -235,10 +229,7 @@ class PersonTracker(MemorySystem):
         }
 
     def _colour_views(self, context: Context, colours: Array) -> ColourViews | None:
-        """Return the context's pictures with the colours learned so far; None without a picture.
-
-        ``colours``: the state vector of that name.
-        """
+        """Return the context's pictures with ``colours`` learned so far; None without a picture."""
         pictures = self._colours.pictures(context)
         if not pictures:
             return None
@@ -270,10 +261,7 @@ class PersonTracker(MemorySystem):
         return found, separated
 
     def _follow_one(self, last: TrackState | None, seen: FrameViews) -> TrackState | None:
-        """Return the person's next state in the views ``seen``, given the last state.
-
-        None if no person was found or fewer than two cameras see one.
-        """
+        """Return the person's next state in ``seen``; None: nobody, or in fewer than two views."""
         return self._tracker.follow(last, seen) if len(seen.showing) >= 2 else None
 
     def _without_others(self, seen: FrameViews, last: TrackState | None) -> "_SeparatedViews":

@@ -35,10 +35,7 @@ T = TypeVar("T")
 
 
 def require_period(owner: str, period: float) -> None:
-    """Raise SettingsError unless a period [s] is positive and finite.
-
-    ``owner``: what has the period, for the message.
-    """
+    """Raise SettingsError, which names ``owner``, unless a period [s] is positive and finite."""
     if not 0.0 < period < math.inf:
         raise SettingsError(f"the {owner}'s period must be positive, not {period}")
 
@@ -54,10 +51,7 @@ def require_distinct_cameras(cameras: Sequence[Camera], fewest: int, message: st
 
 
 def require_time_forward(system: LeafSystem, context: Context, last: float) -> None:
-    """Raise SettingsError if the context's time precedes ``last``, that of the last update [s].
-
-    ``system`` is named in the message.
-    """
+    """Raise SettingsError, which names ``system``, if the context's time precedes ``last`` [s]."""
     now = context.get_time()
     if now < last:
         raise SettingsError(
@@ -67,18 +61,12 @@ def require_time_forward(system: LeafSystem, context: Context, last: float) -> N
 
 
 def camera_port(kind: str, camera: Camera, cameras: Sequence[Camera]) -> str:
-    """Return a camera's port name: ``kind`` for a single camera, else ``<kind>_<camera>``.
-
-    ``cameras``: all cameras of the system.
-    """
+    """Return a camera's port name: ``kind`` if it is the only one, else ``<kind>_<camera>``."""
     return kind if len(cameras) == 1 else f"{kind}_{camera.name}"
 
 
 def connect_matching_ports(builder: DiagramBuilder, source: System, target: System) -> None:
-    """Connect each output port of ``source`` to the input port of ``target`` with the same name.
-
-    Both are systems in ``builder``. Output ports without such an input port are not connected.
-    """
+    """Connect outputs of ``source`` to the inputs of ``target`` that have the same name."""
     for index in range(source.num_output_ports()):
         port = source.get_output_port(index)
         if target.HasInputPort(port.get_name()):
@@ -191,10 +179,7 @@ class PortedSystem(LeafSystem):
         return eval_inputs
 
     def add_parameter(self, initial: Any) -> Callable[[Context], Any]:
-        """Declare an abstract parameter; return a function that reads it from a context.
-
-        Parameters are numbered in the order of declaration.
-        """
+        """Declare the next abstract parameter; return a function that reads it from a context."""
         index = self.DeclareAbstractParameter(AbstractValue.Make(initial))
         return lambda context: context.get_abstract_parameter(int(index)).get_value()
 
@@ -206,20 +191,14 @@ class PortedSystem(LeafSystem):
 
 
 class ImmutableValue:
-    """Base class of immutable values; a deep copy is the value itself.
-
-    Drake would otherwise copy abstract state twice in each update.
-    """
+    """Base class of immutable values: Drake's deep copies in each update are the value itself."""
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Any:
         return self
 
 
 class BeliefSystem(PortedSystem, Generic[T]):
-    """A system whose state is one abstract value, the belief, replaced by a periodic update.
-
-    The update is unrestricted, as abstract state requires.
-    """
+    """A system whose state is an abstract belief, replaced by an unrestricted periodic update."""
 
     def declare_belief(self, initial: T, period: float) -> None:
         """Declare the belief with its initial value, and its update every ``period`` [s]."""
@@ -245,10 +224,7 @@ class BeliefSystem(PortedSystem, Generic[T]):
         return known
 
     def next_belief(self, context: Context, last: T) -> T:
-        """Return the belief after an update at the context's inputs, given the ``last`` one.
-
-        Return ``last`` itself if nothing changes. Subclasses implement this.
-        """
+        """Return the belief after an update, ``last`` itself if nothing changes; for subclasses."""
         raise NotImplementedError
 
     def _update(self, context: Context, state: State) -> EventStatus:

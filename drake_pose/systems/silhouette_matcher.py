@@ -326,10 +326,7 @@ class SilhouetteTracker(SilhouetteMatcher):
     def _find(
         self, context: Context, memory: _Memory, views: Sequence[View]
     ) -> tuple[PoseEstimate | None, _Memory]:
-        """Return the tracked or searched pose, and the next memory; None before any evidence.
-
-        ``memory`` is that of the last update, ``views`` are the cameras that see the body.
-        """
+        """Return the tracked or searched pose, None before any evidence, and the next memory."""
         pictures = self._colours.pictures(context)
         last, root_position = memory.tracker_state, self.eval_input(context, "root_position")
         if not views and not pictures and last.track is None:

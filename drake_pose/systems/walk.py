@@ -330,10 +330,7 @@ def build_walk(
 
 
 def add_garden(builder: DiagramBuilder, X_WG: RigidTransform | None = None) -> SceneGraph:
-    """Add urdf/garden/garden.sdf to a diagram; return the SceneGraph that is added for it.
-
-    ``X_WG``: pose of the garden in the world; None: the identity.
-    """
+    """Add urdf/garden/garden.sdf, at X_WG (None: identity), to a diagram; return its SceneGraph."""
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
     ModelSource(package_folder() / "garden" / "garden.sdf", {}).parse(plant, scene_graph)
     frame = plant.GetFrameByName("garden")

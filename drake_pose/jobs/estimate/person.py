@@ -245,10 +245,7 @@ def describe_faults(checked: CheckedCapture, frames: Sequence[str]) -> tuple[str
 
 
 def describe_views(views: ViewFaults, frames: Sequence[str]) -> tuple[str, ...]:
-    """Return warnings of frames without the person or with other people in view.
-
-    ``views`` has indices of frames, ``frames`` their names.
-    """
+    """Return warnings of frames, by name, without the person or with other people in view."""
 
     def listed(*several: Sequence[int]) -> str:
         """Return a text of the names of frames, given as sequences of indices."""
@@ -297,10 +294,7 @@ def describe_fit(inlier_ratios: Sequence[float], usual_from: float = 0.6) -> tup
 
 
 def describe_alternatives(captured: PersonCapture, frames: Sequence[str]) -> tuple[str, ...]:
-    """Return warnings of frames that another pose fits equally well.
-
-    They name the landmarks that differ; ``frames`` are the names of the capture's frames.
-    """
+    """Return warnings of frames, by name, that another pose fits equally well: its landmarks."""
     model, found = captured.tree.model, []
     marks = load_landmarks(model.path)
     for k, alternatives in sorted(captured.alternatives.items()):
@@ -340,10 +334,7 @@ def describe_rig(rig: RigFault | None) -> tuple[str, ...]:
 
 
 def describe_camera(fault: CameraFault, frames: Sequence[str]) -> str:
-    """Return the warning of a camera that has moved or is inconsistent with the others.
-
-    ``frames`` are the names of the recording's frames.
-    """
+    """Return the warning of a camera that moved or is inconsistent; ``frames`` are all names."""
     motion = fault.motion
     since = "" if fault.first == 0 else f" since frame {frames[fault.first]}"
     action = f"left out{since}" if fault.is_left_out else "still used"

@@ -373,10 +373,7 @@ class _FrameWriter:
         self._index, self._time, self._begin = -1, float("nan"), time.perf_counter()
 
     def watch(self, context: Context) -> None:
-        """Write a frame if the pictures at the time of the diagram's context are new.
-
-        The frame's name counts periods since the first frame, with six digits, and always grows.
-        """
+        """Write a frame, named by its count of periods, if the pictures of the context are new."""
         now = float(self._value(context, "time")[0])
         if np.isnan(now) or now == self._time:
             return

@@ -135,10 +135,7 @@ def live_player(
 
 
 def stride_positions(model: ArticulatedModel) -> Array:
-    """Return positions (n, nq) [rad or m] of one stride on the spot, at RATE_HZ, ending standing.
-
-    Joints that the bundled person does not have keep their default positions.
-    """
+    """Return positions (n, nq) of one stride on the spot, at RATE_HZ; unknown joints rest."""
     person = load_model(bundled_model("person"), check=False)
     motion = make_motion(load_skeleton(person), 5 * int(RATE_HZ), 0)
     walking = motion.q[[name == "walk" for name in motion.names]]
@@ -213,10 +210,7 @@ def walk(
 
 
 class _WalkLog:
-    """Logs the duration of each command and the final pose of a diagram of build_walk.
-
-    ``on_command`` and ``on_report`` are as in `walk`.
-    """
+    """Logs each command's duration and the final pose of a build_walk diagram, as in `walk`."""
 
     def __init__(
         self, diagram: Diagram, on_command: Callable[[str], None], on_report: Callable[[str], None]

@@ -102,10 +102,7 @@ def move_upper_body(skeleton: Skeleton, q: Array, features: Array, *, face_known
 
 
 def move_limb(skeleton: Skeleton, q: Array, name: str, target: Array) -> Array:
-    """Move a limb of q (nq,) until its end is at a target (3,) [m]; return the new positions.
-
-    `name` is one of LIMBS. The other limbs' positions stay.
-    """
+    """Move a limb of LIMBS until its end is at a target (3,) [m]; return the new q (nq,)."""
     limb = skeleton.limbs[name]
     part = limb.lower_node, limb.end_L
     return reach(skeleton, _with_bent_joint(q, limb), limb.positions, part, target)[0]

@@ -189,10 +189,7 @@ def load_skeleton(model: ArticulatedModel) -> Skeleton:
 
 
 def registered_positions(skeleton: Skeleton, spread_deg: float = 80.0) -> Array:
-    """Return q (nq,) [rad, m] of the registered pose (3.1.1): upright, head at the origin.
-
-    Both arms are spread sideways by `spread_deg` [deg], as far as their limits allow.
-    """
+    """Return q (nq,) of the registered pose (3.1.1), arms spread by `spread_deg` within limits."""
     q = np.zeros(len(skeleton.lower))
     for name in LIMBS[:2]:
         limb = skeleton.limbs[name]
@@ -201,11 +198,7 @@ def registered_positions(skeleton: Skeleton, spread_deg: float = 80.0) -> Array:
 
 
 def _chain(packed: PackedTree, node: int) -> tuple[PackedTree, Indices]:
-    """Pack the chain of nodes from the root to a node.
-
-    `packed` is the whole tree. The indices of the chain's values among the tree's are returned,
-    too.
-    """
+    """Pack a node's chain from the root, and return its values' indices among the tree's, too."""
     path: list[int] = []
     while node >= 0:
         path, node = [node, *path], int(packed.parents[node])

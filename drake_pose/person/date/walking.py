@@ -171,10 +171,7 @@ def _sides(left: float = 1.0, right: float = 1.0, **degrees: float) -> dict[str,
 
 
 def _key_poses(motion: str) -> list[dict[str, float]]:
-    """Return the key poses of a motion of MOTIONS: angles [deg] by joint; others are relaxed.
-
-    The motion goes from one key pose to the next.
-    """
+    """Return a motion's key poses in order: angles [deg] by joint; other joints are relaxed."""
     if motion == "walk":
         return [
             _sides(side, -side, upper_arm_x=28.0, thigh_x=-25.0)
@@ -283,10 +280,7 @@ def make_gestures(skeleton: Skeleton, frames: int = 84) -> Motion:
 
 
 def _positions(skeleton: Skeleton, key: dict[str, float], size: float) -> Array:
-    """Return q (nq,) [rad, m] of a key pose: angles [deg] by joint, multiplied by a size.
-
-    Joints that are not in `key` are relaxed.
-    """
+    """Return q (nq,) of a key pose: angles [deg] by joint, times a size; the rest is relaxed."""
     q = np.zeros(len(skeleton.lower))
     relaxed = _sides(forearm_x=-10.0) | _sides(right=-1.0, upper_arm_z=8.0)
     for name, degrees in {**relaxed, **{n: size * d for n, d in key.items()}}.items():
@@ -295,10 +289,7 @@ def _positions(skeleton: Skeleton, key: dict[str, float], size: float) -> Array:
 
 
 def _through(keys: list[Array], count: int) -> Array:
-    """Return positions (count, nq) from key pose (nq,) to key pose, slowing down at each.
-
-    The first key pose itself is left out; the last is the last row.
-    """
+    """Return positions (count, nq) through key poses (nq,), slower at each, without the first."""
     place = np.linspace(0.0, len(keys) - 1.0, count + 1)[1:]
     index = np.minimum(place.astype(int), len(keys) - 2)
     weight = 0.5 - 0.5 * np.cos(np.pi * (place - index))

@@ -77,10 +77,7 @@ def intersection_over_union(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def _overlap(first: np.ndarray, second: np.ndarray) -> tuple[int, int, float]:
-    """Return the area where two masks (H, W) bool differ, the first mask's area, and their IoU.
-
-    The areas are in pixels. The IoU (intersection over union) of two empty masks is 1.
-    """
+    """Return where two masks (H, W) differ, the first's area [pixel], and the IoU (1: empty)."""
     first_area, second_area, intersection = (
         int(np.count_nonzero(area)) for area in (first, second, first & second)
     )
@@ -91,10 +88,7 @@ def _overlap(first: np.ndarray, second: np.ndarray) -> tuple[int, int, float]:
 def compare_masks(
     masks: Mapping[str, np.ndarray], bodies: Mapping[str, np.ndarray]
 ) -> MaskAgreement:
-    """Return the agreement of silhouettes with the body's masks, both (H, W) bool by camera.
-
-    ``bodies``: the body's masks, at least of the cameras of ``masks``.
-    """
+    """Return the agreement of silhouettes with ``bodies``, both (H, W) bool by camera."""
     found = {camera: _overlap(mask, bodies[camera]) for camera, mask in masks.items()}
     return MaskAgreement(
         sum(differing for differing, _, _ in found.values()),

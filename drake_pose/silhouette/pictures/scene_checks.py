@@ -124,10 +124,7 @@ def leave_out_unreadable(scene: Scene, frames: Iterable[str]) -> Scene:
 
 
 def require_readable(refused: Mapping[tuple[str, str], str], scene: Scene) -> None:
-    """Raise SceneError, with the first reason, if all of a scene's masks were refused.
-
-    ``refused``: reasons by (camera, frame).
-    """
+    """Raise SceneError, with the first reason by (camera, frame), if all masks were refused."""
     if refused and len(refused) == len(scene.masks):
         first = next(iter(refused.values()))
         raise SceneError(f"{scene.path}: none of {len(refused)} masks can be used: {first}")
@@ -151,10 +148,7 @@ def describe_unreadable(
 
 
 def frame_ranges(frames: Iterable[str], known: Sequence[str], max_ranges: int = 6) -> str:
-    """Return frames as text, consecutive ones as first-last, with at most ``max_ranges`` ranges.
-
-    ``known``: names of all frames, in order; these must include the given ones.
-    """
+    """Return frames as at most ``max_ranges`` ranges first-last, in the order of ``known``."""
     order = {frame: k for k, frame in enumerate(known)}
     places = np.sort([order[frame] for frame in frames]).astype(int)
     runs = np.split(places, np.flatnonzero(np.diff(places) > 1) + 1) if len(places) else []
@@ -194,10 +188,7 @@ def _find_repeats(scene: Scene, min_change: float = 0.02) -> tuple[dict[str, lis
 
 
 def _repeated_files(scene: Scene) -> set[tuple[str, str]]:
-    """Return (camera, frame) of each mask of a scene whose file equals the previous frame's.
-
-    Files are read only where sizes are equal; an unreadable file equals none.
-    """
+    """Return (camera, frame) of masks whose file equals the frame's before; unreadable: no."""
     found = []
     for name in scene.cameras:
         last: tuple[Path, int] | None = None

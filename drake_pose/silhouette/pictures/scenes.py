@@ -231,10 +231,7 @@ class Scene:
             self._videos[self.images[name, frame]].require_before(int(frame))
 
     def _file(self, files: Mapping[tuple[str, str], Path], camera: str, frame: str) -> Path:
-        """Return the file of a camera's frame in ``files``, which are by (camera, frame).
-
-        Raises UnknownNameError: there is no such camera, or it has no such frame.
-        """
+        """Return the file of a camera's frame in ``files``; UnknownNameError: there is none."""
         if camera not in self.cameras:
             raise UnknownNameError("camera", camera, self.cameras, str(self.path))
         if (camera, frame) not in files:

@@ -75,10 +75,7 @@ def default_arguments(kernel: Callable[..., Any]) -> tuple[Any, ...]:
 
 
 def _without_literals(find_template: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a kernel's ``get_call_template`` that drops literal types from call signatures.
-
-    numba would compile a kernel once per literal.
-    """
+    """Return a kernel's ``get_call_template`` without literal types, each of which is compiled."""
 
     def find(args: Any, kws: Any) -> Any:
         plain = {name: types.unliteral(kind) for name, kind in kws.items()}

@@ -172,10 +172,7 @@ class LinkGraph:
 
 
 class PlantKinematics:
-    """Forward kinematics of a model's plant, with a context of its own.
-
-    ``body`` is the index of a body in the plant.
-    """
+    """Forward kinematics of a model's plant, in its own context; ``body`` is a body's index."""
 
     def __init__(self, model: ParsedModel) -> None:
         """Start at the model's default positions."""

@@ -323,10 +323,7 @@ _written: dict[Path, TriangleMesh] = {}
 
 
 def write_obj(mesh: TriangleMesh, name: str) -> Path:
-    """Write an OBJ file with normals into a temporary folder and return its path.
-
-    The file name begins with ``name``; equal meshes of one name share a file.
-    """
+    """Write an OBJ file with normals in a temporary folder; meshes equal in ``name`` share it."""
     digest = hashlib.sha256(mesh.vertices.tobytes() + mesh.triangles.tobytes()).hexdigest()[:16]
     path = workspace() / f"{re.sub(r'[^A-Za-z0-9_-]', '_', name)}_{digest}.obj"
     if path not in _written and not path.exists():

@@ -470,10 +470,7 @@ class ParsedModel:
         return self.link_names.index(name)
 
     def carried_by(self, link: str) -> tuple[str, ...]:
-        """Return a link and all links that it carries, by joints or welded to it, base first.
-
-        Raises UnknownNameError: there is no such link.
-        """
+        """Return a link and all that it carries, base first; UnknownNameError: no such link."""
         plant, names = self.plant, self.link_names
         joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
         pairs = [(int(j.parent_body().index()), int(j.child_body().index())) for j in joints]

@@ -274,10 +274,7 @@ class PoseTree:
         return np.where(around, low, placement.lower), np.where(around, high, placement.upper)
 
     def value_limits(self, node: int) -> tuple[Array, Array]:
-        """Return the lower and upper limits (k,), (k,) of a node's values [rad or m].
-
-        They are equal for a held value and infinite for an angle without limits.
-        """
+        """Return a node's limits (k,), (k,) [rad or m]; equal if held, infinite without limits."""
         placement = self.placements[node]
         lower = np.where(placement.is_unlimited_angle, -np.inf, placement.lower)
         return lower, np.where(placement.is_unlimited_angle, np.inf, placement.upper)

@@ -223,10 +223,7 @@ def _plain(node: Any) -> Any:
 
 
 def _numbers(value: Any) -> Array | None:
-    """Return the numbers (n,), by rows, of an array, a list, or a mapping with ``data``.
-
-    The result is None for anything else, and if an entry is not a finite number.
-    """
+    """Return the finite numbers (n,), by rows, of an array, list or mapping ``data``; or None."""
     if isinstance(value, dict):
         value = value.get("data")
     return finite_numbers(value)

@@ -195,10 +195,7 @@ class PinholeCamera(_PosedCamera):
     near: float = 0.01
 
     def project(self, p_W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Project world points (n, 3) [m] to (n, 2) pixels and (n,) depths z_C [m].
-
-        The pixels of points whose depth is not positive are nan.
-        """
+        """Project points (n, 3) [m] to (n, 2) pixels, nan if not in front, and depths z_C [m]."""
         p_C = self._in_camera(p_W)
         depth = p_C[:, 2]
         visible = np.where(depth > 0.0, depth, np.nan)

@@ -462,10 +462,7 @@ class TimedVideo:
         self.height, self.width = self.read(0).shape[:2]
 
     def _scan(self) -> Iterator[tuple[int, bool]]:
-        """Yield the time stamp [time base of the stream] of each displayed, complete image.
-
-        A flag says whether the image is a keyframe.
-        """
+        """Yield each complete image's time stamp [stream's time base], and whether a keyframe."""
         try:
             for packet in self._container.demux(self._stream):
                 if packet.pts is not None and not (packet.is_corrupt or packet.is_discard):

@@ -336,10 +336,7 @@ class RecordedSource(FrameSource):
         return taken
 
     def _advance(self) -> TimedPicture | None:
-        """Return the next image of the calibrated size, or None; drop those of other sizes.
-
-        SceneError if the first image has another size.
-        """
+        """Return the next image of the calibrated size, or None; SceneError: the first differs."""
         for path, one in self._pictures:
             wrong = self.specification.size_problem(one.picture)
             if not wrong:

@@ -121,10 +121,7 @@ def main(words: Sequence[str] | None = None) -> None:
 
 
 def _run(words: Sequence[str] | None) -> None:
-    """Parse the arguments (as in `main`) and run the command.
-
-    An error becomes one line on stderr and a SystemExit.
-    """
+    """Parse arguments (as in `main`) and run the command; errors become a line and SystemExit."""
     try:
         command, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
     except (CycloptsError, SettingsError) as error:

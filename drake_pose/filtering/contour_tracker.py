@@ -117,10 +117,7 @@ class ContourMeasurement(LinearObservation):
 
 
 class ContourObservation(BodyState):
-    """Turns masks and pictures into measurements of a pose tree's state.
-
-    Colour histograms are arrays (cameras, nodes, 3, colours), see ``fit.colours``.
-    """
+    """Turns masks and pictures into measurements of a tree's state, with ``fit.colours``."""
 
     def gather_evidence(
         self,

@@ -134,10 +134,7 @@ class HandModel:
 
     @cached_property
     def measured(self) -> tuple[str, ...]:
-        """The measurements (13).
-
-        Points [pixel]; alpha [rad] and rho [pixel] of lines; scale; prior of the joints.
-        """
+        """The measurements (13): points [pixel]; alpha [rad]; rho [pixel]; scale; joints' prior."""
         points = [f"{i}{j}" for i in self.fingers for j in (0, *self.joints)]
         lines = [f"{i}{j}" for i in self.fingers for j in self.joints]
         lines += [f"palm_{edge}" for edge in PALM_EDGES]

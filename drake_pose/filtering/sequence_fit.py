@@ -203,10 +203,7 @@ class FittedSequence:
     deviations: Array
 
     def estimates(self, frame: int) -> tuple[JointEstimate, ...]:
-        """Return the estimate of each value of the tree in the frame of this index.
-
-        The intervals are 95 % intervals inside the limits, at most one turn of an angle.
-        """
+        """Return each value's estimate in a frame: 95 % intervals in limits, at most one turn."""
         kinematics = self.body.kinematics
         count, around = len(kinematics.names), kinematics.covers_full_turn
         values = self.fitted.parameters[frame, :count]

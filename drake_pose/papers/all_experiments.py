@@ -48,10 +48,7 @@ class Experiment(NamedTuple):
 
 
 def _kameda(short: bool, folder: Path, count: Count) -> Outcome:
-    """Run Kameda's experiment A by the paper's and by the beam search; 3 poses if `short`, or 219.
-
-    Pictures are written to `folder`, progress is reported to `count`.
-    """
+    """Run Kameda's experiment A by both searches, 3 poses if `short` or 219; pictures: `folder`."""
     searches: dict[str, PoseSearch] = {
         "paper": kameda.experiment_search(),
         "beam": kameda.beam_experiment_search(),

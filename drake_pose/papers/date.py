@@ -166,10 +166,7 @@ class DateResult:
         return max((lap["pose"] for track in own for lap in track.milliseconds), default=0.0)
 
     def milliseconds(self, method: str) -> dict[str, float]:
-        """Return median processor times [ms] of a frame by stage, and their sum as "all".
-
-        Times of all cameras are added.
-        """
+        """Return a frame's median processor times [ms], of all cameras, by stage and as "all"."""
         laps = self._tracks[method].milliseconds
         names = dict.fromkeys(name for lap in laps for name in lap)
         stages = {name: float(np.median([lap.get(name, 0.0) for lap in laps])) for name in names}

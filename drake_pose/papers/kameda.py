@@ -496,10 +496,7 @@ class RealPictures(NamedTuple):
     paper_E_total: float
 
     def settings(self, scene: Path) -> EstimateSettings:
-        """Return settings with the root's position, and its rotation's range.
-
-        `scene` is the folder of the stored scene, or of a copy.
-        """
+        """Return settings with the root's position and rotation's range for a stored scene."""
         if self.model == "man":
             return demo_settings(scene)
         # The forearm points up in the pictures, within 30 degrees; the hand may show either side.

@@ -84,10 +84,7 @@ def save_pictures(
 
 
 def _draw_examples(title: str, trials: list[RandomPose], result: RandomPoses) -> Figure:
-    """Draw true and estimated poses of trials from the camera and from the side.
-
-    Between them, the agreement of the silhouettes is drawn. `result` is the run of the trials.
-    """
+    """Draw trials of a run, true and estimated, from camera and side; between them agreement."""
     tree = result.search.tree
     front, side = (
         LabelRenderer(tree.model, camera)
@@ -131,10 +128,7 @@ def _crop(pictures: list[np.ndarray], margin: int = 20) -> list[np.ndarray]:
 
 
 def _draw_histogram(values: np.ndarray, end: int, label: str) -> Figure:
-    """Draw a histogram of values (n,), one per image, from 0 to `end`.
-
-    The last bin also counts all values beyond `end`. `label` says what the values are.
-    """
+    """Draw a histogram of values (n,), named by `label`; its last bin counts those over `end`."""
     figure = Figure(figsize=(6, 4))
     axis = figure.subplots()
     axis.hist(np.minimum(values, end), bins=np.linspace(0, end, 21).tolist(), color="0.4")

@@ -81,10 +81,7 @@ class PersonCapture:
         state: TrackState,
         seen: FrameViews | ColourViews,
     ) -> None:
-        """Store the pose of a tracker's state in row `frame`, and its standard deviations.
-
-        `seen` are the views of the frame that the state was fitted to.
-        """
+        """Store pose and deviations of a tracker's state, fitted to views `seen`, in a row."""
         lengths = None if self.shape is None else self.shape.covariance
         self.q[frame] = tracker.positions(state.values)
         self.inlier_ratios[frame] = state.inlier_ratio
@@ -306,10 +303,7 @@ class _Capture:
         return found
 
     def _search_frame(self, frame: int, known: TrackState | None) -> TrackState | None:
-        """Return the state of one frame by itself, with the tracker's shape; None: no person.
-
-        `known` is the state from which the pose is refined; None: the person is searched.
-        """
+        """Return a frame's own state, refined from `known` or searched; None: no person."""
         if known is None:
             explained = self.find_explanations(frame)
             if not explained:

@@ -348,10 +348,7 @@ class PersonPoseTracker:
         )
 
     def distance_by_colour(self, values: Array, colours: ColourViews) -> float:
-        """Return the RMS distance of the contour at values (m,) from the colours' edge [pixel].
-
-        nan where no edge is found in any picture.
-        """
+        """Return the contour's RMS distance [pixel] at values (m,) from colours; nan: no edge."""
         placement = self.fit.body.place(values)
         sums = colours.compare(self.fit, placement, self.settings.follow[-1]).sums
         squares, weight = sums[:, :, [Sum.SQUARES, Sum.WEIGHT]].sum(axis=(0, 1))

@@ -106,10 +106,7 @@ class PersonSettings:
         return self.headings // self.headings_per_frame
 
     def headings_of(self, frame: int) -> list[int]:
-        """Return the indices of the headings tried in a troubled frame, spread all around.
-
-        `frame` is the number of a troubled frame, any integer; it is taken modulo `cycle`.
-        """
+        """Return the indices of headings tried in a troubled frame, spread over a `cycle`."""
         # The bit-reversed order puts neighbouring headings late.
         order = sorted(range(self.cycle), key=lambda k: f"{k:032b}"[::-1])
         return list(range(order[frame % self.cycle], self.headings, self.cycle))
@@ -257,10 +254,7 @@ class BodyPlan:
         return self._samples(limb.joints, X_WN[None])[0]
 
     def _samples(self, joints: Indices, X_WN: Array) -> Array:
-        """Return points (n, m, 3) along a limb in the world [m], nodes at X_WN (n, nodes, 4, 4).
-
-        `joints` (3,) are the indices of its landmarks.
-        """
+        """Return points (n, m, 3) [m] along a limb of landmarks (3,), X_WN (n, nodes, 4, 4)."""
         a, b, c = np.moveaxis(self.landmarks.positions(X_WN)[:, joints], 1, 0)
         upper = np.minimum(self.along, 1.0)[:, None]
         lower = np.maximum(self.along - 1.0, 0.0)[:, None]

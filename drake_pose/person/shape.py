@@ -38,10 +38,7 @@ NOISE = Noise(deviation=0.02, correlation=0.15)
 
 @dataclass(frozen=True, eq=False)
 class KnownShape:
-    """A person's lengths by shape joint [m] and radius scales by part.
-
-    Shape joints that are not named have the model's length, parts that are not named scale 1.
-    """
+    """A person's lengths by shape joint [m], else the model's; radius scales by part, else 1."""
 
     lengths: Mapping[str, float]
     radius_scales: Mapping[str, float]

@@ -250,10 +250,7 @@ class FrameViews:
         )
 
     def middle(self) -> Array | None:
-        """Return where the person is (3,) [m], from the silhouettes' middles.
-
-        None where fewer than two silhouettes are not empty.
-        """
+        """Return where the person is (3,) [m]; None: fewer than two silhouettes are not empty."""
         if len(self.nonempty) < 2:
             return None
         return triangulate(

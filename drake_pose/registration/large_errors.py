@@ -167,10 +167,7 @@ class LargeErrorSearch:
         return min(best, key=lambda one: (one[0].rank, one[1]))[0] if best else None
 
     def misfits(self, correction: Correction) -> Array:
-        """Return the area (frames,) in body or silhouette alone, summed over cameras [pixel].
-
-        Frames are those compared, and pixels those of the downscaled pictures.
-        """
+        """Return the area (frames,) in body or silhouette alone, over cameras [small pixel]."""
         frames = map(correction.apply, self._frames)
         rows = [self._compare(one, one.values[None], correction.cameras)[0] for one in frames]
         return np.array(rows)

@@ -274,18 +274,12 @@ class OnlineRegistration:
     def _kept(
         self, frames: Sequence[PosedFrame], frame: PosedFrame, instead_of: int | None = None
     ) -> tuple[PosedFrame, ...]:
-        """Return frames with one more, the newest, at the end; at most `most_frames`.
-
-        instead_of: index of the frame that it replaces; None: none.
-        """
+        """Return frames with a new one at the end, for `instead_of`; at most `most_frames`."""
         others = [one for k, one in enumerate(frames) if k != instead_of]
         return (*others, frame)[-self.settings.most_frames :]
 
     def _nearest(self, frame: PosedFrame, frames: Sequence[PosedFrame]) -> int | None:
-        """Return the index of the last of `frames` with the body posed as in `frame`; None: none.
-
-        Poses are the same if the body's points are nearer than `novelty`.
-        """
+        """Return the index of the last of `frames` posed within `novelty` of a frame, or None."""
         here = self._points(frame)
         extent = float(np.sqrt(((here - here.mean(axis=0)) ** 2).sum(axis=1).mean()))
         for k in reversed(range(len(frames))):

@@ -119,10 +119,7 @@ class PosedFrames:
         return float(np.sqrt((off**2).sum(axis=1).mean()))
 
     def observations(self, camera: int, count: int) -> list[Observation]:
-        """Return the frames as observations by `count` cameras; only `camera` has evidence.
-
-        camera: index of the camera that took the frames, from 0.
-        """
+        """Return frames as observations by `count` cameras; only number `camera` has evidence."""
         observations = []
         for frame, edge in zip(self.frames, self._edges, strict=True):
             edges = pack_evidence([edge if c == camera else NO_EDGE for c in range(count)])
@@ -145,19 +142,13 @@ class PosedFrames:
         ]
 
     def downscaled(self, side: float) -> PinholeCamera:
-        """Return the camera with pictures so small that `size` is at most `side` [pixel].
-
-        Pictures are never enlarged, and have at least 8 x 8 pixels.
-        """
+        """Return the camera with `size` at most `side` [pixel]; at least 8 x 8, never enlarged."""
         camera, scale = self.camera, min(1.0, side / self.size)
         width, height = max(8, round(scale * camera.width)), max(8, round(scale * camera.height))
         return camera.resized(width, height)
 
     def sums(self, frame: int, camera: PinholeCamera) -> NDArray[np.int32]:
-        """Return the prefix sums (H, W + 1) of a frame's mask, see ``reduced_sums``.
-
-        frame: its index. camera: the downscaled camera, with pictures of H x W pixels.
-        """
+        """Return prefix sums (H, W + 1) of a frame's mask in a small camera: ``reduced_sums``."""
         return reduced_sums(self.frames[frame].mask, camera)
 
 

@@ -142,10 +142,7 @@ class PyramidLevel:
         )[0]  # fmt: skip
 
     def explained(self, X_CW: Array) -> tuple[float, float]:
-        """Return the explained fraction and mean edge strength of a pose (4, 4).
-
-        They are the `explained` and `contour` of a ``PictureFit``.
-        """
+        """Return a pose's `explained` fraction and mean `contour`, as of ``PictureFit``."""
         sums = self.statistics(X_CW)
         fraction = float(sums[Explained.GAIN]) / max(self.backgrounds.max_gain, 1e-9)
         return fraction, float(sums[Explained.CONTOUR]) / max(float(sums[Explained.OUTLINE]), 1.0)
@@ -155,10 +152,7 @@ class PyramidLevel:
         return float(self.scores([X_CW], frames)[0])
 
     def scores(self, X_CW: Sequence[Array] | Array, frames: int | None = None) -> Array:
-        """Return the scores (n,), see `evidence`, of n poses (4, 4).
-
-        frames: number of frames that are used, from the first on; None: all.
-        """
+        """Return scores (n,), see `evidence`, of poses (4, 4) in the first `frames`, or all."""
         pictures, poses = self._scored(frames), np.asarray(X_CW)[:, :3]
 
         def sums(chunk: Array) -> Array:
@@ -193,10 +187,7 @@ class PyramidLevel:
         )  # fmt: skip
 
     def best(self, X_CW: Sequence[Array], frames: int, fraction: float) -> list[Array]:
-        """Return the fraction of the poses (4, 4) that has the best scores, best first.
-
-        frames: number of frames that are used, from the first on.
-        """
+        """Return the fraction of poses (4, 4) with the best scores in the first `frames`."""
         order = np.argsort(-self.scores(X_CW, frames), kind="stable")
         return [X_CW[k] for k in order[: math.ceil(fraction * len(order))]]
 
@@ -293,10 +284,7 @@ class PyramidLevel:
         return -costs[order, 0], [self.moved(X_CW[k], corners[k, 0]) for k in order]
 
     def opposite(self, X_CW: Array) -> Array:
-        """Return the pose X_CW (4, 4) of a camera opposite to another, as far from the body.
-
-        It sees about the mirror images of the silhouettes that a camera at `X_CW` (4, 4) sees.
-        """
+        """Return X_CW (4, 4) of an opposite camera, as far away, which sees mirror images."""
         X = np.diag([-1.0, 1.0, -1.0, 1.0]) @ X_CW
         X[2, 3] += 2.0 * float(X_CW[2, :3] @ self._middle + X_CW[2, 3])
         return X

@@ -176,10 +176,7 @@ def choose_pictures(
 def posed_pictures(
     recording: Recording, indices: Sequence[int], offset: float, known: Sequence[PosedPicture] = ()
 ) -> list[PosedPicture]:
-    """Return the pictures of `indices` that have logged values at a time offset [s].
-
-    known: pictures of the recording that have been read before.
-    """
+    """Return pictures of `indices` with logged values at a time offset [s], or `known` ones."""
     values, rates = recording.values_at(offset), recording.rates_at(offset)
     pictures = {frame.name: frame.picture for frame in known}
 

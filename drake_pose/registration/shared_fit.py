@@ -272,10 +272,7 @@ class SharedFit:
         return np.array(map_ordered(ratio, masks))
 
     def matched_lengths(self, found: SharedValues) -> Array:
-        """Return the length of each node's contours in all masks, and how much of it fits.
-
-        The result is (nodes, 2) [pixel].
-        """
+        """Return (nodes, 2) the length of contours in all masks, and how much fits [pixel]."""
 
         def lengths(mask: tuple[Observation, Array]) -> Array:
             sums = self.problem.compare(*mask, SHARED.inlier_stage)[0].sums
@@ -295,10 +292,7 @@ class SharedFit:
         return np.array(map_ordered(cost, masks))
 
     def inliers(self, ratios: Array) -> Mask:
-        """Return which masks (rows,) are inliers, from all masks' inlier ratios (rows,).
-
-        The threshold, `inlier_threshold`, is that of the mask's camera.
-        """
+        """Return which masks (rows,) reach their camera's `inlier_threshold`, by inlier ratio."""
         own = [ratios[self.rows == c] for c in range(len(self.views))]
         return np.concatenate([one >= inlier_threshold(one) for one in own])
 

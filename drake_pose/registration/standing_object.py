@@ -105,10 +105,7 @@ class CalibrationTarget:
         return other
 
     def tree(self, X_WT: Array) -> PoseTree:
-        """Return the pose tree from the link to the target, for TARGET_POSITIONS 0 at X_WT (4, 4).
-
-        Raises SettingsError: no joint moves the link.
-        """
+        """Return the tree from link to target, 0 at X_WT (4, 4); SettingsError: no joint."""
         mesh = self._mesh.transformed(inverse_transforms(self._X_TO))
         model = self._robot.with_target(self._link, mesh, X_WT @ self._X_TO)
         tree = model.pose_tree(
@@ -495,10 +492,7 @@ class TargetSearch:
     def _distinct(
         self, poses: Sequence[HandEye] | Array, frames: Sequence[PosedFrame]
     ) -> list[HandEye]:
-        """Return the poses that show the target apart from all kept before, up to its symmetries.
-
-        frames: those in which the target's poses in the camera are compared.
-        """
+        """Return poses that show the target, in frames, unlike earlier ones, up to symmetries."""
         X_WL = self._target.link_poses(np.array([one.values for one in frames]))
         X_CT = [inverse_transforms(X_WL @ X_LC) @ X_WT for X_LC, X_WT in poses]
         kept = self._apart(X_CT, self._target.symmetry[0])

@@ -256,10 +256,7 @@ class _BranchAndBound:
         return PosesWithin(self.J_limit, graph, self._complete, self._limited, bound)
 
     def _drop(self, bounds: np.ndarray, limited: bool = False) -> None:
-        """Record the bounds (n,) of dropped partial poses that may lead to poses in the limit.
-
-        ``limited``: whether a limit of the search is the reason.
-        """
+        """Record bounds (n,) of dropped partial poses; ``limited``: for a limit of the search."""
         if len(bounds):
             self._complete = False
             self._limited = self._limited or limited

@@ -211,10 +211,7 @@ class PoseSet:
         return tuple(joint.determined for joint in self.joints)
 
     def position_intervals(self, tree: PoseTree) -> np.ndarray:
-        """Return (3, nq) ``determined``, ``low`` and ``high`` of the plant's positions.
-
-        Columns of positions that are not in the tree are NaN. Mimic joints are included.
-        """
+        """Return (3, nq) ``determined``, ``low``, ``high`` of q; NaN: it is not in the tree."""
         joints = (*self.joints, *mimic_joints(tree, self.joints))
         known = {joint.name: (joint.determined, joint.low, joint.high) for joint in joints}
         names = tree.model.position_names

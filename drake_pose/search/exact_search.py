@@ -115,10 +115,7 @@ class ExactSearch:
         return reached._replace(steps=reached.steps + sum(steps for _, _, steps in coarse))
 
     def refine(self, problem: RefinementProblem, start: np.ndarray, deadline: float) -> ExactPose:
-        """Refine parameters ``start`` (m + 4,), and place parts anew where J decreases.
-
-        ``deadline``: time.perf_counter() at which no further part is tried [s].
-        """
+        """Refine ``start`` (m + 4,), and place parts anew until ``deadline`` (perf_counter)."""
         fine, _, steps = descend(problem, start, self.body.freedom(), PASSES.fine)
         neighbourhood = NeighbourhoodSearch(problem, self._parts)
         good = self._settings.good * problem.border_length

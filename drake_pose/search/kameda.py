@@ -135,10 +135,7 @@ class PaperRun:
                 return
 
     def _complete(self) -> bool:
-        """Run steps 1 to 6 until every node is placed; return whether every node is.
-
-        False: no pose is left, or the limit of runs is reached.
-        """
+        """Run steps 1 to 6; return whether every node is placed before poses or runs end."""
         uncovered: Regions | None = None
         while len(self.lists) < len(self.nodes):
             # Step 1: of the nodes whose parent is placed, the one nearest to the root.
@@ -292,10 +289,7 @@ class PaperRun:
         return np.concatenate(all_patterns), np.concatenate(all_gains)
 
     def _adopt_most_exposed(self) -> bool:
-        """Adopt a better candidate of the most exposed inner node (section 5.2.2).
-
-        Return False if no node has a better candidate (the paper's set A becomes empty).
-        """
+        """Adopt the most exposed inner node's better candidate (5.2.2); False: it has none."""
         covers = []
         samples, poses = self._adopted()
         for i, node in enumerate(self.nodes):

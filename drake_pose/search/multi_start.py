@@ -283,10 +283,7 @@ class _MultiStartRun:
         return refine_best(self._fit, self._values(starts), self._passes, self._proceed)
 
     def _looks_exact(self, values: np.ndarray) -> bool:
-        """Return whether masks may be exact: their border coincides with the fitted body's.
-
-        ``values``: (m,) the tree's values of the fitted pose [rad or m].
-        """
+        """Return whether masks may be exact: their border is the body's at ``values`` (m,)."""
         # Masks with many specks are not exact.
         if self._clean is not self._problem or not self._proceed():
             return False

@@ -138,10 +138,7 @@ class RowTable:
         self._made = np.zeros(0, dtype=np.bool_)
 
     def missing(self, indices: np.ndarray) -> np.ndarray:
-        """Return the distinct indices, of those given, whose rows are not yet stored.
-
-        The table grows to hold them; their rows must be stored by ``make``.
-        """
+        """Return the distinct indices whose rows ``make`` must store; the table grows by them."""
         size = int(indices.max(initial=0)) + 1
         if len(self.rows) < size:
             more = np.zeros((size - len(self.rows) + 64, self.rows.shape[1]), dtype=np.int64)
@@ -297,10 +294,7 @@ class PoseStore:
             raise LimitReached
 
     def _batches(self, missing: np.ndarray, batch: int) -> Iterator[np.ndarray]:
-        """Yield poses ``missing`` (n,) of a parent in parts of ``batch``.
-
-        Raises LimitReached: a limit is reached before a part.
-        """
+        """Yield ``missing`` poses (n,) of a parent in parts of ``batch``, until LimitReached."""
         for begin in range(0, len(missing), batch):
             self.reserve()
             yield missing[begin : begin + batch]
@@ -359,10 +353,7 @@ class PoseStore:
         return np.asarray(poses[:, parent])
 
     def _parent_poses(self, node: int, parents: np.ndarray) -> np.ndarray:
-        """Return X_WP (n, 4, 4) of poses ``parents`` (n,) of the node's parent.
-
-        For a root it is (1, 4, 4), the identity.
-        """
+        """Return X_WP (n, 4, 4) of poses (n,) of the node's parent; a root's: (1, 4, 4), I."""
         parent = self.tree_nodes[node].parent
         return np.eye(4)[None] if parent < 0 else self.nodes[parent].X_WN[parents]
 

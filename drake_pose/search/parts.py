@@ -348,10 +348,7 @@ class PartSearch:
     def _restore(
         self, parameters: np.ndarray, X_WN: np.ndarray, nodes: Sequence[int]
     ) -> np.ndarray:
-        """Return parameters (m + 4,) with some nodes moved back to X_WN by their own values.
-
-        ``X_WN``: (all nodes, 4, 4) wanted poses; ``nodes``: indices of these nodes.
-        """
+        """Return parameters (m + 4,) with ``nodes`` moved back to X_WN by their own values."""
         for node in nodes:
             radius = max(float(self._balls[node, 3]), 1e-6)
             p_N = radius * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])

@@ -92,10 +92,7 @@ class RefinementBody:
         return self.kinematics.split(parameters[:-4])
 
     def nearest_turns(self, parameters: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
-        """Return parameters (m + 4,) of the same pose, with angles in the turn nearest to ``near``.
-
-        ``near``: (m + 4,) parameters; None: the turn that ``TreeKinematics.nearest_turns`` chooses.
-        """
+        """Return parameters (m + 4,) in the turns nearest to ``near``, see ``TreeKinematics``."""
         values = None if near is None else near[:-4]
         turned = self.kinematics.nearest_turns(parameters[:-4], values)
         return np.concatenate([turned, parameters[-4:]])
@@ -164,10 +161,7 @@ class RefinementProblem:
         self.border_length = sum(border.length for border in self._silhouettes)
 
     def mismatch(self, parameters: np.ndarray) -> list[np.ndarray]:
-        """Return for each view (H, W) bool the pixels covered by body or silhouette, but not both.
-
-        ``parameters``: (m + 4,) the pose of the body.
-        """
+        """Return by view (H, W) bool where body at parameters (m + 4,) and silhouette differ."""
         placed = self.body.place(parameters)
         return [
             draw_packed(placed.packed, view.camera.X_CW @ placed.X_WN, view.camera) != view.mask

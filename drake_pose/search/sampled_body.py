@@ -209,11 +209,7 @@ class Scoring:
     def subtract(
         self, regions: Regions, nodes: Sequence[int], samples: np.ndarray, X_WN: np.ndarray
     ) -> None:
-        """Remove the projections of k nodes, at samples (k,) and X_WN (k, 4, 4), from regions.
-
-        ``regions``: the uncovered part of the silhouette in each view, changed in place; ``nodes``:
-        indices of the k nodes.
-        """
+        """Remove k nodes at samples (k,), X_WN (k, 4, 4) from each view's ``regions``, in place."""
         outlines = self.sampled.outlines_at(nodes, samples)
         for view, X_CW, (mask, prefixes) in zip(self.views, self.X_CW, regions, strict=True):
             subtract_body(mask, prefixes[1], outlines, X_CW @ X_WN, view.camera)
@@ -232,10 +228,7 @@ class Scoring:
     def draw(
         self, nodes: Sequence[int], samples: np.ndarray, X_WN: np.ndarray, view: int
     ) -> np.ndarray:
-        """Return the union of k nodes' projections in one view, (H, W) bool.
-
-        ``samples``: (k,) and ``X_WN``: (k, 4, 4) of these nodes; ``view``: index of the view.
-        """
+        """Return the union (H, W) of k nodes at samples (k,), X_WN (k, 4, 4), in one view."""
         outlines = self.sampled.outlines_at(nodes, samples)
         return draw_mask(outlines, self.X_CW[view] @ X_WN, self.views[view].camera)
 
@@ -391,10 +384,7 @@ class SampledBody:
         return np.asarray(np.linalg.norm(np.vstack(roots) - camera.X_WC[:3, 3], axis=1))
 
     def _find_balls(self, node: int, hulls: list[VisualHull]) -> np.ndarray:
-        """Return (k, 4) centres and radii of a node's inscribed balls in its frame N [m].
-
-        ``hulls``: the visual hulls of all nodes, at rest.
-        """
+        """Return a node's inscribed balls (k, 4), centres and radii [m] in N, from hulls."""
         balls = [hulls[node].spread_balls(10)]
         # A ball far from the parent's joint is most likely outside the silhouette: test it first.
         balls[0] = balls[0][np.argsort(-np.linalg.norm(balls[0][:, :3], axis=1), kind="stable")]

@@ -107,11 +107,7 @@ class ViewsFit:
         self.evaluations, self._counting = 0, Lock()
 
     def cost(self, values: np.ndarray, stage: AnnealingStage) -> float:
-        """Return the robust cost at the tree's values (m,) in a stage [pixel].
-
-        ``stage`` sets the robust cost's scale and the spacing of contour points; its iterations are
-        not used.
-        """
+        """Return the robust cost [pixel] at values (m,); ``stage``: its scale and spacing."""
         self._count(1)
         fit, views = self._level(stage)
         sums = fit.compare(views, values, stage).sums
@@ -359,10 +355,7 @@ class RobustModes:
         return not modes or (len(modes) < self._settings.modes and self._proceed())
 
     def _add_to_known(self, modes: list[FittedPose], values: np.ndarray) -> bool:
-        """Return whether values (m,) belong to one of the modes, and if so add them to it.
-
-        Values that a mode does not determine may differ: they widen its intervals.
-        """
+        """Return whether values (m,) belong to one of the modes, which they then widen."""
         widest = self._settings.widest(self._kinematics.is_angle)
         for i, mode in enumerate(modes):
             near = self._kinematics.nearest_turns(values, mode.values)
@@ -374,10 +367,7 @@ class RobustModes:
         return False
 
     def _add_flipped(self, modes: list[FittedPose], mode: FittedPose) -> None:
-        """Add the flipped poses of a mode that fit as well as the best, with flipped intervals.
-
-        They are appended to ``modes``, or added to one of these if they belong to it.
-        """
+        """Add a mode's flipped poses that fit as well, to ``modes`` or to one of these."""
         kinematics, stage = self._kinematics, self._settings.comparison
 
         def settle(flip: Flip) -> tuple[np.ndarray, np.ndarray]:

@@ -35,10 +35,7 @@ class AnnotatedPicture:
     annotations: Sequence[tuple[str, Mapping[str, Any]]] = ()
 
     def draw(self, classes: Container[str]) -> Mask:
-        """Return the union (H, W) of the areas of annotations whose class name is in ``classes``.
-
-        Raises ValueError, which names the annotation: an area cannot be drawn.
-        """
+        """Return the union (H, W) of annotations of ``classes``; ValueError: one has no area."""
         mask = np.zeros((self.height, self.width), dtype=np.bool_)
         for name, entry in self.annotations:
             if name not in classes:

@@ -521,10 +521,7 @@ class TreeSurfaces:
 
 
 class PackedSurfaces:
-    """A tree's surfaces in the kernel's arrays, deformed to values of the tree.
-
-    The rigid parts may be simplified ones.
-    """
+    """A tree's surfaces, maybe simplified, in the kernel's arrays, deformed to its values."""
 
     def __init__(self, surfaces: TreeSurfaces) -> None:
         self._rest = pack(tuple(surfaces.at_rest(node) for node in range(len(surfaces.rigid))))

@@ -197,19 +197,13 @@ class MatchingDiagram:
     player: MaskPlayer | None = None
 
     def estimate(self, context: Context) -> PoseEstimate | None:
-        """Return the last update's estimate; None: no body was visible, or there was no update.
-
-        ``context`` is the diagram's.
-        """
+        """Return the last update's estimate, by the diagram's context; None: there is none."""
         own = self.matcher.GetMyContextFromRoot(context)
         estimate: PoseEstimate | None = self.matcher.GetOutputPort("pose_estimate").Eval(own)
         return estimate
 
     def was_tracked(self, context: Context) -> bool:
-        """Return whether the last update tracked the pose without a search.
-
-        ``context`` is the diagram's.
-        """
+        """Return whether the last update tracked without a search, by the diagram's context."""
         own = self.matcher.GetMyContextFromRoot(context)
         tracks = isinstance(self.matcher, SilhouetteTracker)
         return tracks and bool(self.matcher.GetOutputPort("track").Eval(own)[0])

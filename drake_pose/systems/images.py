@@ -169,10 +169,7 @@ class MaskPlayer(PortedSystem):
         return min(max(index, 0), len(self.frames) - 1)
 
     def _play(self, port: str, model_value: Any, read: Callable[[str], Any]) -> None:
-        """Declare an output port whose value is ``read`` of the name of the frame shown.
-
-        ``model_value``: a value of the port's type, or the size of its vector.
-        """
+        """Declare an output ``read`` of the shown frame's name; a model value or a size."""
         self.add_output(
             port,
             model_value,

@@ -41,10 +41,7 @@ def require_period(owner: str, period: float) -> None:
 
 
 def require_distinct_cameras(cameras: Sequence[Camera], fewest: int, message: str) -> None:
-    """Raise SettingsError if there are fewer than ``fewest`` cameras or two have the same name.
-
-    ``message`` is the error's, followed by the names.
-    """
+    """Raise SettingsError (``message``, names): fewer than ``fewest``, or equal names."""
     names = [camera.name for camera in cameras]
     if len(names) < fewest or len(set(names)) != len(names):
         raise SettingsError(f"{message}: {names}")
@@ -209,10 +206,7 @@ class BeliefSystem(PortedSystem, Generic[T]):
     def add_belief_output(
         self, name: str, model_value: Any, read: Callable[[T], Any]
     ) -> OutputPort:
-        """Declare an output port ``name`` whose value is ``read`` of the belief.
-
-        ``model_value``: a value of the port's type, or the size of its vector.
-        """
+        """Declare an output ``read`` of the belief, of the model value's type or size."""
         ticket = {self.abstract_state_ticket(self._belief)}
         return self.add_output(
             name, model_value, lambda context: read(self.belief(context)), ticket
@@ -272,10 +266,7 @@ class MemorySystem(PortedSystem):
             state.set_value(self._vectors[name], np.ravel(value))
 
     def next_vectors(self, context: Context, known: dict[str, Array]) -> Mapping[str, Array]:
-        """Return the vectors that an update at the context's inputs changes, by name.
-
-        ``known``: a copy of all vectors by name, which may be modified. Subclasses implement this.
-        """
+        """Return the vectors that an update changes, of copies ``known``; for subclasses."""
         raise NotImplementedError
 
     def _update(self, context: Context, state: DiscreteValues) -> EventStatus:

@@ -348,10 +348,7 @@ class SilhouetteTracker(SilhouetteMatcher):
         return memory.tracker_state.track is not None
 
     def with_intervals(self, context: Context) -> PoseEstimate:
-        """Return the tracked pose of the last update with intervals; see ``MatchAndTrack``.
-
-        This costs about as much as an update, so that no output port has them.
-        """
+        """Return the last tracked pose with intervals, at the cost of an update."""
         known = self.belief(context)
         assert known.estimate is not None, "nothing was tracked"
         follower = self._follower(self._tracking(context))

@@ -119,10 +119,7 @@ class Walker(MemorySystem):
         self.declare_vectors(outputs | inner, outputs, period)
 
     def next_vectors(self, context: Context, known: dict[str, Array]) -> Mapping[str, Array]:
-        """Return the state vectors after the next step of the walk, by name.
-
-        ``known``: copies of the last ones by name, which are modified.
-        """
+        """Return the state vectors after the next step, by name; ``known``: the last ones."""
         q = self.GetInputPort("positions").Eval(context)
         turn, walk = 0, 0
         if np.isfinite(q).all():

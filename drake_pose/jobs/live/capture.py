@@ -458,10 +458,7 @@ class _FrameWriter:
             self._doubts.setdefault(text, []).append(frame)
 
     def finish(self, sensors: PictureCapture, replay: bool) -> None:
-        """Write warnings, the use of pictures, and the files about all frames.
-
-        ``sensors`` is the sensor system of the capture; ``replay``: whether replay.html is written.
-        """
+        """Write warnings, the use of pictures by ``sensors``, and the files about all frames."""
         writer = self._writer
         writer.warnings += [
             f"frame {frame_ranges(frames, list(self._times))}: {text}"

@@ -430,10 +430,7 @@ def limb_angles(
 
 
 def _directions(root: Array, ends: Array) -> tuple[Array, Array]:
-    """Return directions (..., 3) and distances (...) [m] from root to ends (..., 3).
-
-    The direction is downwards where both points coincide.
-    """
+    """Return directions (..., 3), down if undefined, and distances [m] of ends from a root."""
     across = ends - root
     distances = np.sqrt((across**2).sum(axis=-1))
     is_far = distances[..., None] > _TINY

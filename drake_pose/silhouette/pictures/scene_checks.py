@@ -45,10 +45,7 @@ def read_scene(
 
 
 def check_scene(scene: Scene) -> Scene:
-    """Return a scene with warnings about its files, and without masks of cameras that froze.
-
-    A scene of uncalibrated cameras (``scale_unknown``) is returned unchanged.
-    """
+    """Return a scene with warnings, without frozen cameras' masks; ``scale_unknown``: unchanged."""
     if scene.scale_unknown:
         return scene
     warnings, known, files = list(scene.warnings), scene.frames, {*scene.masks, *scene.images}

@@ -78,10 +78,7 @@ class Scene:
     )
 
     def cameras_of(self, frame: str) -> tuple[str, ...]:
-        """Return the names of the cameras with a mask of a frame.
-
-        Raises UnknownNameError: there is no such frame.
-        """
+        """Return the names of cameras with a mask of a frame; UnknownNameError: no such frame."""
         names = tuple(camera for camera in self.cameras if (camera, frame) in self.masks)
         if not names and frame not in self.frames:
             raise UnknownNameError("frame", frame, self.frames, str(self.path))

@@ -261,7 +261,7 @@ class PersonTracker(MemorySystem):
         return found, separated
 
     def _follow_one(self, last: TrackState | None, seen: FrameViews) -> TrackState | None:
-        """Return the person's next state in ``seen``; None: nobody, or in fewer than two views."""
+        """Return the person's next state in ``seen``; None: no person, or fewer than two views."""
         return self._tracker.follow(last, seen) if len(seen.showing) >= 2 else None
 
     def _without_others(self, seen: FrameViews, last: TrackState | None) -> "_SeparatedViews":

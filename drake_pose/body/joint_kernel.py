@@ -10,38 +10,25 @@ from drake_pose.compiled import compiled, multiply
 
 
 class PackedSteps(NamedTuple):
-    """s joints in the arrays that kernels take, usually a chain or several chains in a row.
+    """s joints in the arrays that kernels take, usually a chain or several chains in a row."""
 
-    Attributes:
-        sizes: (s,) int64 number of positions of each joint.
-        inverted: (s,) bool, whether the joint is traversed inwards.
-        starts: (s,) int64 index of each joint's first row in ``coefficients``.
-        coefficients: (r, 16) coefficients of each joint's ``JointMap``, one joint after another.
-    """
-
-    sizes: np.ndarray
-    inverted: np.ndarray
-    starts: np.ndarray
+    sizes: np.ndarray  # (s,) int64 number of positions of each joint.
+    inverted: np.ndarray  # (s,) bool, whether the joint is traversed inwards.
+    starts: np.ndarray  # (s,) int64 index of each joint's first row in ``coefficients``.
+    # (r, 16) coefficients of each joint's ``JointMap``, one joint after another.
     coefficients: np.ndarray
 
 
 class PackedBands(NamedTuple):
-    """b skin bands with v vertices in all, in the arrays that kernels take, one after another.
+    """b skin bands with v vertices in all, in the arrays that kernels take, one after another."""
 
-    Attributes:
-        starts: (b + 1, 3) int64 index of each band's first step, weight and vertex.
-        steps: the joints from each node's parent to the node.
-        weights: (l,) the distinct vertex weights in [0, 1] of each band.
-        weight_index: (v,) int64 index of each vertex's weight, counted in its band.
-        points: (v, 3) vertices at rest [m], in the node's frame, or in its parent's if inverted.
-        inverted: (b,) bool, whether the node is nearer to the plant's world than its parent.
-    """
-
-    starts: np.ndarray
-    steps: PackedSteps
-    weights: np.ndarray
-    weight_index: np.ndarray
+    starts: np.ndarray  # (b + 1, 3) int64 index of each band's first step, weight and vertex.
+    steps: PackedSteps  # The joints from each node's parent to the node.
+    weights: np.ndarray  # (l,) the distinct vertex weights in [0, 1] of each band.
+    weight_index: np.ndarray  # (v,) int64 index of each vertex's weight, counted in its band.
+    # (v, 3) vertices at rest [m], in the node's frame, or in its parent's if inverted.
     points: np.ndarray
+    # (b,) bool, whether the node is nearer to the plant's world than its parent.
     inverted: np.ndarray
 
 

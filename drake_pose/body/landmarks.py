@@ -29,17 +29,11 @@ class Landmark:
 
 @dataclass(frozen=True, eq=False)
 class NodeLandmarks:
-    """Landmarks in the frames of a pose tree's nodes.
+    """Landmarks in the frames of a pose tree's nodes."""
 
-    Attributes:
-        names: names of the landmarks.
-        nodes: (n,) index of each landmark's node.
-        points: (n, 3) positions in the nodes' frames [m].
-    """
-
-    names: tuple[str, ...]
-    nodes: Indices
-    points: Array
+    names: tuple[str, ...]  # Names of the landmarks.
+    nodes: Indices  # (n,) index of each landmark's node.
+    points: Array  # (n, 3) positions in the nodes' frames [m].
 
     def positions(self, X_WN: Array) -> Array:
         """Return the landmarks (..., n, 3) in the world [m], given X_WN (..., nodes, 4, 4)."""

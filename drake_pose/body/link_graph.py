@@ -32,18 +32,13 @@ def inverse_transforms(X: Array) -> Array:
 
 @dataclass(frozen=True)
 class JointMap:
-    """The pose X_AC(q) of a joint's outer link frame C in its inner link frame A.
+    """The pose X_AC(q) of a joint's outer link frame C in its inner link frame A."""
 
-    Attributes:
-        coefficients: (4^k, 16), one row of X_AC's entries for each product of basis functions of
-            the k positions; the last position's function changes fastest.
-        position_count: number of positions k.
-        inverted: whether a chain traverses the joint inwards, from C to A.
-    """
-
+    # (4^k, 16), one row of X_AC's entries for each product of basis functions of the k positions;
+    # the last position's function changes fastest.
     coefficients: Array
-    position_count: int
-    inverted: bool = False
+    position_count: int  # Number of positions k.
+    inverted: bool = False  # Whether a chain traverses the joint inwards, from C to A.
 
     @staticmethod
     def measure(pose: Callable[[Array], Array], position_count: int, name: str) -> "JointMap":
@@ -108,37 +103,23 @@ def _basis(values: NDArray[Any]) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class LinkGroup:
-    """Links welded to each other, the one nearest to the world first.
+    """Links welded to each other, the one nearest to the world first."""
 
-    Attributes:
-        name: the link whose frame is the group's frame.
-        links: names of all links of the group.
-        body: index of the named link among the plant's bodies.
-        mesh: the visual geometry of all links in the group's frame.
-    """
-
-    name: str
-    links: tuple[str, ...]
-    body: int
-    mesh: TriangleMesh
+    name: str  # The link whose frame is the group's frame.
+    links: tuple[str, ...]  # Names of all links of the group.
+    body: int  # Index of the named link among the plant's bodies.
+    mesh: TriangleMesh  # The visual geometry of all links in the group's frame.
 
 
 @dataclass(frozen=True)
 class JointEdge:
-    """A joint between two groups.
+    """A joint between two groups."""
 
-    Attributes:
-        joint: index of the joint in the plant.
-        inner: index of the group nearer to the world.
-        outer: index of the group farther from the world.
-        positions: indices of the joint's positions in q.
-        joint_map: the pose of the outer group in the inner one; None for a floating joint.
-    """
-
-    joint: int
-    inner: int
-    outer: int
-    positions: tuple[int, ...]
+    joint: int  # Index of the joint in the plant.
+    inner: int  # Index of the group nearer to the world.
+    outer: int  # Index of the group farther from the world.
+    positions: tuple[int, ...]  # Indices of the joint's positions in q.
+    # The pose of the outer group in the inner one; None for a floating joint.
     joint_map: JointMap | None
 
     def other(self, group: int) -> int:
@@ -148,15 +129,10 @@ class JointEdge:
 
 @dataclass(frozen=True)
 class LinkGraph:
-    """All link groups and the joints between them, which form a tree.
+    """All link groups and the joints between them, which form a tree."""
 
-    Attributes:
-        groups: the groups; group 0 holds the world.
-        edges: the joints that are not welds, outwards from the world.
-    """
-
-    groups: tuple[LinkGroup, ...]
-    edges: tuple[JointEdge, ...]
+    groups: tuple[LinkGroup, ...]  # The groups; group 0 holds the world.
+    edges: tuple[JointEdge, ...]  # The joints that are not welds, outwards from the world.
 
     def group_of(self, link: str) -> int:
         """Return the index of the group that a link belongs to; the link must exist."""

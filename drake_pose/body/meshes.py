@@ -42,15 +42,10 @@ from drake_pose.errors import ModelError
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """A surface of triangles, which need not be closed or connected. Immutable.
+    """A surface of triangles, which need not be closed or connected. Immutable."""
 
-    Attributes:
-        vertices: (n, 3) float64 points [m], usually in a link's frame.
-        triangles: (m, 3) int32 indices of vertices.
-    """
-
-    vertices: Array
-    triangles: NDArray[np.int32]
+    vertices: Array  # (n, 3) float64 points [m], usually in a link's frame.
+    triangles: NDArray[np.int32]  # (m, 3) int32 indices of vertices.
 
     def __post_init__(self) -> None:
         """Store private read-only copies of the arrays."""

@@ -37,22 +37,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class NodeSkin:
-    """The skin band between a node and its parent, in the node's frame N.
+    """The skin band between a node and its parent, in the node's frame N."""
 
-    Attributes:
-        mesh: the closed band at rest (all joints at zero).
-        weights: (v,) float64 read-only weights in [0, 1] with which vertices move with the link
-            farther from the plant's world: the node, or its parent if ``inverted``.
-        colour: (red, green, blue) in [0, 1].
-        inverted: whether the node, not its parent, is nearer to the plant's world.
-        steps: the joints from the parent to the node.
-    """
-
-    mesh: TriangleMesh
+    mesh: TriangleMesh  # The closed band at rest (all joints at zero).
+    # (v,) float64 read-only weights in [0, 1] with which vertices move with the link farther from
+    # the plant's world: the node, or its parent if ``inverted``.
     weights: Array
-    colour: tuple[float, float, float]
-    inverted: bool
-    steps: tuple[JointMap, ...]
+    colour: tuple[float, float, float]  # (red, green, blue) in [0, 1].
+    inverted: bool  # Whether the node, not its parent, is nearer to the plant's world.
+    steps: tuple[JointMap, ...]  # The joints from the parent to the node.
 
     @property
     def triangles(self) -> NDArray[np.int32]:

@@ -27,21 +27,14 @@ from drake_pose.yaml_files import read_yaml, typed_entry
 
 @dataclass(frozen=True, eq=False)
 class SkinBand:
-    """A band of surface between two links; the parent link is nearer to the world.
+    """A band of surface between two links; the parent link is nearer to the world."""
 
-    Attributes:
-        parent: name of the link that vertices of weight 0 move with.
-        child: name of the link that vertices of weight 1 move with.
-        mesh: the closed surface [m] at rest (all joints at zero), in the child link's frame.
-        weights: (n,) weight of each vertex in [0, 1], read-only.
-        colour: (r, g, b) in [0, 1].
-    """
-
-    parent: str
-    child: str
+    parent: str  # Name of the link that vertices of weight 0 move with.
+    child: str  # Name of the link that vertices of weight 1 move with.
+    # The closed surface [m] at rest (all joints at zero), in the child link's frame.
     mesh: TriangleMesh
-    weights: Array
-    colour: tuple[float, float, float] = (0.8, 0.8, 0.8)
+    weights: Array  # (n,) weight of each vertex in [0, 1], read-only.
+    colour: tuple[float, float, float] = (0.8, 0.8, 0.8)  # (r, g, b) in [0, 1].
 
     def __post_init__(self) -> None:
         """Store a read-only copy of the weights, rounded to six digits."""

@@ -58,19 +58,12 @@ _JOINTS: dict[str, _Make] = {
 
 
 class Coupling(NamedTuple):
-    """A position that follows another one: q[follower] = multiplier * q[leader] + offset.
+    """A position that follows another one: q[follower] = multiplier * q[leader] + offset."""
 
-    Attributes:
-        follower: index in q.
-        leader: index in q, or where stated so among the values of a tree's node.
-        multiplier: factor of the leader's value.
-        offset: constant [rad or m].
-    """
-
-    follower: int
-    leader: int
-    multiplier: float
-    offset: float
+    follower: int  # Index in q.
+    leader: int  # Index in q, or where stated so among the values of a tree's node.
+    multiplier: float  # Factor of the leader's value.
+    offset: float  # Constant [rad or m].
 
 
 def read_couplings(plant: MultibodyPlant) -> list[Coupling]:

@@ -19,24 +19,17 @@ from drake_pose.errors import DrakePoseError, listed
 
 @dataclass(frozen=True)
 class ModelReport:
-    """What a model file holds, what may be unexpected, and what forbids its use.
+    """What a model file holds, what may be unexpected, and what forbids its use."""
 
-    Attributes:
-        path: the model file.
-        name: the model's name; "" if the model cannot be used.
-        nodes: one dictionary for each node of the pose tree: ``name``, ``parent`` (its name, or
-            "world"), ``triangles`` (number of them), ``watertight`` (bool), ``joints``. A joint has
-            ``name``, ``kind`` (as ``position_kinds``), ``lower`` and ``upper`` limit [deg or m],
-            and ``follows``: multiplier, leader and offset [rad or m] as a text ("": none).
-        warnings: what may be unexpected.
-        errors: why the model cannot be used.
-    """
-
-    path: Path
-    name: str
+    path: Path  # The model file.
+    name: str  # The model's name; "" if the model cannot be used.
+    # One dictionary for each node of the pose tree: ``name``, ``parent`` (its name, or "world"),
+    # ``triangles`` (number of them), ``watertight`` (bool), ``joints``. A joint has ``name``,
+    # ``kind`` (as ``position_kinds``), ``lower`` and ``upper`` limit [deg or m], and ``follows``:
+    # multiplier, leader and offset [rad or m] as a text ("": none).
     nodes: tuple[dict[str, Any], ...]
-    warnings: tuple[str, ...]
-    errors: tuple[str, ...]
+    warnings: tuple[str, ...]  # What may be unexpected.
+    errors: tuple[str, ...]  # Why the model cannot be used.
 
     @property
     def usable(self) -> bool:

@@ -195,31 +195,21 @@ def _full_turn(count: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class BasePose:
-    """How the plant takes up the pose of a tree that does not start at the plant's world.
+    """How the plant takes up the pose of a tree that does not start at the plant's world."""
 
-    Attributes:
-        kind: "constant": the plant's world stands at X_WB. "floating": a floating joint takes up
-            the pose. "joints": base joints are solved for. "placed": X_WB is solved for, because
-            the plant's world is part of the tree or the base joints cannot reach every pose and
-            keep their values.
-        X_WB: (4, 4) pose of the plant's world, for "constant".
-        node: index of the anchor, the tree's node from which the base is solved.
-        body: index of the plant's body of the anchor.
-        positions: indices in q of the base positions that are solved for.
-        steps: for "joints", the base joints from the world outwards.
-        chain: for "joints", the indices of their positions in q; those not in ``positions`` are
-            held.
-        joint: for "floating", the index of the floating joint.
-    """
-
+    # "constant": the plant's world stands at X_WB. "floating": a floating joint takes up the pose.
+    # "joints": base joints are solved for. "placed": X_WB is solved for, because the plant's world
+    # is part of the tree or the base joints cannot reach every pose and keep their values.
     kind: Literal["constant", "floating", "joints", "placed"]
+    # (4, 4) pose of the plant's world, for "constant".
     X_WB: Array = field(default_factory=lambda: np.eye(4))
-    node: int = -1
-    body: int = 0
-    positions: tuple[int, ...] = ()
-    steps: tuple[JointMap, ...] = ()
+    node: int = -1  # Index of the anchor, the tree's node from which the base is solved.
+    body: int = 0  # Index of the plant's body of the anchor.
+    positions: tuple[int, ...] = ()  # Indices in q of the base positions that are solved for.
+    steps: tuple[JointMap, ...] = ()  # For "joints", the base joints from the world outwards.
+    # For "joints", the indices of their positions in q; those not in ``positions`` are held.
     chain: tuple[int, ...] = ()
-    joint: int = -1
+    joint: int = -1  # For "floating", the index of the floating joint.
 
     def solve(self, model: ParsedModel, q: Array, X_WN: Array) -> tuple[Array, Array]:
         """Complete the base positions in q (nq,) and return q and X_WB (4, 4).

@@ -32,22 +32,14 @@ Roots = dict[int, tuple[Array, RootRotation | None]]
 
 @dataclass(frozen=True)
 class Branch:
-    """A node under construction.
+    """A node under construction."""
 
-    Attributes:
-        group: index of the node's link group.
-        parent: index of the parent branch; -1: the world.
-        depth: number of edges to the root.
-        steps: the joints from the parent to the node, in traversal order.
-        positions: indices of their positions in q.
-        follows: how the joints follow the parent's values; the branch then has no positions.
-    """
-
-    group: int
-    parent: int
-    depth: int
-    steps: tuple[JointMap, ...] = ()
-    positions: tuple[int, ...] = ()
+    group: int  # Index of the node's link group.
+    parent: int  # Index of the parent branch; -1: the world.
+    depth: int  # Number of edges to the root.
+    steps: tuple[JointMap, ...] = ()  # The joints from the parent to the node, in traversal order.
+    positions: tuple[int, ...] = ()  # Indices of their positions in q.
+    # How the joints follow the parent's values; the branch then has no positions.
     follows: tuple[Coupling, ...] = ()
 
 

@@ -23,24 +23,16 @@ from drake_pose.errors import SettingsError
 
 
 class PackedTree(NamedTuple):
-    """A pose tree in the arrays that the kernel takes.
+    """A pose tree in the arrays that the kernel takes."""
 
-    Attributes:
-        parents: (n,) index of each node's parent; -1: the world.
-        X_PA: (n, 4, 4) constant transforms, with R_W0 of rotated roots included.
-        value_starts: (n + 1,) index of each node's first value. The kernel's values are those of
-            the tree, followed by those of joints that follow others.
-        free: (n,) bool, whether the node's values begin with a rotation vector.
-        step_starts: (n + 1,) index of each node's first joint in ``steps``.
-        steps: all joints.
-    """
-
-    parents: np.ndarray
-    X_PA: np.ndarray
+    parents: np.ndarray  # (n,) index of each node's parent; -1: the world.
+    X_PA: np.ndarray  # (n, 4, 4) constant transforms, with R_W0 of rotated roots included.
+    # (n + 1,) index of each node's first value. The kernel's values are those of the tree, followed
+    # by those of joints that follow others.
     value_starts: np.ndarray
-    free: np.ndarray
-    step_starts: np.ndarray
-    steps: PackedSteps
+    free: np.ndarray  # (n,) bool, whether the node's values begin with a rotation vector.
+    step_starts: np.ndarray  # (n + 1,) index of each node's first joint in ``steps``.
+    steps: PackedSteps  # All joints.
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,16 +42,11 @@ class Motions:
     The parameters are the tree's values, then those that ``TreeKinematics.motions`` adds. A point
     p_W of node i moves with motion j by omega x p_W + v + sigma p_W if ``moves[i, j]``, else not at
     all. Motions are in the order of ``TreeKinematics.motion_values``, then the added parameters.
-
-    Attributes:
-        X_WN: (nodes, 4, 4) poses of the nodes.
-        twists: (k, 7) omega, v, sigma of each motion, in the world and about its origin.
-        moves: (nodes, k) bool, whether the motion moves the node.
     """
 
-    X_WN: np.ndarray
-    twists: np.ndarray
-    moves: np.ndarray
+    X_WN: np.ndarray  # (nodes, 4, 4) poses of the nodes.
+    twists: np.ndarray  # (k, 7) omega, v, sigma of each motion, in the world and about its origin.
+    moves: np.ndarray  # (nodes, k) bool, whether the motion moves the node.
 
 
 class TreeKinematics:
@@ -324,27 +311,19 @@ def find_motions(packed: PackedTree, values: np.ndarray) -> tuple[np.ndarray, np
 
 
 class LinkVector(NamedTuple):
-    """The vector from the previous joint's origin (or the world's) to a joint's origin.
+    """The vector from the previous joint's origin (or the world's) to a joint's origin."""
 
-    Attributes:
-        joint: name of the joint.
-        link: name of the joint's parent link.
-        node: index of the node that the joint moves.
-        step: index of the joint among the node's joints.
-        inverted: whether the tree traverses the joint inwards, from its child link to its parent.
-        p_A: (3,) displacement [m] of the tree behind the joint when the vector is added, in frame
-            A. A is the parent link's frame, which is the parent node's if ``step`` is 0 and the
-            joint is not inverted. The displacement is the vector, or its negative if inverted.
-        p_L: (3,) the vector in the parent link's frame [m].
-    """
-
-    joint: str
-    link: str
-    node: int
-    step: int
+    joint: str  # Name of the joint.
+    link: str  # Name of the joint's parent link.
+    node: int  # Index of the node that the joint moves.
+    step: int  # Index of the joint among the node's joints.
+    # Whether the tree traverses the joint inwards, from its child link to its parent.
     inverted: bool
+    # (3,) displacement [m] of the tree behind the joint when the vector is added, in frame A. A is
+    # the parent link's frame, which is the parent node's if ``step`` is 0 and the joint is not
+    # inverted. The displacement is the vector, or its negative if inverted.
     p_A: Array
-    p_L: Array
+    p_L: Array  # (3,) the vector in the parent link's frame [m].
 
 
 def link_vectors(tree: PoseTree, min_length: float = 1e-3) -> tuple[LinkVector, ...]:

@@ -15,20 +15,14 @@ from drake_pose.errors import SceneError, UnknownNameError
 
 @dataclass(frozen=True, eq=False)
 class JointLog:
-    """Joint positions as logged by a robot, in the log's units.
+    """Joint positions as logged by a robot, in the log's units."""
 
-    Args:
-        names: names of the joints in the log.
-        times: (n,) ascending times [s]; None: rows are identified by frames only.
-        positions: (n, m) positions; nan where there is no reading.
-        frames: (n,) names or numbers of the rows' frames; empty: rows are identified by times only.
-        servos: motors of the robot that LeRobot recorded; None: another recorder.
-    """
-
-    names: tuple[str, ...]
-    times: Array | None
-    positions: Array
+    names: tuple[str, ...]  # Names of the joints in the log.
+    times: Array | None  # (n,) ascending times [s]; None: rows are identified by frames only.
+    positions: Array  # (n, m) positions; nan where there is no reading.
+    # (n,) names or numbers of the rows' frames; empty: rows are identified by times only.
     frames: tuple[str, ...] = ()
+    # Motors of the robot that LeRobot recorded; None: another recorder.
     servos: Servos | None = None
 
     def at(self, times: Array) -> Array:

@@ -30,29 +30,19 @@ UNITS = {"rad": 1.0, "deg": math.pi / 180.0}
 
 @dataclass(frozen=True, eq=False)
 class MappedJoints:
-    """A joint log in the names, order and units of a model.
+    """A joint log in the names, order and units of a model."""
 
-    Args:
-        log: positions by the model's names and order [rad or m]; nan for joints that are not
-            logged.
-        clipped: (n, m) whether a reading is at an end of its range, so that the joint is there or
-            beyond.
-        not_logged: names of the model's joints without a column.
-        unused: names of columns without a joint.
-        warnings: assumptions that were made, and anomalies.
-        columns: by name of each logged joint, the linear map from its column.
-        encoding: of columns that LeRobot recorded from servos; None: they are angles or lengths.
-        joints: the joints with such columns; empty for None.
-    """
-
+    # Positions by the model's names and order [rad or m]; nan for joints that are not logged.
     log: JointLog
+    # (n, m) whether a reading is at an end of its range, so that the joint is there or beyond.
     clipped: Mask
-    not_logged: tuple[str, ...]
-    unused: tuple[str, ...]
-    warnings: tuple[str, ...]
-    columns: Mapping[str, Column]
+    not_logged: tuple[str, ...]  # Names of the model's joints without a column.
+    unused: tuple[str, ...]  # Names of columns without a joint.
+    warnings: tuple[str, ...]  # Assumptions that were made, and anomalies.
+    columns: Mapping[str, Column]  # By name of each logged joint, the linear map from its column.
+    # Of columns that LeRobot recorded from servos; None: they are angles or lengths.
     encoding: Encoding | None = None
-    joints: tuple[ServoJoint, ...] = ()
+    joints: tuple[ServoJoint, ...] = ()  # The joints with such columns; empty for None.
 
 
 def map_joints(

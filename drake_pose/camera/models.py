@@ -383,20 +383,14 @@ def _camera(name: str, X_WC: Array, field_of_view: float, size: tuple[int, int])
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A pinhole with radial and tangential distortion, or a fisheye, as in OpenCV.
+    """A pinhole with radial and tangential distortion, or a fisheye, as in OpenCV."""
 
-    Args:
-        width, height: size of the images [pixel].
-        matrix: (3, 3) camera matrix of the images as taken [pixel], pixel centres at integers.
-        distortion: OpenCV's coefficients k1, k2, p1, p2, k3 ...; for a fisheye (4,) k1 to k4.
-        fisheye: whether it is OpenCV's fisheye, called equidistant by ROS and Kalibr.
-    """
-
+    # width, height: size of the images [pixel].
     width: int
     height: int
-    matrix: Array
-    distortion: Array
-    fisheye: bool = False
+    matrix: Array  # (3, 3) camera matrix of the images as taken [pixel], pixel centres at integers.
+    distortion: Array  # OpenCV's coefficients k1, k2, p1, p2, k3 ...; for a fisheye (4,) k1 to k4.
+    fisheye: bool = False  # Whether it is OpenCV's fisheye, called equidistant by ROS and Kalibr.
 
     @cached_property
     def undistorted_matrix(self) -> Array:

@@ -17,37 +17,26 @@ from drake_pose.regular_files import read_regular
 
 
 class Motor(NamedTuple):
-    """A motor's entry in a calibration file.
+    """A motor's entry in a calibration file."""
 
-    Attributes:
-        low, high: ends of its range in homed positions [steps]; nan in lists, which have none,
-            unless the motor's readings are 0 to 100.
-        homing: homing offset [steps].
-        is_inverted: its drive mode.
-    """
-
+    # low, high: ends of its range in homed positions [steps]; nan in lists, which have none, unless
+    # the motor's readings are 0 to 100.
     low: float
     high: float
-    homing: int
-    is_inverted: bool
+    homing: int  # Homing offset [steps].
+    is_inverted: bool  # Its drive mode.
 
 
 @dataclass(frozen=True)
 class Servos:
-    """What a LeRobot data set tells of its robot's motors.
+    """What a LeRobot data set tells of its robot's motors."""
 
-    Attributes:
-        robot: type of the robot, `robot_type` in the data set; "": unknown.
-        path: the calibration file; None: there is none.
-        motors: by name of the motor; empty without a file.
-        has_lists: whether the file is of the older kind.
-        turn: steps of an encoder in a full turn, the same in all motors of LeRobot's arms.
-    """
-
-    robot: str = ""
-    path: Path | None = None
+    robot: str = ""  # Type of the robot, `robot_type` in the data set; "": unknown.
+    path: Path | None = None  # The calibration file; None: there is none.
+    # By name of the motor; empty without a file.
     motors: Mapping[str, Motor] = field(default_factory=dict)
-    has_lists: bool = False
+    has_lists: bool = False  # Whether the file is of the older kind.
+    # Steps of an encoder in a full turn, the same in all motors of LeRobot's arms.
     turn: int = 4096
 
     @property

@@ -25,16 +25,11 @@ from drake_pose.regular_files import read_regular
 
 
 class RecordedPose(NamedTuple):
-    """Pose of a camera's optical frame (x right, y down, z forward).
+    """Pose of a camera's optical frame (x right, y down, z forward)."""
 
-    Args:
-        X: (4, 4) pose in the world, or in the link's frame [m].
-        link: link on which the camera rides; "": it stands in the world.
-        assumed: how the file was read where it does not say so itself, for a warning; "": it does.
-    """
-
-    X: Array
-    link: str = ""
+    X: Array  # (4, 4) pose in the world, or in the link's frame [m].
+    link: str = ""  # Link on which the camera rides; "": it stands in the world.
+    # How the file was read where it does not say so itself, for a warning; "": it does.
     assumed: str = ""
 
 

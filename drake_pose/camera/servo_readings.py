@@ -40,26 +40,18 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ServoJoint:
-    """A joint whose column holds the readings of a servo.
+    """A joint whose column holds the readings of a servo."""
 
-    Attributes:
-        name: name of the joint.
-        column: name of the column.
-        readings: (n,) readings [degrees, radians, LeRobot's -100 ... 100, or steps]; nan: missing.
-        lower, upper: limits of the joint, infinite if there are none [rad or m].
-        is_angle: whether the joint is revolute.
-        is_gripper: whether the joint opens a gripper.
-        motor: the motor's calibration; None: unknown.
-    """
-
-    name: str
-    column: str
+    name: str  # Name of the joint.
+    column: str  # Name of the column.
+    # (n,) readings [degrees, radians, LeRobot's -100 ... 100, or steps]; nan: missing.
     readings: Array
+    # lower, upper: limits of the joint, infinite if there are none [rad or m].
     lower: float
     upper: float
-    is_angle: bool
-    is_gripper: bool
-    motor: Motor | None
+    is_angle: bool  # Whether the joint is revolute.
+    is_gripper: bool  # Whether the joint opens a gripper.
+    motor: Motor | None  # The motor's calibration; None: unknown.
 
     def is_called(self, names: tuple[str, ...]) -> bool:
         """Return whether the column's or the joint's name ends with one of the names."""
@@ -411,20 +403,14 @@ def is_gripper_name(words: Sequence[str]) -> bool:
 
 @dataclass(frozen=True)
 class HomingCorrection:
-    """A motor's corrected homing offset.
+    """A motor's corrected homing offset."""
 
-    Attributes:
-        motor: name of the motor.
-        before, after: homing offset in the file, and corrected [steps].
-        shift: increase of the motor's positions by the correction [steps].
-        reason: why the offset is not corrected; "": it is.
-    """
-
-    motor: str
+    motor: str  # Name of the motor.
+    # before, after: homing offset in the file, and corrected [steps].
     before: int
     after: int
-    shift: int
-    reason: str = ""
+    shift: int  # Increase of the motor's positions by the correction [steps].
+    reason: str = ""  # Why the offset is not corrected; "": it is.
 
 
 def correct_homing(

@@ -18,17 +18,12 @@ class SynchronisedFrames(NamedTuple, Generic[Item]):
 
 
 class CameraChange(NamedTuple):
-    """A camera that stopped or returned.
+    """A camera that stopped or returned."""
 
-    Attributes:
-        camera: name of the camera.
-        time: its last (stopped) or first (returned) time stamp [s]; nan if it never had an image.
-        stopped: whether it stopped; else it returned.
-    """
-
-    camera: str
+    camera: str  # Name of the camera.
+    # Its last (stopped) or first (returned) time stamp [s]; nan if it never had an image.
     time: float
-    stopped: bool
+    stopped: bool  # Whether it stopped; else it returned.
 
 
 class Synchroniser(Generic[Item]):

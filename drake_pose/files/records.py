@@ -116,23 +116,14 @@ class FrameRecord:
 
 @dataclass(frozen=True)
 class SceneEstimate:
-    """The estimate of a scene.
+    """The estimate of a scene."""
 
-    Args:
-        position_names: (nq,) in the plant's order.
-        position_kinds: (nq,) "angle" [rad], "length" [m] or "quaternion".
-        records: estimates by frame, in the scene's order.
-        summary: content of summary.json.
-        folder: the result folder; None if nothing was written.
-        warnings: messages for the user.
-    """
-
-    position_names: tuple[str, ...]
-    position_kinds: tuple[str, ...]
-    records: Mapping[str, FrameRecord]
-    summary: Mapping[str, Any]
-    folder: Path | None
-    warnings: tuple[str, ...] = ()
+    position_names: tuple[str, ...]  # (nq,) in the plant's order.
+    position_kinds: tuple[str, ...]  # (nq,) "angle" [rad], "length" [m] or "quaternion".
+    records: Mapping[str, FrameRecord]  # Estimates by frame, in the scene's order.
+    summary: Mapping[str, Any]  # Content of summary.json.
+    folder: Path | None  # The result folder; None if nothing was written.
+    warnings: tuple[str, ...] = ()  # Messages for the user.
 
     @property
     def found_count(self) -> int:

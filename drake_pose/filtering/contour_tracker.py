@@ -99,21 +99,14 @@ class ContourMeasurement(LinearObservation):
 
     The distances of hundreds of contour points are summed to normal equations. Their factorisation
     gives one scalar measurement with variance 1 for each observable direction of the state.
-
-    Attributes:
-        y: (k,) measured values; the predicted value at ``at`` is 0.
-        inlier_ratio: fraction of the visible model contour with an edge nearby.
-        distance: robustly weighted root mean square distance of contour and edges [pixel].
-        part_distances: (nodes,) the same by part, in pictures [pixel]; 0 where evidence is too
-            weak.
-        compared: the comparison of the contours at ``at``.
     """
 
-    y: Array
-    inlier_ratio: float
-    distance: float
+    y: Array  # (k,) measured values; the predicted value at ``at`` is 0.
+    inlier_ratio: float  # Fraction of the visible model contour with an edge nearby.
+    distance: float  # Robustly weighted root mean square distance of contour and edges [pixel].
+    # (nodes,) the same by part, in pictures [pixel]; 0 where evidence is too weak.
     part_distances: Array
-    compared: Comparison
+    compared: Comparison  # The comparison of the contours at ``at``.
 
 
 class ContourObservation(BodyState):

@@ -31,66 +31,45 @@ _FROM_LINK = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 
 
 class Chains(NamedTuple):
-    """A hand as arrays for ``project_hand``; elements are indices into ``HandModel.visible``.
+    """A hand as arrays for ``project_hand``; elements are indices into ``HandModel.visible``."""
 
-    Attributes:
-        firsts: (F + 1,) index of each finger's first step.
-        kinds, elements: (S,) kind and element of each ``Step``, finger by finger.
-        vectors: (S, 3) vector of each ``Step``.
-        rings, rows: see ``HandModel``.
-        palm: (3,) elements of the palm's height, thickness and width.
-        lines: (L, 2) indices of the points that are the lines' ends.
-    """
-
-    firsts: Indices
+    firsts: Indices  # (F + 1,) index of each finger's first step.
+    # kinds, elements: (S,) kind and element of each ``Step``, finger by finger.
     kinds: Indices
     elements: Indices
-    vectors: Array
+    vectors: Array  # (S, 3) vector of each ``Step``.
+    # rings, rows: see ``HandModel``.
     rings: Array
     rows: Array
-    palm: Indices
-    lines: Indices
+    palm: Indices  # (3,) elements of the palm's height, thickness and width.
+    lines: Indices  # (L, 2) indices of the points that are the lines' ends.
 
 
 class Step(NamedTuple):
-    """A step from the palm outwards along a finger, with all joints at 0.
+    """A step from the palm outwards along a finger, with all joints at 0."""
 
-    Attributes:
-        element: name in the state: an angle [rad], a length [m], or a size of the palm [m].
-        kind: TURN, BASE or SEGMENT.
-        vector: axis of a rotation, or translation per unit of the element, in the palm's frame.
-    """
-
-    element: str
-    kind: int
+    element: str  # Name in the state: an angle [rad], a length [m], or a size of the palm [m].
+    kind: int  # TURN, BASE or SEGMENT.
+    # Axis of a rotation, or translation per unit of the element, in the palm's frame.
     vector: tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class HandModel:
-    """A palm that is a convex body, and fingers with the same number of segments each.
+    """A palm that is a convex body, and fingers with the same number of segments each."""
 
-    Args:
-        fingers: (F) names.
-        steps: steps of each finger, from the palm's origin to the centre of the fingertip.
-        radii: (F, J + 1) radii of the fingers at base, joints and tip [m].
-        rings: (2, K, 3) outlines of the palm at the wrist and at the fingers, as fractions of its
-            height, thickness and width along x, y and z. The palm is their convex hull.
-        rows: (2, R, 2, 3) end points of candidates for its far and its near edge, as such
-            fractions.
-        sizes: lengths and sizes of the palm in the model's file [m].
-        hidden: names among ``measured`` that silhouettes do not show.
-        prior: prior of the joints, over ``angles``; None: there is none.
-    """
-
-    fingers: tuple[str, ...]
+    fingers: tuple[str, ...]  # (F) names.
+    # Steps of each finger, from the palm's origin to the centre of the fingertip.
     steps: tuple[tuple[Step, ...], ...]
-    radii: Array
+    radii: Array  # (F, J + 1) radii of the fingers at base, joints and tip [m].
+    # (2, K, 3) outlines of the palm at the wrist and at the fingers, as fractions of its height,
+    # thickness and width along x, y and z. The palm is their convex hull.
     rings: Array
+    # (2, R, 2, 3) end points of candidates for its far and its near edge, as such fractions.
     rows: Array
-    sizes: Mapping[str, float]
-    hidden: tuple[str, ...] = ()
-    prior: JointPrior | None = None
+    sizes: Mapping[str, float]  # Lengths and sizes of the palm in the model's file [m].
+    hidden: tuple[str, ...] = ()  # Names among ``measured`` that silhouettes do not show.
+    prior: JointPrior | None = None  # Prior of the joints, over ``angles``; None: there is none.
 
     @cached_property
     def flexions(self) -> tuple[str, ...]:

@@ -68,38 +68,24 @@ MATCHING = MatchingSettings()
 
 
 class RoughBody(NamedTuple):
-    """The image of a rough pose [pixel].
+    """The image of a rough pose [pixel]."""
 
-    Attributes:
-        ends: (L, 2, 2) start and end of each segment's axis, or of a palm edge.
-        widths: (L,) half the width of a segment; 0 for a palm edge.
-        sides: (L, 2) whether a side may be visible: that of the normal (-y, x), and the other.
-        tips: (T,) indices of the segments that end in a round tip of their width.
-        drawn: (H, W) the silhouette; 0 outside.
-    """
-
-    ends: Array
-    widths: Array
-    sides: Mask
-    tips: NDArray[np.intp]
-    drawn: NDArray[np.uint8] | Mask
+    ends: Array  # (L, 2, 2) start and end of each segment's axis, or of a palm edge.
+    widths: Array  # (L,) half the width of a segment; 0 for a palm edge.
+    sides: Mask  # (L, 2) whether a side may be visible: that of the normal (-y, x), and the other.
+    tips: NDArray[np.intp]  # (T,) indices of the segments that end in a round tip of their width.
+    drawn: NDArray[np.uint8] | Mask  # (H, W) the silhouette; 0 outside.
 
 
 class Axes(NamedTuple):
-    """Measured lines and tips, NaN where not visible, in the order of ``RoughBody``.
+    """Measured lines and tips, NaN where not visible, in the order of ``RoughBody``."""
 
-    Attributes:
-        lines: (L, 2) alpha, the angle from start to end [rad], and rho [pixel]; a line's points (u,
-            v) satisfy rho = v cos(alpha) - u sin(alpha).
-        line_covariances: (L, 2, 2) covariances of alpha and rho.
-        tips: (T, 2) centres of the tips [pixel].
-        tip_covariances: (T, 2, 2) [pixel^2].
-    """
-
+    # (L, 2) alpha, the angle from start to end [rad], and rho [pixel]; a line's points (u, v)
+    # satisfy rho = v cos(alpha) - u sin(alpha).
     lines: Array
-    line_covariances: Array
-    tips: Array
-    tip_covariances: Array
+    line_covariances: Array  # (L, 2, 2) covariances of alpha and rho.
+    tips: Array  # (T, 2) centres of the tips [pixel].
+    tip_covariances: Array  # (T, 2, 2) [pixel^2].
 
 
 def match_axes(
@@ -299,18 +285,12 @@ SEARCH = HandSearchSettings()
 
 
 class HandMeasurement(NamedTuple):
-    """The measurement of a hand in a silhouette.
+    """The measurement of a hand in a silhouette."""
 
-    Attributes:
-        y: (m,) as in ``HandObservation``, NaN where hidden.
-        covariance: (m, m) of its noise.
-        rough: (n,) the pose to which the edge was matched.
-        difference: area in which the silhouette differs from this pose's, as a fraction of its own.
-    """
-
-    y: Array
-    covariance: Array
-    rough: Array
+    y: Array  # (m,) as in ``HandObservation``, NaN where hidden.
+    covariance: Array  # (m, m) of its noise.
+    rough: Array  # (n,) the pose to which the edge was matched.
+    # Area in which the silhouette differs from this pose's, as a fraction of its own.
     difference: float
 
 
@@ -320,22 +300,16 @@ class HandSilhouette:
 
     A rough pose (the prediction, corrected by the measurements it leads to) assigns edge points to
     segments. If its silhouette differs too much, poses around the prediction are searched.
-
-    Args:
-        belief_filter: a filter of a ``HandObservation`` and its hand's state.
-        width, height: of the image [pixel].
-        center: (2,) image point that is the origin of the state [pixel].
-        well_matched: largest difference of a rough pose without search, as a fraction of the
-            silhouette.
-        unmatched: largest difference of a rough pose at which anything is measured.
     """
 
-    belief_filter: TruncatedFilter
+    belief_filter: TruncatedFilter  # A filter of a ``HandObservation`` and its hand's state.
+    # width, height: of the image [pixel].
     width: int
     height: int
-    center: tuple[float, float]
+    center: tuple[float, float]  # (2,) image point that is the origin of the state [pixel].
+    # Largest difference of a rough pose without search, as a fraction of the silhouette.
     well_matched: float = 0.045
-    unmatched: float = 0.25
+    unmatched: float = 0.25  # Largest difference of a rough pose at which anything is measured.
 
     def draw(self, x: Array, zoom: float = 1.0) -> NDArray[np.uint8]:
         """Return (zoom H, zoom W), 1 in the hand at x (n,): a convex palm and round-ended rods."""

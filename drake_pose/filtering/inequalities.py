@@ -22,19 +22,12 @@ from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 
 @dataclass(frozen=True, eq=False)
 class Inequalities:
-    """Inequalities phi_k^T x <= b_k, k = 1 ... K: (18).
+    """Inequalities phi_k^T x <= b_k, k = 1 ... K: (18)."""
 
-    Attributes:
-        columns: (n) names of the elements of x.
-        rows: (K) text of each inequality, for messages and logs.
-        phi: (K, n) coefficients, read-only.
-        b: (K,) bounds, read-only.
-    """
-
-    columns: tuple[str, ...]
-    rows: tuple[str, ...]
-    phi: Array
-    b: Array
+    columns: tuple[str, ...]  # (n) names of the elements of x.
+    rows: tuple[str, ...]  # (K) text of each inequality, for messages and logs.
+    phi: Array  # (K, n) coefficients, read-only.
+    b: Array  # (K,) bounds, read-only.
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -282,38 +275,26 @@ class Difference:
 
 @dataclass
 class GeneralRow:
-    """An entry of ``rows``: lower <= sum of coefficient x joint <= upper.
+    """An entry of ``rows``: lower <= sum of coefficient x joint <= upper."""
 
-    Attributes:
-        name: begins the text of the inequality.
-        terms: coefficient by joint.
-        lower, upper: bounds in ``unit``; infinite where not given.
-        unit: as in ``Difference``.
-    """
-
-    name: str = ""
-    terms: dict[str, float] = field(default_factory=dict)
+    name: str = ""  # Begins the text of the inequality.
+    terms: dict[str, float] = field(default_factory=dict)  # Coefficient by joint.
+    # lower, upper: bounds in ``unit``; infinite where not given.
     lower: float = -math.inf
     upper: float = math.inf
-    unit: str = ""
+    unit: str = ""  # As in ``Difference``.
 
 
 @dataclass
 class PriorRow:
-    """An entry of ``usual``: the sum of coefficient x joint is normally distributed.
+    """An entry of ``usual``: the sum of coefficient x joint is normally distributed."""
 
-    Attributes:
-        name: for messages.
-        terms: coefficient by joint.
-        mean, deviation: mean and standard deviation in ``unit``.
-        unit: as in ``Difference``.
-    """
-
-    name: str = ""
-    terms: dict[str, float] = field(default_factory=dict)
+    name: str = ""  # For messages.
+    terms: dict[str, float] = field(default_factory=dict)  # Coefficient by joint.
+    # mean, deviation: mean and standard deviation in ``unit``.
     mean: float = math.nan
     deviation: float = math.nan
-    unit: str = ""
+    unit: str = ""  # As in ``Difference``.
 
 
 @dataclass

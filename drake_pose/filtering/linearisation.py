@@ -23,18 +23,12 @@ FunctionWithJacobian = Callable[[Array], tuple[Array, Array]]
 
 
 class Linear(NamedTuple):
-    """A linearised function: value + slope (x - at), with an error of covariance ``remainder``.
+    """A linearised function: value + slope (x - at), with an error of covariance ``remainder``."""
 
-    Attributes:
-        at: (n,) point of linearisation.
-        value: (m,) value there.
-        slope: (m, n) derivative, or slope over a belief.
-        remainder: (m, m) covariance of the linearisation error; None: not estimated.
-    """
-
-    at: Array
-    value: Array
-    slope: Array
+    at: Array  # (n,) point of linearisation.
+    value: Array  # (m,) value there.
+    slope: Array  # (m, n) derivative, or slope over a belief.
+    # (m, m) covariance of the linearisation error; None: not estimated.
     remainder: Array | None = None
 
 

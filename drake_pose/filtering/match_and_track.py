@@ -30,22 +30,15 @@ from drake_pose.silhouette.pictures.masks import count_edge_pixels
 
 @dataclass(frozen=True, eq=False)
 class TrackerState:
-    """The state of ``MatchAndTrack`` after a frame.
+    """The state of ``MatchAndTrack`` after a frame."""
 
-    Attributes:
-        track: the contour track; None before the first pose.
-        reference: E_total after the last match; a track with a much larger one is lost.
-        matches: number of searches so far.
-        unexplained: number of consecutive frames, up to this one, that no pose explains; the track
-            is predicted through them.
-        retries: number of following frames in which the search is repeated because it reached its
-            time limit.
-    """
-
-    track: Track | None = None
-    reference: float = 0.0
-    matches: int = 0
+    track: Track | None = None  # The contour track; None before the first pose.
+    reference: float = 0.0  # E_total after the last match; a track with a much larger one is lost.
+    matches: int = 0  # Number of searches so far.
+    # Number of consecutive frames, up to this one, that no pose explains; the track is predicted
+    # through them.
     unexplained: int = 0
+    # Number of following frames in which the search is repeated because it reached its time limit.
     retries: int = 0
 
 
@@ -72,23 +65,16 @@ def make_tracker(
 
 @dataclass(frozen=True, eq=False)
 class _GivenFrame:
-    """The evidence of a frame.
+    """The evidence of a frame."""
 
-    Attributes:
-        views: the cameras that have a mask, with it; for the search.
-        root_position: (3,) the root's known position in the world [m]; None: as in the tree.
-        observation: the body with its root there.
-        masks: for each camera (H, W) or None.
-        pictures: for each camera (H, W, 3 or 4) or None; None: no pictures.
-        begin: time at which the processing of the frame started [s].
-    """
-
-    views: Sequence[View]
+    views: Sequence[View]  # The cameras that have a mask, with it; for the search.
+    # (3,) the root's known position in the world [m]; None: as in the tree.
     root_position: Array | None
-    observation: ContourObservation
-    masks: list[Mask | None]
+    observation: ContourObservation  # The body with its root there.
+    masks: list[Mask | None]  # For each camera (H, W) or None.
+    # For each camera (H, W, 3 or 4) or None; None: no pictures.
     pictures: list[Picture | None] | None
-    begin: float
+    begin: float  # Time at which the processing of the frame started [s].
 
     @property
     def has_no_evidence(self) -> bool:

@@ -82,19 +82,12 @@ SEQUENCE = SequenceSettings()
 
 @dataclass(frozen=True, eq=False)
 class TrackedStart:
-    """A start and its track through the following frames.
+    """A start and its track through the following frames."""
 
-    Args:
-        states: state (n,) in each frame.
-        track: the track after the last frame.
-        errors: E_total in each frame.
-        prior_distances: ``BodyState.prior_distance`` in each frame.
-    """
-
-    states: tuple[Array, ...]
-    track: Track
-    errors: tuple[float, ...]
-    prior_distances: tuple[float, ...]
+    states: tuple[Array, ...]  # State (n,) in each frame.
+    track: Track  # The track after the last frame.
+    errors: tuple[float, ...]  # E_total in each frame.
+    prior_distances: tuple[float, ...]  # ``BodyState.prior_distance`` in each frame.
 
     @property
     def x(self) -> Array:
@@ -190,17 +183,11 @@ def _evaluated(
 
 @dataclass(frozen=True, eq=False)
 class FittedSequence:
-    """One explanation of a sequence: proportions and all poses.
+    """One explanation of a sequence: proportions and all poses."""
 
-    Attributes:
-        body: the body whose parameters were fitted.
-        fitted: the fit; ``parameters`` (frames, n) are those of ``body``.
-        deviations: (frames, k) standard deviations of the tree's values and ROOT_NAMES.
-    """
-
-    body: ProportionedBody
-    fitted: Solution
-    deviations: Array
+    body: ProportionedBody  # The body whose parameters were fitted.
+    fitted: Solution  # The fit; ``parameters`` (frames, n) are those of ``body``.
+    deviations: Array  # (frames, k) standard deviations of the tree's values and ROOT_NAMES.
 
     def estimates(self, frame: int) -> tuple[JointEstimate, ...]:
         """Return each value's estimate in a frame: 95 % intervals in limits, at most one turn."""

@@ -47,30 +47,21 @@ from drake_pose.filtering.views import (
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """One hypothesis of the state.
+    """One hypothesis of the state."""
 
-    Attributes:
-        belief: mean and covariance inside the limits.
-        free: the belief without the limits of this step; the next step is predicted from it.
-        log_weight: logarithm of its weight among all hypotheses.
-        log_evidence: ``log_weight`` without the probability of the limits in this step.
-        born: step in which it was made by mirroring; 0 for the first.
-        number: index among the hypotheses made in that step; unique together with ``born``.
-        active: texts of the inequalities that changed its belief in the last step.
-        sites: of the last truncation, where the next one starts; see ``Truncated``.
-        tangent: (n,) state at which the first frame of the current view was linearised.
-        repeated: belief within a static view from its second frame on; None in its first.
-    """
-
-    belief: Belief
-    free: Belief
-    log_weight: float = 0.0
-    log_evidence: float = 0.0
-    born: int = 0
-    number: int = 0
+    belief: Belief  # Mean and covariance inside the limits.
+    free: Belief  # The belief without the limits of this step; the next step is predicted from it.
+    log_weight: float = 0.0  # Logarithm of its weight among all hypotheses.
+    log_evidence: float = 0.0  # ``log_weight`` without the probability of the limits in this step.
+    born: int = 0  # Step in which it was made by mirroring; 0 for the first.
+    number: int = 0  # Index among the hypotheses made in that step; unique together with ``born``.
+    # Texts of the inequalities that changed its belief in the last step.
     active: tuple[str, ...] = ()
+    # Of the last truncation, where the next one starts; see ``Truncated``.
     sites: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    # (n,) state at which the first frame of the current view was linearised.
     tangent: Array = field(default_factory=lambda: np.zeros(0))
+    # Belief within a static view from its second frame on; None in its first.
     repeated: RepeatedView | None = None
 
     @property
@@ -81,20 +72,13 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Rejection:
-    """A hypothesis that was removed.
+    """A hypothesis that was removed."""
 
-    Attributes:
-        step: number of the step.
-        hypothesis: as it was then; for "constraint" with the belief before truncation.
-        reason: "constraint", "weight", "twin" (a duplicate) or "cap".
-        row: text of the violated inequality, for "constraint".
-        c: margin c_k (24) of the mean from this inequality [standard deviations], for "constraint".
-    """
-
-    step: int
-    hypothesis: Hypothesis
-    reason: str
-    row: str = ""
+    step: int  # Number of the step.
+    hypothesis: Hypothesis  # As it was then; for "constraint" with the belief before truncation.
+    reason: str  # "constraint", "weight", "twin" (a duplicate) or "cap".
+    row: str = ""  # Text of the violated inequality, for "constraint".
+    # Margin c_k (24) of the mean from this inequality [standard deviations], for "constraint".
     c: float = math.nan
 
 
@@ -232,23 +216,16 @@ class FilterSettings:
 
 @dataclass(frozen=True, eq=False)
 class FilterState:
-    """The state of a filter after a step.
+    """The state of a filter after a step."""
 
-    Attributes:
-        step: number of measurements used.
-        hypotheses: sorted by weight, descending; at least one.
-        rejections: hypotheses removed in the last step.
-        distance, count: squared Mahalanobis distance and number of measurements of the best
-            hypothesis' last update; see ``Updated``.
-        view: the current static view.
-    """
-
-    step: int
-    hypotheses: tuple[Hypothesis, ...]
-    rejections: tuple[Rejection, ...] = ()
+    step: int  # Number of measurements used.
+    hypotheses: tuple[Hypothesis, ...]  # Sorted by weight, descending; at least one.
+    rejections: tuple[Rejection, ...] = ()  # Hypotheses removed in the last step.
+    # distance, count: squared Mahalanobis distance and number of measurements of the best
+    # hypothesis' last update; see ``Updated``.
     distance: float = 0.0
     count: int = 0
-    view: StaticView | None = None
+    view: StaticView | None = None  # The current static view.
 
     @property
     def best(self) -> Belief:

@@ -291,23 +291,16 @@ class MergedRows:
 
     Rows along the same line, of any length and sign, become one pair of bounds; duplicated rows
     count once.
-
-    Attributes:
-        inequalities: the K inequalities before merging.
-        used: (m,) indices of the state's elements that occur in a row.
-        directions: (S, m) unit vectors over the used elements.
-        lower, upper: (S,) bounds along the directions; may be infinite.
-        group: (K,) index of each row's direction.
-        whole: (S, n) the directions over all elements.
     """
 
-    inequalities: Inequalities
-    used: NDArray[np.intp]
-    directions: Array
+    inequalities: Inequalities  # The K inequalities before merging.
+    used: NDArray[np.intp]  # (m,) indices of the state's elements that occur in a row.
+    directions: Array  # (S, m) unit vectors over the used elements.
+    # lower, upper: (S,) bounds along the directions; may be infinite.
     lower: Array
     upper: Array
-    group: NDArray[np.intp]
-    whole: Array
+    group: NDArray[np.intp]  # (K,) index of each row's direction.
+    whole: Array  # (S, n) the directions over all elements.
 
 
 def merge_rows(inequalities: Inequalities) -> MergedRows:

@@ -57,21 +57,15 @@ class ObservationModel(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class LinearObservation:
-    """The ``ObservationModel`` h + H (x - at), without mirrors.
+    """The ``ObservationModel`` h + H (x - at), without mirrors."""
 
-    Attributes:
-        names, variances, wraps: (m), (m,) and (m,); see ``ObservationModel``.
-        at: (n,) point of linearisation.
-        h: (m,) value at ``at``.
-        H: (m, n) Jacobian.
-    """
-
+    # names, variances, wraps: (m), (m,) and (m,); see ``ObservationModel``.
     names: tuple[str, ...]
     variances: Array
     wraps: Mask
-    at: Array
-    h: Array
-    H: Array
+    at: Array  # (n,) point of linearisation.
+    h: Array  # (m,) value at ``at``.
+    H: Array  # (m, n) Jacobian.
 
     def predict(self, x: Array) -> tuple[Array, Array]:
         """Return the value (m,) at x (n,), and H (m, n)."""
@@ -156,22 +150,15 @@ class Measurement(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Updated:
-    """A belief after a measurement.
+    """A belief after a measurement."""
 
-    Attributes:
-        belief: without limits.
-        truncated: inside the limits.
-        log_likelihood: log probability density of the measurement under the linearised model.
-        distance: squared Mahalanobis distance of the innovation; chi-squared distributed with
-            ``count`` degrees of freedom if the models are right.
-        count: number of measurements used.
-    """
-
-    belief: Belief
-    truncated: Truncated
-    log_likelihood: float
+    belief: Belief  # Without limits.
+    truncated: Truncated  # Inside the limits.
+    log_likelihood: float  # Log probability density of the measurement under the linearised model.
+    # Squared Mahalanobis distance of the innovation; chi-squared distributed with ``count`` degrees
+    # of freedom if the models are right.
     distance: float
-    count: int
+    count: int  # Number of measurements used.
 
 
 def make_measurement(

@@ -21,15 +21,10 @@ from drake_pose.filtering.update import LinearObservation, Measurement, Observat
 
 @dataclass(frozen=True, eq=False)
 class StaticView:
-    """A static view.
+    """A static view."""
 
-    Attributes:
-        reference: (m,) measurement of its first frame, NaN where occluded.
-        count: number of its frames so far.
-    """
-
-    reference: Array
-    count: int
+    reference: Array  # (m,) measurement of its first frame, NaN where occluded.
+    count: int  # Number of its frames so far.
 
 
 def next_view(view: StaticView | None, measurement: Measurement, significance: float) -> StaticView:

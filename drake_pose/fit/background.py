@@ -120,19 +120,12 @@ def apply_gain(picture: Picture | Floats, gain: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Backgrounds:
-    """Possible backgrounds of a body, in small images of a static camera.
+    """Possible backgrounds of a body, in small images of a static camera."""
 
-    Args:
-        pictures: (f, H, W, 3) images after photometric correction.
-        gains: (3, 4) photometric gain of each image, see ``estimate_gain``.
-        colours: (3, H, W, 3) background colours, the most frequent first; they may coincide.
-        deviations: (H, W) standard deviations of a background's colours.
-    """
-
-    pictures: Floats
-    gains: tuple[Floats, ...]
-    colours: Floats
-    deviations: Floats
+    pictures: Floats  # (f, H, W, 3) images after photometric correction.
+    gains: tuple[Floats, ...]  # (3, 4) photometric gain of each image, see ``estimate_gain``.
+    colours: Floats  # (3, H, W, 3) background colours, the most frequent first; they may coincide.
+    deviations: Floats  # (H, W) standard deviations of a background's colours.
 
     @staticmethod
     def estimate(pictures: Picture) -> "Backgrounds":
@@ -291,19 +284,13 @@ def _compare_likeliest(
 
 @dataclass(frozen=True, eq=False)
 class KnownBackground:
-    """The background of a body whose pose is approximately known.
+    """The background of a body whose pose is approximately known."""
 
-    Args:
-        colours: (H, W, 3) colours of the background.
-        deviations: (H, W) their standard deviations.
-        unseen: (H, W) whether no frame shows the background at a pixel.
-        on, beside: (COLOURS,) logarithms of the relative frequencies of colours on the body, and
-            beside it (0: as frequent as if all colours were equally frequent).
-    """
-
-    colours: Floats
-    deviations: Floats
-    unseen: Mask
+    colours: Floats  # (H, W, 3) colours of the background.
+    deviations: Floats  # (H, W) their standard deviations.
+    unseen: Mask  # (H, W) whether no frame shows the background at a pixel.
+    # on, beside: (COLOURS,) logarithms of the relative frequencies of colours on the body, and
+    # beside it (0: as frequent as if all colours were equally frequent).
     on: Floats
     beside: Floats
 

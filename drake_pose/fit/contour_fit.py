@@ -73,23 +73,17 @@ class Views(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """Quadratic costs x^T A x - 2 b^T x of each node's affine motion x (12,), per camera.
+    """Quadratic costs x^T A x - 2 b^T x of each node's affine motion x (12,), per camera."""
 
-    Attributes:
-        A: (cameras, nodes, 12, 12) lower triangles.
-        b: (cameras, nodes, 12).
-        sums: (cameras, nodes + 1, 6) by ``Sum`` of each node's contour, and of the silhouette's
-            edge in the last row.
-        bias_terms: (cameras, nodes, 13) derivatives by the boundary bias, as of
-            `compare_contours`; 0 if they were not requested.
-        placement: the body at the pose that was compared.
-    """
-
-    A: Array
-    b: Array
+    A: Array  # (cameras, nodes, 12, 12) lower triangles.
+    b: Array  # (cameras, nodes, 12).
+    # (cameras, nodes + 1, 6) by ``Sum`` of each node's contour, and of the silhouette's edge in the
+    # last row.
     sums: Array
+    # (cameras, nodes, 13) derivatives by the boundary bias, as of `compare_contours`; 0 if they
+    # were not requested.
     bias_terms: Array
-    placement: Placement
+    placement: Placement  # The body at the pose that was compared.
 
     @property
     def inlier_ratio(self) -> float:
@@ -103,20 +97,14 @@ Compare = Callable[[Placement, AnnealingStage], Comparison]
 
 @dataclass(frozen=True, eq=False)
 class PoseFit:
-    """A fitted pose.
+    """A fitted pose."""
 
-    Args:
-        values: (m,) tree values [rad or m].
-        sums: (nodes + 1, 6) as of ``Comparison``, over all cameras, at the last comparison, which
-            may be that of a rejected step or precede a single step.
-        cost: cost at the last accepted comparison, including the prior.
-        evaluations: number of comparisons.
-    """
-
-    values: Array
+    values: Array  # (m,) tree values [rad or m].
+    # (nodes + 1, 6) as of ``Comparison``, over all cameras, at the last comparison, which may be
+    # that of a rejected step or precede a single step.
     sums: Array
-    cost: float
-    evaluations: int
+    cost: float  # Cost at the last accepted comparison, including the prior.
+    evaluations: int  # Number of comparisons.
 
     @property
     def inlier_ratio(self) -> float:

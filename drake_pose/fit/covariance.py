@@ -77,25 +77,15 @@ class Distances(NamedTuple):
 
 
 class ComparedMask(NamedTuple):
-    """A body's contours compared with one silhouette.
+    """A body's contours compared with one silhouette."""
 
-    Attributes:
-        A: (nodes, 12, 12), lower triangles, one camera's part of ``Comparison.A``.
-        b: (nodes, 12), likewise.
-        X_WN: (nodes, 4, 4) poses of the nodes.
-        X_CW: (4, 4) pose of the world in the camera.
-        moves: (nodes, m, 12) affine motions of the nodes caused by the m values.
-        size: unit of errors, some pixels of the image, at the body's distance [m].
-        camera: index of the camera.
-    """
-
-    A: Array
-    b: Array
-    X_WN: Array
-    X_CW: Array
-    moves: Array
-    size: float
-    camera: int = 0
+    A: Array  # (nodes, 12, 12), lower triangles, one camera's part of ``Comparison.A``.
+    b: Array  # (nodes, 12), likewise.
+    X_WN: Array  # (nodes, 4, 4) poses of the nodes.
+    X_CW: Array  # (4, 4) pose of the world in the camera.
+    moves: Array  # (nodes, m, 12) affine motions of the nodes caused by the m values.
+    size: float  # Unit of errors, some pixels of the image, at the body's distance [m].
+    camera: int = 0  # Index of the camera.
 
 
 def error_unit(size: float) -> float:

@@ -12,19 +12,12 @@ from drake_pose.compiled import compiled
 
 
 class EdgePoints(NamedTuple):
-    """Points of a silhouette's edge in one image, from top to bottom.
+    """Points of a silhouette's edge in one image, from top to bottom."""
 
-    Attributes:
-        uv: (n, 2) points [pixel].
-        normals: (n, 2) unit normals, pointing out of the silhouette.
-        lengths: (n,) length of edge that each point represents [pixel].
-        middle: (2,) centroid of the largest contour [pixel]; nan if there is no edge.
-    """
-
-    uv: Array
-    normals: Array
-    lengths: Array
-    middle: Array
+    uv: Array  # (n, 2) points [pixel].
+    normals: Array  # (n, 2) unit normals, pointing out of the silhouette.
+    lengths: Array  # (n,) length of edge that each point represents [pixel].
+    middle: Array  # (2,) centroid of the largest contour [pixel]; nan if there is no edge.
 
 
 NO_EDGE = EdgePoints(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.full(2, np.nan))
@@ -32,19 +25,12 @@ NO_EDGE = EdgePoints(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.full(2,
 
 
 class Evidence(NamedTuple):
-    """Edges of the silhouettes of one frame, ordered by camera.
+    """Edges of the silhouettes of one frame, ordered by camera."""
 
-    Attributes:
-        uv: (n, 2) points [pixel], v ascending in each camera.
-        normals: (n, 2) unit normals, pointing out of the silhouettes.
-        lengths: (n,) length of edge that each point represents [pixel].
-        starts: (cameras + 1,) index of each camera's first point.
-    """
-
-    uv: Array
-    normals: Array
-    lengths: Array
-    starts: NDArray[np.int64]
+    uv: Array  # (n, 2) points [pixel], v ascending in each camera.
+    normals: Array  # (n, 2) unit normals, pointing out of the silhouettes.
+    lengths: Array  # (n,) length of edge that each point represents [pixel].
+    starts: NDArray[np.int64]  # (cameras + 1,) index of each camera's first point.
 
 
 class Observation(NamedTuple):

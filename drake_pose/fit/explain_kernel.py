@@ -18,23 +18,16 @@ from drake_pose.silhouette.span_kernel import Rows, fill_rows, find_spans, make_
 
 
 class PixelSums(NamedTuple):
-    """Log-likelihoods of each pixel, from which ``explain`` scores poses.
+    """Log-likelihoods of each pixel, from which ``explain`` scores poses."""
 
-    Attributes:
-        visible: (H, W, 3) log-likelihoods of the three backgrounds if no frame is covered.
-        covered: (H, W, f, 3) change of each log-likelihood if a frame is covered.
-        uncovered: (H, W) maximum of ``visible``.
-        edges: (2, f, H, W) strength of edges across u and v in each frame, minus its mean.
-        kinds: (H, W, f) kind of each pixel in each frame, and counts: (k,) number of pixels of each
-            kind. With k > 0, the gain is what the silhouettes tell about the kinds: that of the log
-            likelihood if pixels in and outside of them have frequencies of their own. The first
-            three are then not used.
-    """
-
-    visible: Floats
-    covered: Floats
-    uncovered: Floats
-    edges: Floats
+    visible: Floats  # (H, W, 3) log-likelihoods of the three backgrounds if no frame is covered.
+    covered: Floats  # (H, W, f, 3) change of each log-likelihood if a frame is covered.
+    uncovered: Floats  # (H, W) maximum of ``visible``.
+    edges: Floats  # (2, f, H, W) strength of edges across u and v in each frame, minus its mean.
+    # (H, W, f) kind of each pixel in each frame, and counts: (k,) number of pixels of each kind.
+    # With k > 0, the gain is what the silhouettes tell about the kinds: that of the log likelihood
+    # if pixels in and outside of them have frequencies of their own. The first three are then not
+    # used.
     kinds: NDArray[np.uint8] = np.zeros((1, 1, 1), np.uint8)
     counts: Array = np.zeros(0)
 

@@ -28,16 +28,11 @@ from drake_pose.errors import SettingsError
 
 @dataclass(frozen=True)
 class AnnealingStage:
-    """Part of a fit with a constant scale; lengths in m, or in the fit's unit of length.
+    """Part of a fit with a constant scale; lengths in m, or in the fit's unit of length."""
 
-    Args:
-        scale: distance at which a point's weight drops to a quarter.
-        spacing: distance between sampled points of the body's contour.
-        iterations: maximum number of steps; a single step is taken without checking the cost.
-    """
-
-    scale: float
-    spacing: float
+    scale: float  # Distance at which a point's weight drops to a quarter.
+    spacing: float  # Distance between sampled points of the body's contour.
+    # Maximum number of steps; a single step is taken without checking the cost.
     iterations: int = 1
 
     def __post_init__(self) -> None:
@@ -53,55 +48,37 @@ class StepSettings:
     """Settings of the steps.
 
     The damping is divided by 5 after a step that reduces the cost, and else multiplied by 10.
-
-    Args:
-        max_step: maximum change of an unknown per step [rad, m or a logarithm].
-        damping: initial fraction of the diagonal that is added to it.
-        uniform_damping: fraction of the diagonal's mean that is added; it fixes unobservable
-            unknowns.
-        min_damping, max_damping: limits of the damping; a step that needs more ends the stage.
-        max_start_damping: maximum damping at the start of a stage.
-        min_decrease: a step that reduces the cost by a smaller fraction ends the stage.
     """
 
-    max_step: float = 0.35
-    damping: float = 1e-3
+    max_step: float = 0.35  # Maximum change of an unknown per step [rad, m or a logarithm].
+    damping: float = 1e-3  # Initial fraction of the diagonal that is added to it.
+    # Fraction of the diagonal's mean that is added; it fixes unobservable unknowns.
     uniform_damping: float = 1e-4
+    # min_damping, max_damping: limits of the damping; a step that needs more ends the stage.
     min_damping: float = 1e-4
     max_damping: float = 1e2
-    max_start_damping: float = 0.1
-    min_decrease: float = 1e-3
+    max_start_damping: float = 0.1  # Maximum damping at the start of a stage.
+    min_decrease: float = 1e-3  # A step that reduces the cost by a smaller fraction ends the stage.
 
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """The normal equations H dx = -g of frames at given unknowns.
+    """The normal equations H dx = -g of frames at given unknowns."""
 
-    Attributes:
-        H: (frames, u, u) contribution of each frame; u = p own unknowns of the frame, then q
-            shared ones. The shared parts of all frames add up.
-        g: (frames, u) likewise.
-        cost: cost of all frames.
-    """
-
+    # (frames, u, u) contribution of each frame; u = p own unknowns of the frame, then q shared
+    # ones. The shared parts of all frames add up.
     H: Array
-    g: Array
-    cost: float
+    g: Array  # (frames, u) likewise.
+    cost: float  # Cost of all frames.
 
 
 @dataclass(frozen=True, eq=False)
 class LinearPrior:
-    """Normal priors of linear combinations of all frames' own unknowns x (frames p,).
+    """Normal priors of linear combinations of all frames' own unknowns x (frames p,)."""
 
-    Attributes:
-        rows: (k, frames p) the combinations: rows x has the prior.
-        mean: (k,) means.
-        information: (k,) inverse variances.
-    """
-
-    rows: csr_array
-    mean: Array
-    information: Array
+    rows: csr_array  # (k, frames p) the combinations: rows x has the prior.
+    mean: Array  # (k,) means.
+    information: Array  # (k,) inverse variances.
 
     def augment(self, equations: Equations, own: Array) -> Equations:
         """Return equations with the prior's gradient and cost added; H stays, see ``curvature``.

@@ -44,22 +44,14 @@ class Placement(NamedTuple):
 
     A node's motion caused by a parameter is the sum of the affine motions that ``owners`` and
     ``parameters`` list for both.
-
-    Attributes:
-        packed: surfaces of the nodes.
-        X_WN: (nodes, 4, 4) poses of the nodes.
-        motions: (k, 12) affine motions per unit of their parameters.
-        starts: (nodes + 1,) index of each node's first entry in owners; the last one is s.
-        owners: (s,) indices of motions that move a node, ordered by node.
-        parameters: (s,) index of the parameter that causes each of these motions.
     """
 
-    packed: PackedOutlines
-    X_WN: Array
-    motions: Array
-    starts: Indices
-    owners: Indices
-    parameters: Indices
+    packed: PackedOutlines  # Surfaces of the nodes.
+    X_WN: Array  # (nodes, 4, 4) poses of the nodes.
+    motions: Array  # (k, 12) affine motions per unit of their parameters.
+    starts: Indices  # (nodes + 1,) index of each node's first entry in owners; the last one is s.
+    owners: Indices  # (s,) indices of motions that move a node, ordered by node.
+    parameters: Indices  # (s,) index of the parameter that causes each of these motions.
 
     def dense(self, size: int) -> Array:
         """Return affine motions (nodes, size, 12) of nodes by all parameters, 0 if not moved."""

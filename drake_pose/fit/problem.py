@@ -68,23 +68,16 @@ class Unknowns:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The best fit of a problem.
+    """The best fit of a problem."""
 
-    Attributes:
-        own: (frames, p) each frame's own unknowns, in the order of ``Problem.names``.
-        shared: (q,) shared unknowns, likewise.
-        parameters: (frames, n) all parameters of the frames, in the order of ``parameter_names``.
-        cost: cost of all frames, including priors.
-        ending: returns ``equations`` and ``inlier_ratios``, evaluated on the first call.
-        coupling: prior that couples the frames' own unknowns; None: none.
-    """
-
-    own: Array
-    shared: Array
+    own: Array  # (frames, p) each frame's own unknowns, in the order of ``Problem.names``.
+    shared: Array  # (q,) shared unknowns, likewise.
+    # (frames, n) all parameters of the frames, in the order of ``parameter_names``.
     parameters: Array
-    cost: float
+    cost: float  # Cost of all frames, including priors.
+    # Returns ``equations`` and ``inlier_ratios``, evaluated on the first call.
     ending: Callable[[], tuple[Equations, Array]]
-    coupling: LinearPrior | None = None
+    coupling: LinearPrior | None = None  # Prior that couples the frames' own unknowns; None: none.
 
     @property
     def equations(self) -> Equations:

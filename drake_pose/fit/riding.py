@@ -34,23 +34,16 @@ from drake_pose.fit.explain_kernel import PixelSums
 
 
 class RidingSettings(NamedTuple):
-    """Settings for a body that moves with the camera; chosen on simulated wrists of three arms.
+    """Settings for a body that moves with the camera; chosen on simulated wrists of three arms."""
 
-    Args:
-        share: approximate fraction of the picture that the body covers.
-        groups: number of groups of colours.
-        edge: gradient of an edge of full strength, 1 [of 255 per pixel].
-        weight: of the mean strength of edges along the contours, beside the explained fraction.
-        threshold: strength of a lasting edge that is as likely on a contour as elsewhere.
-        full_gain: mean gain of a pixel at which the explained fraction is 1 [nat].
-    """
-
-    share: float = 0.2
-    groups: int = 12
-    edge: float = 6.0
+    share: float = 0.2  # Approximate fraction of the picture that the body covers.
+    groups: int = 12  # Number of groups of colours.
+    edge: float = 6.0  # Gradient of an edge of full strength, 1 [of 255 per pixel].
+    # Of the mean strength of edges along the contours, beside the explained fraction.
     weight: float = 2.0
+    # Strength of a lasting edge that is as likely on a contour as elsewhere.
     threshold: float = 0.2
-    full_gain: float = 0.35
+    full_gain: float = 0.35  # Mean gain of a pixel at which the explained fraction is 1 [nat].
 
 
 RIDING = RidingSettings()
@@ -58,21 +51,13 @@ RIDING = RidingSettings()
 
 @dataclass(frozen=True, eq=False)
 class RidingPictures:
-    """Small images of a camera that moves, and of a body that moves with it.
+    """Small images of a camera that moves, and of a body that moves with it."""
 
-    Args:
-        pictures: (f, H, W, 3) images after photometric correction [0 to 255].
-        gains: (3, 4) photometric gain of each image, see ``estimate_gain``.
-        colours: (H, W, 3) median colours of all images [0 to 255].
-        deviations: (H, W) standard deviations of the body's colours [of 255].
-        alike: (f, f) similarity of the body's poses in two frames; 1: the same, 0: none.
-    """
-
-    pictures: Floats
-    gains: tuple[Floats, ...]
-    colours: Floats
-    deviations: Floats
-    alike: Array
+    pictures: Floats  # (f, H, W, 3) images after photometric correction [0 to 255].
+    gains: tuple[Floats, ...]  # (3, 4) photometric gain of each image, see ``estimate_gain``.
+    colours: Floats  # (H, W, 3) median colours of all images [0 to 255].
+    deviations: Floats  # (H, W) standard deviations of the body's colours [of 255].
+    alike: Array  # (f, f) similarity of the body's poses in two frames; 1: the same, 0: none.
 
     @staticmethod
     def estimate(pictures: Picture, alike: Array) -> "RidingPictures":

@@ -18,31 +18,22 @@ from drake_pose.yaml_files import read_yaml
 
 @dataclass(frozen=True)
 class SceneJob:
-    """One scene of a batch.
+    """One scene of a batch."""
 
-    Args:
-        name: name of the scene and its result folder.
-        scene: the scene's folder; of an audit also an episode, a folder or file.
-        model: the model file.
-        settings: settings of the estimate or audit.
-        truth: measured joint positions to compare an estimate with; None: the scene's own, if any.
-        overlay, replay: whether overlays and replay.html are written.
-        chunk: number of frames in a chunk; recordings of a person and audits are not cut.
-        audit: table of joint positions to be audited; True: the episode's own joint log; None: the
-            scene is estimated.
-        camera_file: camera file of an audit; None: the scene's cameras.yaml.
-    """
-
-    name: str
-    scene: Path
-    model: Path
-    settings: EstimateSettings | AuditSettings
+    name: str  # Name of the scene and its result folder.
+    scene: Path  # The scene's folder; of an audit also an episode, a folder or file.
+    model: Path  # The model file.
+    settings: EstimateSettings | AuditSettings  # Settings of the estimate or audit.
+    # Measured joint positions to compare an estimate with; None: the scene's own, if any.
     truth: Path | None = None
+    # overlay, replay: whether overlays and replay.html are written.
     overlay: bool = True
     replay: bool = True
-    chunk: int = 100
+    chunk: int = 100  # Number of frames in a chunk; recordings of a person and audits are not cut.
+    # Table of joint positions to be audited; True: the episode's own joint log; None: the scene is
+    # estimated.
     audit: Path | bool | None = None
-    camera_file: Path | None = None
+    camera_file: Path | None = None  # Camera file of an audit; None: the scene's cameras.yaml.
 
     def describe(self) -> dict[str, Any]:
         """Return plain JSON values, equal only if a resumed job is unchanged."""

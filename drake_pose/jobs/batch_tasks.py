@@ -73,16 +73,11 @@ class Task:
 
 
 class Outcome(NamedTuple):
-    """Result of a task.
+    """Result of a task."""
 
-    Args:
-        error: message of the error; None if the task succeeded.
-        seconds: wall time [s]; 0 if the result existed already.
-        totals: of a whole scene that succeeded, the result of `_totals`; else None.
-    """
-
-    error: str | None
-    seconds: float = 0.0
+    error: str | None  # Message of the error; None if the task succeeded.
+    seconds: float = 0.0  # Wall time [s]; 0 if the result existed already.
+    # Of a whole scene that succeeded, the result of `_totals`; else None.
     totals: Mapping[str, Any] | None = None
 
 

@@ -60,27 +60,16 @@ Find = Callable[[str, Picture], tuple[Mask, float, tuple[str, ...]]]
 
 
 class FoundMask(NamedTuple):
-    """The mask of one picture, or why it was rejected.
+    """The mask of one picture, or why it was rejected."""
 
-    Args:
-        camera: the camera's name.
-        frame: the frame's name.
-        where: origin of the picture, for messages.
-        mask: (H, W) bool.
-        picture: (H, W, 3) RGB; None if only the mask is given.
-        refusal: why the mask is rejected; "" if it is accepted.
-        warnings: messages for the user.
-        agreement: lowest IoU with masks of slightly different settings, or with the colours; nan if
-            not known.
-    """
-
-    camera: str
-    frame: str
-    where: str
-    mask: Mask
-    picture: Picture | None = None
-    refusal: str = ""
-    warnings: tuple[str, ...] = ()
+    camera: str  # The camera's name.
+    frame: str  # The frame's name.
+    where: str  # Origin of the picture, for messages.
+    mask: Mask  # (H, W) bool.
+    picture: Picture | None = None  # (H, W, 3) RGB; None if only the mask is given.
+    refusal: str = ""  # Why the mask is rejected; "" if it is accepted.
+    warnings: tuple[str, ...] = ()  # Messages for the user.
+    # Lowest IoU with masks of slightly different settings, or with the colours; nan if not known.
     agreement: float = math.nan
 
 

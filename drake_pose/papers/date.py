@@ -34,21 +34,14 @@ _OBSERVED_FRAMES = 30
 
 
 class MotionSample(NamedTuple):
-    """The middle frame of a motion, for pictures.
+    """The middle frame of a motion, for pictures."""
 
-    Attributes:
-        compared: (H, W, 3) true pose and all estimates, side by side.
-        picture: (H, W, 3) input of the shown camera.
-        views: the person as each camera sees it, for the paper's method.
-        found: features in space.
-        faces: (130, 80, 3) input face, nearest template and the model's face at the estimate; () if
-            no face was seen.
-    """
-
-    compared: Picture
-    picture: Picture
-    views: Mapping[str, PersonView]
-    found: Features
+    compared: Picture  # (H, W, 3) true pose and all estimates, side by side.
+    picture: Picture  # (H, W, 3) input of the shown camera.
+    views: Mapping[str, PersonView]  # The person as each camera sees it, for the paper's method.
+    found: Features  # Features in space.
+    # (130, 80, 3) input face, nearest template and the model's face at the estimate; () if no face
+    # was seen.
     faces: tuple[Picture, ...]
 
 

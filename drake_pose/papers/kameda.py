@@ -72,37 +72,24 @@ class Causes(NamedTuple):
     """Why a wrong pose has the true pose's silhouette (6.1). Both causes may hold.
 
     Neither holds where a segment only turns about its own axis.
-
-    Attributes:
-        hidden: a segment with wrong angles is hidden in both poses: the paper's occlusion.
-        inner_edges: edges inside the silhouette differ.
     """
 
-    hidden: bool
-    inner_edges: bool
+    hidden: bool  # A segment with wrong angles is hidden in both poses: the paper's occlusion.
+    inner_edges: bool  # Edges inside the silhouette differ.
 
 
 @dataclass(frozen=True)
 class RandomPose:
-    """One pose of experiment A, and the result of the search.
+    """One pose of experiment A, and the result of the search."""
 
-    Args:
-        true_values: the drawn values (k_i,) of each node [rad or m].
-        inside: whether the whole body is inside the picture.
-        result: the pose that the search found.
-        seconds: processor time of the search [s].
-        more_seconds: processor time of proof and modes, or of intervals [s].
-        tolerance: silhouettes that differ by at most this are equal [pixel].
-        causes: why angles are wrong although the silhouette is matched; None: they are right, the
-            silhouette is not matched, or angles are continuous.
-    """
-
-    true_values: tuple[np.ndarray, ...]
-    inside: bool
-    result: PoseEstimate
-    seconds: float
-    more_seconds: float = 0.0
-    tolerance: float = 0.0
+    true_values: tuple[np.ndarray, ...]  # The drawn values (k_i,) of each node [rad or m].
+    inside: bool  # Whether the whole body is inside the picture.
+    result: PoseEstimate  # The pose that the search found.
+    seconds: float  # Processor time of the search [s].
+    more_seconds: float = 0.0  # Processor time of proof and modes, or of intervals [s].
+    tolerance: float = 0.0  # Silhouettes that differ by at most this are equal [pixel].
+    # Why angles are wrong although the silhouette is matched; None: they are right, the silhouette
+    # is not matched, or angles are continuous.
     causes: Causes | None = None
 
     @property

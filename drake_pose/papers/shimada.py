@@ -61,17 +61,11 @@ PICTURES = "pictures"
 
 
 class FilteredHand(NamedTuple):
-    """A filtered sequence.
+    """A filtered sequence."""
 
-    Attributes:
-        sequence: true states and measurements.
-        track: beliefs of the filter.
-        bound: (n,) final mean of a filter that linearises at the truth and has no limits; nan with
-            pictures.
-    """
-
-    sequence: SyntheticSequence
-    track: HandTrack
+    sequence: SyntheticSequence  # True states and measurements.
+    track: HandTrack  # Beliefs of the filter.
+    # (n,) final mean of a filter that linearises at the truth and has no limits; nan with pictures.
     bound: Array
 
 
@@ -349,27 +343,19 @@ COUPLED = ("flexion_12 - flexion_13", "flexion_22 - flexion_23")
 
 @dataclass(frozen=True, eq=False)
 class HypothesisHistory:
-    """A hypothesis of one run, from the frame in which it was made to its end.
+    """A hypothesis of one run, from the frame in which it was made to its end."""
 
-    Attributes:
-        run: index of the run.
-        frames: (k,) frames in which it lived, counted from 1; in the last one it ended.
-        means: (k, n) mean states; the last one before truncation if it was rejected.
-        weights: (k,) between 0 and 1; NaN in the last frame if it was rejected.
-        reason, row, c: as of ``Rejection``; the reason is "" if it outlived the sequence.
-        error: RMS error of its joint angles in its last valid frame [deg].
-        kept_error: that of the heaviest hypothesis in the frame of its end [deg].
-    """
-
-    run: int
+    run: int  # Index of the run.
+    # (k,) frames in which it lived, counted from 1; in the last one it ended.
     frames: NDArray[np.int64]
-    means: Array
-    weights: Array
+    means: Array  # (k, n) mean states; the last one before truncation if it was rejected.
+    weights: Array  # (k,) between 0 and 1; NaN in the last frame if it was rejected.
+    # reason, row, c: as of ``Rejection``; the reason is "" if it outlived the sequence.
     reason: str
     row: str
     c: float
-    error: float
-    kept_error: float
+    error: float  # RMS error of its joint angles in its last valid frame [deg].
+    kept_error: float  # That of the heaviest hypothesis in the frame of its end [deg].
 
     def at(self, frame: int) -> Array:
         """Return the mean state (n,) in a frame in which it lived."""
@@ -388,20 +374,13 @@ class HypothesisHistory:
 
 @dataclass(frozen=True, eq=False)
 class HypothesesResult:
-    """All hypotheses of all runs.
-
-    Attributes:
-        sequences: of each run.
-        final_errors: (runs,) RMS errors of the heaviest hypothesis's angles at the end [deg].
-        inequalities: of the filter.
-        settings: arguments of the experiment by name.
-    """
+    """All hypotheses of all runs."""
 
     histories: tuple[HypothesisHistory, ...]
-    sequences: tuple[SyntheticSequence, ...]
-    final_errors: Array
-    inequalities: Inequalities
-    settings: Mapping[str, object]
+    sequences: tuple[SyntheticSequence, ...]  # Of each run.
+    final_errors: Array  # (runs,) RMS errors of the heaviest hypothesis's angles at the end [deg].
+    inequalities: Inequalities  # Of the filter.
+    settings: Mapping[str, object]  # Arguments of the experiment by name.
 
     def example(self, lived: int = 2) -> tuple[HypothesisHistory, HypothesisHistory] | None:
         """Return a wrong hypothesis that an inequality rejected, and its survivor (figure 9).

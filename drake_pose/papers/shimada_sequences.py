@@ -75,17 +75,11 @@ ACCELERATIONS = {
 
 @dataclass(frozen=True, eq=False)
 class SyntheticSequence:
-    """A synthetic sequence of 55 frames.
+    """A synthetic sequence of 55 frames."""
 
-    Args:
-        states: (55, n) true states, elements as of HAND_STATE.
-        measurements: (55, m) noisy measurements, elements as of MEASURED; nan: not measured.
-        guess: table 2's belief about the first state.
-    """
-
-    states: Array
-    measurements: Array
-    guess: Belief
+    states: Array  # (55, n) true states, elements as of HAND_STATE.
+    measurements: Array  # (55, m) noisy measurements, elements as of MEASURED; nan: not measured.
+    guess: Belief  # Table 2's belief about the first state.
 
 
 def true_states(r_13: float, phase: Array, yaw_middle: float = 0.0) -> Array:
@@ -300,20 +294,13 @@ def follow_pictures(
 
 @dataclass(frozen=True, eq=False)
 class SequenceResult:
-    """A filtered recorded sequence.
+    """A filtered recorded sequence."""
 
-    Attributes:
-        name: of the sequence's folder.
-        observation: predicts measurements, and has the hand.
-        guess: belief about the rough pose of the first frame.
-        track: beliefs after each frame.
-        truth: (frames,) true values by name of the angle [deg]; {} if they are unknown.
-    """
-
-    name: str
-    observation: HandObservation
-    guess: Belief
-    track: HandTrack
+    name: str  # Of the sequence's folder.
+    observation: HandObservation  # Predicts measurements, and has the hand.
+    guess: Belief  # Belief about the rough pose of the first frame.
+    track: HandTrack  # Beliefs after each frame.
+    # (frames,) true values by name of the angle [deg]; {} if they are unknown.
     truth: Mapping[str, Array]
 
     def warning(self) -> str:

@@ -56,48 +56,32 @@ class FrameEdges:
 
 @dataclass(frozen=True, eq=False)
 class CameraMotion:
-    """Estimated motion of a camera since its calibration.
+    """Estimated motion of a camera since its calibration."""
 
-    Args:
-        X_WC: (4, 4) pose of the camera that fits its silhouettes.
-        shift: (2,) displacement of the person in its pictures, right and down [pixel].
-        pixels: RMS displacement of the person's joints in its pictures [pixel].
-        metres: the same at the person's distance [m].
-        turn: rotation of the person in its pictures, clockwise [rad].
-        inlier_ratio_before, inlier_ratio_after: of the contours, with the calibration and after
-            the motion.
-    """
-
-    X_WC: Array
-    shift: Array
-    pixels: float
-    metres: float
-    turn: float
+    X_WC: Array  # (4, 4) pose of the camera that fits its silhouettes.
+    shift: Array  # (2,) displacement of the person in its pictures, right and down [pixel].
+    pixels: float  # RMS displacement of the person's joints in its pictures [pixel].
+    metres: float  # The same at the person's distance [m].
+    turn: float  # Rotation of the person in its pictures, clockwise [rad].
+    # inlier_ratio_before, inlier_ratio_after: of the contours, with the calibration and after the
+    # motion.
     inlier_ratio_before: float
     inlier_ratio_after: float
 
 
 @dataclass(frozen=True, eq=False)
 class CameraFault:
-    """A camera whose silhouettes disagree with the others'.
-
-    Args:
-        motion: how it has moved; turns about the camera itself may be undetermined.
-        is_explained: whether the motion explains the silhouettes. If not, the masks may be poor,
-            mirrored, or another camera's.
-        alternatives: cameras that may be at fault instead.
-        others_inlier_ratio: inlier ratio of the other cameras' contours without this one.
-        first: index of the first frame in which it is at fault.
-        is_left_out: whether it was left out.
-    """
+    """A camera whose silhouettes disagree with the others'."""
 
     name: str
-    motion: CameraMotion
+    motion: CameraMotion  # How it has moved; turns about the camera itself may be undetermined.
+    # Whether the motion explains the silhouettes. If not, the masks may be poor, mirrored, or
+    # another camera's.
     is_explained: bool
-    alternatives: tuple[str, ...]
-    others_inlier_ratio: float
-    first: int = 0
-    is_left_out: bool = False
+    alternatives: tuple[str, ...]  # Cameras that may be at fault instead.
+    others_inlier_ratio: float  # Inlier ratio of the other cameras' contours without this one.
+    first: int = 0  # Index of the first frame in which it is at fault.
+    is_left_out: bool = False  # Whether it was left out.
 
 
 class CameraComparison:

@@ -424,21 +424,15 @@ def capture_by_colour(
 
 @dataclass(frozen=True, eq=False)
 class CheckedCapture:
-    """A captured recording and its faults.
+    """A captured recording and its faults."""
 
-    Args:
-        captured: all frames; nan where fewer than two cameras see the person.
-        views: what else was in view, or was not.
-        cameras: cameras that disagree with the others, evaluated once more at the end.
-        rig: the fault of the rig as a whole, if no single camera explains it; undone if identified.
-        read: returns the masks that were used.
-    """
-
-    captured: PersonCapture
-    views: ViewFaults
+    captured: PersonCapture  # All frames; nan where fewer than two cameras see the person.
+    views: ViewFaults  # What else was in view, or was not.
+    # Cameras that disagree with the others, evaluated once more at the end.
     cameras: tuple[CameraFault, ...]
+    # The fault of the rig as a whole, if no single camera explains it; undone if identified.
     rig: RigFault | None
-    read: ReadFrame
+    read: ReadFrame  # Returns the masks that were used.
 
 
 def capture_checked(

@@ -30,32 +30,21 @@ _MAX_RAY_DISTANCE = 0.35
 
 
 class Figure(NamedTuple):
-    """A connected component of a mask.
+    """A connected component of a mask."""
 
-    Args:
-        middle: (2,) centroid [pixel].
-        area: [pixel^2].
-        box: (4,) left, top, right, bottom [pixel].
-    """
-
-    middle: Array
-    area: float
-    box: Array
+    middle: Array  # (2,) centroid [pixel].
+    area: float  # [pixel^2].
+    box: Array  # (4,) left, top, right, bottom [pixel].
 
 
 @dataclass(frozen=True, eq=False)
 class Person:
-    """A person seen by two or more cameras.
+    """A person seen by two or more cameras."""
 
-    Args:
-        position: (3,) middle of the body [m].
-        figures: index of the person's figure, by index of the camera.
-        area: median area of these figures, of an even number the lower one [pixel^2].
-    """
-
-    position: Array
+    position: Array  # (3,) middle of the body [m].
+    # Index of the person's figure, by index of the camera.
     figures: dict[int, int] = field(default_factory=dict)
-    area: float = 0.0
+    area: float = 0.0  # Median area of these figures, of an even number the lower one [pixel^2].
 
 
 def find_figures(

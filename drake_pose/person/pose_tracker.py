@@ -24,19 +24,12 @@ from drake_pose.person.views import ColourViews, FrameViews
 
 
 class PoseUncertainty(NamedTuple):
-    """Uncertainty of a pose.
+    """Uncertainty of a pose."""
 
-    Args:
-        covariance: (m, m) of the pose tree's values [rad, m].
-        information: (m, m) of all values, held ones included, from the silhouettes alone.
-        noise: variance of the contours' distances, relative to the fit's `Noise`.
-        surface: standard deviation of the parts' surfaces from the model's [m].
-    """
-
-    covariance: Array
-    information: Array
-    noise: float
-    surface: float
+    covariance: Array  # (m, m) of the pose tree's values [rad, m].
+    information: Array  # (m, m) of all values, held ones included, from the silhouettes alone.
+    noise: float  # Variance of the contours' distances, relative to the fit's `Noise`.
+    surface: float  # Standard deviation of the parts' surfaces from the model's [m].
 
 
 def pose_uncertainty(

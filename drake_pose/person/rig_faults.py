@@ -52,15 +52,11 @@ class RigFault:
 
     In a ring of four cameras, exchanging opposite ones is the same as mirroring all; the latter is
     reported.
-
-    Args:
-        mirrored: cameras whose pictures are mirrored, left for right.
-        exchanged: two cameras whose pictures are exchanged.
-        filled: fraction of the silhouettes that a visual hull fills, by camera, before the change.
     """
 
-    mirrored: tuple[str, ...]
-    exchanged: tuple[str, ...]
+    mirrored: tuple[str, ...]  # Cameras whose pictures are mirrored, left for right.
+    exchanged: tuple[str, ...]  # Two cameras whose pictures are exchanged.
+    # Fraction of the silhouettes that a visual hull fills, by camera, before the change.
     filled: Mapping[str, float]
 
     @property

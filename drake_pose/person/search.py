@@ -135,25 +135,15 @@ LENIENT = PersonSettings(
 
 
 class PlannedLimb(NamedTuple):
-    """An arm or leg of a pose tree.
+    """An arm or leg of a pose tree."""
 
-    Args:
-        nodes: (j,) indices of the nodes that only this limb has.
-        values: (k,) indices of the pose tree's values that move these nodes alone.
-        joints: (3,) indices of root, middle joint and end among the landmarks.
-        poses: (n, k) these values in n poses between their limits; the first is at rest [rad].
-        samples_T: (n, m, 3) points along the limb in the trunk's frame in each pose [m].
-        weights: (n, m) weights of the points.
-        length: from root to end, stretched out [m].
-    """
-
-    nodes: Indices
-    values: Indices
-    joints: Indices
-    poses: Array
-    samples_T: Array
-    weights: Array
-    length: float
+    nodes: Indices  # (j,) indices of the nodes that only this limb has.
+    values: Indices  # (k,) indices of the pose tree's values that move these nodes alone.
+    joints: Indices  # (3,) indices of root, middle joint and end among the landmarks.
+    poses: Array  # (n, k) these values in n poses between their limits; the first is at rest [rad].
+    samples_T: Array  # (n, m, 3) points along the limb in the trunk's frame in each pose [m].
+    weights: Array  # (n, m) weights of the points.
+    length: float  # From root to end, stretched out [m].
 
     def points_at(self, X_WT: Array) -> Array:
         """Return the points (n, m, 3) in the world [m] where the trunk is at X_WT (4, 4)."""

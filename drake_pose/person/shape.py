@@ -46,20 +46,13 @@ class KnownShape:
 
 @dataclass(frozen=True, eq=False)
 class PersonShape:
-    """A person's fitted shape.
-
-    Args:
-        values: (m,) values of the pose tree: fitted shape joints [m], others 0.
-        covariance: (h, h) covariance of the shape joints [m^2].
-        poses: (frames, m) values in the fitted frames [rad, m].
-        outlines: the model's simplified surfaces with these radius scales.
-    """
+    """A person's fitted shape."""
 
     known: KnownShape
-    values: Array
-    covariance: Array
-    poses: Array
-    outlines: tuple[Outline, ...]
+    values: Array  # (m,) values of the pose tree: fitted shape joints [m], others 0.
+    covariance: Array  # (h, h) covariance of the shape joints [m^2].
+    poses: Array  # (frames, m) values in the fitted frames [rad, m].
+    outlines: tuple[Outline, ...]  # The model's simplified surfaces with these radius scales.
 
 
 def shape_values(tree: PoseTree) -> Mask:

@@ -85,37 +85,25 @@ class Nudge(NamedTuple):
 
 
 class PictureMotion(NamedTuple):
-    """The motion of a camera that should stand still.
+    """The motion of a camera that should stand still."""
 
-    Args:
-        nudges: sudden motions, in order.
-        drift: largest slow shift of the background between two nudges [pixel]; 0: none.
-        shake: median distance of the background's shift from its running median [pixel]; 0: none.
-    """
-
-    nudges: tuple[Nudge, ...]
-    drift: float = 0.0
+    nudges: tuple[Nudge, ...]  # Sudden motions, in order.
+    drift: float = 0.0  # Largest slow shift of the background between two nudges [pixel]; 0: none.
+    # Median distance of the background's shift from its running median [pixel]; 0: none.
     shake: float = 0.0
 
 
 class CameraPart(NamedTuple):
-    """A part of a recording in which its camera was not moved; it may be the whole recording.
+    """A part of a recording in which its camera was not moved; it may be the whole recording."""
 
-    Args:
-        of: the recorded camera's name.
-        pictures: indices of the part's pictures in the recording.
-        rotation: (3, 3) approximate rotation of the camera, in its frame of the first part.
-        since, until: times of the part's first and last picture [s]; None: not logged.
-        is_whole: whether it is the whole recording.
-        drift, shake: of ``PictureMotion`` [pixel].
-    """
-
-    of: str
-    pictures: slice
-    rotation: Array
+    of: str  # The recorded camera's name.
+    pictures: slice  # Indices of the part's pictures in the recording.
+    rotation: Array  # (3, 3) approximate rotation of the camera, in its frame of the first part.
+    # since, until: times of the part's first and last picture [s]; None: not logged.
     since: float | None
     until: float | None
-    is_whole: bool
+    is_whole: bool  # Whether it is the whole recording.
+    # drift, shake: of ``PictureMotion`` [pixel].
     drift: float
     shake: float
 

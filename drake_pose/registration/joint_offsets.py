@@ -57,25 +57,17 @@ class KinematicParameter:
 
 @dataclass(frozen=True, eq=False)
 class JointCalibration:
-    """Joint offsets, link scales, and the cameras fitted with them.
+    """Joint offsets, link scales, and the cameras fitted with them."""
 
-    Args:
-        offsets, link_scales: of the requested joints and links.
-        cameras: the cameras with their fitted poses and focal lengths.
-        covariances: (cameras, 6, 6), see ``RegisteredCamera``.
-        focal_deviations: (cameras,) standard deviations over the focal lengths; 0: not fitted.
-        object_values: (6,) the calibration target's TARGET_POSITIONS; empty without a target.
-        object_covariance: (6, 6) their covariance; empty without a target.
-        inlier_ratios, is_inlier: for each camera (frames,), with the fitted parameters.
-    """
-
+    # offsets, link_scales: of the requested joints and links.
     offsets: tuple[KinematicParameter, ...]
     link_scales: tuple[KinematicParameter, ...]
-    cameras: tuple[PinholeCamera, ...]
-    covariances: Array
-    focal_deviations: Array
-    object_values: Array
-    object_covariance: Array
+    cameras: tuple[PinholeCamera, ...]  # The cameras with their fitted poses and focal lengths.
+    covariances: Array  # (cameras, 6, 6), see ``RegisteredCamera``.
+    focal_deviations: Array  # (cameras,) standard deviations over the focal lengths; 0: not fitted.
+    object_values: Array  # (6,) the calibration target's TARGET_POSITIONS; empty without a target.
+    object_covariance: Array  # (6, 6) their covariance; empty without a target.
+    # inlier_ratios, is_inlier: for each camera (frames,), with the fitted parameters.
     inlier_ratios: tuple[Array, ...]
     is_inlier: tuple[Mask, ...]
 

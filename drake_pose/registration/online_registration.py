@@ -83,23 +83,17 @@ class OnlineSettings:
 
 @dataclass(frozen=True, eq=False)
 class OnlineState:
-    """Immutable state of a registration.
+    """Immutable state of a registration."""
 
-    Args:
-        keyframes, outlier_frames: the kept frames, and the latest consecutive outlier frames, the
-            oldest first; the body's pose differs in all of them.
-        registered: the camera's estimated pose; None: not yet known.
-        outlier_count: number of consecutive outlier frames.
-        moves: number of detected motions of the camera.
-        distances: squared Mahalanobis distances between the poses from the newest and from all
-            keyframes, the latest last.
-    """
-
+    # keyframes, outlier_frames: the kept frames, and the latest consecutive outlier frames, the
+    # oldest first; the body's pose differs in all of them.
     keyframes: tuple[PosedFrame, ...] = ()
     outlier_frames: tuple[PosedFrame, ...] = ()
-    registered: RegisteredCamera | None = None
-    outlier_count: int = 0
-    moves: int = 0
+    registered: RegisteredCamera | None = None  # The camera's estimated pose; None: not yet known.
+    outlier_count: int = 0  # Number of consecutive outlier frames.
+    moves: int = 0  # Number of detected motions of the camera.
+    # Squared Mahalanobis distances between the poses from the newest and from all keyframes, the
+    # latest last.
     distances: tuple[float, ...] = ()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "OnlineState":

@@ -33,22 +33,15 @@ LAST_SPACING = 1.0 / 300.0
 
 @dataclass(frozen=True, eq=False)
 class PosedFrame:
-    """One camera's frame of a body at known joint positions.
+    """One camera's frame of a body at known joint positions."""
 
-    Args:
-        name: the frame's name.
-        values: (m,) values of the body's pose tree [rad or m].
-        mask: (H, W) the silhouette.
-        foreground: (H, W, 3) log-odds of each pixel to show the body, coded as colours
-            (``fit.background``), which fits use in place of the mask; None: they use the mask.
-        rates: (m,) velocities of the values [rad/s or m/s]; None: unknown.
-    """
-
-    name: str
-    values: Array
-    mask: Mask
+    name: str  # The frame's name.
+    values: Array  # (m,) values of the body's pose tree [rad or m].
+    mask: Mask  # (H, W) the silhouette.
+    # (H, W, 3) log-odds of each pixel to show the body, coded as colours (``fit.background``),
+    # which fits use in place of the mask; None: they use the mask.
     foreground: NDArray[np.uint8] | None = None
-    rates: Array | None = None
+    rates: Array | None = None  # (m,) velocities of the values [rad/s or m/s]; None: unknown.
 
 
 class PosedFrames:
@@ -193,21 +186,15 @@ def placed_points(outlines: Sequence[Outline], X_WN: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class MultiViewFrame:
-    """Synchronised pictures of several cameras of a body at known joint positions.
+    """Synchronised pictures of several cameras of a body at known joint positions."""
 
-    Args:
-        name: the frame's name.
-        values: (m,) values of the body's pose tree [rad or m].
-        masks: silhouettes (H, W) by camera name; a camera without a mask has no entry.
-        foreground: coded log-odds (H, W, 3) by camera name, see ``PosedFrame``.
-        rates: (m,) velocities of the values [rad/s or m/s]; None: unknown.
-    """
-
-    name: str
-    values: Array
+    name: str  # The frame's name.
+    values: Array  # (m,) values of the body's pose tree [rad or m].
+    # Silhouettes (H, W) by camera name; a camera without a mask has no entry.
     masks: Mapping[str, Mask]
+    # Coded log-odds (H, W, 3) by camera name, see ``PosedFrame``.
     foreground: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
-    rates: Array | None = None
+    rates: Array | None = None  # (m,) velocities of the values [rad/s or m/s]; None: unknown.
 
     @classmethod
     def alone(cls, camera: str, frame: PosedFrame) -> "MultiViewFrame":

@@ -133,21 +133,13 @@ class RegistrationBody:
 
 @dataclass(frozen=True, eq=False)
 class FrameMisfit:
-    """How well one frame fits a camera's pose.
+    """How well one frame fits a camera's pose."""
 
-    Args:
-        frame: the frame's name.
-        E_total: area in body or silhouette alone, over the silhouette's area.
-        iou: intersection over union of body and silhouette.
-        inlier_ratio: fraction of both contours' lengths that fits.
-        is_inlier: whether the frame agrees with the others; outliers did not count in the fit.
-    """
-
-    frame: str
-    E_total: float
-    iou: float
-    inlier_ratio: float
-    is_inlier: bool
+    frame: str  # The frame's name.
+    E_total: float  # Area in body or silhouette alone, over the silhouette's area.
+    iou: float  # Intersection over union of body and silhouette.
+    inlier_ratio: float  # Fraction of both contours' lengths that fits.
+    is_inlier: bool  # Whether the frame agrees with the others; outliers did not count in the fit.
 
 
 class _UncertainPose:
@@ -187,22 +179,16 @@ class TargetPose(_UncertainPose):
 
 @dataclass(frozen=True, eq=False)
 class RegisteredCamera(_UncertainPose):
-    """A camera's estimated pose.
+    """A camera's estimated pose."""
 
-    Args:
-        camera: the camera at its estimated pose X_WC.
-        covariance: (6, 6) covariance of the pose's error: rotation vector [rad] and translation
-            [m], both along the world's axes.
-        frames: how well each frame fits.
-        alternatives: (n, 4, 4) other poses X_WC that fit equally well.
-        target: the pose of the calibration target, where it was estimated.
-    """
-
-    camera: PinholeCamera
+    camera: PinholeCamera  # The camera at its estimated pose X_WC.
+    # (6, 6) covariance of the pose's error: rotation vector [rad] and translation [m], both along
+    # the world's axes.
     covariance: Array
-    frames: tuple[FrameMisfit, ...]
+    frames: tuple[FrameMisfit, ...]  # How well each frame fits.
+    # (n, 4, 4) other poses X_WC that fit equally well.
     alternatives: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    target: TargetPose | None = None
+    target: TargetPose | None = None  # The pose of the calibration target, where it was estimated.
 
     @property
     def outliers(self) -> tuple[str, ...]:

@@ -31,18 +31,12 @@ class Layer:
     """The edges of the graph that place one node, sorted by origin and sample.
 
     A state is a partial pose; states of a layer are numbered from 0.
-
-    Args:
-        node: index of the node.
-        origins: (m,) int64 states of this layer from which the edges start.
-        samples: (m,) int64 the node's samples: indices in its grid.
-        ends: (m,) int64 states of the next layer at which the edges end.
     """
 
-    node: int
-    origins: np.ndarray
-    samples: np.ndarray
-    ends: np.ndarray
+    node: int  # Index of the node.
+    origins: np.ndarray  # (m,) int64 states of this layer from which the edges start.
+    samples: np.ndarray  # (m,) int64 the node's samples: indices in its grid.
+    ends: np.ndarray  # (m,) int64 states of the next layer at which the edges end.
 
     def chosen(self, edges: np.ndarray) -> "Layer":
         """Return the layer with a subset of its edges, (m,) bool."""
@@ -159,20 +153,13 @@ class PartialPoseGraph:
 
 @dataclass(frozen=True)
 class PosesWithin:
-    """Result of a branch and bound.
+    """Result of a branch and bound."""
 
-    Attributes:
-        J_limit: the limit of the objective [pixel].
-        graph: poses of the grid with J up to the limit.
-        complete: whether the graph certainly holds all of them.
-        limited: whether poses may be missing because a limit of the search was reached.
-        lower_bound: lower bound of J of all poses of the grid that are not in the graph [pixel].
-    """
-
-    J_limit: float
-    graph: PartialPoseGraph
-    complete: bool
-    limited: bool
+    J_limit: float  # The limit of the objective [pixel].
+    graph: PartialPoseGraph  # Poses of the grid with J up to the limit.
+    complete: bool  # Whether the graph certainly holds all of them.
+    limited: bool  # Whether poses may be missing because a limit of the search was reached.
+    # Lower bound of J of all poses of the grid that are not in the graph [pixel].
     lower_bound: float
 
 

@@ -34,47 +34,31 @@ from drake_pose.workers import map_ordered
 
 
 class CoarseView(NamedTuple):
-    """One silhouette with the lookup tables of the coarse search.
+    """One silhouette with the lookup tables of the coarse search."""
 
-    Attributes:
-        camera: (8,) ``Camera.kernel_parameters()``.
-        X_CW: (4, 4) pose of the world in the camera.
-        origin: (2,) row and column of the corner of the first cell of the cover [pixel].
-        cell: side of the cover's cells [pixel].
-        radii: (levels,) radii for which the cover is tabulated, equally spaced [pixel].
-        cover: (levels, rows, columns, 4) uint64 for each radius and cell the set of points of the
-            silhouette within that radius of the cell's centre, one bit for each point.
-        parts: number of distances along a cell's side.
-        distances: (parts * rows, parts * columns) float32 signed distance of each part's centre
-            from the silhouette's edge, positive outside [pixel].
-        point_area: silhouette area for which a point stands [pixel].
-        slack: distance that costs nothing [pixel].
-    """
-
-    camera: np.ndarray
-    X_CW: np.ndarray
-    origin: np.ndarray
-    cell: float
-    radii: np.ndarray
+    camera: np.ndarray  # (8,) ``Camera.kernel_parameters()``.
+    X_CW: np.ndarray  # (4, 4) pose of the world in the camera.
+    origin: np.ndarray  # (2,) row and column of the corner of the first cell of the cover [pixel].
+    cell: float  # Side of the cover's cells [pixel].
+    radii: np.ndarray  # (levels,) radii for which the cover is tabulated, equally spaced [pixel].
+    # (levels, rows, columns, 4) uint64 for each radius and cell the set of points of the silhouette
+    # within that radius of the cell's centre, one bit for each point.
     cover: np.ndarray
-    parts: int
+    parts: int  # Number of distances along a cell's side.
+    # (parts * rows, parts * columns) float32 signed distance of each part's centre from the
+    # silhouette's edge, positive outside [pixel].
     distances: np.ndarray
-    point_area: float
-    slack: float
+    point_area: float  # Silhouette area for which a point stands [pixel].
+    slack: float  # Distance that costs nothing [pixel].
 
 
 class Balls(NamedTuple):
-    """The k inscribed balls of a node.
+    """The k inscribed balls of a node."""
 
-    Attributes:
-        p_PB: (k, 3, n) float32 their centres in the parent's frame at each of n samples [m].
-        radii: (k,) float32 their radii [m].
-        area: the part of the node's mean projected area for which each stands [m^2].
-    """
-
+    # (k, 3, n) float32 their centres in the parent's frame at each of n samples [m].
     p_PB: np.ndarray
-    radii: np.ndarray
-    area: float
+    radii: np.ndarray  # (k,) float32 their radii [m].
+    area: float  # The part of the node's mean projected area for which each stands [m^2].
 
 
 @compiled
@@ -264,17 +248,11 @@ class CoarseSettings:
 
 @dataclass(frozen=True)
 class CoarsePoses:
-    """Poses of the grid, best first.
+    """Poses of the grid, best first."""
 
-    Args:
-        samples: (n, nodes) samples of all nodes; -1 for nodes that were not searched.
-        X_WN: (n, nodes, 4, 4) poses of the nodes.
-        costs: (n,) costs [pixel], comparable within one search.
-    """
-
-    samples: np.ndarray
-    X_WN: np.ndarray
-    costs: np.ndarray
+    samples: np.ndarray  # (n, nodes) samples of all nodes; -1 for nodes that were not searched.
+    X_WN: np.ndarray  # (n, nodes, 4, 4) poses of the nodes.
+    costs: np.ndarray  # (n,) costs [pixel], comparable within one search.
 
     def __len__(self) -> int:
         return len(self.samples)

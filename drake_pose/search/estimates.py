@@ -147,23 +147,16 @@ def mimic_joints(tree: PoseTree, joints: Sequence[JointEstimate]) -> tuple[Joint
 
 @dataclass(frozen=True)
 class PoseMode:
-    """One mode of the solution: a connected set of poses, and a representative.
+    """One mode of the solution: a connected set of poses, and a representative."""
 
-    Args:
-        q: (nq,) the representative's positions in the plant's order [rad, m].
-        X_WB: (4, 4) pose of the plant's world frame B in the world W.
-        node_values: for each node (k_i,) the representative's values in the pose tree [rad or m].
-        J: the representative's objective, as in ``PoseEstimate`` [pixel].
-        joints: the mode's interval of each value of the pose tree, in the order of the nodes.
-        size: number of poses found in the mode.
-    """
-
-    q: np.ndarray
-    X_WB: np.ndarray
+    q: np.ndarray  # (nq,) the representative's positions in the plant's order [rad, m].
+    X_WB: np.ndarray  # (4, 4) pose of the plant's world frame B in the world W.
+    # For each node (k_i,) the representative's values in the pose tree [rad or m].
     node_values: tuple[np.ndarray, ...]
-    J: float
+    J: float  # The representative's objective, as in ``PoseEstimate`` [pixel].
+    # The mode's interval of each value of the pose tree, in the order of the nodes.
     joints: tuple[JointEstimate, ...]
-    size: float
+    size: float  # Number of poses found in the mode.
 
     @classmethod
     def of_values(

@@ -21,21 +21,13 @@ from drake_pose.search.views_fit import FittedPose, describe_modes
 
 
 class ExactPose(NamedTuple):
-    """A pose refined by pixels.
+    """A pose refined by pixels."""
 
-    Args:
-        parameters: (m + 4,) parameters of the pose, as in ``RefinementBody``.
-        J: its objective [pixel].
-        first_J: objective of the start [pixel].
-        steps: number of steps of the refinement.
-        neighbourhood: the search around the pose, which holds alternative poses.
-    """
-
-    parameters: np.ndarray
-    J: float
-    first_J: float
-    steps: int
-    neighbourhood: NeighbourhoodSearch
+    parameters: np.ndarray  # (m + 4,) parameters of the pose, as in ``RefinementBody``.
+    J: float  # Its objective [pixel].
+    first_J: float  # Objective of the start [pixel].
+    steps: int  # Number of steps of the refinement.
+    neighbourhood: NeighbourhoodSearch  # The search around the pose, which holds alternative poses.
 
 
 class ExactSearch:

@@ -21,17 +21,11 @@ from drake_pose.search.settings import PaperSearchSettings
 
 @dataclass(frozen=True)
 class NodeList:
-    """The candidate list of one node, best first: JAC_i(1), JAC_i(2), ...
+    """The candidate list of one node, best first: JAC_i(1), JAC_i(2), ..."""
 
-    Args:
-        samples: (n,) the candidates: indices in the node's grid.
-        X_WN: (n, 4, 4) the node's poses at these.
-        adopted: u_i, index of the adopted candidate, from 0.
-    """
-
-    samples: np.ndarray
-    X_WN: np.ndarray
-    adopted: int = 0
+    samples: np.ndarray  # (n,) the candidates: indices in the node's grid.
+    X_WN: np.ndarray  # (n, 4, 4) the node's poses at these.
+    adopted: int = 0  # u_i, index of the adopted candidate, from 0.
 
     @property
     def has_untried(self) -> bool:

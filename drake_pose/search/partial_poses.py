@@ -157,18 +157,12 @@ class RowTable:
 
 @dataclass
 class _Poses:
-    """Drawn poses of one node, in groups with the same pose of the parent.
+    """Drawn poses of one node, in groups with the same pose of the parent."""
 
-    Attributes:
-        samples: (n,) int32 the node's sample at each pose.
-        X_WN: (n, 4, 4) the poses in the world.
-        areas: (n, 3) int32 area in the silhouettes, in the bands and beyond [pixel].
-        runs, words: bit masks of the poses, as in ``score_pairs``.
-    """
-
-    samples: np.ndarray
-    X_WN: np.ndarray
-    areas: np.ndarray
+    samples: np.ndarray  # (n,) int32 the node's sample at each pose.
+    X_WN: np.ndarray  # (n, 4, 4) the poses in the world.
+    areas: np.ndarray  # (n, 3) int32 area in the silhouettes, in the bands and beyond [pixel].
+    # runs, words: bit masks of the poses, as in ``score_pairs``.
     runs: np.ndarray
     words: np.ndarray
 

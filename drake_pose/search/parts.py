@@ -35,17 +35,12 @@ _Region = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Part:
-    """A part of the body that is placed anew or mirrored.
+    """A part of the body that is placed anew or mirrored."""
 
-    Args:
-        nodes: its nodes, parents before children.
-        sources: for each node the node whose mirror image it becomes, usually itself.
-        held: children of these nodes that keep their pose.
-    """
-
-    nodes: tuple[int, ...]
+    nodes: tuple[int, ...]  # Its nodes, parents before children.
+    # For each node the node whose mirror image it becomes, usually itself.
     sources: tuple[int, ...]
-    held: tuple[int, ...] = ()
+    held: tuple[int, ...] = ()  # Children of these nodes that keep their pose.
 
     @property
     def exchanged(self) -> bool:

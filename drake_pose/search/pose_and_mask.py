@@ -119,31 +119,21 @@ class PictureLevel(NamedTuple):
 
 @dataclass(eq=False)
 class _Progress:
-    """The current estimate of one frame.
+    """The current estimate of one frame."""
 
-    Args:
-        values: (m,) current values [rad or m].
-        start: (m,) initial values [rad or m].
-        rng: the frame's generator of random numbers.
-        error: error of the pose, as a fraction of the initial standard deviations.
-        probabilities: for each camera (H, W) the foreground probability at the round's level.
-        cuts: for each camera (H, W) the mask by colours; None where there is no image.
-        drawn: for each camera (H, W) the model's silhouette; empty before the first round.
-        agreements: as in ``FoundPose``.
-        unchanged: whether the silhouettes are those of the previous round.
-        settled: whether the frame is finished.
-    """
-
-    values: Array
-    start: Array
-    rng: np.random.Generator
-    error: float = 1.0
+    values: Array  # (m,) current values [rad or m].
+    start: Array  # (m,) initial values [rad or m].
+    rng: np.random.Generator  # The frame's generator of random numbers.
+    error: float = 1.0  # Error of the pose, as a fraction of the initial standard deviations.
+    # For each camera (H, W) the foreground probability at the round's level.
     probabilities: Sequence[Floats] = ()
+    # For each camera (H, W) the mask by colours; None where there is no image.
     cuts: Sequence[Mask | None] = ()
+    # For each camera (H, W) the model's silhouette; empty before the first round.
     drawn: Sequence[Mask] = ()
-    agreements: tuple[float, ...] = ()
-    unchanged: bool = False
-    settled: bool = False
+    agreements: tuple[float, ...] = ()  # As in ``FoundPose``.
+    unchanged: bool = False  # Whether the silhouettes are those of the previous round.
+    settled: bool = False  # Whether the frame is finished.
 
 
 class PoseAndMask:

@@ -163,17 +163,11 @@ def split_into_modes(
 
 @dataclass(frozen=True)
 class GridPoseSet(PoseSet):
-    """A set of poses of a grid, with a test of membership.
+    """A set of poses of a grid, with a test of membership."""
 
-    Args:
-        graph: the poses.
-        sampled: the tree and its grids.
-        budget_spent: whether a limit of the search may have left out poses.
-    """
-
-    graph: PartialPoseGraph
-    sampled: SampledTree
-    budget_spent: bool
+    graph: PartialPoseGraph  # The poses.
+    sampled: SampledTree  # The tree and its grids.
+    budget_spent: bool  # Whether a limit of the search may have left out poses.
 
     @property
     def size(self) -> float:

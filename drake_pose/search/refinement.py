@@ -28,15 +28,10 @@ from drake_pose.silhouette.scoring import draw_packed
 
 
 class Freedom(NamedTuple):
-    """The parameters of a refinement that may change.
+    """The parameters of a refinement that may change."""
 
-    Args:
-        columns: (k,) int64 their indices.
-        moved: (nodes,) bool whether they move each node.
-    """
-
-    columns: np.ndarray
-    moved: np.ndarray
+    columns: np.ndarray  # (k,) int64 their indices.
+    moved: np.ndarray  # (nodes,) bool whether they move each node.
 
 
 class RefinementBody:

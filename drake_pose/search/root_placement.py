@@ -158,19 +158,12 @@ def choose_root_samples(
 
 @dataclass(frozen=True, eq=False)
 class _PlacedPose:
-    """A pose with its root position and camera scale.
+    """A pose with its root position and camera scale."""
 
-    Args:
-        views: the silhouettes; a parallel camera has its estimated scale.
-        scale: ratio of that scale to the given one.
-        parameters: (m + 4,) parameters of the refinement, with log scale 0.
-        J: the objective [pixel].
-    """
-
-    views: tuple[View, ...]
-    scale: float
-    parameters: np.ndarray
-    J: float
+    views: tuple[View, ...]  # The silhouettes; a parallel camera has its estimated scale.
+    scale: float  # Ratio of that scale to the given one.
+    parameters: np.ndarray  # (m + 4,) parameters of the refinement, with log scale 0.
+    J: float  # The objective [pixel].
 
 
 class RootPlacementSearch:

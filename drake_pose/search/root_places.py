@@ -28,17 +28,11 @@ from drake_pose.silhouette.scoring import score_bodies
 
 
 class RootPlaces(NamedTuple):
-    """Root positions of one scale or depth.
+    """Root positions of one scale or depth."""
 
-    Attributes:
-        views: the silhouettes; a parallel camera has the scale that is tried.
-        positions: (n, 3) positions of the root's origin in the world [m].
-        scale: ratio of the camera's tried to its given ``pixels_per_metre``.
-    """
-
-    views: tuple[View, ...]
-    positions: np.ndarray
-    scale: float = 1.0
+    views: tuple[View, ...]  # The silhouettes; a parallel camera has the scale that is tried.
+    positions: np.ndarray  # (n, 3) positions of the root's origin in the world [m].
+    scale: float = 1.0  # Ratio of the camera's tried to its given ``pixels_per_metre``.
 
 
 def find_root_places(

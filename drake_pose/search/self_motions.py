@@ -17,17 +17,11 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 
 @dataclass(frozen=True, eq=False)
 class Flip:
-    """A pose with three joints of a chain flipped, once or several times in succession.
+    """A pose with three joints of a chain flipped, once or several times in succession."""
 
-    Args:
-        values: (m,) the flipped values [rad or m].
-        changed: (m,) bool which values were turned by pi or mirrored.
-        mirrored: (m,) bool which values have the opposite direction of motion: a2 becomes -a2 or
-            pi - a2.
-    """
-
-    values: np.ndarray
-    changed: np.ndarray
+    values: np.ndarray  # (m,) the flipped values [rad or m].
+    changed: np.ndarray  # (m,) bool which values were turned by pi or mirrored.
+    # (m,) bool which values have the opposite direction of motion: a2 becomes -a2 or pi - a2.
     mirrored: np.ndarray
 
 

@@ -339,25 +339,20 @@ class RobustSettings(NamedTuple):
 class BoundLimits:
     """Limits of a branch and bound.
 
-    Args:
-        states: greatest number of partial poses kept after each node.
-        pairs: greatest number of pairs of a partial pose and a pose of the next node that are
-            evaluated for one node.
-        poses: number of drawn poses of nodes after which the search stops.
-        memory: the search stops before the drawn poses and the areas that they reach take more than
-            this, and it keeps fewer partial poses if all would take more than a quarter of this
-            [byte]. Temporary arrays take about as much again.
-        time_limit: time after which the search stops [s]; None: no limit.
-
     Raises:
         SettingsError: if a value is out of its range.
     """
 
-    states: int = 20_000
+    states: int = 20_000  # Greatest number of partial poses kept after each node.
+    # Greatest number of pairs of a partial pose and a pose of the next node that are evaluated for
+    # one node.
     pairs: int = 1_000_000
-    poses: int = 1_000_000
+    poses: int = 1_000_000  # Number of drawn poses of nodes after which the search stops.
+    # The search stops before the drawn poses and the areas that they reach take more than this, and
+    # it keeps fewer partial poses if all would take more than a quarter of this [byte]. Temporary
+    # arrays take about as much again.
     memory: int = 400_000_000
-    time_limit: float | None = None
+    time_limit: float | None = None  # Time after which the search stops [s]; None: no limit.
 
     def __post_init__(self) -> None:
         for name in ("states", "pairs", "poses", "memory"):

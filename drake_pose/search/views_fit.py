@@ -48,20 +48,14 @@ from drake_pose.workers import map_ordered
 
 
 class FittedPose(NamedTuple):
-    """A fitted pose, and its mode's intervals.
+    """A fitted pose, and its mode's intervals."""
 
-    Args:
-        values: (m,) values of the pose tree [rad or m].
-        cost: robust cost [pixel]; comparable only at the same scale and spacing.
-        low, high: (m,) ends of the intervals [rad or m]; (0,) if they were not computed.
-        size: number of poses in the mode.
-    """
-
-    values: np.ndarray
-    cost: float = 0.0
+    values: np.ndarray  # (m,) values of the pose tree [rad or m].
+    cost: float = 0.0  # Robust cost [pixel]; comparable only at the same scale and spacing.
+    # low, high: (m,) ends of the intervals [rad or m]; (0,) if they were not computed.
     low: np.ndarray = np.zeros(0)
     high: np.ndarray = np.zeros(0)
-    size: int = 1
+    size: int = 1  # Number of poses in the mode.
 
 
 class ViewsFit:

@@ -229,24 +229,16 @@ def find_line_spans(
 
 
 class ContourPoints(NamedTuple):
-    """Points on the contour of a body's silhouette inside the image.
+    """Points on the contour of a body's silhouette inside the image."""
 
-    Attributes:
-        uv: (n, 2) image coordinates [pixel].
-        normals: (n, 2) outward unit normals.
-        lengths: (n,) length of contour that each point represents [pixel].
-        nodes: (n,) int64 index of the surface that each point lies on.
-        p_N: (n, 3) the surface point in the surface's frame N [m].
-        clearances: (n, 2) distances along the normal [pixel], inwards to where the silhouette ends
-            and outwards to where it begins again, as if the contour there were parallel; inf if it
-            does not begin again.
-    """
-
-    uv: np.ndarray
-    normals: np.ndarray
-    lengths: np.ndarray
-    nodes: np.ndarray
-    p_N: np.ndarray
+    uv: np.ndarray  # (n, 2) image coordinates [pixel].
+    normals: np.ndarray  # (n, 2) outward unit normals.
+    lengths: np.ndarray  # (n,) length of contour that each point represents [pixel].
+    nodes: np.ndarray  # (n,) int64 index of the surface that each point lies on.
+    p_N: np.ndarray  # (n, 3) the surface point in the surface's frame N [m].
+    # (n, 2) distances along the normal [pixel], inwards to where the silhouette ends and outwards
+    # to where it begins again, as if the contour there were parallel; inf if it does not begin
+    # again.
     clearances: np.ndarray
 
 

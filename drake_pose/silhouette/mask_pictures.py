@@ -51,18 +51,12 @@ class AnnotatedPicture:
 
 @dataclass(frozen=True)
 class Annotations:
-    """The content of a COCO file.
-
-    Attributes:
-        pictures: the pictures, in the file's order.
-        names: class names by class number.
-        warnings: what was left out.
-    """
+    """The content of a COCO file."""
 
     path: Path
-    pictures: tuple[AnnotatedPicture, ...]
-    names: Mapping[str, str]
-    warnings: tuple[str, ...] = ()
+    pictures: tuple[AnnotatedPicture, ...]  # The pictures, in the file's order.
+    names: Mapping[str, str]  # Class names by class number.
+    warnings: tuple[str, ...] = ()  # What was left out.
 
     @property
     def classes(self) -> tuple[str, ...]:

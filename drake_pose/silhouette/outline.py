@@ -87,28 +87,19 @@ class Outline:
 
 
 class PackedOutlines(NamedTuple):
-    """Several outlines, one after the other, in the arrays that kernels take.
+    """Several outlines, one after the other, in the arrays that kernels take."""
 
-    Attributes:
-        points: (3, n) float64 vertices [m].
-        planes: (4, m) float64 planes, as ``Outline.planes``.
-        balls: (nodes, 4) float64 bounding balls, as ``Outline.ball``.
-        triangles: (m, 3) int32 vertex indices, counted from the outline's own first vertex.
-        edges: (4, e) uint32 rows v0, v1, t0, t1, counted from the outline's own first vertex and
-            triangle; t1 is the outline's number of triangles if there is no second triangle.
-        sides: (e,) int8 s1 of ``Outline.edges``.
-        starts: (nodes + 1, 3) int64 first vertex, triangle and edge of each outline.
-        ordinary_ends: (nodes,) int64 end of each outline's ordinary edges (s1 = -1), which come
-            first.
-    """
-
-    points: np.ndarray
-    planes: np.ndarray
-    balls: np.ndarray
+    points: np.ndarray  # (3, n) float64 vertices [m].
+    planes: np.ndarray  # (4, m) float64 planes, as ``Outline.planes``.
+    balls: np.ndarray  # (nodes, 4) float64 bounding balls, as ``Outline.ball``.
+    # (m, 3) int32 vertex indices, counted from the outline's own first vertex.
     triangles: np.ndarray
+    # (4, e) uint32 rows v0, v1, t0, t1, counted from the outline's own first vertex and triangle;
+    # t1 is the outline's number of triangles if there is no second triangle.
     edges: np.ndarray
-    sides: np.ndarray
-    starts: np.ndarray
+    sides: np.ndarray  # (e,) int8 s1 of ``Outline.edges``.
+    starts: np.ndarray  # (nodes + 1, 3) int64 first vertex, triangle and edge of each outline.
+    # (nodes,) int64 end of each outline's ordinary edges (s1 = -1), which come first.
     ordinary_ends: np.ndarray
 
 

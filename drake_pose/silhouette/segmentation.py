@@ -321,19 +321,12 @@ def grab_cut(
 
 
 class _Region(NamedTuple):
-    """A region in a smaller picture.
+    """A region in a smaller picture."""
 
-    Attributes:
-        mask: (h, w) the region.
-        strength: strength of its outline, a quantile of gradient magnitudes times sqrt(area).
-        sign: 1 if the region's channel is above the threshold, -1 if below.
-        level: the threshold [grey levels].
-    """
-
-    mask: Mask
-    strength: float
-    sign: float
-    level: float
+    mask: Mask  # (h, w) the region.
+    strength: float  # Strength of its outline, a quantile of gradient magnitudes times sqrt(area).
+    sign: float  # 1 if the region's channel is above the threshold, -1 if below.
+    level: float  # The threshold [grey levels].
 
 
 def find_regions(

@@ -26,24 +26,17 @@ SHIFT, BIAS = 3, 4
 
 
 class Rows(NamedTuple):
-    """Scratch arrays for one body at one pose.
+    """Scratch arrays for one body at one pose."""
 
-    Attributes:
-        u, v: (points,) image coordinates of one surface's points [pixel].
-        facings: (triangles + 1,) int8 output of ``find_facings``.
-        counts: (height,) int32 number of crossings of each row.
-        row_range: (3,) int64 first row touched, row after the last, and whether a row overflowed.
-        changes: (width + 1,) int32 difference array, zero between calls.
-        spans: (width + 1, 2) int32 spans [a, b) of one row.
-    """
-
+    # u, v: (points,) image coordinates of one surface's points [pixel].
     u: np.ndarray
     v: np.ndarray
-    facings: np.ndarray
-    counts: np.ndarray
+    facings: np.ndarray  # (triangles + 1,) int8 output of ``find_facings``.
+    counts: np.ndarray  # (height,) int32 number of crossings of each row.
+    # (3,) int64 first row touched, row after the last, and whether a row overflowed.
     row_range: np.ndarray
-    changes: np.ndarray
-    spans: np.ndarray
+    changes: np.ndarray  # (width + 1,) int32 difference array, zero between calls.
+    spans: np.ndarray  # (width + 1, 2) int32 spans [a, b) of one row.
 
 
 @compiled

@@ -37,16 +37,11 @@ class CameraRig:
     The body is posed by the input port ``positions`` (nq) or by a trajectory. The output ports
     ``color_image_<camera>``, ``label_image_<camera>`` and ``depth_image_<camera>`` render when they
     are evaluated. Render in one thread only: Drake's engine gives wrong images in another thread.
-
-    Attributes:
-        diagram: the diagram.
-        cameras: the cameras by name.
-        sensors: the simulated cameras in the diagram, by name.
     """
 
-    diagram: Diagram
-    cameras: Mapping[str, PinholeCamera]
-    sensors: Mapping[str, RgbdSensor]
+    diagram: Diagram  # The diagram.
+    cameras: Mapping[str, PinholeCamera]  # The cameras by name.
+    sensors: Mapping[str, RgbdSensor]  # The simulated cameras in the diagram, by name.
 
     def set_positions(self, context: Context, q: Array) -> None:
         """Fix the body's positions q (nq,) [rad or m] in a context of the diagram."""

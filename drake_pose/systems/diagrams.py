@@ -180,21 +180,14 @@ ESTIMATE_COLOUR = Rgba(0.0, 0.45, 0.70, 0.6)
 
 @dataclass(frozen=True)
 class MatchingDiagram:
-    """A diagram that estimates poses from silhouettes, and its parts.
+    """A diagram that estimates poses from silhouettes, and its parts."""
 
-    Args:
-        diagram: the diagram.
-        matcher: the system that estimates the poses.
-        positions_log, error_log: logs of ``estimated_positions`` and ``error``, one sample a
-            period.
-        player: source of recorded masks; None: the cameras are simulated.
-    """
-
-    diagram: Diagram
-    matcher: SilhouetteMatcher
+    diagram: Diagram  # The diagram.
+    matcher: SilhouetteMatcher  # The system that estimates the poses.
+    # positions_log, error_log: logs of ``estimated_positions`` and ``error``, one sample a period.
     positions_log: VectorLogSink
     error_log: VectorLogSink
-    player: MaskPlayer | None = None
+    player: MaskPlayer | None = None  # Source of recorded masks; None: the cameras are simulated.
 
     def estimate(self, context: Context) -> PoseEstimate | None:
         """Return the last update's estimate, by the diagram's context; None: there is none."""
@@ -431,19 +424,12 @@ def _finish(
 
 @dataclass(frozen=True)
 class RegistrationDiagram:
-    """A diagram that registers a simulated camera, and its parts.
+    """A diagram that registers a simulated camera, and its parts."""
 
-    Args:
-        diagram: the diagram.
-        registration: the system that finds the camera's pose.
-        sensor: the simulated camera; ``sensor.SetX_PB(context, X_WC)`` moves it.
-        status_log: log of ``status``, one sample a period.
-    """
-
-    diagram: Diagram
-    registration: CameraRegistration
-    sensor: RgbdSensor
-    status_log: VectorLogSink
+    diagram: Diagram  # The diagram.
+    registration: CameraRegistration  # The system that finds the camera's pose.
+    sensor: RgbdSensor  # The simulated camera; ``sensor.SetX_PB(context, X_WC)`` moves it.
+    status_log: VectorLogSink  # Log of ``status``, one sample a period.
 
 
 def build_simulated_registration(

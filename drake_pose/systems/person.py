@@ -279,16 +279,11 @@ class PersonTracker(MemorySystem):
 
 
 class _SeparatedViews(NamedTuple):
-    """Views of one person.
+    """Views of one person."""
 
-    Attributes:
-        views: the cameras that have a picture, and the silhouettes in them.
-        others: whether there were other persons.
-        merged: names of the cameras in which the person and another are one figure.
-    """
-
-    views: FrameViews
-    others: bool = False
+    views: FrameViews  # The cameras that have a picture, and the silhouettes in them.
+    others: bool = False  # Whether there were other persons.
+    # Names of the cameras in which the person and another are one figure.
     merged: tuple[str, ...] = ()
 
 

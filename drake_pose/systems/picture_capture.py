@@ -26,19 +26,12 @@ from drake_pose.systems.ports import PortedSystem, require_period
 
 @dataclass(frozen=True)
 class CameraCount:
-    """Counters of a camera's pictures.
+    """Counters of a camera's pictures."""
 
-    Args:
-        used: number of pictures in synchronised frames that were shown.
-        dropped: number of pictures that could not be used.
-        late: number of pictures that arrived after their synchronised frames.
-        changes: when the camera stopped and returned.
-    """
-
-    used: int
-    dropped: int
-    late: int
-    changes: tuple[CameraChange, ...]
+    used: int  # Number of pictures in synchronised frames that were shown.
+    dropped: int  # Number of pictures that could not be used.
+    late: int  # Number of pictures that arrived after their synchronised frames.
+    changes: tuple[CameraChange, ...]  # When the camera stopped and returned.
 
 
 class PictureCapture(PortedSystem):

@@ -84,17 +84,12 @@ def evaluate(port: OutputPort, context: Context) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class StagedDiagram(Generic[T]):
-    """A diagram with an estimator whose computation can be timed by stages.
+    """A diagram with an estimator whose computation can be timed by stages."""
 
-    Args:
-        diagram: the diagram.
-        stages: output ports by name of the stage, in the order of computation.
-        estimator: the system that computes the pose.
-    """
-
-    diagram: Diagram
+    diagram: Diagram  # The diagram.
+    # Output ports by name of the stage, in the order of computation.
     stages: Mapping[str, tuple[OutputPort, ...]]
-    estimator: T
+    estimator: T  # The system that computes the pose.
 
     def evaluate(self, context: Context, stage: str) -> None:
         """Evaluate all ports of the stage of this name; ``context`` is the diagram's."""

@@ -34,19 +34,12 @@ STATISTICS = ("found", "J", "E_total", "first_E_total", "runs", "outside_limit",
 
 @dataclass(frozen=True, eq=False)
 class MatcherState(ImmutableValue):
-    """The state of a SilhouetteMatcher.
+    """The state of a SilhouetteMatcher."""
 
-    Args:
-        q: (nq,) positions of the last pose found.
-        X_WB: (4, 4) pose of its base.
-        estimate: estimate of the last update; None: no camera saw the body.
-        memory: a subclass's own state; None: it has none.
-    """
-
-    q: Array
-    X_WB: Array
-    estimate: PoseEstimate | None
-    memory: Any
+    q: Array  # (nq,) positions of the last pose found.
+    X_WB: Array  # (4, 4) pose of its base.
+    estimate: PoseEstimate | None  # Estimate of the last update; None: no camera saw the body.
+    memory: Any  # A subclass's own state; None: it has none.
 
 
 class SilhouetteMatcher(BeliefSystem[MatcherState]):
@@ -222,17 +215,11 @@ TRACK = ("tracked", "matches", "distance")
 
 
 class _Memory(NamedTuple):
-    """The state of a SilhouetteTracker.
+    """The state of a SilhouetteTracker."""
 
-    Attributes:
-        tracker_state: state of the ``MatchAndTrack``.
-        track: elements of TRACK.
-        time: time of the last update [s].
-    """
-
-    tracker_state: TrackerState
-    track: tuple[float, float, float]
-    time: float
+    tracker_state: TrackerState  # State of the ``MatchAndTrack``.
+    track: tuple[float, float, float]  # Elements of TRACK.
+    time: float  # Time of the last update [s].
 
 
 class SilhouetteTracker(SilhouetteMatcher):

@@ -44,21 +44,13 @@ STATISTICS = ("step", "hypotheses", "distance", "count", "lost")
 
 @dataclass(frozen=True, eq=False)
 class _EkfState(ImmutableValue):
-    """The state of a TruncatedEkf.
+    """The state of a TruncatedEkf."""
 
-    Attributes:
-        state: state of the filter.
-        step: number of updates.
-        unlikely: number of consecutive unlikely measurements.
-        lost: whether these are too many.
-        time: time of the last update [s].
-    """
-
-    state: FilterState
-    step: int = 0
-    unlikely: int = 0
-    lost: bool = False
-    time: float = -math.inf
+    state: FilterState  # State of the filter.
+    step: int = 0  # Number of updates.
+    unlikely: int = 0  # Number of consecutive unlikely measurements.
+    lost: bool = False  # Whether these are too many.
+    time: float = -math.inf  # Time of the last update [s].
 
     def statistics(self) -> list[float]:
         """Return the elements of STATISTICS."""

@@ -198,30 +198,21 @@ def _in_plant_units(model: ArticulatedModel, values: Mapping[str, float]) -> dic
 
 @dataclass(frozen=True)
 class EstimateInputs:
-    """Inputs of an estimate.
+    """Inputs of an estimate."""
 
-    Args:
-        scene: the scene with the cameras that are used.
-        model: the body's model.
-        frames: names of the frames to be estimated.
-        tracked: whether the body is tracked from frame to frame.
-        search: search for the body's pose; None for the method person.
-        truth: measured joint positions to compare with; None if there are none.
-        warnings: messages for the user.
-        root_positions: position (3,) of the root by frame [m]; None if it is the same in all.
-        starts: known positions (nq,) by frame, at which a track starts [rad or m]; may be empty.
-        known: estimates by frame that were made before, of the first frames; may be empty.
-    """
-
-    scene: Scene
-    model: ArticulatedModel
-    frames: tuple[str, ...]
-    tracked: bool
-    search: PoseSearch | None
+    scene: Scene  # The scene with the cameras that are used.
+    model: ArticulatedModel  # The body's model.
+    frames: tuple[str, ...]  # Names of the frames to be estimated.
+    tracked: bool  # Whether the body is tracked from frame to frame.
+    search: PoseSearch | None  # Search for the body's pose; None for the method person.
+    # Measured joint positions to compare with; None if there are none.
     truth: MeasuredPositions | None
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # Messages for the user.
+    # Position (3,) of the root by frame [m]; None if it is the same in all.
     root_positions: Mapping[str, np.ndarray] | None = None
+    # Known positions (nq,) by frame, at which a track starts [rad or m]; may be empty.
     starts: Mapping[str, np.ndarray] = field(default_factory=dict)
+    # Estimates by frame that were made before, of the first frames; may be empty.
     known: Mapping[str, PoseEstimate] = field(default_factory=dict)
 
     def joint_errors(self, frame: str, q: np.ndarray) -> dict[str, float]:

@@ -42,21 +42,15 @@ from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, SCENE_FILE, Scene
 
 @dataclass(frozen=True)
 class MeasuredPositions:
-    """Joint positions of a table.
+    """Joint positions of a table."""
 
-    Args:
-        path: the table.
-        names: names of the positions.
-        values: (len(names),) positions [rad or m] by frame, see `frame_key`.
-        bases: (7,) BASE_COLUMNS by frame, from an estimate whose base moved; otherwise empty.
-        is_estimate: whether the table is the poses.csv of an estimate.
-    """
-
-    path: Path
-    names: tuple[str, ...]
+    path: Path  # The table.
+    names: tuple[str, ...]  # Names of the positions.
+    # (len(names),) positions [rad or m] by frame, see `frame_key`.
     values: Mapping[int | str, np.ndarray]
+    # (7,) BASE_COLUMNS by frame, from an estimate whose base moved; otherwise empty.
     bases: Mapping[int | str, np.ndarray] = field(default_factory=dict)
-    is_estimate: bool = False
+    is_estimate: bool = False  # Whether the table is the poses.csv of an estimate.
 
     def of(self, frame: str) -> np.ndarray | None:
         """Return the values (len(names),) of a frame; None if it has no row."""
@@ -285,40 +279,26 @@ def _numbers(cells: Sequence[str], path: Path, line: int) -> np.ndarray:
 
 
 class PlacedCameras(NamedTuple):
-    """Cameras of an episode that are used.
+    """Cameras of an episode that are used."""
 
-    Args:
-        cameras: the cameras, in the episode's order.
-        placed: names of all cameras of the camera file with a known, static pose X_WC.
-        warnings: how the camera file was read where it does not say so itself.
-    """
-
-    cameras: list[EpisodeCamera]
+    cameras: list[EpisodeCamera]  # The cameras, in the episode's order.
+    # Names of all cameras of the camera file with a known, static pose X_WC.
     placed: frozenset[str]
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # How the camera file was read where it does not say so itself.
 
 
 class TreeLog(NamedTuple):
-    """A joint log in the values of a pose tree.
+    """A joint log in the values of a pose tree."""
 
-    Args:
-        log: positions (rows, asked) of the tree's values ``asked`` [rad or m]; nan for readings
-            that are not used, the model's defaults for values that are not logged.
-        asked: (asked,) indices of the tree's values that are not held.
-        names: names of the logged values.
-        posed: nodes that only logged or held joints move.
-        unposed: all other nodes.
-        warnings: messages for the user.
-        mapped: how the columns were mapped.
-    """
-
+    # Positions (rows, asked) of the tree's values ``asked`` [rad or m]; nan for readings that are
+    # not used, the model's defaults for values that are not logged.
     log: JointLog
-    asked: Indices
-    names: tuple[str, ...]
-    posed: tuple[str, ...]
-    unposed: tuple[str, ...]
-    warnings: list[str]
-    mapped: MappedJoints
+    asked: Indices  # (asked,) indices of the tree's values that are not held.
+    names: tuple[str, ...]  # Names of the logged values.
+    posed: tuple[str, ...]  # Nodes that only logged or held joints move.
+    unposed: tuple[str, ...]  # All other nodes.
+    warnings: list[str]  # Messages for the user.
+    mapped: MappedJoints  # How the columns were mapped.
 
 
 def is_episode(path: Path, settings: EpisodeSettings) -> bool:

@@ -53,16 +53,11 @@ from drake_pose.systems.ports import evaluate
 
 
 class LiveResult(NamedTuple):
-    """Result of a live capture.
+    """Result of a live capture."""
 
-    Args:
-        estimate: the estimate of all frames.
-        interrupted: whether Ctrl-C ended the capture.
-        unreported: warnings that were not passed to ``on_report`` during the capture.
-    """
-
-    estimate: SceneEstimate
-    interrupted: bool
+    estimate: SceneEstimate  # The estimate of all frames.
+    interrupted: bool  # Whether Ctrl-C ended the capture.
+    # Warnings that were not passed to ``on_report`` during the capture.
     unreported: tuple[str, ...]
 
 

@@ -32,18 +32,12 @@ from drake_pose.systems.picture_capture import PictureCapture
 
 @dataclass(frozen=True, eq=False)
 class LiveScene:
-    """Calibrated cameras, the sources of their pictures, and their background models.
+    """Calibrated cameras, the sources of their pictures, and their background models."""
 
-    Args:
-        path: the scene's folder.
-        cameras: cameras by name.
-        specifications: sources by camera.
-        backgrounds: background models by camera, without cameras whose sources deliver masks.
-    """
-
-    path: Path
-    cameras: Mapping[str, Camera]
-    specifications: Mapping[str, SourceSpecification]
+    path: Path  # The scene's folder.
+    cameras: Mapping[str, Camera]  # Cameras by name.
+    specifications: Mapping[str, SourceSpecification]  # Sources by camera.
+    # Background models by camera, without cameras whose sources deliver masks.
     backgrounds: Mapping[str, Background]
 
     def open_sensors(

@@ -55,19 +55,12 @@ class SkinColour:
 
 @dataclass(frozen=True, eq=False)
 class Blobs:
-    """Skin-coloured blobs of one picture, the largest first.
+    """Skin-coloured blobs of one picture, the largest first."""
 
-    Args:
-        centroids: (n, 2) [pixel].
-        areas: (n,) [pixel^2].
-        boxes: (n, 4) left, top, width, height [pixel].
-        mask: (H, W) pixels of the blobs.
-    """
-
-    centroids: Array
-    areas: Indices
-    boxes: Indices
-    mask: Mask
+    centroids: Array  # (n, 2) [pixel].
+    areas: Indices  # (n,) [pixel^2].
+    boxes: Indices  # (n, 4) left, top, width, height [pixel].
+    mask: Mask  # (H, W) pixels of the blobs.
 
 
 def skin_blobs(
@@ -158,19 +151,12 @@ def similarity(first: Array, second: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Positions of the features in a frame.
+    """Positions of the features in a frame."""
 
-    Args:
-        positions: (k, 3) positions [m]; the last frame's where nothing was measured.
-        support: (k,) number of 3-D points that each is the mean of; 0: not measured.
-        points: (m, 3) all 3-D points inside every silhouette [m].
-        owners: (m,) index of the feature that each point belongs to.
-    """
-
-    positions: Array
-    support: Indices
-    points: Array
-    owners: Indices
+    positions: Array  # (k, 3) positions [m]; the last frame's where nothing was measured.
+    support: Indices  # (k,) number of 3-D points that each is the mean of; 0: not measured.
+    points: Array  # (m, 3) all 3-D points inside every silhouette [m].
+    owners: Indices  # (m,) index of the feature that each point belongs to.
 
 
 def find_features(
@@ -230,21 +216,14 @@ def find_features(
 
 @dataclass(frozen=True, eq=False)
 class RegisteredPose:
-    """Contour templates of the registered pose, for all cameras and headings (5).
+    """Contour templates of the registered pose, for all cameras and headings (5)."""
 
-    Args:
-        q: (nq,) positions of the registered pose where the templates were made [rad, m].
-        heading_position: index in q of the head's angle about the vertical.
-        headings: (n,) headings of the templates [rad].
-        shapes: (n, DIRECTIONS) contour shapes by camera; nan where the person is not whole.
-        middles: (n, 2) middles of the bounding boxes by camera [pixel], or nan.
-    """
-
-    q: Array
-    heading_position: int
-    headings: Array
+    q: Array  # (nq,) positions of the registered pose where the templates were made [rad, m].
+    heading_position: int  # Index in q of the head's angle about the vertical.
+    headings: Array  # (n,) headings of the templates [rad].
+    # (n, DIRECTIONS) contour shapes by camera; nan where the person is not whole.
     shapes: Mapping[str, Array]
-    middles: Mapping[str, Array]
+    middles: Mapping[str, Array]  # (n, 2) middles of the bounding boxes by camera [pixel], or nan.
 
 
 def place_registered(
@@ -338,18 +317,12 @@ def recognise(
 
 @dataclass(frozen=True, eq=False)
 class FaceTemplates:
-    """Faces of known directions in their eigenspace (3.2.2).
+    """Faces of known directions in their eigenspace (3.2.2)."""
 
-    Args:
-        mean: (d,) mean face, d = 80 x 130 x 3.
-        basis: (k, d) leading eigenvectors, orthonormal.
-        coordinates: (n, k) the templates in the eigenspace.
-        directions: (n, 2) turn to the person's left and nod down, from facing the camera [rad].
-    """
-
-    mean: NDArray[np.float32]
-    basis: NDArray[np.float32]
-    coordinates: NDArray[np.float32]
+    mean: NDArray[np.float32]  # (d,) mean face, d = 80 x 130 x 3.
+    basis: NDArray[np.float32]  # (k, d) leading eigenvectors, orthonormal.
+    coordinates: NDArray[np.float32]  # (n, k) the templates in the eigenspace.
+    # (n, 2) turn to the person's left and nod down, from facing the camera [rad].
     directions: Array
 
 

@@ -19,28 +19,19 @@ class WalkSettings:
 
     A command begins at the first threshold of a pair and ends at the second, lower one, so that
     noise does not toggle it.
-
-    Args:
-        turn_rate: of the view [rad/s].
-        speed: of walking [m/s].
-        body_radius: least distance from walls and obstacles [m].
-        turn: thresholds of the face's turn from the rest direction [rad].
-        step: thresholds of the distance from the rest place [m].
-        lift: least height of a lifted foot above the other one [m].
-        pause: walking on the spot ends at this time after the last step [s].
-        start: pose in which a walk begins: x, y [m] and heading [rad].
-        half_size: half the side of the square place, whose middle is the origin [m].
     """
 
-    turn_rate: float = math.radians(40.0)
-    speed: float = 0.9
-    body_radius: float = 0.3
+    turn_rate: float = math.radians(40.0)  # Of the view [rad/s].
+    speed: float = 0.9  # Of walking [m/s].
+    body_radius: float = 0.3  # Least distance from walls and obstacles [m].
+    # Thresholds of the face's turn from the rest direction [rad].
     turn: tuple[float, float] = (math.radians(25.0), math.radians(15.0))
-    step: tuple[float, float] = (0.18, 0.10)
-    lift: float = 0.05
-    pause: float = 1.0
+    step: tuple[float, float] = (0.18, 0.10)  # Thresholds of the distance from the rest place [m].
+    lift: float = 0.05  # Least height of a lifted foot above the other one [m].
+    pause: float = 1.0  # Walking on the spot ends at this time after the last step [s].
+    # Pose in which a walk begins: x, y [m] and heading [rad].
     start: tuple[float, float, float] = (-8.0, 0.0, 0.0)
-    half_size: float = 12.0
+    half_size: float = 12.0  # Half the side of the square place, whose middle is the origin [m].
 
 
 WALK = WalkSettings()

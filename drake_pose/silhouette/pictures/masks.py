@@ -53,17 +53,11 @@ def encode_mask(mask: np.ndarray) -> bytes:
 
 @dataclass(frozen=True)
 class MaskAgreement:
-    """Agreement between the silhouettes of a frame and the body's masks at an estimated pose.
+    """Agreement between the silhouettes of a frame and the body's masks at an estimated pose."""
 
-    Args:
-        differing: area where silhouettes and body's masks differ, summed over cameras [pixel].
-        area: area of the silhouettes, summed over cameras [pixel].
-        ious: intersection over union by camera.
-    """
-
-    differing: int
-    area: int
-    ious: Mapping[str, float]
+    differing: int  # Area where silhouettes and body's masks differ, summed over cameras [pixel].
+    area: int  # Area of the silhouettes, summed over cameras [pixel].
+    ious: Mapping[str, float]  # Intersection over union by camera.
 
     @property
     def E_total(self) -> float:

@@ -16,14 +16,10 @@ from drake_pose.yaml_files import read_yaml, typed_entry
 
 @dataclass
 class Landmark:
-    """A named point of the object.
+    """A named point of the object."""
 
-    Attributes:
-        link: the link that the point is fixed to.
-        point: (3,) position in the link's frame [m].
-    """
-
-    link: str = ""
+    link: str = ""  # The link that the point is fixed to.
+    # (3,) position in the link's frame [m].
     point: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
 
 

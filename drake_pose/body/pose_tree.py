@@ -74,30 +74,23 @@ class NodePlacement:
     """How values place a node: X_PN = X_PA R(rotation values) T_1(values) T_2(values) ...
 
     A node whose joints all follow its parent's joints has no values of its own.
-
-    Attributes:
-        X_PA: (4, 4) constant transform; the identity except for roots.
-        rotation: the rotation of a root; None: the node has none.
-        steps: the joints from the parent to the node.
-        lower, upper: (k,) limits of the values [rad or m]; equal where a value is held, one turn
-            wide for an angle without limits.
-        defaults: (k,) default values [rad or m].
-        is_angle: (k,) bool, whether a value is an angle; else a length.
-        periodic: (k,) bool, whether the value is an angle with the same pose after a full turn.
-        is_unlimited_angle: (k,) bool, whether the value is an angle without limits, and not held.
-        follows: for each position of the steps: its index in q, the index of the parent's value
-            that it follows, multiplier and offset; (): the node has values of its own.
     """
 
-    X_PA: Array
-    rotation: RootRotation | None
-    steps: tuple[JointMap, ...]
+    X_PA: Array  # (4, 4) constant transform; the identity except for roots.
+    rotation: RootRotation | None  # The rotation of a root; None: the node has none.
+    steps: tuple[JointMap, ...]  # The joints from the parent to the node.
+    # lower, upper: (k,) limits of the values [rad or m]; equal where a value is held, one turn wide
+    # for an angle without limits.
     lower: Array
     upper: Array
-    defaults: Array
-    is_angle: NDArray[np.bool_]
+    defaults: Array  # (k,) default values [rad or m].
+    is_angle: NDArray[np.bool_]  # (k,) bool, whether a value is an angle; else a length.
+    # (k,) bool, whether the value is an angle with the same pose after a full turn.
     periodic: NDArray[np.bool_]
+    # (k,) bool, whether the value is an angle without limits, and not held.
     is_unlimited_angle: NDArray[np.bool_]
+    # For each position of the steps: its index in q, the index of the parent's value that it
+    # follows, multiplier and offset; (): the node has values of its own.
     follows: tuple[Coupling, ...] = ()
 
 

@@ -91,23 +91,18 @@ def load_cameras(
 
 @dataclass(frozen=True)
 class CameraFile:
-    """Content of a camera file, in which poses are optional.
+    """Content of a camera file, in which poses are optional."""
 
-    Args:
-        cameras: pinhole or parallel cameras by name, in the file's order, for undistorted images. A
-            camera without pose is at the world's origin.
-        unplaced: names of the cameras without pose.
-        links: link of each camera that is mounted on one, by the camera's name; its X_WC holds
-            X_LC, the pose in the link.
-        lenses: lens of each camera with distortion, for the images as taken.
-        warnings: how the file was read where it does not say so itself.
-    """
-
+    # Pinhole or parallel cameras by name, in the file's order, for undistorted images. A camera
+    # without pose is at the world's origin.
     cameras: dict[str, Camera]
-    unplaced: tuple[str, ...]
+    unplaced: tuple[str, ...]  # Names of the cameras without pose.
+    # Link of each camera that is mounted on one, by the camera's name; its X_WC holds X_LC, the
+    # pose in the link.
     links: Mapping[str, str] = field(default_factory=dict)
+    # Lens of each camera with distortion, for the images as taken.
     lenses: Mapping[str, Lens] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # How the file was read where it does not say so itself.
 
 
 Known = Callable[[], CameraFile | None]

@@ -61,31 +61,23 @@ class JointLog:
 
 @dataclass(frozen=True, eq=False)
 class EpisodeCamera:
-    """One camera of an episode, and its n images.
+    """One camera of an episode, and its n images."""
 
-    Args:
-        name: name of the camera.
-        width, height: size of the images [pixel].
-        times: (n,) ascending times of the images [s]; nan if unknown.
-        camera: calibrated camera of the undistorted images; None: none was recorded. Its X_WC is
-            the pose in ``link``; without a link it is unknown, unless ``is_posed``.
-        link: link on which the camera is mounted, named as in the recording; None: unknown.
-        read_recorded: returns image k (H, W, 3) as recorded, with distortion.
-        frames: (n,) names of the images; empty: they have none.
-        lens: lens that undistorts the images; None: they have no distortion.
-        is_posed: whether X_WC was recorded, as the pose in the robot's base.
-    """
-
-    name: str
+    name: str  # Name of the camera.
+    # width, height: size of the images [pixel].
     width: int
     height: int
-    times: Array
+    times: Array  # (n,) ascending times of the images [s]; nan if unknown.
+    # Calibrated camera of the undistorted images; None: none was recorded. Its X_WC is the pose in
+    # ``link``; without a link it is unknown, unless ``is_posed``.
     camera: PinholeCamera | None
+    # Link on which the camera is mounted, named as in the recording; None: unknown.
     link: str | None
+    # Returns image k (H, W, 3) as recorded, with distortion.
     read_recorded: Callable[[int], Picture]
-    frames: tuple[str, ...] = ()
-    lens: Lens | None = None
-    is_posed: bool = False
+    frames: tuple[str, ...] = ()  # (n,) names of the images; empty: they have none.
+    lens: Lens | None = None  # Lens that undistorts the images; None: they have no distortion.
+    is_posed: bool = False  # Whether X_WC was recorded, as the pose in the robot's base.
 
     def pinhole(self) -> PinholeCamera:
         """Return the camera; without one, its focal length is 0.65 of the pictures' width."""

@@ -50,46 +50,37 @@ class FrameRecord:
     """Estimate of one frame: its row of poses.csv and its part of summary.json.
 
     Fields that the method does not estimate are None or empty.
-
-    Args:
-        q: (nq,) positions [rad or m]; NaN if no pose was found.
-        base: (7,) BASE_COLUMNS; None if the model's own joints place it in the world.
-        E_total: area where body and silhouettes differ, divided by the silhouettes' area; None if
-            no pose was found.
-        seconds: the search's wall time [s].
-        first_E_total: E_total of the first whole pose, before it was refined or estimated again.
-        runs: number of times the search placed a segment, or compared contours.
-        stopped_by: why the search ended: "end", "exact", "run_limit" or "time_limit"; "tracked" if
-            the pose was tracked, "followed" if a person was.
-        outside_limit: Kameda's r in each view: allowed area of a segment outside the mask [pixel].
-        joint_errors: estimate minus ground truth by position [deg or m], as far as that is known.
-        camera_scale: estimated scale of a parallel camera [pixel/m].
-        explained: whether the pose fits the silhouettes at least roughly.
-        joints: interval of each value of the pose tree, over all modes.
-        modes: the same for each of the first modes; a mode is a set of poses that fit equally well.
-        mode_count: number of modes; None if the search does not count them.
-        ious: intersection over union of silhouette and body by camera, of the cameras used.
-        inlier_ratio: inlier ratio of the contours, by length; only with the method person.
-        masks: digest of the mask file by camera (``mask_digests``).
     """
 
     frame: str
-    q: Array
-    base: Array | None
+    q: Array  # (nq,) positions [rad or m]; NaN if no pose was found.
+    base: Array | None  # (7,) BASE_COLUMNS; None if the model's own joints place it in the world.
+    # Area where body and silhouettes differ, divided by the silhouettes' area; None if no pose was
+    # found.
     E_total: float | None
-    seconds: float
+    seconds: float  # The search's wall time [s].
+    # E_total of the first whole pose, before it was refined or estimated again.
     first_E_total: float | None = None
-    runs: int | None = None
+    runs: int | None = None  # Number of times the search placed a segment, or compared contours.
+    # Why the search ended: "end", "exact", "run_limit" or "time_limit"; "tracked" if the pose was
+    # tracked, "followed" if a person was.
     stopped_by: str | None = None
+    # Kameda's r in each view: allowed area of a segment outside the mask [pixel].
     outside_limit: Sequence[float] | None = None
+    # Estimate minus ground truth by position [deg or m], as far as that is known.
     joint_errors: Mapping[str, float] = field(default_factory=dict)
-    camera_scale: float | None = None
-    explained: bool = True
+    camera_scale: float | None = None  # Estimated scale of a parallel camera [pixel/m].
+    explained: bool = True  # Whether the pose fits the silhouettes at least roughly.
+    # Interval of each value of the pose tree, over all modes.
     joints: Joints = field(default_factory=dict)
+    # The same for each of the first modes; a mode is a set of poses that fit equally well.
     modes: Sequence[Joints] = ()
-    mode_count: int | None = None
+    mode_count: int | None = None  # Number of modes; None if the search does not count them.
+    # Intersection over union of silhouette and body by camera, of the cameras used.
     ious: Mapping[str, float] = field(default_factory=dict)
+    # Inlier ratio of the contours, by length; only with the method person.
     inlier_ratio: float | None = None
+    # Digest of the mask file by camera (``mask_digests``).
     masks: Mapping[str, str] = field(default_factory=dict)
 
     @property

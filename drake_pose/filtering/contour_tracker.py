@@ -46,24 +46,16 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage
 
 @dataclass(frozen=True)
 class ContourSettings:
-    """Settings of contour measurements.
+    """Settings of contour measurements."""
 
-    Args:
-        spacing: distance between two contour points [pixel].
-        deviation: smallest standard deviation of a mask's edge about the body's contour [pixel].
-        correlation: contour length over which errors are correlated; its points count as one
-            [pixel].
-        reach: largest distance between the model's contour and a mask's edge [pixel].
-        robust_width: scale of the Geman-McClure weight [standard deviations].
-        negligible: directions of the state with less than this fraction of the largest information
-            are dropped.
-    """
-
-    spacing: float = 3.0
+    spacing: float = 3.0  # Distance between two contour points [pixel].
+    # Smallest standard deviation of a mask's edge about the body's contour [pixel].
     deviation: float = 0.7
+    # Contour length over which errors are correlated; its points count as one [pixel].
     correlation: float = 12.0
-    reach: float = 40.0
-    robust_width: float = 2.5
+    reach: float = 40.0  # Largest distance between the model's contour and a mask's edge [pixel].
+    robust_width: float = 2.5  # Scale of the Geman-McClure weight [standard deviations].
+    # Directions of the state with less than this fraction of the largest information are dropped.
     negligible: float = 1e-12
 
 

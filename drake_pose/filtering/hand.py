@@ -36,35 +36,28 @@ _QUATERNION, _ANGLES = 2, 6
 class HandObservation:
     """The observation h of (13) for the state ``hand.layout``.
 
-    Args:
-        pixels_per_metre: of the image at scale 1.
-        point_deviation: standard deviation of a joint, fingertip or the wrist [pixel].
-        angle_deviation, distance_deviation: standard deviation of a line's alpha [rad] and rho
-            [pixel].
-        mirror_slope: (30) holds if a joint's rotation moves its segment's end in the image by less
-            than this fraction of its motion in space.
-        smallest_change: mirrored angles closer to the original are skipped [rad].
-        mirror_reach: mirrored angles farther from the prediction are skipped [standard deviations].
-        shortest: segments shorter in the image have no line [pixel].
-        scale_deviation: standard deviation of a known scale.
-        prior_frames: number of frames in which the joints' prior counts as one measurement.
-        hand: the hand's fingers and palm.
-
     Raises:
         SettingsError: a number is not positive.
     """
 
-    pixels_per_metre: float = 1000.0
-    point_deviation: float = 0.5
+    pixels_per_metre: float = 1000.0  # Of the image at scale 1.
+    point_deviation: float = 0.5  # Standard deviation of a joint, fingertip or the wrist [pixel].
+    # angle_deviation, distance_deviation: standard deviation of a line's alpha [rad] and rho
+    # [pixel].
     angle_deviation: float = math.radians(1.0)
     distance_deviation: float = 1.0
+    # (30) holds if a joint's rotation moves its segment's end in the image by less than this
+    # fraction of its motion in space.
     mirror_slope: float = 0.35
+    # Mirrored angles closer to the original are skipped [rad].
     smallest_change: float = math.radians(8.0)
+    # Mirrored angles farther from the prediction are skipped [standard deviations].
     mirror_reach: float = 3.0
-    shortest: float = 5.0
-    scale_deviation: float = 1e-3
+    shortest: float = 5.0  # Segments shorter in the image have no line [pixel].
+    scale_deviation: float = 1e-3  # Standard deviation of a known scale.
+    # Number of frames in which the joints' prior counts as one measurement.
     prior_frames: float = 30.0
-    hand: HandModel = field(default=TWO_FINGERS, repr=False)
+    hand: HandModel = field(default=TWO_FINGERS, repr=False)  # The hand's fingers and palm.
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():

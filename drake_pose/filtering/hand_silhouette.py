@@ -24,44 +24,35 @@ from drake_pose.fit.evidence import EdgePoints, find_edge_points
 
 @dataclass(frozen=True)
 class MatchingSettings:
-    """Settings of the assignment of edge points to the segments of a rough pose.
+    """Settings of the assignment of edge points to the segments of a rough pose."""
 
-    Args:
-        spacing: distance between two edge points [pixel].
-        gates: largest distance between edge points and a rough side, by iteration [pixel].
-        edge_deviation, correlation: standard deviation of an edge point, and edge length over which
-            errors are correlated, increased because they are also correlated between frames
-            [pixel].
-        width_deviation: standard deviation of half a segment's width [pixel].
-        min_offset_deviation, min_angle_deviation, min_tip_deviation: smallest standard deviation of
-            a line's offset [pixel] and direction [rad], and of a tip [pixel].
-        max_angle_deviation, max_tip_deviation: a line [rad] or tip [pixel] with a larger standard
-            deviation is not measured.
-        facing, facing_tip: smallest cosine between the normals of an edge point and of a side, or
-            tip.
-        end: fraction of a side at each end that is not matched.
-        beside: distance outside a side at which the rough body must be empty, else the side is
-            hidden [pixel].
-        rounds: iterations of the robust fit.
-        shortest: segments shorter in the image have no line [pixel].
-    """
-
-    spacing: float = 2.0
+    spacing: float = 2.0  # Distance between two edge points [pixel].
+    # Largest distance between edge points and a rough side, by iteration [pixel].
     gates: tuple[float, ...] = (14.0, 9.0, 6.0, 4.0)
+    # edge_deviation, correlation: standard deviation of an edge point, and edge length over which
+    # errors are correlated, increased because they are also correlated between frames [pixel].
     edge_deviation: float = 0.35
     correlation: float = 8.0
-    width_deviation: float = 0.4
+    width_deviation: float = 0.4  # Standard deviation of half a segment's width [pixel].
+    # min_offset_deviation, min_angle_deviation, min_tip_deviation: smallest standard deviation of a
+    # line's offset [pixel] and direction [rad], and of a tip [pixel].
     min_offset_deviation: float = 0.1
     min_angle_deviation: float = math.radians(0.2)
     min_tip_deviation: float = 0.15
+    # max_angle_deviation, max_tip_deviation: a line [rad] or tip [pixel] with a larger standard
+    # deviation is not measured.
     max_angle_deviation: float = math.radians(10.0)
     max_tip_deviation: float = 3.0
+    # facing, facing_tip: smallest cosine between the normals of an edge point and of a side, or
+    # tip.
     facing: float = 0.85
     facing_tip: float = 0.7
-    end: float = 0.08
+    end: float = 0.08  # Fraction of a side at each end that is not matched.
+    # Distance outside a side at which the rough body must be empty, else the side is hidden
+    # [pixel].
     beside: float = 2.0
-    rounds: int = 4
-    shortest: float = 5.0
+    rounds: int = 4  # Iterations of the robust fit.
+    shortest: float = 5.0  # Segments shorter in the image have no line [pixel].
 
 
 MATCHING = MatchingSettings()
@@ -251,33 +242,27 @@ def block_covariance(blocks: Array) -> Array:
 
 @dataclass(frozen=True)
 class HandSearchSettings:
-    """Settings of the cross-entropy search for a hand's pose.
+    """Settings of the cross-entropy search for a hand's pose."""
 
-    Args:
-        searches: largest number of searches.
-        poses, elite, rounds: number of poses of a round, of the best ones that define the next
-            round's distribution, and of rounds.
-        tracked: number of poses whose edges are matched.
-        wrist_deviation, turn_deviation, angle_deviation, length_deviation: largest standard
-            deviations of the first round: wrist [pixel], quaternion, angles [rad], lengths [m].
-        zoom: size of the compared images relative to the mask.
-        inside, along: standard deviation of a hidden joint or tip across the silhouette's edge, and
-            along it [radii].
-        reference_radius: finger radius for which gates and ``wrist_deviation`` are given [pixel].
-    """
-
-    searches: int = 3
+    searches: int = 3  # Largest number of searches.
+    # poses, elite, rounds: number of poses of a round, of the best ones that define the next
+    # round's distribution, and of rounds.
     poses: int = 120
     elite: int = 15
     rounds: int = 5
-    tracked: int = 4
+    tracked: int = 4  # Number of poses whose edges are matched.
+    # wrist_deviation, turn_deviation, angle_deviation, length_deviation: largest standard
+    # deviations of the first round: wrist [pixel], quaternion, angles [rad], lengths [m].
     wrist_deviation: float = 8.0
     turn_deviation: float = 0.14
     angle_deviation: float = math.radians(18.0)
     length_deviation: float = 0.012
-    zoom: float = 0.5
+    zoom: float = 0.5  # Size of the compared images relative to the mask.
+    # inside, along: standard deviation of a hidden joint or tip across the silhouette's edge, and
+    # along it [radii].
     inside: float = 0.5
     along: float = 10.0
+    # Finger radius for which gates and ``wrist_deviation`` are given [pixel].
     reference_radius: float = 8.0
 
 

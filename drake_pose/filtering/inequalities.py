@@ -299,28 +299,20 @@ class PriorRow:
 
 @dataclass
 class Couplings:
-    """The schema of a couplings file.
+    """The schema of a couplings file."""
 
-    Attributes:
-        differences, rows: inequalities (``load_couplings``).
-        usual: the joints' prior (``load_joint_prior``).
-    """
-
+    # differences, rows: inequalities (``load_couplings``).
     differences: list[Difference] = field(default_factory=list)
     rows: list[GeneralRow] = field(default_factory=list)
-    usual: list[PriorRow] = field(default_factory=list)
+    usual: list[PriorRow] = field(default_factory=list)  # The joints' prior (``load_joint_prior``).
 
 
 @dataclass(frozen=True, eq=False)
 class JointPrior:
-    """A normal prior of a state x: phi x is normally distributed, with independent components.
+    """A normal prior of a state x: phi x is normally distributed, with independent components."""
 
-    Attributes:
-        phi: (k, n) coefficients.
-        mean, deviation: (k,) mean and standard deviation of phi x.
-    """
-
-    phi: Array
+    phi: Array  # (k, n) coefficients.
+    # mean, deviation: (k,) mean and standard deviation of phi x.
     mean: Array
     deviation: Array
 

@@ -27,53 +27,42 @@ from drake_pose.silhouette.outline import TreeSurfaces
 
 @dataclass(frozen=True)
 class SequenceSettings:
-    """Settings of the fit of a recorded sequence; chosen on ``hand_sequences``.
+    """Settings of the fit of a recorded sequence; chosen on ``hand_sequences``."""
 
-    Args:
-        same_fit: two fits are the same if the root mean square difference of each angle over all
-            frames is below this [rad].
-        triangles: number of triangles of each rigid part.
-        spacing: distance between two edge points of a silhouette [pixel].
-        rounds: annealing stages of a fit.
-        memory: correlation time of the frames' errors; frames in this time count as one [s].
-        deviation, correlation: standard deviation of the body's contour about a mask's edge, and
-            contour length over which errors are correlated [pixel]; the model's flesh differs from
-            the person's along a whole finger bone.
-        start_frames: number of frames through which starts are tracked.
-        tilt: starts are tilted by plus and minus this angle about both image axes [rad].
-        settling_iterations: number of comparisons of a start with the first frame.
-        start_distance: starts closer than this in all elements are the same [rad].
-        worse_start: starts whose E_total in the first frame exceeds the best by more are dropped.
-        tracked_starts, fitted_starts: largest number of starts that are tracked, and fitted.
-        prior_weight: E_total equivalent of one squared standard deviation of a joint from its
-            prior.
-        worse_fit: fits with a cost above this multiple of the best are dropped. With a hand of
-            other proportions of flesh, the better of two fits may be the wrong one.
-        interval_factor: factor on the standard deviations of intervals, because flesh errors are
-            the same in all frames. Without it 80 to 99 % of the joints were in their 95 %
-            intervals, in ``grasp`` 68 %.
-    """
-
+    # Two fits are the same if the root mean square difference of each angle over all frames is
+    # below this [rad].
     same_fit: float = 0.1
-    triangles: int = 160
-    spacing: float = 2.0
+    triangles: int = 160  # Number of triangles of each rigid part.
+    spacing: float = 2.0  # Distance between two edge points of a silhouette [pixel].
+    # Annealing stages of a fit.
     rounds: tuple[AnnealingStage, ...] = (
         AnnealingStage(15.0, 3.0, 6),
         AnnealingStage(6.0, 3.0, 8),
         AnnealingStage(3.0, 3.0, 20),
     )
+    # Correlation time of the frames' errors; frames in this time count as one [s].
     memory: float = 0.15
+    # deviation, correlation: standard deviation of the body's contour about a mask's edge, and
+    # contour length over which errors are correlated [pixel]; the model's flesh differs from the
+    # person's along a whole finger bone.
     deviation: float = 2.0
     correlation: float = 75.0
-    start_frames: int = 90
-    tilt: float = 0.7
-    settling_iterations: int = 4
-    start_distance: float = 0.2
+    start_frames: int = 90  # Number of frames through which starts are tracked.
+    tilt: float = 0.7  # Starts are tilted by plus and minus this angle about both image axes [rad].
+    settling_iterations: int = 4  # Number of comparisons of a start with the first frame.
+    start_distance: float = 0.2  # Starts closer than this in all elements are the same [rad].
+    # Starts whose E_total in the first frame exceeds the best by more are dropped.
     worse_start: float = 0.03
+    # tracked_starts, fitted_starts: largest number of starts that are tracked, and fitted.
     tracked_starts: int = 6
+    # E_total equivalent of one squared standard deviation of a joint from its prior.
     prior_weight: float = 0.0003
     fitted_starts: int = 6
+    # Fits with a cost above this multiple of the best are dropped. With a hand of other proportions
+    # of flesh, the better of two fits may be the wrong one.
     worse_fit: float = 1.3
+    # Factor on the standard deviations of intervals, because flesh errors are the same in all
+    # frames. Without it 80 to 99 % of the joints were in their 95 % intervals, in ``grasp`` 68 %.
     interval_factor: float = 1.6
 
 

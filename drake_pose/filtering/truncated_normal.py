@@ -267,21 +267,16 @@ SKIP_ABOVE = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Truncated(Belief):
-    """A truncated belief; its covariance is positive definite if that of the given belief is.
+    """A truncated belief; its covariance is positive definite if that of the given belief is."""
 
-    Attributes:
-        c: (K,) (24) before truncation: margin of the mean from each row [standard deviations],
-            negative where the row is violated, infinite where it has no variance. In the sequential
-            form, before this row is used.
-        active: (K,) whether the row changed the belief (c_k at most SKIP_ABOVE).
-        log_probability: estimated logarithm of the probability that all rows hold.
-        sites: (S, 2) EP sites of the directions of ``MergedRows``; empty unless ``truncate_joint``
-            made the belief.
-    """
-
+    # (K,) (24) before truncation: margin of the mean from each row [standard deviations], negative
+    # where the row is violated, infinite where it has no variance. In the sequential form, before
+    # this row is used.
     c: Array
-    active: Mask
-    log_probability: float
+    active: Mask  # (K,) whether the row changed the belief (c_k at most SKIP_ABOVE).
+    log_probability: float  # Estimated logarithm of the probability that all rows hold.
+    # (S, 2) EP sites of the directions of ``MergedRows``; empty unless ``truncate_joint`` made the
+    # belief.
     sites: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
 

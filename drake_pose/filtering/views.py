@@ -90,14 +90,10 @@ def after_step(belief: Belief, step: Linear, U: Array) -> Belief:
 
 @dataclass(frozen=True, eq=False)
 class RepeatedView:
-    """The belief within a static view: the state and the offsets of the tangent.
+    """The belief within a static view: the state and the offsets of the tangent."""
 
-    Attributes:
-        tangent: (n,) state at which the view's first frame was linearised.
-        belief: over n + m numbers: the state, then the linearisation error of each measurement.
-    """
-
-    tangent: Array
+    tangent: Array  # (n,) state at which the view's first frame was linearised.
+    # Over n + m numbers: the state, then the linearisation error of each measurement.
     belief: Belief
 
     def state(self) -> Belief:

@@ -107,15 +107,11 @@ def colour_numbers(pixels: Picture) -> NDArray[np.intp]:
 
 @dataclass(frozen=True, eq=False)
 class PartColours:
-    """Characteristic colours of a body's parts, learnt from any cameras at a known pose.
+    """Characteristic colours of a body's parts, learnt from any cameras at a known pose."""
 
-    Args:
-        is_own: (nodes, COLOURS) whether a colour is characteristic of a part.
-        usual_fractions: (nodes,) fraction of the part's pixels with these colours at that pose;
-            nan: the part was occluded.
-    """
-
-    is_own: Mask
+    is_own: Mask  # (nodes, COLOURS) whether a colour is characteristic of a part.
+    # (nodes,) fraction of the part's pixels with these colours at that pose; nan: the part was
+    # occluded.
     usual_fractions: Array
 
     @staticmethod

@@ -32,14 +32,10 @@ FINEST_SCALE = 1.5
 
 @dataclass(frozen=True)
 class Noise:
-    """Errors of silhouettes, which determine the weight per unit of contour length.
+    """Errors of silhouettes, which determine the weight per unit of contour length."""
 
-    Args:
-        deviation: standard deviation of the distance between the contours [m].
-        correlation: length of contour over which errors are correlated [m], scalar or (cameras,).
-    """
-
-    deviation: float = 0.006
+    deviation: float = 0.006  # Standard deviation of the distance between the contours [m].
+    # Length of contour over which errors are correlated [m], scalar or (cameras,).
     correlation: float | Array = 0.06
 
     @classmethod
@@ -61,15 +57,11 @@ class Prior:
 
 
 class Views(NamedTuple):
-    """Cameras and the edges of their silhouettes in one frame.
+    """Cameras and the edges of their silhouettes in one frame."""
 
-    Attributes:
-        cameras: X_CW (c, 4, 4) and kernel parameters (c, 8), see ``pack_cameras``.
-        evidence: edges of the c silhouettes, in the same order.
-    """
-
+    # X_CW (c, 4, 4) and kernel parameters (c, 8), see ``pack_cameras``.
     cameras: tuple[Array, Array]
-    evidence: Evidence
+    evidence: Evidence  # Edges of the c silhouettes, in the same order.
 
 
 class Comparison(NamedTuple):

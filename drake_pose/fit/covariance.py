@@ -30,49 +30,37 @@ _on_one_thread = ThreadpoolController().wrap(limits=1, user_api="blas")
 
 
 class ErrorSizes(NamedTuple):
-    """Standard deviations of the errors of contours.
+    """Standard deviations of the errors of contours."""
 
-    Attributes:
-        noise: independent noise of a contour point, relative to the fit's weights.
-        repeated: noise repeated in all images of a part that is static relative to a camera,
-            likewise; 0 if there is none.
-        surface, mask, camera: displacement of contours by an error of a part's surface, of its edge
-            in one mask, and of a camera's extrinsics [unit of errors, see ``ComparedMask``].
-        nuisances: each group of nuisance parameters [unit of the group].
-    """
-
-    noise: float
+    noise: float  # Independent noise of a contour point, relative to the fit's weights.
+    # Noise repeated in all images of a part that is static relative to a camera, likewise; 0 if
+    # there is none.
     repeated: float
+    # surface, mask, camera: displacement of contours by an error of a part's surface, of its edge
+    # in one mask, and of a camera's extrinsics [unit of errors, see ``ComparedMask``].
     surface: float
     mask: float
     camera: float
-    nuisances: tuple[float, ...] = ()
+    nuisances: tuple[float, ...] = ()  # Each group of nuisance parameters [unit of the group].
 
 
 class Distances(NamedTuple):
     """Residuals of the contours' distances, in independent linear combinations.
 
     The m values are the parameters that were fitted, such as joint positions.
-
-    Attributes:
-        y: (n,) residuals; their standard deviation is one if the fit's weights are correct.
-        X: (n, m) derivatives of y by the values.
-        effects: (5, n, n) covariances of y for the first five errors of ``ErrorSizes``, each of
-            size one.
-        information: (m, m) information about the values if all errors were independent.
-        surface_derivatives: (n, 12 nodes) derivatives of y by deformations of the parts' surfaces,
-            common to all images [per unit of errors].
-        pictures: (n,) index of each residual's mask.
-        nuisances: per group (n, k) derivatives by nuisance parameters that are common to all images
-            and not among the values, such as joint offsets; each by a unit of its group.
     """
 
-    y: Array
-    X: Array
+    y: Array  # (n,) residuals; their standard deviation is one if the fit's weights are correct.
+    X: Array  # (n, m) derivatives of y by the values.
+    # (5, n, n) covariances of y for the first five errors of ``ErrorSizes``, each of size one.
     effects: Array
-    information: Array
+    information: Array  # (m, m) information about the values if all errors were independent.
+    # (n, 12 nodes) derivatives of y by deformations of the parts' surfaces, common to all images
+    # [per unit of errors].
     surface_derivatives: Array
-    pictures: Indices
+    pictures: Indices  # (n,) index of each residual's mask.
+    # Per group (n, k) derivatives by nuisance parameters that are common to all images and not
+    # among the values, such as joint offsets; each by a unit of its group.
     nuisances: tuple[Array, ...] = ()
 
 

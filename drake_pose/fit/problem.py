@@ -49,20 +49,15 @@ TIME_OFFSET = "time_offset"
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """Unknown parameters of frames.
+    """Unknown parameters of frames."""
 
-    Args:
-        names: (u,) names of the parameters, see ``parameter_names``.
-        shared: whether all frames share one value of each; else each frame has its own.
-        lower, upper: limits, scalar or (u,) [rad, m, s, pixel or a logarithm].
-        deviation: standard deviation of the prior [same unit], scalar or (u,); infinite: no
-            prior. Its mean is given to ``Problem.solve``.
-    """
-
-    names: Sequence[str]
-    shared: bool = False
+    names: Sequence[str]  # (u,) names of the parameters, see ``parameter_names``.
+    shared: bool = False  # Whether all frames share one value of each; else each frame has its own.
+    # lower, upper: limits, scalar or (u,) [rad, m, s, pixel or a logarithm].
     lower: float | Array = -np.inf
     upper: float | Array = np.inf
+    # Standard deviation of the prior [same unit], scalar or (u,); infinite: no prior. Its mean is
+    # given to ``Problem.solve``.
     deviation: float | Array = np.inf
 
 

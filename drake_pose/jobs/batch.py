@@ -44,25 +44,19 @@ OnProgress = Callable[[int, int, str], None]
 
 @dataclass
 class SceneState:
-    """Progress of a scene.
+    """Progress of a scene."""
 
-    Args:
-        job: the scene's job.
-        described: ``SceneJob.describe()`` at the start.
-        tasks: its chunks, or the single task of a scene that is not cut; () before planning.
-        done: indices (``Task.index``) of the finished tasks.
-        errors: by message, the ranges of frames that failed ("": the whole scene).
-        totals: as in Outcome; empty until the scene is finished.
-        seconds: time spent on the scene in this run, summed over all workers [s].
-    """
-
-    job: SceneJob
-    described: Mapping[str, Any]
+    job: SceneJob  # The scene's job.
+    described: Mapping[str, Any]  # ``SceneJob.describe()`` at the start.
+    # Its chunks, or the single task of a scene that is not cut; () before planning.
     tasks: tuple[Task, ...] = ()
+    # Indices (``Task.index``) of the finished tasks.
     done: set[int | None] = field(default_factory=set)
+    # By message, the ranges of frames that failed ("": the whole scene).
     errors: dict[str, list[str]] = field(default_factory=dict)
+    # As in Outcome; empty until the scene is finished.
     totals: Mapping[str, Any] = field(default_factory=dict)
-    seconds: float = 0.0
+    seconds: float = 0.0  # Time spent on the scene in this run, summed over all workers [s].
 
     @property
     def state(self) -> str:

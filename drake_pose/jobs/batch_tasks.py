@@ -33,23 +33,17 @@ from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, Scene, load_scene
 
 @dataclass(frozen=True)
 class Task:
-    """A chunk of a scene, or a whole scene.
+    """A chunk of a scene, or a whole scene."""
 
-    Args:
-        job: the scene's job.
-        out: folder of the batch.
-        index: index of the chunk; None: the whole scene, joined from its chunks if it has any.
-        frames: names of the frames of the chunk or of the whole scene.
-        chunks: result folders of the chunks to be joined; () if there are none.
-        near: result folder of an earlier episode, near whose poses cameras are expected; None:
-            they are searched.
-    """
-
-    job: SceneJob
-    out: Path
+    job: SceneJob  # The scene's job.
+    out: Path  # Folder of the batch.
+    # Index of the chunk; None: the whole scene, joined from its chunks if it has any.
     index: int | None
-    frames: tuple[str, ...]
+    frames: tuple[str, ...]  # Names of the frames of the chunk or of the whole scene.
+    # Result folders of the chunks to be joined; () if there are none.
     chunks: tuple[Path, ...] = ()
+    # Result folder of an earlier episode, near whose poses cameras are expected; None: they are
+    # searched.
     near: Path | None = None
 
     @property

@@ -35,19 +35,14 @@ camera_file: file with the cameras' poses, combined from all episodes that share
 
 @dataclass(frozen=True, eq=False)
 class EpisodesTable:
-    """The cameras of all audited episodes.
+    """The cameras of all audited episodes."""
 
-    Args:
-        text: of episodes.csv.
-        files: texts of camera files (YAML) by name; {} without audited episodes.
-        moves: sentences, for each camera which episodes share a pose and since when it has moved.
-        picture: of episodes.png, displacement and joint offsets over the episodes (PNG); b"": there
-            are fewer than two episodes.
-    """
-
-    text: str
-    files: Mapping[str, str]
+    text: str  # Of episodes.csv.
+    files: Mapping[str, str]  # Texts of camera files (YAML) by name; {} without audited episodes.
+    # Sentences, for each camera which episodes share a pose and since when it has moved.
     moves: tuple[str, ...]
+    # Of episodes.png, displacement and joint offsets over the episodes (PNG); b"": there are fewer
+    # than two episodes.
     picture: bytes
 
 

@@ -29,24 +29,19 @@ class Source:
     """Pictures or annotations of all cameras.
 
     A single camera without a name is "".
-
-    Args:
-        path: folder or file of the source.
-        camera_file: the camera file; None if there is none.
-        cameras: content of the camera file; None if there is none.
-        pictures: picture files by camera and frame.
-        videos: video files by camera, of cameras without picture files.
-        annotated: COCO files, each after the name of the folder that it lies in ("": the source's);
-            then pictures and videos are empty.
-        episode: recorded episode whose pictures are read; None if there is none.
     """
 
-    path: Path
-    camera_file: Path | None = None
-    cameras: CameraFile | None = None
+    path: Path  # Folder or file of the source.
+    camera_file: Path | None = None  # The camera file; None if there is none.
+    cameras: CameraFile | None = None  # Content of the camera file; None if there is none.
+    # Picture files by camera and frame.
     pictures: Mapping[str, Mapping[str, Path]] = field(default_factory=dict)
+    # Video files by camera, of cameras without picture files.
     videos: Mapping[str, Path] = field(default_factory=dict)
+    # COCO files, each after the name of the folder that it lies in ("": the source's); then
+    # pictures and videos are empty.
     annotated: Sequence[tuple[str, Annotations]] = ()
+    # Recorded episode whose pictures are read; None if there is none.
     episode: Episode | None = None
     _sizes: dict[str, tuple[int, ...]] = field(default_factory=dict, repr=False, compare=False)
 

@@ -75,15 +75,11 @@ class FoundMask(NamedTuple):
 
 @dataclass(frozen=True)
 class SceneMasks:
-    """A written scene of masks.
+    """A written scene of masks."""
 
-    Args:
-        folder: the scene's folder.
-        summary: content of its summary.json: for each camera and frame the mask's area [pixel] or
-            why it was rejected, and warnings.
-    """
-
-    folder: Path
+    folder: Path  # The scene's folder.
+    # Content of its summary.json: for each camera and frame the mask's area [pixel] or why it was
+    # rejected, and warnings.
     summary: Mapping[str, Any]
 
     @property

@@ -62,23 +62,18 @@ def one_core() -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class Studio:
-    """Simulated person before cameras.
+    """Simulated person before cameras."""
 
-    Args:
-        model, skeleton: of the person.
-        cameras: by name, the face camera included.
-        rig, context: diagram that renders the cameras' pictures, and its context.
-        backgrounds: learnt from noisy pictures without the person, by camera.
-        generator: of the pictures' noise.
-    """
-
+    # model, skeleton: of the person.
     model: ArticulatedModel
     skeleton: Skeleton
-    cameras: Mapping[str, PinholeCamera]
+    cameras: Mapping[str, PinholeCamera]  # By name, the face camera included.
+    # rig, context: diagram that renders the cameras' pictures, and its context.
     rig: CameraRig
     context: Context
+    # Learnt from noisy pictures without the person, by camera.
     backgrounds: Mapping[str, Background]
-    generator: np.random.Generator
+    generator: np.random.Generator  # Of the pictures' noise.
 
     @staticmethod
     def build(cameras: int, size: tuple[int, int], generator: np.random.Generator) -> "Studio":

@@ -40,14 +40,10 @@ from drake_pose.systems.walk import Walker, add_garden, view_from_behind, walker
 
 
 class WalkThrough(NamedTuple):
-    """Commands and walk by captured gestures, compared with those by the true poses.
+    """Commands and walk by captured gestures, compared with those by the true poses."""
 
-    Attributes:
-        figures: results by key.
-        pictures: of each command's middle frame, the shown camera's input and the virtual place.
-    """
-
-    figures: dict[str, Any]
+    figures: dict[str, Any]  # Results by key.
+    # Of each command's middle frame, the shown camera's input and the virtual place.
     pictures: Mapping[str, tuple[Picture, Picture]]
 
     def table(self) -> Table:

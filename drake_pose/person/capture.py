@@ -48,24 +48,18 @@ ReadPictures = Callable[[int], Mapping[str, Picture]]
 
 @dataclass(frozen=True, eq=False)
 class PersonCapture:
-    """A captured recording.
+    """A captured recording."""
 
-    Args:
-        q: (frames, nq) the plant's positions [rad, m]; nan where no person was found.
-        inlier_ratios: (frames,) inlier ratio of the contours; 0 where no person was seen.
-        shape: the person's; None where the model has no shape joints.
-        outlines: simplified surfaces of the tree's nodes with the person's radius scales.
-        deviations: (frames, nq) standard deviations of q [rad, m] by pictures and limits, or nan.
-        alternatives: (q, deviations) of distinct alternative poses that fit as well, by frame. Only
-            frames in which the person was searched have any.
-    """
-
-    q: Array
-    inlier_ratios: Array
-    shape: PersonShape | None
+    q: Array  # (frames, nq) the plant's positions [rad, m]; nan where no person was found.
+    inlier_ratios: Array  # (frames,) inlier ratio of the contours; 0 where no person was seen.
+    shape: PersonShape | None  # The person's; None where the model has no shape joints.
+    # Simplified surfaces of the tree's nodes with the person's radius scales.
     outlines: tuple[Outline, ...]
     tree: PoseTree
+    # (frames, nq) standard deviations of q [rad, m] by pictures and limits, or nan.
     deviations: Array
+    # (q, deviations) of distinct alternative poses that fit as well, by frame. Only frames in which
+    # the person was searched have any.
     alternatives: dict[int, tuple[tuple[Array, Array], ...]] = field(default_factory=dict)
 
     @staticmethod

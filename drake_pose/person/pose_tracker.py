@@ -134,23 +134,18 @@ def _noise(A: Array, b: Array, Q: Array, assumed: float = 4.0) -> float:
 
 @dataclass(frozen=True, eq=False)
 class TrackState:
-    """Tracker state: what is known of a person after a frame.
+    """Tracker state: what is known of a person after a frame."""
 
-    Args:
-        values, step: (m,) values of the pose tree, and their change since the last frame [rad, m].
-        inlier_ratio: inlier ratio of the contours, 0 to 1.
-        usual_ratio: the usual one: a running mean that follows higher ratios at once.
-        troubled_frames: number of successive frames with a low inlier ratio. Negative: the person
-            was found anew, and the remaining headings are tried in as many frames.
-        worst_part: lowest inlier ratio of a part, or lowest relative fraction of a limb's own
-            colours, where the person is tracked by colours; otherwise 1.
-    """
-
+    # values, step: (m,) values of the pose tree, and their change since the last frame [rad, m].
     values: Array
     step: Array
-    inlier_ratio: float
-    usual_ratio: float
+    inlier_ratio: float  # Inlier ratio of the contours, 0 to 1.
+    usual_ratio: float  # The usual one: a running mean that follows higher ratios at once.
+    # Number of successive frames with a low inlier ratio. Negative: the person was found anew, and
+    # the remaining headings are tried in as many frames.
     troubled_frames: int = 0
+    # Lowest inlier ratio of a part, or lowest relative fraction of a limb's own colours, where the
+    # person is tracked by colours; otherwise 1.
     worst_part: float = 1.0
 
     @property

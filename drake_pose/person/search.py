@@ -36,65 +36,50 @@ PERSON_LANDMARKS = (
 
 @dataclass(frozen=True, kw_only=True)
 class PersonSettings:
-    """How a person is tracked, and searched where lost.
+    """How a person is tracked, and searched where lost."""
 
-    Args:
-        follow, search: stages of a frame's fit from the predicted pose, and from a coarse guess.
-        step_fraction: fraction of the last frame's step that is predicted for the next.
-        angle_deviation, length_deviation: standard deviations of the prediction [rad, m].
-        retry_below: limbs are searched again where the inlier ratio is below the usual one by this.
-        lost_below: the person is lost below this fraction of the usual inlier ratio.
-        part_lost_below: a person tracked by colour is lost where a part's ratio is below this.
-        memory: number of frames over which the usual inlier ratio is averaged.
-        usual_ratio: usual inlier ratio at the start.
-        min_contour: least contour of a part in all cameras for the part's ratio to count [m].
-        headings: number of headings, evenly spread, in which a lost person is searched.
-        headings_per_frame: number of them in each frame of a sequence.
-        limbs_per_frame: number of doubtful limbs searched in each frame of a sequence.
-        min_limb_ratio: a limb is doubtful below this inlier ratio of its contour.
-        limb_gain: a limb is doubtful if the score of another of its poses is higher by this: the
-            fraction of the limb that covers unexplained silhouette.
-        min_limb_contour: a limb is doubtful if its visible contour, in the mean of the cameras, is
-            shorter than this fraction of its length.
-        fitted_fraction: fraction of the fresh starts that is fitted, the most promising first.
-        searched_starts: number of fresh starts whose doubtful limbs are searched.
-        placements: number of placements of a limb by its colours that are fitted.
-        distinct_distance: limb poses with tips farther apart than this are distinct [m].
-        same_distance: limb poses with no point farther apart than this are about the same [m].
-        alternative_margin: the limbs of an alternative pose are searched before it is compared if
-            its closeness is lower by at most this.
-        ambiguity_margin: an alternative pose is as good if its closeness is lower by at most this;
-            chosen on 36 drawn persons of other measures and clothes before four cameras.
-        ranking_stages: number of fit stages after which guesses are ranked.
-        ranking_spacing: factor on the spacing of contour points in these stages.
-    """
-
+    # follow, search: stages of a frame's fit from the predicted pose, and from a coarse guess.
     follow: tuple[AnnealingStage, ...]
     search: tuple[AnnealingStage, ...]
-    step_fraction: float = 0.7
+    step_fraction: float = 0.7  # Fraction of the last frame's step that is predicted for the next.
+    # angle_deviation, length_deviation: standard deviations of the prediction [rad, m].
     angle_deviation: float = 0.3
     length_deviation: float = 0.15
+    # Limbs are searched again where the inlier ratio is below the usual one by this.
     retry_below: float = 0.03
-    lost_below: float = 0.75
+    lost_below: float = 0.75  # The person is lost below this fraction of the usual inlier ratio.
+    # A person tracked by colour is lost where a part's ratio is below this.
     part_lost_below: float = 0.4
-    memory: float = 60.0
-    usual_ratio: float = 0.95
+    memory: float = 60.0  # Number of frames over which the usual inlier ratio is averaged.
+    usual_ratio: float = 0.95  # Usual inlier ratio at the start.
+    # Least contour of a part in all cameras for the part's ratio to count [m].
     min_contour: float = 0.3
-    headings: int = 12
-    headings_per_frame: int = 3
-    limbs_per_frame: int = 2
-    min_limb_ratio: float = 0.8
+    headings: int = 12  # Number of headings, evenly spread, in which a lost person is searched.
+    headings_per_frame: int = 3  # Number of them in each frame of a sequence.
+    limbs_per_frame: int = 2  # Number of doubtful limbs searched in each frame of a sequence.
+    min_limb_ratio: float = 0.8  # A limb is doubtful below this inlier ratio of its contour.
+    # A limb is doubtful if the score of another of its poses is higher by this: the fraction of the
+    # limb that covers unexplained silhouette.
     limb_gain: float = 0.15
+    # A limb is doubtful if its visible contour, in the mean of the cameras, is shorter than this
+    # fraction of its length.
     min_limb_contour: float = 0.5
+    # Fraction of the fresh starts that is fitted, the most promising first.
     fitted_fraction: float = 0.5
-    searched_starts: int = 3
-    placements: int = 3
+    searched_starts: int = 3  # Number of fresh starts whose doubtful limbs are searched.
+    placements: int = 3  # Number of placements of a limb by its colours that are fitted.
+    # Limb poses with tips farther apart than this are distinct [m].
     distinct_distance: float = 0.25
+    # Limb poses with no point farther apart than this are about the same [m].
     same_distance: float = 0.15
+    # The limbs of an alternative pose are searched before it is compared if its closeness is lower
+    # by at most this.
     alternative_margin: float = 0.15
+    # An alternative pose is as good if its closeness is lower by at most this; chosen on 36 drawn
+    # persons of other measures and clothes before four cameras.
     ambiguity_margin: float = 0.02
-    ranking_stages: int = 3
-    ranking_spacing: float = 1.5
+    ranking_stages: int = 3  # Number of fit stages after which guesses are ranked.
+    ranking_spacing: float = 1.5  # Factor on the spacing of contour points in these stages.
 
     def __post_init__(self) -> None:
         if not self.follow or not self.search:

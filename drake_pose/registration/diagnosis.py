@@ -31,20 +31,15 @@ from drake_pose.registration.shared_fit import SHARED
 
 
 class DiagnosisSettings(NamedTuple):
-    """Thresholds of a diagnosis.
+    """Thresholds of a diagnosis."""
 
-    Args:
-        significance: probability with which a correct scene, or a correct frame, gets a finding.
-        min_pixels: errors that move outlines by less get no finding [pixel].
-        min_joint_pixels: the same for joint offsets in all frames, beside errors of the cameras.
-        focal_sd_floor: minimum standard deviation of focal lengths [relative].
-        min_information: statistics use directions of x with more information [of x's prior].
-    """
-
+    # Probability with which a correct scene, or a correct frame, gets a finding.
     significance: float = 1e-4
-    min_pixels: float = 1.0
+    min_pixels: float = 1.0  # Errors that move outlines by less get no finding [pixel].
+    # The same for joint offsets in all frames, beside errors of the cameras.
     min_joint_pixels: float = 0.3
-    focal_sd_floor: float = 0.001
+    focal_sd_floor: float = 0.001  # Minimum standard deviation of focal lengths [relative].
+    # Statistics use directions of x with more information [of x's prior].
     min_information: float = 1.0
 
 

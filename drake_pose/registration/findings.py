@@ -8,64 +8,49 @@ from drake_pose.fit.covariance import ErrorSizes
 
 @dataclass(frozen=True)
 class Finding:
-    """An error in what is given: joint positions, cameras, clocks or masks.
+    """An error in what is given: joint positions, cameras, clocks or masks."""
 
-    Args:
-        kind: what is wrong. "joint": an offset; "camera" or "base": its pose; "focal": focal
-            lengths; "center": principal points; "clock": a camera's time offset; "rate": its
-            drift; "joints": several joints; "unexplained": nothing within reach explains the frame;
-            "refused": a camera whose pictures no pose explains.
-            In all frames also "sign" or "log": a joint's column in the log; "link": a link's shape;
-            "reading": the meaning of what is given; "moved": a pose that changed after a frame.
-        name: of the joint or camera, "" for several; for a "reading" a sentence.
-        angle, shift: correction to be added [rad, m]. Of several joints, the largest. Focal lengths
-            [relative], principal points [pixel]; a camera's shift is that of its own centre. Clock
-            [s]: how much later the pictures' joint positions are logged. Rate [s/s]: how much
-            faster the log's clock runs.
-        angle_sd, shift_sd: their standard deviations; 0 for several joints.
-        pixels: root mean square distance by which it moves the outlines it affects [pixel].
-        p_value: probability of an error at least as large if nothing is wrong.
-        alternatives: names of other causes that explain it equally well.
-        joints: significant corrections by joint, where several are wrong [rad or m].
-        at_body: how far a camera's error shifts the body [m]; 0 for other kinds.
-        link: of a "link" finding the misplaced link; of a "moved" finding "camera" or "base", and
-            "" for one in pictures.
-        text: details in words; "" for none.
-    """
-
+    # What is wrong. "joint": an offset; "camera" or "base": its pose; "focal": focal lengths;
+    # "center": principal points; "clock": a camera's time offset; "rate": its drift; "joints":
+    # several joints; "unexplained": nothing within reach explains the frame; "refused": a camera
+    # whose pictures no pose explains. In all frames also "sign" or "log": a joint's column in the
+    # log; "link": a link's shape; "reading": the meaning of what is given; "moved": a pose that
+    # changed after a frame.
     kind: str
-    name: str
+    name: str  # Of the joint or camera, "" for several; for a "reading" a sentence.
+    # angle, shift: correction to be added [rad, m]. Of several joints, the largest. Focal lengths
+    # [relative], principal points [pixel]; a camera's shift is that of its own centre. Clock [s]:
+    # how much later the pictures' joint positions are logged. Rate [s/s]: how much faster the log's
+    # clock runs.
     angle: float
     shift: float
+    # angle_sd, shift_sd: their standard deviations; 0 for several joints.
     angle_sd: float
     shift_sd: float
-    pixels: float
-    p_value: float
-    alternatives: tuple[str, ...] = ()
+    pixels: float  # Root mean square distance by which it moves the outlines it affects [pixel].
+    p_value: float  # Probability of an error at least as large if nothing is wrong.
+    alternatives: tuple[str, ...] = ()  # Names of other causes that explain it equally well.
+    # Significant corrections by joint, where several are wrong [rad or m].
     joints: Mapping[str, float] = field(default_factory=dict)
-    at_body: float = 0.0
+    at_body: float = 0.0  # How far a camera's error shifts the body [m]; 0 for other kinds.
+    # Of a "link" finding the misplaced link; of a "moved" finding "camera" or "base", and "" for
+    # one in pictures.
     link: str = ""
-    text: str = ""
+    text: str = ""  # Details in words; "" for none.
 
 
 @dataclass(frozen=True)
 class FrameDiagnosis:
-    """The diagnosis of one frame.
+    """The diagnosis of one frame."""
 
-    Args:
-        frame: its name.
-        given_ratios, fitted_ratios: inlier ratios (the fraction of both contours that fits) by
-            name of each camera with a mask, at the given values and with the frame fitted.
-        pixels: root mean square distance of the outlines from the pose common to all frames
-            [pixel].
-        finding: the error, for an outlier frame; None for an inlier.
-    """
-
-    frame: str
+    frame: str  # Its name.
+    # given_ratios, fitted_ratios: inlier ratios (the fraction of both contours that fits) by name
+    # of each camera with a mask, at the given values and with the frame fitted.
     given_ratios: Mapping[str, float]
     fitted_ratios: Mapping[str, float]
+    # Root mean square distance of the outlines from the pose common to all frames [pixel].
     pixels: float
-    finding: Finding | None
+    finding: Finding | None  # The error, for an outlier frame; None for an inlier.
 
 
 @dataclass(frozen=True)

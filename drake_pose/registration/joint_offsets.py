@@ -28,25 +28,19 @@ from drake_pose.registration.shared_fit import SHARED, SharedFit, SharedValues
 
 @dataclass(frozen=True)
 class KinematicParameter:
-    """An estimated joint offset, or the relative change of a link's scale.
+    """An estimated joint offset, or the relative change of a link's scale."""
 
-    Args:
-        name: of the joint or link.
-        value: the offset [rad or m] or the relative change of the scale; 0 if not determined.
-        deviation: its standard deviation; infinite if not determined.
-        low, high: its 95 % interval.
-        significant: whether it differs from 0 at the 5 % level over all requested parameters
-            (Bonferroni). Its 95 % interval may exclude 0 although it is not significant.
-        gauge: names of the unknowns that it is strongly correlated with; for a determined
-            parameter, those that only static parts separate it from; often empty.
-    """
-
-    name: str
-    value: float
-    deviation: float
+    name: str  # Of the joint or link.
+    value: float  # The offset [rad or m] or the relative change of the scale; 0 if not determined.
+    deviation: float  # Its standard deviation; infinite if not determined.
+    # low, high: its 95 % interval.
     low: float
     high: float
+    # Whether it differs from 0 at the 5 % level over all requested parameters (Bonferroni). Its 95
+    # % interval may exclude 0 although it is not significant.
     significant: bool
+    # Names of the unknowns that it is strongly correlated with; for a determined parameter, those
+    # that only static parts separate it from; often empty.
     gauge: tuple[str, ...] = ()
 
     @property

@@ -41,37 +41,30 @@ class CameraStatus(IntEnum):
 class OnlineSettings:
     """Which frames are kept, and when a camera counts as moved.
 
-    Args:
-        least_frames: minimum number of keyframes for a search.
-        most_frames: maximum number of keyframes; the newest are kept.
-        newest: number of newest keyframes, or of outlier frames, that show a motion of the camera.
-        min_inlier_ratio: a frame is an outlier if its inlier ratio is below this fraction of the
-            keyframes' median.
-        bump: maximum rotation [rad] and shift [its distance from the body] of a camera that a local
-            fit finds again. After larger motions all poses are searched.
-        trust: degrees of freedom of the prior of the covariance's scale. Successive poses are
-            fitted to overlapping newest keyframes, so each adds fewer than the pose's six.
-        novelty: a frame is a keyframe if the body's points are this far from every keyframe's, root
-            mean square [extent of the body].
-        tolerance: a frame in the pose of a keyframe is fitted, and replaces it, only if its E_total
-            is larger by more than this [the mask's area].
-        min_iou: minimum mean intersection over union of a found pose.
-        false_alarm: p-value of a difference that counts as a moved camera.
-
     Raises:
         SettingsError: not 2 <= newest <= least_frames <= most_frames.
     """
 
-    least_frames: int = 5
-    most_frames: int = 12
+    least_frames: int = 5  # Minimum number of keyframes for a search.
+    most_frames: int = 12  # Maximum number of keyframes; the newest are kept.
+    # Number of newest keyframes, or of outlier frames, that show a motion of the camera.
     newest: int = 3
+    # A frame is an outlier if its inlier ratio is below this fraction of the keyframes' median.
     min_inlier_ratio: float = 0.7
+    # Maximum rotation [rad] and shift [its distance from the body] of a camera that a local fit
+    # finds again. After larger motions all poses are searched.
     bump: float = 0.2
+    # Degrees of freedom of the prior of the covariance's scale. Successive poses are fitted to
+    # overlapping newest keyframes, so each adds fewer than the pose's six.
     trust: float = 4.0
+    # A frame is a keyframe if the body's points are this far from every keyframe's, root mean
+    # square [extent of the body].
     novelty: float = 0.15
+    # A frame in the pose of a keyframe is fitted, and replaces it, only if its E_total is larger by
+    # more than this [the mask's area].
     tolerance: float = 0.04
-    min_iou: float = 0.5
-    false_alarm: float = 1e-6
+    min_iou: float = 0.5  # Minimum mean intersection over union of a found pose.
+    false_alarm: float = 1e-6  # P-value of a difference that counts as a moved camera.
 
     def __post_init__(self) -> None:
         if not 2 <= self.newest <= self.least_frames <= self.most_frames:

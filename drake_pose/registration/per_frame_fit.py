@@ -26,24 +26,19 @@ from drake_pose.silhouette.outline import Outline
 
 @dataclass(frozen=True, eq=False)
 class FrameFit:
-    """A frame with fitted joints and cameras.
+    """A frame with fitted joints and cameras."""
 
-    Args:
-        name: the frame's name.
-        compared_masks: the comparison of the contours with each mask, linearised at the end of the
-            fit. Distances are measured from the given values; the unknowns are the corrections of
-            the joints and of the POSE_NAMES of each camera.
-        inlier_ratios: two mappings by name of each camera with a mask: the fraction of both
-            contours that fits, at given and at fitted values.
-        outline_lengths: (nodes,) weighted length of each node's contours [pixel].
-        matched_lengths: (nodes, 2) length of each node's contours that was compared with masks, and
-            the part of it that fits [pixel].
-    """
-
-    name: str
+    name: str  # The frame's name.
+    # The comparison of the contours with each mask, linearised at the end of the fit. Distances are
+    # measured from the given values; the unknowns are the corrections of the joints and of the
+    # POSE_NAMES of each camera.
     compared_masks: tuple[ComparedMask, ...]
+    # Two mappings by name of each camera with a mask: the fraction of both contours that fits, at
+    # given and at fitted values.
     inlier_ratios: tuple[Mapping[str, float], Mapping[str, float]]
-    outline_lengths: Array
+    outline_lengths: Array  # (nodes,) weighted length of each node's contours [pixel].
+    # (nodes, 2) length of each node's contours that was compared with masks, and the part of it
+    # that fits [pixel].
     matched_lengths: Array
 
 

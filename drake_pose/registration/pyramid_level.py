@@ -25,25 +25,19 @@ from drake_pose.workers import map_ordered
 
 
 class PictureSettings(NamedTuple):
-    """Parameters of a search in pictures.
+    """Parameters of a search in pictures."""
 
-    Args:
-        search_frames: number of frames in a search.
-        triangles: maximum number of triangles of a node's surface in pyramid levels up to 64 pixels
-            wide, up to 120, and in wider ones.
-        compare_width, background_width: width of the pictures in which poses are compared, and of
-            those in which backgrounds are estimated [pixel].
-        fitted: maximum number of a search's pose hypotheses that are fitted to contours.
-        contour_weight: weight of edges along the contours beside the explained fraction.
-        rate_step: half the interval of the differences that estimate joint velocities [s].
-    """
-
-    search_frames: int = 12
+    search_frames: int = 12  # Number of frames in a search.
+    # Maximum number of triangles of a node's surface in pyramid levels up to 64 pixels wide, up to
+    # 120, and in wider ones.
     triangles: tuple[int, int, int] = (12, 40, 100)
+    # compare_width, background_width: width of the pictures in which poses are compared, and of
+    # those in which backgrounds are estimated [pixel].
     compare_width: int = 160
     background_width: int = 320
-    fitted: int = 3
-    contour_weight: float = 4.0
+    fitted: int = 3  # Maximum number of a search's pose hypotheses that are fitted to contours.
+    contour_weight: float = 4.0  # Weight of edges along the contours beside the explained fraction.
+    # Half the interval of the differences that estimate joint velocities [s].
     rate_step: float = 0.05
 
 

@@ -22,20 +22,15 @@ from drake_pose.workers import map_ordered
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Pictures of one camera, and a joint log.
+    """Pictures of one camera, and a joint log."""
 
-    Args:
-        names: names of the n pictures.
-        values_at: returns the pose tree's values (n, m) [rad or m] at the pictures' times plus a
-            time offset [s], a number or (n,); NaN at times that are not logged.
-        read: returns picture k (H, W, 3).
-        times: (n,) times of the pictures [s]; None: the log has no times, and the values do not
-            depend on the offset.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # Names of the n pictures.
+    # Returns the pose tree's values (n, m) [rad or m] at the pictures' times plus a time offset
+    # [s], a number or (n,); NaN at times that are not logged.
     values_at: Callable[[float | Array], Array]
-    read: Callable[[int], Picture]
+    read: Callable[[int], Picture]  # Returns picture k (H, W, 3).
+    # (n,) times of the pictures [s]; None: the log has no times, and the values do not depend on
+    # the offset.
     times: Array | None
 
     def rates_at(self, offset: float) -> Array | None:

@@ -160,20 +160,15 @@ class _UncertainPose:
 
 @dataclass(frozen=True, eq=False)
 class TargetPose(_UncertainPose):
-    """The pose of a calibration target seen by a camera on a robot's link.
+    """The pose of a calibration target seen by a camera on a robot's link."""
 
-    Args:
-        X_WT: (4, 4) pose of the target's frame T in the robot's world.
-        covariance: (6, 6) covariance of the pose's error: rotation vector [rad] and translation
-            [m], both along the world's axes.
-        alternatives: (n, 4, 4) other poses X_WT at which the target looks the same.
-        symmetry_axes: (k, 3) axes in frame T, through the target's middle, about which the target
-            is round: its rotation about them is not observable.
-    """
-
-    X_WT: Array
+    X_WT: Array  # (4, 4) pose of the target's frame T in the robot's world.
+    # (6, 6) covariance of the pose's error: rotation vector [rad] and translation [m], both along
+    # the world's axes.
     covariance: Array
-    alternatives: Array
+    alternatives: Array  # (n, 4, 4) other poses X_WT at which the target looks the same.
+    # (k, 3) axes in frame T, through the target's middle, about which the target is round: its
+    # rotation about them is not observable.
     symmetry_axes: Array
 
 

@@ -73,22 +73,17 @@ def require_views(views: Sequence[View]) -> None:
 
 @dataclass(frozen=True)
 class JointEstimate:
-    """Interval of one value of the pose tree, as determined by the silhouettes.
+    """Interval of one value of the pose tree, as determined by the silhouettes."""
 
-    Args:
-        name: name of the position (or of the root's angle).
-        determined: True: the value lies between ``low`` and ``high``; False: the silhouettes do
-            not determine the value, and ``low`` and ``high`` are the extremes that were found.
-        low, high: ends of the interval [rad or m]. For an angle that turns around they may lie
-            beyond the limits by full turns.
-        covers_full_turn: whether the value is an angle that can make a full turn.
-    """
-
-    name: str
+    name: str  # Name of the position (or of the root's angle).
+    # True: the value lies between ``low`` and ``high``; False: the silhouettes do not determine the
+    # value, and ``low`` and ``high`` are the extremes that were found.
     determined: bool
+    # low, high: ends of the interval [rad or m]. For an angle that turns around they may lie beyond
+    # the limits by full turns.
     low: float
     high: float
-    covers_full_turn: bool = False
+    covers_full_turn: bool = False  # Whether the value is an angle that can make a full turn.
 
     def holds(self, value: float, margin: float = 1e-9) -> bool:
         """Return whether a value is in the interval and ``margin`` [rad or m], up to full turns."""
@@ -181,22 +176,16 @@ class PoseMode:
 
 @dataclass(frozen=True)
 class PoseSet:
-    """All poses found whose objective exceeds the best one by no more than the noise.
+    """All poses found whose objective exceeds the best one by no more than the noise."""
 
-    Args:
-        modes: modes, sorted by objective; of equal ones the larger first.
-        joints: interval of each value of the pose tree over all modes, in the order of the nodes.
-        tolerance: greatest excess over the best pose's objective J, or over its edge cost [pixel].
-        complete: whether every pose within the tolerance (of the grid, for a search on a grid) is
-            in the set.
-        mode_count: number of modes; ``modes`` may hold only the first of them.
-    """
-
-    modes: tuple[PoseMode, ...]
+    modes: tuple[PoseMode, ...]  # Modes, sorted by objective; of equal ones the larger first.
+    # Interval of each value of the pose tree over all modes, in the order of the nodes.
     joints: tuple[JointEstimate, ...]
+    # Greatest excess over the best pose's objective J, or over its edge cost [pixel].
     tolerance: float
+    # Whether every pose within the tolerance (of the grid, for a search on a grid) is in the set.
     complete: bool
-    mode_count: int
+    mode_count: int  # Number of modes; ``modes`` may hold only the first of them.
 
     @property
     def determined(self) -> tuple[bool, ...]:

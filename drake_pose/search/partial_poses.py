@@ -169,24 +169,18 @@ class _Poses:
 
 @dataclass(frozen=True)
 class PartialPoses:
-    """B partial poses in which the same nodes are placed.
+    """B partial poses in which the same nodes are placed."""
 
-    Attributes:
-        masks: (B, W) uint64 bit masks of the covered pixels.
-        poses: (B, nodes) int32 index of each node's pose in the PoseStore; -1: not placed.
-        hashes: (B,) uint64 hashes of the masks.
-        covered: (B,) int64 covered area of the silhouettes [pixel].
-        outside: (B,) int64 area outside the silhouettes, beyond the bands a sum over nodes [pixel].
-        beyond: (B, 2) int64 greatest and summed area of the nodes beyond the bands [pixel].
-        unreachable: (B,) int64 area of the silhouettes that no later node can cover [pixel].
-    """
-
-    masks: np.ndarray
+    masks: np.ndarray  # (B, W) uint64 bit masks of the covered pixels.
+    # (B, nodes) int32 index of each node's pose in the PoseStore; -1: not placed.
     poses: np.ndarray
-    hashes: np.ndarray
-    covered: np.ndarray
+    hashes: np.ndarray  # (B,) uint64 hashes of the masks.
+    covered: np.ndarray  # (B,) int64 covered area of the silhouettes [pixel].
+    # (B,) int64 area outside the silhouettes, beyond the bands a sum over nodes [pixel].
     outside: np.ndarray
+    # (B, 2) int64 greatest and summed area of the nodes beyond the bands [pixel].
     beyond: np.ndarray
+    # (B,) int64 area of the silhouettes that no later node can cover [pixel].
     unreachable: np.ndarray
 
     def __len__(self) -> int:

@@ -32,25 +32,19 @@ NEAREST_STRIDE = 32768
 
 
 class BitView(NamedTuple):
-    """A silhouette and the margin around it, cropped to a window of the image.
+    """A silhouette and the margin around it, cropped to a window of the image."""
 
-    Attributes:
-        camera: (8,) ``Camera.kernel_parameters()``.
-        X_CW: (4, 4) pose of the world in the camera.
-        window: (4,) int64 first row, first column, height h and width w [pixel].
-        inside: (h, w + 1) int32 number of silhouette pixels before each pixel, row after row.
-        margin: (h, w + 1) int32 the same for the pixels of the margin; (0, 0) without a margin.
-        nearest: (h, w) int32 for each silhouette pixel, about the nearest pixel outside the
-            silhouette, as row * NEAREST_STRIDE + column in the image; -1 where there is none.
-        sums: (h + 1, w + 1) int32 number of silhouette pixels above and left of each corner.
-    """
-
-    camera: np.ndarray
-    X_CW: np.ndarray
-    window: np.ndarray
+    camera: np.ndarray  # (8,) ``Camera.kernel_parameters()``.
+    X_CW: np.ndarray  # (4, 4) pose of the world in the camera.
+    window: np.ndarray  # (4,) int64 first row, first column, height h and width w [pixel].
+    # (h, w + 1) int32 number of silhouette pixels before each pixel, row after row.
     inside: np.ndarray
+    # (h, w + 1) int32 the same for the pixels of the margin; (0, 0) without a margin.
     margin: np.ndarray
+    # (h, w) int32 for each silhouette pixel, about the nearest pixel outside the silhouette, as row
+    # * NEAREST_STRIDE + column in the image; -1 where there is none.
     nearest: np.ndarray
+    # (h + 1, w + 1) int32 number of silhouette pixels above and left of each corner.
     sums: np.ndarray
 
 

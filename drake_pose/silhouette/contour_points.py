@@ -320,27 +320,20 @@ _CELLS_PER_SIDE = 20
 
 
 class CelledOutline(NamedTuple):
-    """A surface with the possible contour edges of every cell of directions, and its skin band.
+    """A surface with the possible contour edges of every cell of directions, and its skin band."""
 
-    Attributes:
-        points: (n, 4) vertices x, y, z, 1 [m].
-        planes: (m + 1, 4) planes of the triangles, and a zero plane for missing triangles.
-        edges: (e, 5) int32 v0, v1, t0, t1, s1 as packed.
-        cell_starts: (cells + 1,) int64 index of each cell's first entry in ``cell_edges``.
-        cell_edges: (k,) int32 indices of edges, cell after cell.
-        max_sine: (1,) sine of the largest angle between the viewing directions of the surface's
-            points and of its ball's centre for which the cells are valid.
-        packed: the surface, then its band, which kernels deform in place.
-        bands: (n, v, 3) vertices of the band at the samples of its node [m]; n = 0 without a band.
-    """
-
-    points: np.ndarray
+    points: np.ndarray  # (n, 4) vertices x, y, z, 1 [m].
+    # (m + 1, 4) planes of the triangles, and a zero plane for missing triangles.
     planes: np.ndarray
-    edges: np.ndarray
+    edges: np.ndarray  # (e, 5) int32 v0, v1, t0, t1, s1 as packed.
+    # (cells + 1,) int64 index of each cell's first entry in ``cell_edges``.
     cell_starts: np.ndarray
-    cell_edges: np.ndarray
+    cell_edges: np.ndarray  # (k,) int32 indices of edges, cell after cell.
+    # (1,) sine of the largest angle between the viewing directions of the surface's points and of
+    # its ball's centre for which the cells are valid.
     max_sine: np.ndarray
-    packed: PackedOutlines
+    packed: PackedOutlines  # The surface, then its band, which kernels deform in place.
+    # (n, v, 3) vertices of the band at the samples of its node [m]; n = 0 without a band.
     bands: np.ndarray
 
 

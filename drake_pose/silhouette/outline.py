@@ -33,20 +33,16 @@ class Outline:
 
     Any set of triangles is allowed, with holes, inner parts, and edges of three or more triangles,
     which have several records.
-
-    Args:
-        vertices: (n, 3) float64 points in the surface's own frame N [m].
-        triangles: (m, 3) int32 vertex indices, in any orientation.
-        edges: (e, 5) int32 records v0, v1, t0, t1, s1. Triangle t0 traverses the edge from v0 to
-            v1. s1 is +1 if triangle t1 does, too, and -1 if t1 traverses it backwards; t1 = -1 and
-            s1 = 0 if there is no second triangle.
-        rest: the surface at rest, if this one differs from it in vertices only; the arrays that
-            both share are packed once.
     """
 
-    vertices: np.ndarray
-    triangles: np.ndarray
+    vertices: np.ndarray  # (n, 3) float64 points in the surface's own frame N [m].
+    triangles: np.ndarray  # (m, 3) int32 vertex indices, in any orientation.
+    # (e, 5) int32 records v0, v1, t0, t1, s1. Triangle t0 traverses the edge from v0 to v1. s1 is
+    # +1 if triangle t1 does, too, and -1 if t1 traverses it backwards; t1 = -1 and s1 = 0 if there
+    # is no second triangle.
     edges: np.ndarray
+    # The surface at rest, if this one differs from it in vertices only; the arrays that both share
+    # are packed once.
     rest: Outline | None = None
 
     @cached_property

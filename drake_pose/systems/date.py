@@ -60,32 +60,25 @@ from drake_pose.systems.ports import (
 class CaptureSetup:
     """The constants of a capture.
 
-    Args:
-        skeleton: the person's model.
-        cameras: cameras on the circle around the person, by name.
-        face_camera: camera that sees the face; None: there is none.
-        faces: templates of the person's face; None: the face's direction is not measured.
-        registered: pose that is recognised without earlier frames; None: there is none.
-        backgrounds: background model of each camera that gives no masks, by name of the camera.
-        skin: colour of the person's skin.
-        search: whether elbows and knees are searched on their circles; see estimate_pose.
-        recognition: smallest similarity at which the registered pose replaces the state.
-        farthest_face: largest distance of a face from the eigenspace [grey levels].
-
     Raises:
         SettingsError: there are fewer than two cameras, or the face camera has the name of another.
     """
 
-    skeleton: Skeleton
-    cameras: Mapping[str, Camera]
-    face_camera: Camera | None = None
+    skeleton: Skeleton  # The person's model.
+    cameras: Mapping[str, Camera]  # Cameras on the circle around the person, by name.
+    face_camera: Camera | None = None  # Camera that sees the face; None: there is none.
+    # Templates of the person's face; None: the face's direction is not measured.
     faces: FaceTemplates | None = None
+    # Pose that is recognised without earlier frames; None: there is none.
     registered: RegisteredPose | None = None
+    # Background model of each camera that gives no masks, by name of the camera.
     backgrounds: Mapping[str, Background] = field(default_factory=dict)
-    skin: SkinColour = field(default_factory=SkinColour)
+    skin: SkinColour = field(default_factory=SkinColour)  # Colour of the person's skin.
+    # Whether elbows and knees are searched on their circles; see estimate_pose.
     search: bool = True
+    # Smallest similarity at which the registered pose replaces the state.
     recognition: float = 0.93
-    farthest_face: float = 30.0
+    farthest_face: float = 30.0  # Largest distance of a face from the eigenspace [grey levels].
 
     def __post_init__(self) -> None:
         if len(self.cameras) < 2:

@@ -42,15 +42,12 @@ class SkinColour:
     """Range of skin colours: a box in the chroma plane, so that shading matters little.
 
     The defaults are those of Chai and Ngan (1999), found on faces of many origins.
-
-    Args:
-        red, blue: lowest and highest chroma Cr and Cb, 0 to 255; 128 is grey.
-        darkest: lowest brightness Y, 0 to 255: chroma is unreliable in the dark.
     """
 
+    # red, blue: lowest and highest chroma Cr and Cb, 0 to 255; 128 is grey.
     red: tuple[float, float] = (133.0, 173.0)
     blue: tuple[float, float] = (77.0, 127.0)
-    darkest: float = 30.0
+    darkest: float = 30.0  # Lowest brightness Y, 0 to 255: chroma is unreliable in the dark.
 
 
 @dataclass(frozen=True, eq=False)

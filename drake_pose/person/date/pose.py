@@ -24,42 +24,30 @@ from drake_pose.person.views import sum_at_points
 
 @dataclass(frozen=True)
 class PoseSettings:
-    """Step sizes and tolerances of the inverse kinematics and of the circle search.
+    """Step sizes and tolerances of the inverse kinematics and of the circle search."""
 
-    Args:
-        max_step: largest change of any angle in a step [rad].
-        damping: added to the diagonal of a step's normal equations [m^2].
-        tolerance: a point at this distance from its target has reached it [m].
-        min_step: the search ends if no angle changes by more than this in a step [rad].
-        max_steps: largest number of steps.
-        steps_per_turn: number of steps of one arm before the other arm's turn.
-        min_bend: least initial bend of a middle joint; small steps cannot bend a straight limb
-            [rad].
-        elbow_range: angles on the circle [deg]: from behind over outwards to a little in front.
-        knee_range: angles on the circle [deg]: 0 in front, positive outwards, as far as the hip can
-            turn. A straight leg's knee lies behind, as the leg ends at the middle of the foot.
-        circle_step: spacing of the candidates on a circle [deg].
-        bend_tolerance, hip_tolerance: how far a straight limb's middle joint, or a hip, may exceed
-            its limits, because the trunk's direction is measured with errors [rad].
-        along, across: number of points along and across a limb's rectangle.
-        head_fraction: weight of the head's height in the waist's height (4.2); the feet's is the
-            rest.
-    """
-
-    max_step: float = math.radians(2.0)
-    damping: float = 0.05**2
-    tolerance: float = 1e-3
-    min_step: float = 1e-4
-    max_steps: int = 100
-    steps_per_turn: int = 4
+    max_step: float = math.radians(2.0)  # Largest change of any angle in a step [rad].
+    damping: float = 0.05**2  # Added to the diagonal of a step's normal equations [m^2].
+    tolerance: float = 1e-3  # A point at this distance from its target has reached it [m].
+    min_step: float = 1e-4  # The search ends if no angle changes by more than this in a step [rad].
+    max_steps: int = 100  # Largest number of steps.
+    steps_per_turn: int = 4  # Number of steps of one arm before the other arm's turn.
+    # Least initial bend of a middle joint; small steps cannot bend a straight limb [rad].
     min_bend: float = math.radians(3.0)
+    # Angles on the circle [deg]: from behind over outwards to a little in front.
     elbow_range: tuple[float, float] = (0.0, 120.0)
+    # Angles on the circle [deg]: 0 in front, positive outwards, as far as the hip can turn. A
+    # straight leg's knee lies behind, as the leg ends at the middle of the foot.
     knee_range: tuple[float, float] = (-180.0, 175.0)
-    circle_step: float = 5.0
+    circle_step: float = 5.0  # Spacing of the candidates on a circle [deg].
+    # bend_tolerance, hip_tolerance: how far a straight limb's middle joint, or a hip, may exceed
+    # its limits, because the trunk's direction is measured with errors [rad].
     bend_tolerance: float = math.radians(3.0)
     hip_tolerance: float = math.radians(10.0)
+    # along, across: number of points along and across a limb's rectangle.
     along: int = 12
     across: int = 5
+    # Weight of the head's height in the waist's height (4.2); the feet's is the rest.
     head_fraction: float = 0.55
 
 

@@ -24,31 +24,23 @@ FEATURES = ("head", "left_hand", "right_hand", "left_foot", "right_foot")
 
 @dataclass(frozen=True, eq=False)
 class Limb:
-    """An arm or a leg.
+    """An arm or a leg."""
 
-    Args:
-        name: one of LIMBS.
-        upper_node, lower_node: indices of its segments' nodes in the pose tree.
-        root_T: (3,) shoulder or hip in the trunk's frame [m].
-        middle_U: (3,) elbow or knee in the upper segment's frame [m].
-        end_L: (3,) middle of the hand or foot in the lower segment's frame [m].
-        axes: (4,) axes of rotation, 0, 1, 2 for x, y, z: three at the root in order, one at the
-            middle joint.
-        positions: (4,) indices of their angles in q.
-        lower, upper: (4,) limits of the angles [rad].
-        half_widths: (2,) mean distance of each segment's surface from the line of its joints [m].
-    """
-
-    name: str
+    name: str  # One of LIMBS.
+    # upper_node, lower_node: indices of its segments' nodes in the pose tree.
     upper_node: int
     lower_node: int
-    root_T: Array
-    middle_U: Array
-    end_L: Array
+    root_T: Array  # (3,) shoulder or hip in the trunk's frame [m].
+    middle_U: Array  # (3,) elbow or knee in the upper segment's frame [m].
+    end_L: Array  # (3,) middle of the hand or foot in the lower segment's frame [m].
+    # (4,) axes of rotation, 0, 1, 2 for x, y, z: three at the root in order, one at the middle
+    # joint.
     axes: Indices
-    positions: Indices
+    positions: Indices  # (4,) indices of their angles in q.
+    # lower, upper: (4,) limits of the angles [rad].
     lower: Array
     upper: Array
+    # (2,) mean distance of each segment's surface from the line of its joints [m].
     half_widths: Array
 
     @property
@@ -69,29 +61,22 @@ class Limb:
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
-    """A person's pose tree, with the quantities that the paper's method needs.
-
-    Args:
-        nodes: indices of the pose tree's nodes by name.
-        face_H: (3,) middle of the head's surface in the head's frame [m].
-        head_positions: (3,) indices in q of the head's position.
-        head_angles, neck_angles: (2,) indices in q of the head's and of the neck base's angles.
-        order: (m,) indices in q of the pose tree's values.
-        chains: for each node: the chain of nodes from the root to it, packed, and the indices in q
-            of the chain's values.
-        lower, upper: (nq,) limits of q [rad, m].
-    """
+    """A person's pose tree, with the quantities that the paper's method needs."""
 
     model: ArticulatedModel
     kinematics: TreeKinematics
-    nodes: Mapping[str, int]
-    face_H: Array
-    head_positions: Indices
+    nodes: Mapping[str, int]  # Indices of the pose tree's nodes by name.
+    face_H: Array  # (3,) middle of the head's surface in the head's frame [m].
+    head_positions: Indices  # (3,) indices in q of the head's position.
+    # head_angles, neck_angles: (2,) indices in q of the head's and of the neck base's angles.
     head_angles: Indices
     neck_angles: Indices
-    order: Indices
+    order: Indices  # (m,) indices in q of the pose tree's values.
+    # For each node: the chain of nodes from the root to it, packed, and the indices in q of the
+    # chain's values.
     chains: Sequence[tuple[PackedTree, Indices]]
     limbs: Mapping[str, Limb]
+    # lower, upper: (nq,) limits of q [rad, m].
     lower: Array
     upper: Array
 

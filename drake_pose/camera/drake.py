@@ -22,7 +22,7 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraConfig, CameraInfo
 
-from drake_pose.camera.models import HALF_PIXEL, Camera, PinholeCamera, camera_tuple, write_file
+from drake_pose.camera.models import HALF_PIXEL, Camera, PinholeCamera, camera_tuple
 from drake_pose.errors import CameraError
 
 
@@ -240,17 +240,6 @@ def dump_scenario(
             data=yaml_dump_typed(config, schema=CameraConfig, defaults=CameraConfig())
         )
     return str(yaml_dump({"cameras": content}))
-
-
-def save_scenario(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Camera]) -> None:
-    """Write cameras, given by name or in sequence, as a Drake Scenario.
-
-    ``load_cameras`` reads it, too. An existing file is replaced.
-
-    Raises:
-        CameraError: as for ``dump_scenario``, or the file cannot be written.
-    """
-    write_file(path, dump_scenario(cameras), "the cameras")
 
 
 def _rigid_transform(X_AB: np.ndarray) -> RigidTransform:

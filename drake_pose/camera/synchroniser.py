@@ -2,19 +2,12 @@
 
 import math
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Generic, NamedTuple, TypeVar
 
 from drake_pose.errors import SettingsError, UnknownNameError
 
 Item = TypeVar("Item")
-
-
-class SynchronisedFrames(NamedTuple, Generic[Item]):
-    """Items of one time by camera, some may be missing; and their earliest time stamp [s]."""
-
-    time: float
-    items: Mapping[str, Item]
 
 
 class CameraChange(NamedTuple):
@@ -66,11 +59,6 @@ class Synchroniser(Generic[Item]):
         self._finished: set[str] = set()
         self._changes: list[CameraChange] = []
 
-    @property
-    def ignored_cameras(self) -> tuple[str, ...]:
-        """Cameras that are not awaited now."""
-        return tuple(name for name in self.cameras if name in self._ignored_cameras)
-
     def waiting(self, camera: str) -> int:
         """Return the number of a camera's images that wait for their group."""
         return len(self._queues[camera])
@@ -106,8 +94,10 @@ class Synchroniser(Generic[Item]):
         """Declare that a camera will provide no more images, so that it is not awaited."""
         self._finished.add(camera)
 
-    def take(self, now: float | None = None) -> SynchronisedFrames[Item] | None:
-        """Return the next group; None if there is none, or a camera is still awaited.
+    def take(self, now: float | None = None) -> tuple[float, dict[str, Item]] | None:
+        """Return the next group: its earliest time stamp [s], and its items by camera.
+
+        None if there is none, or a camera is still awaited.
 
         Args:
             now: the time [s]; None: the latest time stamp.
@@ -136,7 +126,7 @@ class Synchroniser(Generic[Item]):
             if name in heads and heads[name] <= begin + self.tolerance
         }
         self._group_time, self._group_cameras = begin, set(items)
-        return SynchronisedFrames(begin, items)
+        return begin, items
 
     def take_changes(self) -> list[CameraChange]:
         """Return the cameras that stopped or returned since the last call."""

@@ -276,12 +276,11 @@ def capture(
         def show(count: int, _: bool) -> None:
             progress.show_stage("frames", count, None)
 
-        result = capture_live(studio, out, model, live, warn, show, method)
-    for text in result.unreported:
+        found, interrupted, unreported = capture_live(studio, out, model, live, warn, show, method)
+    for text in unreported:
         warn(text)
-    if result.interrupted:
+    if interrupted:
         say("drake-pose: stopped by Ctrl-C; all frames are kept")
-    found = result.estimate
     if json:
         print_json(found.summary)
     elif found.records:

@@ -8,7 +8,6 @@ leaves out a camera that disagrees with the others, and then captures the record
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,13 +125,6 @@ def capture_person(
     return captured
 
 
-class _Explanation(NamedTuple):
-    """A pose fit together with the person's shape in it, and the tracker with this shape."""
-
-    fit: PoseFit
-    tracker: PersonPoseTracker
-
-
 class _Capture:
     """A recording with the tracker that follows the person in it; arguments as `capture_person`.
 
@@ -190,7 +182,7 @@ class _Capture:
             poses = {k: one.values for k in chosen if (one := rough[k])}
         else:
             explained = {k: self.find_explanations(k) for k in chosen}
-            poses = {k: own[0].fit.values for k, own in explained.items() if own}
+            poses = {k: own[0][0].values for k, own in explained.items() if own}
         shape, self.tracker = self._fit_shape(list(poses), list(poses.values()))
         states = zip(poses, shape.poses, strict=True)
         return shape, {k: self.tracker.start(pose) for k, pose in states}
@@ -205,8 +197,12 @@ class _Capture:
         shaped, plan = ContourFit(fit.kinematics, shape.outlines, NOISE), self.tracker.plan
         return shape, PersonPoseTracker(shaped, LENIENT, shape_values(fit.tree), shape.values, plan)
 
-    def find_explanations(self, frame: int, start: PoseFit | None = None) -> list["_Explanation"]:
-        """Return the distinct poses that explain a frame, best first; [] if no person is visible.
+    def find_explanations(
+        self, frame: int, start: PoseFit | None = None
+    ) -> list[tuple[PoseFit, PersonPoseTracker]]:
+        """Return distinct poses that explain a frame, with trackers of their shapes, best first.
+
+        The list is empty if no person is visible.
 
         Where the shape is unknown, the shape of a first fit is used in the search, and each
         explanation gets its own shape before they are compared: in a body of other proportions a
@@ -224,11 +220,11 @@ class _Capture:
             _, tracker = self._fit_shape([frame], [start.values])
         fits = tracker.search.find_explanations(seen)
         least = fits[0].closeness - tracker.settings.alternative_margin if fits else 0.0
-        found = [_Explanation(one, tracker) for one in fits if one.closeness > least]
+        found = [(one, tracker) for one in fits if one.closeness > least]
         if self._has_shape:
-            found = [self._with_shape(frame, one.fit.values) for one in found]
-        ranked = {id(one.fit): one for one in found}
-        distinct = tracker.search.distinct(one.fit for one in found)
+            found = [self._with_shape(frame, fit.values) for fit, _ in found]
+        ranked = {id(one[0]): one for one in found}
+        distinct = tracker.search.distinct(fit for fit, _ in found)
         found = [ranked[id(fit)] for fit in distinct]
         self.alternatives[frame] = tuple(
             (shaped.positions(fit.values), shaped.deviations(fit.values, seen))
@@ -237,12 +233,12 @@ class _Capture:
         )
         return found
 
-    def _with_shape(self, frame: int, values: Array) -> "_Explanation":
+    def _with_shape(self, frame: int, values: Array) -> tuple[PoseFit, PersonPoseTracker]:
         """Refine a frame's pose and search its limbs, with the shape fitted at `values` (m,)."""
         seen = self._see(frame)
         shape, shaped = self._fit_shape([frame], [values])
         refined = shaped.search.refine(shape.poses[0], seen)
-        return _Explanation(shaped.search.improve_limbs(refined, seen), shaped)
+        return shaped.search.improve_limbs(refined, seen), shaped
 
     def follow_all(
         self,

@@ -15,7 +15,7 @@ from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 from drake_pose.arrays import Mask, Picture
 from drake_pose.camera.models import Camera
 from drake_pose.camera.sources import Clock, FrameSource, TimedPicture
-from drake_pose.camera.synchroniser import CameraChange, SynchronisedFrames, Synchroniser
+from drake_pose.camera.synchroniser import CameraChange, Synchroniser
 from drake_pose.errors import CameraError, SettingsError, UnknownNameError
 from drake_pose.silhouette.pictures.label_images import fill_label_image, label_image_to_mask
 from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ
@@ -110,7 +110,7 @@ class PictureCapture(PortedSystem):
         self._begin: float | None = None
         self._origins: dict[str, float] = {}
         self._pending: dict[str, TimedPicture | None] = dict.fromkeys(self._sources)
-        self.frames: SynchronisedFrames[TimedPicture] | None = None
+        self.frames: tuple[float, dict[str, TimedPicture]] | None = None  # Time [s], by camera.
         self._used = dict.fromkeys(self._sources, 0)
         self._changes: dict[str, list[CameraChange]] = {name: [] for name in self._sources}
         self._reports: list[str] = []
@@ -182,9 +182,10 @@ class PictureCapture(PortedSystem):
                 return EventStatus.ReachedTermination(self, "the recording has ended")
             return EventStatus.Succeeded()
         self.frames = frames
-        for name in frames.items:
+        begin, pictures = frames
+        for name in pictures:
             self._used[name] += 1
-        state.get_mutable_discrete_state(self._time).SetFromVector([frames.time])
+        state.get_mutable_discrete_state(self._time).SetFromVector([begin])
         return EventStatus.Succeeded()
 
     def _start(self) -> float | None:
@@ -253,7 +254,7 @@ class PictureCapture(PortedSystem):
     ) -> None:
         """Write the shown picture of the camera ``name`` to an output; ``fill`` copies it."""
         image = output.get_mutable_value()
-        one = None if self.frames is None else self.frames.items.get(name)
+        one = None if self.frames is None else self.frames[1].get(name)
         if one is None:
             image.resize(0, 0)
         else:

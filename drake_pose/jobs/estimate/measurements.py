@@ -278,15 +278,6 @@ def _numbers(cells: Sequence[str], path: Path, line: int) -> np.ndarray:
     return numbers
 
 
-class PlacedCameras(NamedTuple):
-    """Cameras of an episode that are used."""
-
-    cameras: list[EpisodeCamera]  # The cameras, in the episode's order.
-    # Names of all cameras of the camera file with a known, static pose X_WC.
-    placed: frozenset[str]
-    warnings: tuple[str, ...] = ()  # How the camera file was read where it does not say so itself.
-
-
 class TreeLog(NamedTuple):
     """A joint log in the values of a pose tree."""
 
@@ -314,8 +305,11 @@ def is_episode(path: Path, settings: EpisodeSettings) -> bool:
 
 def cameras_of(
     episode: Episode, camera_path: Path | None, settings: EpisodeSettings
-) -> PlacedCameras:
+) -> tuple[list[EpisodeCamera], frozenset[str], tuple[str, ...]]:
     """Return the chosen cameras of an episode with the calibration of their camera file.
+
+    Also return the names of all cameras with a known, static pose X_WC, and how the camera file was
+    read where it does not say so itself.
 
     Args:
         episode: the episode.
@@ -334,7 +328,7 @@ def cameras_of(
     chosen = [one for one in episode.cameras.values() if one.name in wanted]
     file = camera_path or episode.path / CAMERA_FILE
     if camera_path is None and not file.is_file():
-        return PlacedCameras(chosen, frozenset(one.name for one in chosen if one.is_posed))
+        return chosen, frozenset(one.name for one in chosen if one.is_posed), ()
     given = load_camera_file(
         file,
         distorted=True,
@@ -343,7 +337,7 @@ def cameras_of(
     )
     chosen = [add_calibration(one, given, file) for one in chosen]
     placed = frozenset(given.cameras) - {*given.unplaced, *given.links}
-    return PlacedCameras(chosen, placed, given.warnings)
+    return chosen, placed, given.warnings
 
 
 def left_out_warnings(names: Iterable[str], placed: Collection[str]) -> list[str]:

@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
@@ -52,15 +51,6 @@ from drake_pose.systems.picture_capture import CameraCount, PictureCapture
 from drake_pose.systems.ports import evaluate
 
 
-class LiveResult(NamedTuple):
-    """Result of a live capture."""
-
-    estimate: SceneEstimate  # The estimate of all frames.
-    interrupted: bool  # Whether Ctrl-C ended the capture.
-    # Warnings that were not passed to ``on_report`` during the capture.
-    unreported: tuple[str, ...]
-
-
 @writes_folder
 def capture_live(
     scene: LiveScene,
@@ -70,8 +60,11 @@ def capture_live(
     on_report: Callable[[str], None] = lambda _: None,
     on_frame: Callable[[int, bool], None] = lambda _, __: None,
     method: CaptureMethod = "person",
-) -> LiveResult:
+) -> tuple[SceneEstimate, bool, tuple[str, ...]]:
     """Capture a person as pictures arrive, and write the result folder.
+
+    Return the estimate of all frames, whether Ctrl-C ended the capture, and the warnings that were
+    not passed to ``on_report`` during it.
 
     Ctrl-C ends the capture and keeps all frames. The sources are opened twice if the shape is
     fitted to the first frames or the registered pose is searched.
@@ -137,7 +130,7 @@ def capture_live(
             writer.end()
     estimate = writer.result()
     unreported = tuple(text for text in estimate.warnings if text not in reported)
-    return LiveResult(estimate, interrupted, unreported)
+    return estimate, interrupted, unreported
 
 
 def shape_of_result(result: Path) -> KnownShape:

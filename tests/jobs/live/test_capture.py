@@ -42,7 +42,7 @@ def captured(studio, person, tmp_path_factory):
 
 def test_person_is_captured_frame_by_frame(captured, person):
     out, result, _ = captured
-    assert not result.interrupted
+    assert not result[1]
     rows = rows_of(out / "poses.csv")
     assert [row["frame"] for row in rows] == [f"{k:06d}" for k in SHOWN]
     assert rows[0]["error"] == "", "nobody was there"
@@ -53,11 +53,11 @@ def test_person_is_captured_frame_by_frame(captured, person):
     assert np.sort(off)[-2] < 9.0
     times = [float(row["time"]) for row in rows_of(out / "timestamps.csv")]
     np.testing.assert_allclose(times, np.array(SHOWN) / RATE_HZ, atol=1e-6)
-    assert result.estimate.summary["frame_rate_hz"] == pytest.approx(RATE_HZ)
+    assert result[0].summary["frame_rate_hz"] == pytest.approx(RATE_HZ)
     assert {"joint_centres.csv", "joint_centres.trc", "positions.mot"} <= {
         path.name for path in out.iterdir()
     }
-    assert result.estimate.summary["mean_iou"] > 0.85
+    assert result[0].summary["mean_iou"] > 0.85
 
 
 def test_intervals_of_positions_are_written(captured, person):
@@ -89,7 +89,7 @@ def test_stops_and_returns_of_cameras_are_reported(captured):
     sources = summary["sources"]
     assert [one["dropped"] for one in sources.values()] == [1, 1 + len(GAP), 2]
     assert [one["what"] for one in sources["camera_1"]["changes"]] == ["stopped", "returned"]
-    assert not result.unreported or "could not be used" in result.unreported[0]
+    assert not result[2] or "could not be used" in result[2][0]
 
 
 def test_ctrl_c_keeps_all_frames(studio, person, tmp_path):
@@ -98,10 +98,10 @@ def test_ctrl_c_keeps_all_frames(studio, person, tmp_path):
             raise KeyboardInterrupt
 
     settings = LiveSettings(replay=False, fit_shape=False)
-    result = capture_live(
+    _, interrupted, _ = capture_live(
         load_live_scene(studio), tmp_path / "out", person.path, settings, on_frame=interrupt
     )
-    assert result.interrupted
+    assert interrupted
     assert len(rows_of(tmp_path / "out" / "poses.csv")) == 6
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["complete"]
     assert (tmp_path / "out" / "joint_centres.trc").is_file()
@@ -137,13 +137,13 @@ def test_shape_is_fitted_to_a_video_and_reused_from_its_result(person, tmp_path)
     poses = [standing(person, arm_deg=20.0 + 4.0 * k) for k in range(10)]
     write_studio(folder, person, poses, "videos", cameras=4)
     scene, first, second = load_live_scene(folder), tmp_path / "first", tmp_path / "second"
-    found = capture_live(scene, first, None, LiveSettings(replay=False)).estimate.summary
+    found = capture_live(scene, first, None, LiveSettings(replay=False))[0].summary
     assert found["found_count"] == 10
     assert found["mean_iou"] > 0.85
     assert len(found["lengths_m"]) > 5
-    again = capture_live(scene, second, None, LiveSettings(shape=first, replay=False))
-    assert again.estimate.summary["radius_scales"] == pytest.approx(found["radius_scales"])
-    assert again.estimate.summary["mean_iou"] > 0.85
+    again, _, _ = capture_live(scene, second, None, LiveSettings(shape=first, replay=False))
+    assert again.summary["radius_scales"] == pytest.approx(found["radius_scales"])
+    assert again.summary["mean_iou"] > 0.85
 
 
 def test_known_shape_is_used(person):

@@ -511,11 +511,8 @@ def _round_mesh(
 ) -> TriangleMesh:
     """Return a closed surface of revolution about z.
 
-    Args:
-        radii: (n,) ring radii [m], from the top down.
-        heights: (n,) ring heights [m], from the top down.
-        start_angle: angle [rad] of each ring's first vertex from x.
-        resolution: number of vertices of a ring.
+    ``radii``, ``heights``: (n,) of its rings, from the top down [m]. ``start_angle``: of each
+    ring's first vertex, from x [rad]. ``resolution``: number of vertices of a ring.
     """
     angle = start_angle + np.arange(resolution) * (2.0 * np.pi / resolution)
     level = np.broadcast_to(heights[:, None], (len(heights), resolution))

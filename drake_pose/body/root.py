@@ -302,12 +302,7 @@ class BasePose:
 
 
 def chain_jacobian(steps: Sequence[JointMap], values: Array) -> Array:
-    """Return the derivative (12, k) of the upper rows of a chain's end pose by its positions.
-
-    ``values``: (k,) positions [rad or m] of all joints, one joint after another.
-
-    Complex steps make it exact to rounding.
-    """
+    """Return the derivative (12, k) of a chain's end pose (upper rows) by positions, exactly."""
     step = 1e-30
     change = chain_transforms(steps, values + 1j * step * np.eye(len(values))).imag / step
     return np.asarray(change[:, :3].reshape(len(values), 12).T, dtype=np.float64)

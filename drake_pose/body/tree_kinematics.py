@@ -370,13 +370,10 @@ def link_vectors(tree: PoseTree, min_length: float = 1e-3) -> tuple[LinkVector, 
 def _offset(
     joint: Joint, inboard: Mapping[int, Joint], pose: Callable[[RigidBody], Array]
 ) -> Array:
-    """Return the vector (3,) [m] to a joint from the origin of the rigid part that carries it.
+    """Return the vector (3,) [m], in the plant's world, to a joint from its part's origin.
 
-    The vector is in the plant's world frame.
-
-    Args:
-        inboard: the joint that carries each body, by the index of the body.
-        pose: returns a body's pose (4, 4) in the plant's world.
+    ``inboard``: the joint that carries each body, by the body's index. ``pose``: returns a body's
+    pose (4, 4) in the plant's world.
     """
     link = first = joint.parent_body()
     while (joint_before := inboard.get(int(first.index()))) and joint_before.num_positions() == 0:

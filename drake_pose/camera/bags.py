@@ -404,12 +404,7 @@ def _read_camera(
 
 
 def _field(info: Any, name: str) -> Array:
-    """Return the numbers of a CameraInfo's field.
-
-    Args:
-        info: the CameraInfo message.
-        name: name of the field in lower case; ROS 1 has it in upper case.
-    """
+    """Return the numbers of a CameraInfo's field, given in lower case; ROS 1 has upper case."""
     return np.asarray(getattr(info, name, getattr(info, name.upper(), None)), dtype=np.float64)
 
 
@@ -491,16 +486,9 @@ class _TopicPictures:
 
 
 def _decode_file(message: Any, where: str) -> Picture:
-    """Return the image (H, W, 3) of a CompressedImage, red, green, blue.
+    """Return the image (H, W, 3), red, green, blue, of a CompressedImage, whatever its format says.
 
-    The file has its colours in the usual order, whatever the encodings in the message's format.
-
-    Args:
-        message: the message.
-        where: start of error messages.
-
-    Raises:
-        SceneError: it is damaged, or no PNG or JPEG.
+    ``where``: start of error messages. Raises SceneError: it is damaged, or no PNG or JPEG.
     """
     coding, _, rest = message.format.lower().partition(";")
     try:

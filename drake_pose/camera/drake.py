@@ -105,11 +105,7 @@ def _pinhole(
 ) -> PinholeCamera:
     """Return the camera with Drake's intrinsics, shifted by half a pixel to our convention.
 
-    Args:
-        name: name of the returned camera.
-        source: the intrinsics.
-        X_WC: (4, 4) pose of the camera in the world.
-        near: minimum visible depth [m].
+    ``X_WC``: (4, 4) its pose in the world. ``near``: minimum visible depth [m].
     """
     if isinstance(source, CameraInfo):
         size, center = (source.width(), source.height()), (source.center_x(), source.center_y())

@@ -77,13 +77,7 @@ def open_droid(path: Path, joints: JointLog | None) -> Episode:
 
 
 def _dataset(file: Any, name: str, where: Path) -> Array:
-    """Return the numbers of a table in an HDF5 file; SceneError if it is missing.
-
-    Args:
-        file: the open file (h5py.File).
-        name: path of the table in the file.
-        where: the file's path, for messages.
-    """
+    """Return the numbers of a table of an open HDF5 file; SceneError (``where``): it is missing."""
     found = file
     for part in name.split("/"):
         inside = [*found] if hasattr(found, "keys") else ["a table"]

@@ -46,11 +46,8 @@ class JointLog:
     def of_frames(self, frames: Iterable[str]) -> Array:
         """Return (k, m) positions of all joints in k frames; frames without a row give nan.
 
-        Args:
-            frames: names or numbers of the frames; 7, 7.0 and 0007 are the same.
-
-        Raises:
-            SceneError: the log has no frames.
+        ``frames``: names or numbers; 7, 7.0, 0007 are the same. Raises SceneError: the log has
+        none.
         """
         if not self.frames:
             raise SceneError("the joint log's rows have times, but no frames")

@@ -252,15 +252,8 @@ def read_sequence(path: Path, sequence: bool = False) -> tuple[bool, float | Non
 def add_calibration(camera: EpisodeCamera, calibration: CameraFile, path: Path) -> EpisodeCamera:
     """Return a recorded camera with its intrinsics, pose, link and lens of a camera file.
 
-    A camera without entry in the file is returned as it is.
-
-    Args:
-        camera: the recorded camera.
-        calibration: content of the camera file.
-        path: the camera file, for messages.
-
-    Raises:
-        CameraError: the calibration does not fit the images.
+    A camera without entry in the file is returned as it is. ``path``: the file, for messages.
+    Raises CameraError: the calibration does not fit the images.
     """
     found, where = calibration.cameras.get(camera.name), f"{path}: camera '{camera.name}'"
     if found is None:

@@ -214,14 +214,8 @@ def _match(
 ) -> tuple[dict[str, str], list[str]]:
     """Match columns to joints by `match_names`, or by the order of LeRobot's arms.
 
-    If no column matches, a last column that can be a gripper's opening is left out.
-
-    Args:
-        readings: (n,) readings by column.
-        wanted: names of the joints.
-
-    Returns:
-        the joint of each matched column, and warnings.
+    If no column matches, a last column that can be a gripper's opening is left out. ``readings``:
+    (n,) by column. Returns the joint of each matched column, and warnings.
     """
     matched, warnings = match_names([*readings], wanted)
     *series, last = readings or ("",)
@@ -260,12 +254,8 @@ def _servo_joints(
 ) -> list[ServoJoint]:
     """Return the matched joints that servos may move: revolute joints, and joints of grippers.
 
-    Args:
-        matched: joint by column.
-        readings: (n,) readings by column.
-        limits: lower and upper limit by joint [rad or m].
-        angular: names of the revolute joints.
-        servos: the robot's motors.
+    ``matched``: joint by column. ``readings``: (n,) by column. ``limits``: lower and upper limit by
+    joint [rad or m]. ``angular``: names of the revolute joints.
     """
     motors = match_names([*readings], [*servos.motors])[0] if servos.motors else {}
     return [
@@ -565,16 +555,7 @@ def _read_column(joint: str, entry: Any, where: str) -> Column:
 
 
 def _pair(value: Any, field: str, where: str) -> tuple[float, float]:
-    """Return a file's list of two different numbers.
-
-    Args:
-        value: the list, not yet checked.
-        field: name of its field.
-        where: start of error messages.
-
-    Raises:
-        CameraError: the value is another.
-    """
+    """Return a file's list of two different numbers; CameraError (``where``): it is none."""
     low, high = value if isinstance(value, list) and len(value) == 2 else (0.0, 0.0)
     low, high = (check_number(one, field, where) for one in (low, high))
     if low == high:

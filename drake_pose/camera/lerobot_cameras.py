@@ -19,11 +19,7 @@ def camera_fields(camera: PinholeCamera, link: str | None = None) -> dict[str, A
     """Return the fields of a camera for its feature's `info`.
 
     camera_intrinsics is the camera matrix [pixel], pixel centres at integers; camera_extrinsics is
-    X_WC (4 x 4), the camera's pose (x right, y down, z forward) in the robot's base [m].
-
-    Args:
-        camera: the camera.
-        link: the link in whose frame its pose is; None: the base.
+    X_WC (4 x 4) [m], x right, y down, z forward, in the robot's base or in ``link``.
     """
     fx, fy, cx, cy = camera.focal_x, camera.focal_y, camera.center_x, camera.center_y
     return {

@@ -190,12 +190,7 @@ def column_names(keys: Sequence[str], widths: Iterable[int], features: Features)
     """Return unique names of the numbers of several features.
 
     A name that occurs in several features begins with its feature's key, and one that still occurs
-    twice ends with its index.
-
-    Args:
-        keys: the features.
-        widths: number of numbers of each feature in a row of the table.
-        features: all features.
+    twice ends with its index. ``widths``: each feature's count of numbers in a row.
     """
     parts = [
         feature_names(key, {**features[key], "shape": [width]})

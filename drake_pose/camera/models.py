@@ -19,12 +19,7 @@ LARGEST_SIDE = 16384
 
 
 def check_side(value: Any, field: str, where: str) -> int:
-    """Return a width or height as an int from 1 to LARGEST_SIDE [pixel], or raise CameraError.
-
-    Args:
-        value: the side, not yet checked.
-        field, where: field and start of the error message.
-    """
+    """Return a side as int from 1 to LARGEST_SIDE [pixel]; CameraError (``where``) otherwise."""
     number = check_number(value, field, where)
     if number != math.floor(number) or not 1 <= number <= LARGEST_SIDE:
         raise CameraError(

@@ -61,15 +61,9 @@ def read_picture(path: Path, error_type: type[DrakePoseError]) -> Picture:
 
 
 def decode_colours(data: bytes, path: Path, error_type: type[DrakePoseError]) -> Picture:
-    """Return an image (H, W, 3) red, green, blue from the content of a PNG or JPEG file.
+    """Return an image (H, W, 3) red, green, blue from the ``data`` of a PNG or JPEG file.
 
-    Args:
-        data: content of the file.
-        path: the file, for messages.
-        error_type: class of the exceptions.
-
-    Raises:
-        error_type: the content is invalid; the message names the file.
+    Raises ``error_type``, which names the file at ``path``: the content is invalid.
     """
     picture = _decode(data, cv2.IMREAD_COLOR, path, error_type)
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
@@ -79,10 +73,7 @@ def picture_size(path: Path, error_type: type[DrakePoseError]) -> tuple[int, int
     """Return width and height [pixel] of a PNG or JPEG image, without decoding its pixels.
 
     The file is as whole as `read_picture` asks. None: a check needs the pixels, or the file's EXIF
-    data may turn the image.
-
-    Raises:
-        error_type: the file is unreadable; the message names it.
+    data may turn the image. Raises ``error_type``, which names the file: it is unreadable.
     """
     data = _read(path, error_type)
     size = _require_whole(data, path, error_type)
@@ -185,11 +176,8 @@ def find_pictures(folder: Path, camera: str) -> dict[str, Path]:
 def find_recorded_files(folder: Path, camera: str) -> dict[str, Path] | Path | None:
     """Return a camera's images in a recording's folder: files by frame, a video's path, or None.
 
-    These are the files in images/<camera>, if there is such a folder, or else
-    videos/<camera>.mp4 or another video suffix, or else None.
-
-    Raises:
-        SceneError: a frame occurs twice.
+    These are the files in images/<camera>, or else videos/<camera>.mp4 or another video suffix.
+    Raises SceneError: a frame occurs twice.
     """
     if (own := folder / "images" / camera).is_dir():
         return list_pictures(own, SceneError)
@@ -200,15 +188,8 @@ def find_recorded_files(folder: Path, camera: str) -> dict[str, Path] | Path | N
 def threshold_mask(picture: Picture, where: str, error_type: type[DrakePoseError]) -> Mask:
     """Return the mask (H, W) of the pixels with grey values of 128 or more.
 
-    The image is a lossily compressed mask, so its values are only near black and white.
-
-    Args:
-        picture: (H, W) grey values, or (H, W, 3) colours.
-        where: start of the error message.
-        error_type: class of the exception.
-
-    Raises:
-        error_type: more than a tenth of the grey values are between 64 and 192.
+    ``picture``: (H, W) grey values or (H, W, 3) colours of a lossily compressed mask. Raises
+    ``error_type``, begun by ``where``: over a tenth of the grey values are between 64 and 192.
     """
     grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     between = float(((grey > 64) & (grey < 192)).mean())
@@ -294,13 +275,8 @@ def _require_whole(
 def upper_bits(picture: Any, where: str, error_type: type[DrakePoseError]) -> Picture:
     """Return the upper 8 bits of an image's 16-bit values, in the same shape.
 
-    Args:
-        picture: array of uint16 values, of any shape.
-        where: start of the error message.
-        error_type: class of the exception.
-
-    Raises:
-        error_type: the values use fewer than 13 bits, so that the result would be black.
+    Raises ``error_type``, begun by ``where``: the values use fewer than 13 bits, so that the result
+    would be black.
     """
     brightest = int(picture.max())
     if 0 < brightest < 1 << 12:
@@ -312,15 +288,7 @@ def upper_bits(picture: Any, where: str, error_type: type[DrakePoseError]) -> Pi
 
 
 def import_reader(library: str, path: Path) -> Any:
-    """Return the imported module of a library of the extra `episodes`.
-
-    Args:
-        library: name of the module.
-        path: file that needs it, for the message.
-
-    Raises:
-        SceneError: the library is not installed.
-    """
+    """Import a library of the extra `episodes` for a file; SceneError: it is not installed."""
     try:
         return import_module(library)
     except ImportError as error:

@@ -467,13 +467,7 @@ def correct_homing(
 
 
 def dump_column(joint: str, column: Column, offset: float) -> str:
-    """Return a joint's line of a joint map [rad or m].
-
-    Args:
-        joint: name of the joint.
-        column: its column.
-        offset: added to its positions [rad or m].
-    """
+    """Return a joint's line of a joint map, ``offset`` added to its positions [rad or m]."""
     scale, constant = float(column.scale), float(column.offset + offset)
     name = json.dumps(column.name)
     if column.ends is None:

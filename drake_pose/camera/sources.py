@@ -89,14 +89,9 @@ class SourceSpecification:
         return self.background is None
 
     def convert(self, picture: Picture, where: str) -> Picture | Mask:
-        """Return an image, or its bright pixels (H, W) if the source provides masks.
+        """Return an image (H, W, 3), or its bright pixels (H, W) if the source provides masks.
 
-        Args:
-            picture: (H, W, 3) image.
-            where: start of the error message.
-
-        Raises:
-            SceneError: the image should be a mask and is not.
+        Raises SceneError, begun by ``where``: the image should be a mask and is not.
         """
         return threshold_mask(picture, where, SceneError) if self.gives_masks else picture
 
@@ -511,15 +506,10 @@ def load_sources(
 
 
 def open_source(specification: SourceSpecification, clock: Clock = time.monotonic) -> FrameSource:
-    """Open a camera's source of images.
+    """Open a camera's source of images; ``clock`` gives a live camera's time stamps [s].
 
-    Args:
-        specification: the source.
-        clock: returns the time [s], from which a live camera's images get their time stamps.
-
-    Raises:
-        SceneError: a folder or video is unreadable, empty, or has images of another size than the
-            calibrated one. A live camera does not raise; opening it is retried.
+    Raises SceneError: a folder or video is unreadable, empty, or has images of another size than
+    the calibrated one. A live camera does not raise; opening it is retried.
     """
     if specification.live:
         return DeviceSource(specification, clock)

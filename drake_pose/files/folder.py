@@ -35,13 +35,7 @@ RESULT_FILES = (
 def write_file(folder: Path, name: str, content: bytes | str) -> None:
     """Write bytes or text (UTF-8) atomically to a file; missing folders are created.
 
-    Args:
-        folder: the result folder.
-        name: path of the file relative to ``folder``.
-        content: content of the whole file.
-
-    Raises:
-        OutputError: the file cannot be written.
+    ``name``: its path relative to ``folder``. Raises OutputError: the file cannot be written.
     """
     path = folder / name
     temporary = path.with_name(path.name + ".part")

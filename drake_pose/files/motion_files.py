@@ -94,13 +94,10 @@ def write_motion(
 def joint_centres(
     model: ArticulatedModel, landmarks: Mapping[str, Landmark], q: Array, X_WB: Array | None = None
 ) -> Array:
-    """Return the positions (frames, n, 3) of landmarks in the scene's world [m]; nan where q is.
+    """Return landmark positions (frames, n, 3) in the scene's world [m]; nan where q is.
 
-    Args:
-        model: the model of the positions.
-        landmarks: (n,) landmarks by name.
-        q: (frames, nq) positions [rad or m].
-        X_WB: (frames, 4, 4) poses of the plant's world in the scene's world; None: identity.
+    ``landmarks``: n by name. ``q``: (frames, nq) [rad or m]. ``X_WB``: (frames, 4, 4) poses of the
+    plant's world in the scene's; None: identity.
     """
     places = np.full((len(q), len(landmarks), 3), np.nan)
     for k in np.flatnonzero(np.isfinite(q).all(axis=1)):
@@ -112,10 +109,7 @@ def joint_centres(
 def centres_as_csv(frames: Sequence[str], names: Sequence[str], places: Array) -> str:
     """Return the text of joint_centres.csv: a row for each frame and joint, in the order given.
 
-    Args:
-        frames: names of the frames.
-        names: (joints,) names of the joints.
-        places: (frames, joints, 3) positions [m]; frames with a nan are left out.
+    ``places``: (frames, joints, 3) [m]; frames with a nan are left out.
     """
     cells = [
         [frame, name, *(f"{number:.4f}" for number in place)]

@@ -147,11 +147,8 @@ def _draw_borders(
 ) -> None:
     """Colour the body's pixels whose right or lower neighbour is another segment of the body.
 
-    Args:
-        picture: (H, W, 3) RGB, or (H, W) indices into PALETTE; changed in place.
-        body: (H, W) bool.
-        segments: (H, W) int, index of the segment at each pixel; None: nothing is drawn.
-        colour: RGB, or index into PALETTE.
+    ``picture``: (H, W, 3) RGB or (H, W) indices of PALETTE, as ``colour``; changed in place.
+    ``segments``: (H, W) index of the segment at each pixel; None: nothing is drawn.
     """
     if segments is None:
         return

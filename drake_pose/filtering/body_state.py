@@ -228,11 +228,7 @@ class BodyState:
     def turned(self, x: Array, rotation: Array) -> Array:
         """Return the state x (n,) with the root rotated about its own origin.
 
-        Args:
-            rotation: (3, 3) rotation matrix, applied in the world frame.
-
-        Raises:
-            SettingsError: the tree's root does not turn freely.
+        ``rotation``: (3, 3) in the world. Raises SettingsError: the root does not turn freely.
         """
         placed = self.tree.placements[0]
         if placed.rotation is None or not self.tree.turns_root_freely:

@@ -196,13 +196,8 @@ def warn_if_unlimited(inequalities: Inequalities, where: str) -> Inequalities:
 def row_from_terms(columns: Sequence[str], terms: Mapping[str, float], where: str) -> NDArray:
     """Return the coefficients (n,) of an inequality; elements without a term have 0.
 
-    Args:
-        columns: (n) names of the elements.
-        terms: coefficients by name of an element.
-        where: place in a file, for messages.
-
-    Raises:
-        UnknownNameError: a name is not among the columns.
+    ``terms``: coefficients by name of an element. Raises UnknownNameError, with ``where`` for the
+    place: a name is not among the columns.
     """
     row = np.zeros(len(columns))
     for name, factor in terms.items():
@@ -357,12 +352,8 @@ def load_couplings(path: Path | str, columns: Sequence[str]) -> Inequalities:
 def _difference(one: Difference, file: str) -> tuple[str, GeneralRow]:
     """Return the place of a difference for messages, and the difference as a general row.
 
-    Args:
-        one: the entry of ``differences``.
-        file: begins the place: the file and ": ".
-
-    Raises:
-        ModelError: both joints are the same, or ``within`` is given with ``lower`` or ``upper``.
+    The place begins with ``file``. Raises ModelError: both joints are the same, or ``within`` is
+    given with ``lower`` or ``upper``.
     """
     name = f"{one.first} - {one.second}"
     where = f"{file}'{name}'"

@@ -45,16 +45,10 @@ class TrackerState:
 def make_tracker(
     tree: PoseTree, cameras: Sequence[Camera], period: float, settings: TrackingSettings
 ) -> ContourTracker:
-    """Return a tracker of a pose tree's contour.
+    """Return a tracker of a pose tree's contour; ``period``: time between two frames [s].
 
-    Args:
-        tree: the body.
-        cameras: the cameras whose masks or pictures are given in each frame.
-        period: time between two frames [s].
-
-    Raises:
-        SettingsError: there is no camera, the period is not positive, or the tree has no free
-            value.
+    Raises SettingsError: there is no camera, the period is not positive, or the tree has no free
+    value.
     """
     prior_weight = 0.0 if settings.rest_time is None else period / settings.rest_time
     observation = ContourObservation(
@@ -294,12 +288,7 @@ class MatchAndTrack:
     def _follow(
         self, track: Track, frame: _GivenFrame, first: bool, ignore_evidence: bool = False
     ) -> Track:
-        """Return the track after a frame.
-
-        Args:
-            first: whether the track starts in this frame.
-            ignore_evidence: whether the track is only predicted.
-        """
+        """Return the track after a frame; ``first``: it begins; ``ignore_evidence``: predict."""
         if ignore_evidence:
             masks = [None] * len(frame.masks)
             return self.tracker.follow(track, masks, first, frame.root_position)
@@ -318,10 +307,7 @@ class MatchAndTrack:
     ) -> bool:
         """Return whether evidence is missing, the track left the contour, or E_total is high.
 
-        Args:
-            track: the track after the frame.
-            result: its pose.
-            reference: E_total after the last match.
+        ``reference``: E_total after the last match.
         """
         explains = not frame.views or result.E_total <= self._limit(reference)
         return frame.has_no_evidence or track.lost or not explains

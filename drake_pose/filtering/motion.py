@@ -154,10 +154,7 @@ def require_models(layout: StateLayout, observation: object, motion: object) -> 
 def step_from(motion: MotionModel, belief: Belief, over_belief: bool) -> Linear:
     """Return a step linearised at a belief's mean, or over the belief (``linearise_over``).
 
-    Args:
-        motion: the motion; a ``LinearMotion`` is returned as it is.
-        belief: where to linearise.
-        over_belief: whether to linearise over the belief instead of at its mean.
+    A ``LinearMotion`` is returned as it is.
     """
     if isinstance(motion, LinearMotion):
         nothing = np.zeros(len(belief.mean))

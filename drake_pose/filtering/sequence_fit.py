@@ -94,12 +94,7 @@ class TrackedStart:
 def tilted(observation: ContourObservation, x: Array, tilt: Sequence[float]) -> Array:
     """Return a state x (n,) with its root rotated about the x and y axes of the first camera.
 
-    Args:
-        observation: the body and the cameras.
-        tilt: x and y of the rotation vector in the camera's frame [rad].
-
-    Raises:
-        SettingsError: the tree's root does not turn freely.
+    ``tilt``: x and y of the rotation vector [rad]. SettingsError: the root does not turn freely.
     """
     R_WC = observation.cameras[0].X_WC[:3, :3]
     turn = Rotation.from_rotvec(R_WC @ np.array([tilt[0], tilt[1], 0.0])).as_matrix()

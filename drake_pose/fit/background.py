@@ -107,14 +107,7 @@ def estimate_gain(picture: Picture | Floats, reference: Floats, rounds: int = 4)
 
 
 def apply_gain(picture: Picture | Floats, gain: Floats) -> Floats:
-    """Return an image (H, W, 3) as float32 with a photometric gain (3, 4) applied.
-
-    Values may leave the range 0 to 255.
-
-    Args:
-        picture: (H, W, 3) image.
-        gain: (3, 4) slopes and offsets, see ``estimate_gain``.
-    """
+    """Return an image (H, W, 3) as float32 with a gain (3, 4) of ``estimate_gain``; not clipped."""
     return np.asarray(cv2.transform(picture.astype(np.float32), gain))
 
 
@@ -193,11 +186,8 @@ class Backgrounds:
     def contour_terms(self, size: float, weight: float) -> tuple[float, float]:
         """Return a length that is added to the outlines', and the weight of their mean edges.
 
-        The length limits the score of short outlines, whose edges are strong by chance.
-
-        Args:
-            size: number of frames times their width [pixel].
-            weight: of the mean edge along the outlines, beside the explained fraction.
+        The length limits the score of short outlines, whose edges are strong by chance. ``size``:
+        frames times their width [pixel]. ``weight``: beside the explained fraction.
         """
         return 0.3 * size, weight
 
@@ -214,12 +204,10 @@ class Backgrounds:
         return counts
 
     def known(self, pictures: Sequence[Picture], covered: Mask, small: Mask) -> "KnownBackground":
-        """Return the background behind the body.
+        """Return the background behind the body in images (H, W, 3) of the same f frames.
 
-        Args:
-            pictures: images (H, W, 3) of the same f frames at any size.
-            covered, small: (f, H, W) and (f, h, w) approximate silhouettes of the body at that
-                size, and at the size of these images.
+        ``covered``, ``small``: (f, H, W) and (f, h, w) approximate silhouettes at that size, and at
+        the size of these images.
         """
         return KnownBackground.estimate(pictures, self.gains, self.shows_background(small), covered)
 
@@ -230,11 +218,8 @@ class Backgrounds:
     def shows_background(self, covered: Mask) -> Mask:
         """Return (f, H, W) whether a frame shows the likeliest background of a pixel.
 
-        The colour must be within MODEL.match_deviations standard deviations of that background's,
-        and the pixel more than MODEL.margin from the body.
-
-        Args:
-            covered: (f, H, W) approximate silhouettes of the body.
+        The colour must be within MODEL.match_deviations of that background's, and the pixel more
+        than MODEL.margin from the approximate silhouettes ``covered`` (f, H, W).
         """
         sums, shows = self.sums, np.empty(covered.shape, np.bool_)
         _compare_likeliest(
@@ -472,13 +457,9 @@ def colour_slopes(picture: Floats) -> tuple[Floats, Floats]:
 
 
 def colour_deviations(picture: Floats, noise: float) -> Floats:
-    """Return (H, W) standard deviations of a background's colours [of 255].
+    """Return (H, W) standard deviations of a background's colours (H, W, 3) [of 255].
 
     They combine the noise, at least MODEL.min_noise, and shake, in proportion to the gradient.
-
-    Args:
-        picture: (H, W, 3) the background.
-        noise: standard deviation of the noise [of 255].
     """
     gradient = largest(np.hypot(*colour_slopes(picture)))
     white = max(MODEL.min_noise, noise)

@@ -123,11 +123,8 @@ class PartColours:
     ) -> "PartColours":
         """Learn the colours of parts.
 
-        Args:
-            histograms: (nodes, 3, COLOURS) histograms of each camera, in rows by ``Colour``.
-            outlines: surface of each node.
-            X_WN: (nodes, 4, 4) known poses of the nodes.
-            views: cameras, and an image (H, W, 3) of each at this pose.
+        ``histograms``: (nodes, 3, COLOURS) of each camera, rows by ``Colour``. ``X_WN``: (nodes, 4,
+        4) known poses. ``views``: cameras, and an image (H, W, 3) of each.
         """
         # A characteristic colour covers at least this fraction of the part's pixels.
         is_own = np.any([one[:, Colour.ON] > 4e-4 for one in histograms], axis=0)
@@ -140,12 +137,7 @@ class PartColours:
         """Return (nodes,) fraction of pixels with own colours, over the usual fraction.
 
         The values are divided by their median, because illumination changes affect all parts. They
-        are nan for parts that are occluded here or were when learnt.
-
-        Args:
-            outlines: surface of each node.
-            X_WN: (nodes, 4, 4) estimated poses of the nodes.
-            views: cameras, and an image (H, W, 3) of each.
+        are nan for parts that are occluded here or were when learnt. Arguments as of ``learn``.
         """
         fractions = self._fractions(outlines, X_WN, views) / self.usual_fractions
         return np.asarray(fractions / max(float(np.nanmedian([*fractions, 1.0])), 1e-9))
@@ -155,12 +147,7 @@ class PartColours:
     ) -> Array:
         """Return (nodes,) fraction of each part's pixels with own colours in all views.
 
-        It is nan for parts with fewer than 100 visible pixels.
-
-        Args:
-            outlines: surface of each node.
-            X_WN: (nodes, 4, 4) poses of the nodes.
-            views: cameras, and an image (H, W, 3) of each.
+        It is nan for parts with fewer than 100 visible pixels. Arguments as of ``learn``.
         """
         counts = np.zeros((2, len(outlines)))
         for camera, picture in views:

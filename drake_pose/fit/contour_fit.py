@@ -219,10 +219,7 @@ class ContourFit:
     def compare(self, views: Views, theta: Array, stage: AnnealingStage) -> Comparison:
         """Compare the contours with all cameras' edges at theta and the scale of a stage.
 
-        Args:
-            views: the cameras and edges.
-            theta: (m,) tree values, or (n,) all parameters of the body.
-            stage: scale and spacing [``pixels`` or m].
+        ``theta``: (m,) tree values, or (n,) all parameters. ``stage``: in ``pixels`` or m.
         """
         placement = self.body.place(theta)
         return compare_views(views, placement, self.weights(views.cameras, placement, stage))
@@ -230,11 +227,7 @@ class ContourFit:
     def tile_costs(self, views: Views, theta: Array, stage: AnnealingStage, side: float) -> Array:
         """Return the cost (cameras, 64, 64) in image tiles at theta (m,) or (n,), without prior.
 
-        Args:
-            views: the cameras and edges.
-            theta: (m,) tree values, or (n,) all parameters of the body.
-            stage: scale and spacing [``pixels`` or m].
-            side: side of a tile [pixel]; indices (row, column) of tiles are taken modulo 64.
+        ``stage``: in ``pixels`` or m. ``side``: of a tile [pixel]; indices are taken modulo 64.
         """
         placement = self.body.place(theta)
         weights = self.weights(views.cameras, placement, stage)
@@ -246,10 +239,7 @@ class ContourFit:
     ) -> Array:
         """Return (c, 4) weights of cameras by ``camera_weights``, with this fit's noise and unit.
 
-        Args:
-            cameras: X_CW (c, 4, 4) and kernel parameters (c, 8).
-            placement: the body, whose root gives the unit of length if ``pixels`` is None.
-            stage: scale and spacing [``pixels`` or m].
+        ``cameras``: X_CW (c, 4, 4) and kernel parameters (c, 8). ``stage``: in ``pixels`` or m.
         """
         return camera_weights(cameras, placement, stage, self.noise, self._pixels)
 
@@ -259,11 +249,8 @@ def compare_views(
 ) -> Comparison:
     """Compare a placed body's contours with all cameras' edges.
 
-    Args:
-        views: c cameras and their silhouettes' edges.
-        placement: the body at a pose.
-        weights: (c, 4) scale, spacing and weights of the cameras, see ``camera_weights``.
-        with_bias: compute derivatives by the silhouettes' boundary bias; else they are 0.
+    ``weights``: (c, 4), see ``camera_weights``. ``with_bias``: compute derivatives by the boundary
+    bias; else they are 0.
     """
     placed = placement.packed, placement.X_WN
     A, b, sums, _, bias_terms = compare_contours(*placed, *views, weights, 0, 1.0, with_bias)
@@ -301,12 +288,7 @@ def camera_weights(
 
 
 def normal_equations(compared: Comparison, size: int) -> tuple[Array, Array]:
-    """Return H (size, size) and g (size,) of H dx = -g for a step dx of the body's parameters.
-
-    Args:
-        compared: comparison; its cameras are summed.
-        size: number of parameters, at least those of its placement.
-    """
+    """Return H (size, size), g (size,) of H dx = -g for the body's parameters, over cameras."""
     A, b = compared.A.sum(axis=0), compared.b.sum(axis=0)
     return assemble_normal_equations(A, b, *compared.placement[2:], size)
 

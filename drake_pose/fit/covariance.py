@@ -416,11 +416,7 @@ def score_nuisances(residuals: Distances, sizes: ErrorSizes) -> tuple[Array, Arr
     """Return estimates (k,) and standard deviations (k,) of all groups' nuisance parameters.
 
     Each is estimated beside the values as if all others were 0 (score test, Rao 1948) [unit of its
-    group]. Without nuisances, k is 0.
-
-    Args:
-        residuals: the residuals, whose groups of nuisances are taken one after the other.
-        sizes: sizes of the errors; those of nuisances are ignored.
+    group]. Without nuisances, k is 0; sizes of nuisances are ignored.
     """
     if not residuals.nuisances:
         return np.zeros(0), np.zeros(0)
@@ -441,11 +437,7 @@ def vuong_statistic(tiles: Array, others: Array) -> float:
     """Return the difference of two costs in its standard deviations (Vuong's test, 1989).
 
     The scatter of the differences between tiles gives the standard deviation of their sum. Evidence
-    that no pose explains contributes equally to both costs and cancels.
-
-    Args:
-        tiles, others: first and second cost in the same image tiles, of equal shape. The result is
-            positive if the first one is larger.
+    that no pose explains cancels. Positive: ``tiles`` has the larger cost.
     """
     more = tiles - others
     return float(more.sum() / max(np.sqrt(float((more**2).sum())), 1e-9))

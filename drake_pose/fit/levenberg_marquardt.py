@@ -81,12 +81,7 @@ class LinearPrior:
     information: Array  # (k,) inverse variances.
 
     def augment(self, equations: Equations, own: Array) -> Equations:
-        """Return equations with the prior's gradient and cost added; H stays, see ``curvature``.
-
-        Args:
-            equations: equations of all frames at ``own``.
-            own: (frames, p) own unknowns.
-        """
+        """Return equations at ``own`` (frames, p) with the prior's gradient and cost; H stays."""
         residual = self.rows @ own.ravel() - self.mean
         g = equations.g.copy()
         g[:, : own.shape[1]] += (self.rows.T @ (self.information * residual)).reshape(own.shape)

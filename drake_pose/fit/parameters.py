@@ -337,12 +337,7 @@ def owners_of(moves: NDArray[np.bool_], parameters: Indices) -> tuple[Indices, I
 
 
 def scale_surfaces(packed: PackedOutlines, scale: Array) -> PackedOutlines:
-    """Return packed surfaces scaled about the origins of their nodes' frames.
-
-    Args:
-        packed: surfaces of the nodes; they stay unchanged.
-        scale: (nodes, 3) factors along the axes of each node's frame.
-    """
+    """Return packed surfaces scaled by (nodes, 3) along the axes of their nodes' frames."""
     points, planes = packed.points.copy(), packed.planes.copy()
     for node, (s, volume) in enumerate(zip(scale, scale.prod(axis=1), strict=True)):
         points[:, slice(*packed.starts[node : node + 2, 0])] *= s[:, None]

@@ -263,12 +263,7 @@ class Problem:
         return self._equations(observations, at, expected or at, stage, None)[0]
 
     def parameters(self, observations: Sequence[Observation], own: Array, shared: Array) -> Array:
-        """Return (frames, n) all parameters: the known values plus the unknowns.
-
-        Args:
-            observations: the frames; only their known values are used.
-            own, shared: (frames, p) and (q,) unknowns.
-        """
+        """Return (frames, n) known values plus unknowns, own (frames, p) and shared (q,)."""
         theta = np.zeros((len(observations), self._count))
         for row, one in zip(theta, observations, strict=True):
             row[: len(one.values)] = one.values
@@ -403,16 +398,10 @@ class Problem:
     def tile_costs(
         self, frame: Observation, theta: Array, stage: AnnealingStage, side: float
     ) -> Array:
-        """Return the cost of a frame's silhouettes in square tiles of the images.
+        """Return costs (cameras, 64, 64) of a frame's silhouettes in image tiles at theta (n,).
 
-        Args:
-            frame: evidence of the frame.
-            theta: (n,) all parameters of the frame.
-            stage: scale of the residuals.
-            side: side of a tile [pixel]; indices (row, column) of tiles are taken modulo 64.
-
-        Returns:
-            (cameras, 64, 64) costs without priors and foreground images.
+        They are without priors and foreground images. ``side``: of a tile [pixel]; indices are
+        taken modulo 64.
         """
         views = self._views(frame, theta)
         return self._contours.tile_costs(
@@ -420,15 +409,10 @@ class Problem:
         )
 
     def _body_parameters(self, theta: Array, rates: Array | None) -> Array:
-        """Return the body's parameters, with the tree's values moved on by the time offset.
+        """Return the body's parameters (k,), the tree's values moved on by the time offset.
 
-        Args:
-            theta: (n,) all parameters of a frame.
-            rates: (m,) velocities of the tree's values; None: no motion.
-
-        Returns:
-            (k,) the body's parameters, or only the tree's values (m,) if all others are known and
-            0.
+        ``theta``: (n,) all parameters. ``rates``: (m,) velocities; None: no motion. If all but the
+        tree's values (m,) are known and 0, only these are returned.
         """
         own = theta[: len(self.body.names)]
         if rates is not None:
@@ -437,12 +421,7 @@ class Problem:
         return own[: self._values] if self._values_only and not own[self._values :].any() else own
 
     def _views(self, frame: Observation, theta: Array) -> Views:
-        """Return the cameras, and a frame's edges moved inwards by the boundary biases.
-
-        Args:
-            frame: evidence of the frame.
-            theta: (n,) all parameters of the frame.
-        """
+        """Return cameras at theta (n,), and a frame's edges moved inwards by boundary biases."""
         biases = theta[self._first_bias :]
         edges = offset_edges(frame.edges, -biases) if biases.any() else frame.edges
         return Views(self.place_cameras(theta)[:2], edges)

@@ -163,13 +163,7 @@ class ProportionedBody(BodyParameters):
         )
 
     def relative_joint_shifts(self, theta: Array) -> Array:
-        """Return (nodes,) shift of each part's joint along the part [part's length].
-
-        It is 0 for joints that do not move.
-
-        Args:
-            theta: (n,) all parameters.
-        """
+        """Return (nodes,) shift of parts' joints along the part [its length], 0 if not moved."""
         joint_shifts = np.zeros(len(self.limbs))
         joint_shifts[self.movable] = theta[len(self.names) - len(self.movable) : len(self.names)]
         return joint_shifts

@@ -118,10 +118,7 @@ def _simplify(outline: Outline, count: int) -> Outline:
 def _simplify_cached(vertices: bytes, triangles: bytes, count: int) -> Outline:
     """Return the simplified surface, cached in the process and on disk.
 
-    Args:
-        vertices: bytes of (v, 3) float64 [m].
-        triangles: bytes of (t, 3) int32.
-        count: number of triangles to reach.
+    The bytes are of (v, 3) float64 vertices [m] and (t, 3) int32 triangles.
     """
     # The simplification does not need the edges.
     outline = Outline(
@@ -169,10 +166,8 @@ def _simplify_uncached(outline: Outline, count: int) -> Outline:
 def collapse_edges(outline: Outline, count: int, unit: float = 1.0) -> Outline:
     """Return a surface simplified by edge collapses (quadric error metric, Garland and Heckbert).
 
-    Args:
-        outline: the surface; it stays if it has no more than ``count`` triangles.
-        count: number of triangles to reach; slivers and holes may leave more.
-        unit: unit of length in which the simplifier works [m].
+    It stays if it has at most ``count`` triangles; slivers and holes may leave more. ``unit``: unit
+    of length in which the simplifier works [m].
     """
     if len(outline.triangles) <= count:
         return outline

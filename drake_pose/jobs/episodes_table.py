@@ -104,11 +104,9 @@ def episodes_table(
 def _shared_pose(
     one: FoundCamera, poses: Sequence["_CombinedPose"], last: "_CombinedPose | None"
 ) -> tuple["_CombinedPose | None", float | None]:
-    """Return the pose that a camera shares, and the p-value of its distance; None: a new one.
+    """Return the pose that a camera shares, and its distance's p-value; None: a new one.
 
-    Args:
-        poses: its poses in earlier episodes.
-        last: the pose in the episode before; None: this is the first.
+    ``poses``: its poses in earlier episodes. ``last``: the previous episode's, if any.
     """
     if last is None:
         return None, None

@@ -58,12 +58,9 @@ class Source:
         return (1.0 / float(np.median(steps)) if len(steps) else None), self.episode.warnings
 
     def times(self) -> dict[str, float]:
-        """Return the time [s] of each frame, by name; nan where unknown.
+        """Return the time [s] of each frame by name, that of its first camera; nan: unknown.
 
-        It is that of the first camera with the frame.
-
-        Raises:
-            SceneError: a file is unreadable.
+        Raises SceneError: a file is unreadable.
         """
         scene, found = self.path / SCENE_FILE, dict[str, float]()
         for name in (*self.pictures, *self.videos):
@@ -101,15 +98,10 @@ class Source:
                 yield f"{number:06d}", f"{self.videos[camera]}: frame {number:06d}", picture
 
     def check_size(self, camera: str, shape: tuple[int, ...], where: str) -> None:
-        """Raise a SceneError if a picture differs in size from its camera's calibration.
+        """Raise SceneError if a picture's size is not its camera's, or that of its first picture.
 
-        Without calibration its size must be that of the camera's first picture. Pictures of a
-        camera without a name may have any size.
-
-        Args:
-            camera: the camera's name.
-            shape: (height, width, ...) of the picture.
-            where: the picture's origin, for messages.
+        Pictures of a camera without a name may have any size. ``shape``: (height, width, ...).
+        ``where``: the picture's origin, for messages.
         """
         own = None if self.cameras is None else self.cameras.cameras[camera]
         size, whose = shape[:2], f"camera '{camera}' had before"

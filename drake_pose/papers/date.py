@@ -306,13 +306,7 @@ def run_experiment(
 def _table_of_motions(
     title: str, rows: Mapping[str, Mapping[str, float]], headings: Mapping[str, str], form: str
 ) -> Table:
-    """Tabulate figures: a row per motion, a column per figure.
-
-    Args:
-        rows: figures by motion.
-        headings: heading of each figure's column, by the figure's key.
-        form: format of all figures.
-    """
+    """Tabulate figures: a row per motion, a column per figure with its heading, in a ``form``."""
     columns = {
         heading: {motion: figures[key] for motion, figures in rows.items()}
         for key, heading in headings.items()

@@ -362,14 +362,9 @@ def sequence_table(results: Sequence[SequenceResult]) -> Table:
 
 
 def experiment_settings(truncation: str, iterations: int | None = None) -> FilterSettings:
-    """Return the settings of the hand's filter, which linearises by iterated tangents.
+    """Return the hand filter's settings with iterated tangents; ``iterations`` None: 20.
 
-    Args:
-        truncation: "joint", "sequential", "clip" or "none".
-        iterations: largest number of linearisations per update; None: 20.
-
-    Raises:
-        SettingsError: another value.
+    ``truncation``: "joint", "sequential", "clip" or "none". Raises SettingsError: another.
     """
     return FilterSettings(
         truncation=cast(Truncation, truncation),

@@ -296,13 +296,9 @@ def is_explained(motion: CameraMotion, others_inlier_ratio: float) -> bool:
 
 
 def first_moved_frame(before: Sequence[float], after: Sequence[float]) -> int:
-    """Estimate when a camera moved, from the inlier ratios before and after its motion.
+    """Return the index of the first frame after a camera's motion; n if there is none.
 
-    Args:
-        before, after: (n,) ratios in n frames with the camera as calibrated, and as moved.
-
-    Returns:
-        The index of the first frame after the motion; n if there is none.
+    ``before``, ``after``: (n,) inlier ratios with the camera as calibrated, and as moved.
     """
     gain = np.asarray(after) - np.asarray(before)
     # Sum of the gains from each frame on; the best frame also excludes the gains before it.

@@ -557,10 +557,8 @@ class _CaptureComparison(CameraComparison):
     ) -> int:
         """Return the index of the first picture in which a camera is at fault; their number: none.
 
-        Its inlier ratio after the motion counts as at least 0.7 of the others' ratio.
-
-        Args:
-            edges, poses: edge points in the camera's picture, and pose (m,), of each frame.
+        Its inlier ratio after the motion counts as at least 0.7 of the others' ratio. ``edges``,
+        ``poses``: edge points in its picture, and pose (m,), by frame.
         """
         camera = self._cameras[fault.name]
         before, after = (

@@ -185,12 +185,9 @@ def _filled_fractions(
 
 
 def _cell_indices(camera: Camera, points: Array, size: float, shape: tuple[int, ...]) -> Indices:
-    """Return the index (n,) of the picture's cell that shows each point; -1: outside the picture.
+    """Return the index (n,) of the picture's cell that shows each point (n, 3); -1: outside.
 
-    Args:
-        points: (n, 3) points in the world [m].
-        size: side of a cell [pixel].
-        shape: numbers of rows and columns of cells, which are counted row by row.
+    ``size``: side of a cell [pixel]. ``shape``: rows and columns of cells, counted by rows.
     """
     uv, depth = camera.project(points)
     with np.errstate(invalid="ignore"):

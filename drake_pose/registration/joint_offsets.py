@@ -256,14 +256,9 @@ def _kept(values: Mapping[str, KinematicParameter], fit: SharedFit | None) -> li
 def _fit_to_inliers(
     fit: SharedFit, begin: SharedValues, known: bool
 ) -> tuple[SharedFit, SharedValues, Mask]:
-    """Fit cameras and parameters to the inliers among the masks.
+    """Return the fit to inliers about the found cameras, its values, and the masks (rows,) used.
 
-    Args:
-        fit, begin: the fit, and where it begins.
-        known: whether it begins at fitted values, which large steps may lose.
-
-    Returns:
-        the fit about the found cameras, the values, and the masks (rows,) that entered it.
+    ``known``: whether ``begin`` has fitted values, which large steps may lose.
     """
     found, stages = begin, SHARED.stages_with_constants
     if known:
@@ -414,9 +409,7 @@ def unseen_rotations(
 ) -> dict[str, KinematicParameter]:
     """Return descriptions, by name, of offsets that edges of static parts do not determine.
 
-    They are correlated with the rotations of all cameras.
-
-    static: see ``calibrate_joints``. views: for each camera its frames.
+    They are correlated with the rotations of all cameras. ``static``: see ``calibrate_joints``.
     """
     gauge = tuple(f"{one.camera.name}.{turn}" for one in views for turn in POSE_NAMES[:3])
     unseen = (name for name, (_, deviation) in static.items() if deviation > BASE.max_deviation)

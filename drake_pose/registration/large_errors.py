@@ -340,11 +340,9 @@ def _is_near(body: RegistrationBody, one: Correction) -> bool:
 
 
 def joint_inlier_ratios(fits: Sequence[FrameFit], joints: Sequence[str]) -> dict[str, float]:
-    """Return, by joint, the inlier ratio of the outlines of all links that it moves.
+    """Return, by joint, the inlier ratio of the compared outlines of all links that it moves.
 
-    Joints that move no compared outline are left out.
-
-    joints: names of the first unknowns of the fits, see ``PerFrameFit.joints``.
+    ``joints``: names of the fits' first unknowns, see ``PerFrameFit.joints``.
     """
     moves = [mask.moves.any(axis=2) for one in fits for mask in one.compared_masks]
     if not moves:

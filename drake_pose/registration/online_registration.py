@@ -281,14 +281,7 @@ class OnlineRegistration:
 
 
 def pose_difference(X_WC: Array, from_X_WC: Array) -> Array:
-    """Return rotation vector [rad] and shift [m] (6,) from one pose (4, 4) to another.
-
-    Both are along the world's axes; the shift is that of the camera's centre.
-
-    Args:
-        X_WC: the new pose.
-        from_X_WC: the pose from which the difference is measured.
-    """
+    """Return rotation [rad] and shift of the centre [m] (6,), in the world, to X_WC (4, 4)."""
     R = X_WC[:3, :3] @ from_X_WC[:3, :3].T
     turn = Rotation.from_matrix(R).as_rotvec()
     return np.concatenate([turn, X_WC[:3, 3] - from_X_WC[:3, 3]])

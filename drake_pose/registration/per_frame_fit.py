@@ -223,8 +223,6 @@ class PerFrameFit:
     def camera_jacobian(self, camera: str) -> Array:
         """Return the derivative (3, 6) of a camera's centre by its POSE_NAMES, along its axes [m].
 
-        camera: its name.
-
         POSE_NAMES turn and shift the body about its middle, in the camera's frame.
         """
         X_CW = self.cameras[self.camera_names.index(camera)].X_CW

@@ -174,12 +174,7 @@ def _hull(points: Array) -> Array:
 
 
 def placed_points(outlines: Sequence[Outline], X_WN: Array) -> Array:
-    """Return the vertices (n, 3) of all surfaces, node after node, in the world [m].
-
-    Args:
-        outlines: a surface for each node.
-        X_WN: (nodes, 4, 4) the nodes' poses.
-    """
+    """Return the vertices (n, 3) [m] of all surfaces, placed at X_WN (nodes, 4, 4), in order."""
     placed = zip(outlines, X_WN, strict=True)
     return np.concatenate([outline.vertices @ X[:3, :3].T + X[:3, 3] for outline, X in placed])
 
@@ -210,9 +205,7 @@ class MultiViewFrame:
     def edges(self, cameras: Sequence[Camera], spacing: float) -> Evidence:
         """Return the edge points of each camera's mask; none for a camera without a mask.
 
-        spacing: distance of the points, rounded to an integer of 1 or more [pixel].
-
-        Raises MaskError: a mask's size differs from its camera's.
+        ``spacing``: an integer of 1 or more [pixel]. Raises MaskError: a mask has a wrong size.
         """
         edges = [NO_EDGE] * len(cameras)
         for k, camera in enumerate(cameras):
@@ -223,12 +216,7 @@ class MultiViewFrame:
 
 
 def require_size(camera: Camera, frame: str, mask: Mask) -> None:
-    """Refuse a mask (H, W) whose size differs from the camera's picture.
-
-    frame: the frame's name, for the message.
-
-    Raises MaskError: states both sizes.
-    """
+    """Raise MaskError, which names ``frame``, if a mask (H, W) is not of the camera's size."""
     if mask.shape != (camera.height, camera.width):
         raise MaskError(
             f"camera '{camera.name}', frame '{frame}': a mask of {camera.width} x {camera.height} "

@@ -328,14 +328,7 @@ def select_best(
 def frame_misfits(
     posed: PosedFrames, X_CW: Array, ratios: Array, inliers: NDArray[np.bool_]
 ) -> tuple[FrameMisfit, ...]:
-    """Return how well each frame fits a camera's pose.
-
-    Args:
-        posed: the camera's frames.
-        X_CW: (4, 4) the world's pose in the camera.
-        ratios: (frames,) inlier ratios.
-        inliers: (frames,) which frames are inliers.
-    """
+    """Return how well each frame fits X_CW (4, 4), by inlier ratios and inliers (frames,)."""
     found = overlap_areas(posed, X_CW[None], np.inf)[0]
     columns = (E_total(found), intersection_over_union(found), ratios, inliers)
     rows = zip(posed.frames, *(one.tolist() for one in columns), strict=True)

@@ -205,10 +205,7 @@ class SharedFit:
     ) -> SharedValues:
         """Return all unknowns fitted to the included masks (rows,); biases of others are 0.
 
-        Args:
-            rounds: stages of the fit.
-            start: None: all unknowns start from 0.
-            included: (rows,) which masks enter the fit; None: all.
+        ``start``: None: all unknowns start from 0. ``included``: None: all.
         """
         observations, at, expected, included = self._at(start or self.start, included)
         found = self.problem.solve(observations, rounds, at, expected=expected)
@@ -234,10 +231,7 @@ class SharedFit:
     ) -> Equations:
         """Return the normal equations at given values, boundary biases first.
 
-        Args:
-            at: the values.
-            step: the stage, whose scale weights the residuals.
-            included: (rows,) which masks enter; None: all.
+        ``step``: its scale weights the residuals. ``included``: (rows,) masks; None: all.
         """
         observations, unknowns, expected, _ = self._at(at, included)
         return self.problem.equations(observations, unknowns, step, expected)

@@ -431,12 +431,9 @@ class TargetSearch:
         poses: Array,
         side: float,
     ) -> Array:
-        """Return the mean E_total (n,) of n ``HandEye`` poses over pictures, each by its best mask.
+        """Return the mean E_total (n,) of ``HandEye`` poses (n, 2, 4, 4), by the best masks.
 
-        Args:
-            choices: for each picture one or more masks that may be the target's.
-            poses: (n, 2, 4, 4).
-            side: square root of the mask's area in the downscaled picture [pixel].
+        ``side``: square root of the mask's area in the downscaled picture [pixel].
         """
         off = [
             np.min([self._misfit(camera, one, poses, side) for one in own], axis=0)
@@ -474,11 +471,9 @@ class TargetSearch:
         spacing: float = LAST_SPACING,
         surfaces: str = "full",
     ) -> SharedFit:
-        """Return a fit of both poses, whose unknowns are 0 at a start; it is not solved here.
+        """Return a fit of both poses, not solved here, whose unknowns are 0 at a start.
 
-        Args:
-            spacing: of the masks' edge points, see ``PosedFrames``.
-            surfaces: "coarse", "medium" or "full", see ``RegistrationBody``.
+        ``spacing``: see ``PosedFrames``. ``surfaces``: see ``RegistrationBody``.
         """
         body = self._target.body(start[1])
         posed = PosedFrames(body.kinematics, getattr(body, surfaces), camera, frames, spacing)

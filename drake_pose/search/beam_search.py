@@ -276,13 +276,9 @@ class _BeamRun:
         return True
 
     def _bits_of(self, exact: bool, coarse_pixels: int = 6000) -> SilhouetteBits:
-        """Return the silhouettes as bit masks, at full or at coarse resolution.
+        """Return the silhouettes as bit masks, full ones if ``exact``, or of ``coarse_pixels``.
 
-        Stages that are not exact use coarse ones; their best pose is scored at full resolution.
-
-        Args:
-            exact: whether full resolution is needed.
-            coarse_pixels: approximate area of a coarse silhouette [pixel].
+        The best pose of a stage that is not exact is scored at full resolution.
         """
         if exact not in self._bits:
             if exact:

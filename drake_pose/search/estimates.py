@@ -94,11 +94,7 @@ class JointEstimate:
     def widened(self, other: "JointEstimate", moved: float) -> "JointEstimate":
         """Return the smallest interval that contains this one and another, shifted by ``moved``.
 
-        The value is determined only if it is determined in both.
-
-        Args:
-            other: the interval at an earlier time.
-            moved: change of the value since then [rad or m].
+        The value is determined only if it is so in both. ``moved``: change since then [rad or m].
         """
         if self.covers_full_turn:
             middle = 0.5 * (self.low + self.high - other.low - other.high) - moved
@@ -114,13 +110,7 @@ class JointEstimate:
 def joint_estimates(
     kinematics: TreeKinematics, low: np.ndarray, high: np.ndarray, determined: np.ndarray
 ) -> tuple[JointEstimate, ...]:
-    """Return a JointEstimate for each of a pose tree's m values.
-
-    Args:
-        kinematics: the tree's kinematics.
-        low, high: (m,) ends of the intervals [rad or m].
-        determined: (m,) bool whether each value is determined.
-    """
+    """Return JointEstimates of m values: ends (m,) [rad or m] and ``determined`` (m,) bool."""
     return tuple(
         JointEstimate(name, bool(known), float(least), float(most), bool(around))
         for name, known, least, most, around in zip(
@@ -162,14 +152,9 @@ class PoseMode:
         joints: tuple[JointEstimate, ...],
         size: float = 1.0,
     ) -> "PoseMode":
-        """Make a mode from its representative's values in the pose tree.
+        """Make a mode of its representative's values (k_i,) of each node, with J [pixel].
 
-        Args:
-            tree: the pose tree.
-            node_values: for each node (k_i,) its values [rad or m].
-            J: its objective [pixel].
-            joints: the mode's interval of each value.
-            size: number of poses in the mode.
+        ``joints``: the mode's interval of each value. ``size``: number of poses in the mode.
         """
         return cls(*tree.positions_from(node_values), tuple(node_values), J, joints, size)
 
@@ -254,14 +239,10 @@ class PoseEstimate:
     def of_values(
         cls, tree: PoseTree, node_values: Sequence[np.ndarray], J: float, area: float, **more: Any
     ) -> "PoseEstimate":
-        """Make the estimate of a pose found, from its values in the pose tree.
+        """Make the estimate of a pose found, from its values (k_i,) of each node [rad or m].
 
-        Args:
-            tree: the pose tree.
-            node_values: for each node (k_i,) its values [rad or m].
-            J: objective of the pose [pixel].
-            area: total area of the silhouettes [pixel].
-            more: other fields of the class; ``stopped_by`` is required.
+        ``J``, ``area``: objective, and total area of the silhouettes [pixel]. ``more``: other
+        fields of the class; ``stopped_by`` is required.
         """
         q, X_WB = tree.positions_from(node_values)
         return cls(True, q, X_WB, tuple(node_values), J, area, **more)

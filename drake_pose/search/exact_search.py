@@ -134,13 +134,9 @@ class ExactSearch:
     def modes(
         self, problem: RefinementProblem, reached: ExactPose, tree: PoseTree
     ) -> tuple[ExactPose, PoseSet]:
-        """Return the best pose, which may be an alternative of the given one, and its pose set.
+        """Return the best pose, which may be a stored alternative, and its pose set.
 
-        Args:
-            problem: the silhouettes and the body.
-            reached: the pose found by ``find`` or ``refine``, with the alternatives stored in its
-                neighbourhood.
-            tree: the pose tree, with its root where the body is.
+        ``reached``: from ``find`` or ``refine``. ``tree``: with its root where the body is.
         """
         settings, others = self._settings, []
         for _ in range(settings.replacements):

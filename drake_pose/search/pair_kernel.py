@@ -245,13 +245,7 @@ NO_CHILDREN = np.zeros((0, 0), dtype=np.int64)
 
 
 def unite_poses(masks: np.ndarray, poses: np.ndarray, runs: np.ndarray, words: np.ndarray) -> None:
-    """Add the pixels of one pose to each mask, in place.
-
-    Args:
-        masks: (n, W) uint64 bit masks, changed in place.
-        poses: (n,) index of the pose that is added to each.
-        runs, words: bit masks of the poses, as in ``score_pairs``.
-    """
+    """Add the pixels of poses (n,) to masks (n, W), in place; the rest as in ``score_pairs``."""
     groups = np.column_stack([poses, poses + 1]).astype(np.int64)
     unite(masks, np.arange(len(masks)), groups, runs, words, runs.shape[1], NO_CHILDREN)
 

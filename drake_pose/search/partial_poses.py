@@ -290,12 +290,8 @@ class PoseStore:
     def pose_groups(self, node: int, parents: np.ndarray, batch: int = 100_000) -> np.ndarray:
         """Return (n, 2) the range [first, end) of the node's poses for each pose of its parent.
 
-        Poses that are not in the store are drawn.
-
-        Args:
-            node: index of the node.
-            parents: (n,) indices of the parent's poses in the store; zeros for a root.
-            batch: number of poses tried between checks of the limits.
+        Missing ones are drawn, ``batch`` between checks of limits. ``parents``: (n,); zeros: a
+        root.
         """
         known = self._groups[node]
         batch = max(1, batch // len(self.body.sampled.X_PN[node]))
@@ -541,14 +537,7 @@ class PoseStore:
     def with_masks(
         self, partial: PartialPoses, made: PartialPoses, node: int, pairs: np.ndarray
     ) -> PartialPoses:
-        """Return ``made``, the partial poses made by pairs (n, 2), with their masks.
-
-        Args:
-            partial: the partial poses before the node was placed.
-            made: those made by the pairs, in their order.
-            node: index of the node.
-            pairs: (n, 2) pairs of partial pose and node's pose.
-        """
+        """Return ``made``, the partial poses made of ``partial`` by pairs (n, 2), with masks."""
         masks, stored = partial.masks[pairs[:, 0]], self.nodes[node]
         unite_poses(masks, pairs[:, 1], stored.runs, stored.words)
         return replace(made, masks=masks)

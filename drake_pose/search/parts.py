@@ -278,12 +278,9 @@ class PartSearch:
     def _score(
         self, regions: Sequence[_Region], nodes: Sequence[int], X_WN: np.ndarray
     ) -> np.ndarray:
-        """Return (n,) silhouette minus outside area newly covered by k nodes, over all views.
+        """Return (n,) silhouette minus outside area, in coarse pixels, newly covered by k nodes.
 
-        Args:
-            regions: the coarse views, in whose pixels areas are counted.
-            nodes: (k,) indices of the nodes.
-            X_WN: (n, k, 4, 4) n placements of the nodes.
+        ``nodes``: (k,) indices of the nodes. ``X_WN``: (n, k, 4, 4) n placements of them.
         """
         packed = pack(tuple(self._outlines[i] for i in nodes))
         total = np.zeros(len(X_WN))

@@ -71,11 +71,9 @@ class RefinementBody:
     def parameters(
         self, node_values: Sequence[np.ndarray], root_position: np.ndarray | None = None
     ) -> np.ndarray:
-        """Return the parameters (m + 4,) of a pose at the model's own scale.
+        """Return the parameters (m + 4,) of node values (k,), at the model's own scale.
 
-        Args:
-            node_values: for each node (k,) its values [rad or m].
-            root_position: (3,) position of the first root [m]; None: that of the tree.
+        ``root_position``: (3,) position of the first root [m]; None: that of the tree.
         """
         parameters = np.append(self.kinematics.flatten(node_values), np.zeros(4))
         if root_position is not None:
@@ -168,12 +166,7 @@ class RefinementProblem:
         return sum(int(np.count_nonzero(one)) for one in self.mismatch(parameters))
 
     def fixed_borders(self, parameters: np.ndarray, moved: np.ndarray) -> list[Border]:
-        """Return for each view the border of the union of all nodes that do not move.
-
-        Args:
-            parameters: (m + 4,) the pose, as in ``RefinementBody``.
-            moved: (nodes,) bool whether each node moves; if all do, the borders are empty.
-        """
+        """Return for each view the border of all nodes that are not ``moved`` (nodes,), or none."""
         if moved.all():
             return self._nothing
         placed = self.body.place(parameters)

@@ -412,15 +412,10 @@ class RootPlacementSearch:
         return np.array(self._refined.poses(placed.parameters)[0, :3, 3])
 
     def _finish(self, start: _PlacedPose, moves: bool, deadline: float) -> _PlacedPose:
-        """Refine a pose to the end, and place parts that fit badly anew.
+        """Refine a pose to the end, and place bad parts anew; return the pose of least J.
 
-        Args:
-            start: the pose.
-            moves: whether the root's position is refined, too.
-            deadline: time.perf_counter() after which no further part is placed anew [s].
-
-        Returns:
-            The pose of least J of the start and the poses reached.
+        ``moves``: whether the root's position is refined. ``deadline``: perf_counter() [s] after
+        which no further part is placed anew.
         """
         near = self._settle(start, PASSES.fine[:2], moves)
         problem = RefinementProblem(self._refined, near.views)

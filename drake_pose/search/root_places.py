@@ -107,17 +107,9 @@ def scale_camera(camera: ParallelCamera, scale: float) -> ParallelCamera:
 
 
 def slide_root(camera: ParallelCamera, p_WR: np.ndarray, factor: float) -> np.ndarray:
-    """Return a root position with its distance from a parallel camera's axis multiplied.
+    """Return a root position (3,) [m] with its distance from a parallel camera's axis multiplied.
 
     A camera whose scale is divided by the same factor sees the root at the same place.
-
-    Args:
-        camera: the camera.
-        p_WR: (3,) the root's position in the world [m].
-        factor: factor of the distance.
-
-    Returns:
-        (3,) the position in the world [m].
     """
     p_CR = in_camera(camera, p_WR)
     p_CR[:2] *= factor

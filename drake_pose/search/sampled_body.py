@@ -64,12 +64,7 @@ class SampledTree:
         self._bent_outline = lru_cache(maxsize=256)(self._bend)
 
     def outlines_at(self, nodes: Sequence[int], samples: np.ndarray) -> list[Outline]:
-        """Return the whole surface of each of some nodes at its sample, in the node's frame.
-
-        Args:
-            nodes: (k,) indices of these nodes.
-            samples: (k,) sample of each of these nodes.
-        """
+        """Return the whole surfaces of nodes (k,) at samples (k,), each in its node's frame."""
         return [
             self.outlines[node]
             if self.bands[node] is None
@@ -192,11 +187,9 @@ class Scoring:
         return np.array(outside), covered
 
     def uncovered(self, nodes: Sequence[int], samples: np.ndarray, X_WN: np.ndarray) -> Regions:
-        """Return S minus the projections of some nodes, equations (3) and (6).
+        """Return S minus the projections of some nodes, equations (3) and (6); none: all of S.
 
-        Args:
-            nodes: indices of these nodes; empty: all of S is returned.
-            samples, X_WN: (all nodes,) samples and (all nodes, 4, 4) poses of the whole tree.
+        ``samples``, ``X_WN``: (all nodes,) samples and (all nodes, 4, 4) poses of the whole tree.
         """
         regions = [
             (view.mask.astype(np.uint8), np.repeat(sums, 2, axis=0))
@@ -262,12 +255,9 @@ class PoseSearch(Protocol):
         """The pose tree with its sampling grids."""
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
-        """Estimate the pose of the body in the views of one frame.
+        """Estimate the pose of the body in one frame's views, one per camera.
 
-        Args:
-            views: the silhouettes, one per camera.
-            root_position: (3,) position of the root's origin in the world [m]; None: that of the
-                tree.
+        ``root_position``: (3,) in the world [m]; None: that of the tree.
         """
 
 
@@ -467,13 +457,9 @@ def _fixed_points(X_PN: np.ndarray, ball: np.ndarray) -> np.ndarray:
 
 
 def _ball_around(centers: np.ndarray, radii: np.ndarray) -> np.ndarray:
-    """Return a small ball (4,), centre and radius [m], that contains balls.
+    """Return a small ball (4,), centre and radius, around balls (n, 3), (n,) [m].
 
     It is nearly the smallest one, found by the iteration of Badoiu and Clarkson.
-
-    Args:
-        centers: (n, 3) centres of the balls [m].
-        radii: (n,) their radii [m].
     """
     center = 0.5 * (centers.min(axis=0) + centers.max(axis=0))
     best, best_radius = center, np.inf

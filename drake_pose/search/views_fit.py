@@ -130,12 +130,9 @@ class ViewsFit:
     def refine(
         self, values: np.ndarray, stages: Sequence[AnnealingStage], held: Sequence[int] = ()
     ) -> FittedPose:
-        """Return the pose fitted from values (m,), with the cost at the last stage.
+        """Return the pose fitted from values (m,) in stages, with the cost at the last stage.
 
-        Args:
-            values: (m,) the start [rad or m].
-            stages: stages of the fit, run one after another.
-            held: indices of values that do not change.
+        ``held``: indices of values that do not change.
         """
         fixed = self.kinematics.upper <= self.kinematics.lower
         fixed[list(held)] = True

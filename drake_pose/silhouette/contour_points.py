@@ -425,10 +425,7 @@ def _find_cell_edges(
 def _directions(face: int, s: np.ndarray, t: float) -> np.ndarray:
     """Return unit directions (n, 3) of points on a face of the cube [-1, 1]^3.
 
-    Args:
-        face: index of the axis on which all points have coordinate 1.
-        s: (n,) coordinates on the first of the other axes.
-        t: the points' coordinate on the second.
+    ``face``: the axis on which all are 1. ``s``, ``t``: coordinates on the other axes.
     """
     columns = [s, np.full_like(s, t)]
     columns.insert(face, np.ones_like(s))

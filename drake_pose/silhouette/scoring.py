@@ -81,13 +81,7 @@ def score_bodies(
 
 
 def draw_mask(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return the mask (H, W) bool of a body.
-
-    Args:
-        outlines: the body's surfaces, one per node, each in its node's frame N.
-        X_CN: (nodes, 4, 4) poses of the nodes in the camera.
-        camera: the camera whose image is drawn.
-    """
+    """Return the mask (H, W) bool of surfaces, one per node, at X_CN (nodes, 4, 4) in a camera."""
     packed, poses = _check_body(outlines, np.asarray(X_CN)[None])
     return draw_packed(packed, poses[0], camera)
 
@@ -131,14 +125,9 @@ def subtract_body(
     X_CN: np.ndarray,
     camera: Camera,
 ) -> None:
-    """Remove a body's silhouette from a mask, and update the mask's prefix sums.
+    """Remove a body's silhouette from a mask (H, W) and its ``prefix_sums``, in place.
 
-    Args:
-        mask: (H, W) bool, changed in place.
-        prefix: (H, W + 1) int32 ``prefix_sums`` of the mask, changed in place.
-        outlines: the body's surfaces, one per node, each in its node's frame N.
-        X_CN: (nodes, 4, 4) poses of the nodes in the camera.
-        camera: the camera that the mask is of.
+    ``outlines``: one per node. ``X_CN``: (nodes, 4, 4) poses of the nodes in the camera.
     """
     packed, poses = _check_body(outlines, np.asarray(X_CN)[None])
     first, end = paint(packed, poses[0], camera.kernel_parameters(), mask.view(np.uint8), 0)

@@ -46,9 +46,7 @@ class Background:
 def learn_background(pictures: Sequence[Picture], min_deviation: float = 3.0) -> Background:
     """Return the background model of pictures (H, W, 3) of the empty scene.
 
-    ``min_deviation``: lower bound of the standard deviation [grey levels].
-
-    Raises SettingsError: there is no picture, or sizes differ.
+    ``min_deviation``: least one [grey levels]. SettingsError: no picture, or sizes differ.
     """
     _require_one_size(pictures, 1, "a background needs one or more pictures of the same size")
     stack = np.stack([picture.astype(np.float32) for picture in pictures])
@@ -243,12 +241,9 @@ def foreground_log_ratios(
 
 
 def _masked_median(stack: Floats, hidden: NDArray[np.bool_], count: NDArray[np.intp]) -> Floats:
-    """Return the median (p, 3) over the visible entries of n pictures; 0 where there are none.
+    """Return the median (p, 3) of visible entries of a stack (n, p, 3); 0 where there are none.
 
-    Args:
-        stack: (n, p, 3) colours of p pixels in n pictures.
-        hidden: (n, p) whether a pixel is left out.
-        count: (p,) number of entries of each pixel that are not hidden.
+    ``hidden``: (n, p). ``count``: (p,) number of entries of each pixel that are not hidden.
     """
     values = np.sort(np.where(hidden[:, :, None], np.float32(np.inf), stack), axis=0)
     last, across = np.maximum(count - 1, 0), np.arange(len(count))

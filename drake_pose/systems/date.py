@@ -178,13 +178,9 @@ def learn_rendered_faces(
 def _add_views(
     system: PortedSystem, cameras: Sequence[Camera]
 ) -> Callable[[Context], tuple[list[Camera], list[PersonView]]]:
-    """Add the input ports ``person_view_<camera>`` to a system.
+    """Add input ports ``person_view_<camera>``; return a function of a context: cameras, views.
 
-    Returns:
-        A function that maps the system's context to the cameras with a view, and these views.
-
-    Raises:
-        SettingsError: there are fewer than two cameras, or two have the same name.
+    Raises SettingsError: there are fewer than two cameras, or two have the same name.
     """
     require_distinct_cameras(cameras, 2, "two or more different cameras are needed, not")
     given = system.add_camera_inputs({one.name: f"person_view_{one.name}" for one in cameras})

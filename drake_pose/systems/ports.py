@@ -150,16 +150,10 @@ class PortedSystem(LeafSystem):
     def add_camera_inputs(
         self, ports: Mapping[str, str], model_value: Callable[[str], Any] = lambda _: None
     ) -> Callable[[Context], dict[str, Any]]:
-        """Declare an input port for each camera.
+        """Declare ports by camera's name; return a function of a context: values by camera.
 
-        Args:
-            ports: name of the port by name of the camera.
-            model_value: maps a camera's name to the model value of its port; by default None, for a
-                port of any value.
-
-        Returns:
-            A function that maps a context to the values by name of the camera, without those that
-                are None or not connected.
+        None and unconnected ports are left out. ``model_value``: maps a camera's name to its port's
+        model value; None: a port of any value.
         """
         for name, port in ports.items():
             self.add_input(port, model_value(name))
@@ -235,12 +229,9 @@ class MemorySystem(PortedSystem):
     def declare_vectors(
         self, initial: Mapping[str, Array], output_names: Collection[str], period: float
     ) -> None:
-        """Declare state vectors and their update.
+        """Declare state vectors, with initial values by name, and their update.
 
-        Args:
-            initial: initial vectors by name, which also give their sizes.
-            output_names: names of the vectors that have an output port.
-            period: time between two updates [s].
+        ``output_names``: of vectors with an output port. ``period``: between two updates [s].
         """
         self._vectors = {name: self.DeclareDiscreteState(value) for name, value in initial.items()}
         for name in output_names:

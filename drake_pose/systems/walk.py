@@ -374,11 +374,9 @@ def view_from_behind(pose: Array) -> tuple[Array, Array]:
 
 
 def walker_transform(pose: Array, rest: Array) -> RigidTransform:
-    """Return X_PR, the room's pose in the place, which moves a person at rest to the walker's pose.
+    """Return X_PR of the room in the place, which moves a person at rest to the walker's pose.
 
-    Args:
-        pose: (3,) x, y [m] and heading [rad] of the walker in the place.
-        rest: (5,) rest stance in the room; its heading and the feet's position are used.
+    ``pose``: (3,) x, y [m] and heading [rad]. ``rest``: (5,) stance; heading and feet are used.
     """
     turn = RollPitchYaw(0.0, 0.0, pose[2] - rest[0])
     X_PF = RigidTransform(turn, [pose[0], pose[1], 0.0])

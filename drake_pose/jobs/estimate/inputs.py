@@ -269,13 +269,10 @@ class EstimateInputs:
         return record, {name: (seen, parts.get(name)) for name, seen in shown.items()}
 
     def tracking(self, rest_time: float = 1.0) -> TrackingSettings | None:
-        """Return the settings of the tracker; None if frames are not tracked.
+        """Return the tracker's settings, also for a searched root or scale. None: no tracking.
 
-        A searched root position or scale is tracked as well.
-
-        Args:
-            rest_time: ``TrackingSettings.rest_time`` [s] for a single parallel camera, whose view
-                does not distinguish poses mirrored in depth.
+        ``rest_time``: [s] for a single parallel camera, whose view does not distinguish poses
+        mirrored in depth.
         """
         if not self.tracked:
             return None
@@ -377,12 +374,8 @@ def draw_parts(
 ) -> dict[str, np.ndarray]:
     """Return the index (H, W) of the visible part at each pixel by camera, -1 outside the body.
 
-    Args:
-        outlines: surface of each part of the body.
-        X_WN: (parts, 4, 4) poses of the parts in the world.
-        cameras: the cameras.
-        by_part: whether each part has its index; if not, all have the index 0, which is drawn in a
-            third of the time.
+    ``X_WN``: (parts, 4, 4). ``by_part``: whether each part has its index; if not, all have the
+    index 0, which is drawn in a third of the time.
     """
     if not by_part:
         bodies = {one.name: draw_mask(outlines, one.X_CW @ X_WN, one) for one in cameras}

@@ -420,16 +420,9 @@ def frames_of(camera: EpisodeCamera) -> tuple[str, ...]:
 
 
 def rows_of(log: JointLog, camera: EpisodeCamera, kept: Indices, later: Array) -> Array:
-    """Return a log's positions (k, m) at pictures of a camera, by time or by name.
+    """Return a log's positions (k, m) at pictures of a camera, by time or name; nan: no value.
 
-    Args:
-        log: the joint log.
-        camera: the camera.
-        kept: (k,) indices of pictures.
-        later: () or (k,) time offset added to the pictures' times [s]; unused without times.
-
-    Returns:
-        [rad or m]; nan where the log has no value.
+    ``kept``: (k,) indices of pictures. ``later``: () or (k,) time offset added to their times [s].
     """
     if is_timed(log, camera):
         return log.at(camera.times[kept] + later)
@@ -445,9 +438,7 @@ def is_timed(log: JointLog, camera: EpisodeCamera) -> bool:
 def kept_pictures(camera: EpisodeCamera, settings: EpisodeSettings) -> Indices:
     """Return the indices of a camera's pictures that are chosen by ``frames`` and ``every``.
 
-    Raises:
-        SettingsError: ``every`` is below 1.
-        UnknownNameError: a frame does not exist.
+    Raises SettingsError: ``every`` is below 1; UnknownNameError: a frame does not exist.
     """
     if settings.every < 1:
         raise SettingsError(f"every must be 1 or more, not {settings.every}")

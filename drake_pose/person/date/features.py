@@ -372,15 +372,10 @@ def learn_faces(faces: Sequence[Picture], directions: Array, dimensions: int = 6
 
 
 def head_angles(direction: Array, head: Array, camera: Camera) -> Array:
-    """Return the head's turn and nod in the world (2,) [rad] from a face's direction (2,) [rad].
+    """Return the head's turn, 0 along x, and nod in the world (2,) [rad] by a face's direction.
 
-    Args:
-        direction: turn to the person's left and nod down, from facing the camera.
-        head: (3,) position of the head in the world [m].
-        camera: that sees the face.
-
-    Returns:
-        Turn, 0 along the world's x axis, and nod, positive downwards.
+    ``direction``: (2,) turn to the person's left and nod down, from facing the camera [rad].
+    ``head``: (3,) position of the head in the world [m].
     """
     towards = camera.X_WC[:3, 3] - head
     level = math.hypot(towards[0], towards[1])

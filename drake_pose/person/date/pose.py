@@ -334,14 +334,10 @@ def rectangles(root: Array, middles: Array, end: Array, half_widths: Array) -> A
 
 
 def correlation(samples: Array, cameras: Sequence[Camera], regions: Sequence[Mask]) -> Array:
-    """Return the correlation C (n,) of n limbs with the silhouettes, 0 to 1.
+    """Return the correlation C (n,) of limbs with the silhouettes (H, W), 0 to 1.
 
-    C is the mean, over cameras with a silhouette, of the fraction of a limb's points in the picture
-    that lie inside the silhouette; 0 where no camera has one.
-
-    Args:
-        samples: (n, m, 3) points of each limb, from `rectangles` [m].
-        regions: (H, W) silhouette in each camera's picture.
+    C is the mean, over cameras with a silhouette, of the fraction of a limb's points (n, m, 3) in
+    the picture that lie inside the silhouette; 0 where no camera has one.
     """
     total, seers, weights = np.zeros(len(samples)), 0, np.ones(samples.shape[:2])
     for camera, region in zip(cameras, regions, strict=True):

@@ -40,10 +40,8 @@ WALK = WalkSettings()
 def stance_of(left_W: Array, head_W: Array, feet_W: Array) -> Array:
     """Return how a person stands (5,): heading of the face [rad], x, y of the head and feet [m].
 
-    Args:
-        left_W: (3,) direction to the left of the face; its horizontal part gives the heading.
-        head_W: (3,) position of the head [m].
-        feet_W: (2, 3) positions of the feet [m]; their mean counts.
+    ``left_W``: (3,) direction to the left of the face; its horizontal part gives the heading.
+    ``feet_W``: (2, 3); their mean counts.
     """
     heading = math.atan2(-left_W[0], left_W[1])
     return np.array([heading, *head_W[:2], *np.asarray(feet_W)[:, :2].mean(axis=0)])
@@ -64,14 +62,9 @@ def offsets_from_rest(stance: Array, rest: Array) -> tuple[float, float]:
 
 
 def recognise_command(stance: Array, rest: Array, last: tuple[int, int]) -> tuple[int, int]:
-    """Return the command of a stance (table 1); a person who is not seen stops.
+    """Return turning (1 left, -1 right) and walking (1 ahead, -1 back) of table 1; 0: none.
 
-    Args:
-        stance, rest: (5,) from stance_of, now and at rest.
-        last: the previous command; (0, 0) at first.
-
-    Returns:
-        Turning: 1 left, -1 right, 0 none; walking: 1 forward, -1 backward, 0 none.
+    ``stance``, ``rest``: (5,) of stance_of; not seen: stop. ``last``: the previous command.
     """
     if not np.isfinite(stance).all():
         return 0, 0

@@ -130,12 +130,7 @@ def require_readable(refused: Mapping[tuple[str, str], str], scene: Scene) -> No
 def describe_unreadable(
     refused: Mapping[tuple[str, str], str], known: Sequence[str]
 ) -> tuple[str, ...]:
-    """Return one warning per camera about unreadable masks.
-
-    Args:
-        refused: reasons by (camera, frame).
-        known: names of all the scene's frames, in order.
-    """
+    """Return one warning per camera about refused masks (camera, frame); known: all frames."""
     found = []
     for camera in dict.fromkeys(name for name, _ in refused):
         frames = [frame for name, frame in refused if name == camera]

@@ -101,13 +101,9 @@ class Scene:
         )
 
     def frames_with_files(self, wanted: Sequence[str]) -> tuple[str, ...]:
-        """Return the names of the wanted frames that have a mask or a picture.
+        """Return the wanted frames, ranges ``FIRST:LAST`` or all, that have a mask or a picture.
 
-        ``wanted``: names of frames, or ranges ``FIRST:LAST``; empty: all.
-
-        Raises:
-            SceneError: there is no such frame with a file.
-            UnknownNameError: there is no such frame.
+        Raises SceneError: no such frame has a file; UnknownNameError: there is no such frame.
         """
         with_files = {frame for _, frame in (*self.masks, *self.images)}
         selected = select_frames(self.frames, wanted, str(self.path))

@@ -206,11 +206,7 @@ def _dependencies(function: Callable[..., Any], seen: set[int]) -> Iterator[tupl
     """Yield a function's dependencies, and those of the kernels that it calls.
 
     They are ("file", path) of each function's source, and (name, text of the value, or digest of an
-    array) of each constant.
-
-    Args:
-        function: the kernel in Python.
-        seen: ids of functions that are done; changed.
+    array) of each constant. ``seen``: ids of functions that are done; changed.
     """
     if id(function) in seen:
         return

@@ -157,11 +157,8 @@ def _name(model: Any, address: int) -> str:
 def _add_body(model: Any, body: int, name: str, parent: ElementTree.Element) -> ElementTree.Element:
     """Write a body with n joints as n nested bodies of one joint each; return the innermost.
 
-    Args:
-        model: MuJoCo's compiled model.
-        body: index of the body.
-        name: name of the innermost body.
-        parent: the element that the outermost body is added to.
+    ``model``: MuJoCo's compiled model. ``body``: its index. ``name``: of the innermost body.
+    ``parent``: the element that the outermost body is added to.
     """
     first = model.body_jntadr[body]
     joints = range(first, first + model.body_jntnum[body])

@@ -125,11 +125,8 @@ def _choose_root(
     """Return the group that a RootRotation places, and whether it is the plant's own root.
 
     None: the tree keeps the plant's own roots, which are attached to the plant's world. The plant's
-    own root has a default position; other roots need one.
-
-    Args:
-        root: name of the root link; None: the user named none.
-        rotation: the root's rotation; None: the user gave none.
+    own root has a default position; other roots need one. ``root``, ``rotation``: the user's, if
+    any.
     """
     floating = _floating_tops(graph)
     if len(floating) > 1:

@@ -327,11 +327,8 @@ def _merge_joints(
 ) -> tuple[JointLog, list[str]]:
     """Return all joints at the times of the publisher with most rows, and warnings.
 
-    If several publish the same joint, the one with more rows is used.
-
-    Args:
-        groups: rows by (topic, names of the joints), at least one.
-        shifts: of the groups' stamps, see `_clock_shifts`.
+    If several publish the same joint, the one with more rows is used. ``groups``: rows by (topic,
+    names of the joints), at least one. ``shifts``: see `_clock_shifts`.
     """
     warnings: list[str] = []
     base: JointLog | None = None
@@ -505,12 +502,8 @@ def _decode_file(message: Any, where: str) -> Picture:
 def _decode(message: Any, where: str) -> Picture:
     """Return the image (H, W, 3) of an Image with a known encoding, red, green, blue.
 
-    Args:
-        message: the message.
-        where: start of error messages.
-
-    Raises:
-        SceneError: it has too few bytes, or 16 bits whose upper ones are not used.
+    Raises SceneError, begun by ``where``: it has too few bytes, or 16 bits whose upper ones are not
+    used.
     """
     known = _encoding(message.encoding.lower())
     if known is None:

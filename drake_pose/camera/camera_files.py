@@ -212,15 +212,10 @@ def load_camera_file(
 
 
 def _placed(path: Path, poses: Mapping[str, RecordedPose], known: CameraFile | None) -> CameraFile:
-    """Return the known cameras at the poses of a file that has no intrinsics.
+    """Return the known cameras at the poses of a file (``path``) that has no intrinsics.
 
-    Args:
-        path: the file, for messages.
-        poses: its poses, by the file's names.
-        known: cameras with intrinsics, by the recording's names; None: there are none.
-
-    Raises:
-        CameraError: there are no intrinsics, or no pose is one of a known camera.
+    ``poses``: by the file's names. ``known``: by the recording's names; None: there are none.
+    Raises CameraError: there are no intrinsics, or no pose is one of a known camera.
     """
     names = listed(sorted(poses))
     if known is None or not known.cameras:
@@ -405,13 +400,9 @@ def _read_camera(name: str, entry: Any, path: Path) -> Camera:
 def _read_lens(camera: Camera, value: Any, where: str) -> Lens | None:
     """Return the lens of a camera with distortion; None if there is none.
 
-    Args:
-        camera: the camera, whose intrinsics are those of the distorted images.
-        value: OpenCV's coefficients as in the file, not yet checked; None or all 0: no distortion.
-        where: start of error messages.
-
-    Raises:
-        CameraError: the coefficients are invalid.
+    The camera's intrinsics are those of the distorted images. ``value``: OpenCV's coefficients, not
+    yet checked; None or all 0: no distortion. Raises CameraError, begun by ``where``: they are
+    invalid.
     """
     if value is None:
         return None

@@ -527,15 +527,10 @@ def read_joint_map(path: Path) -> dict[str, Column]:
 
 
 def _read_column(joint: str, entry: Any, where: str) -> Column:
-    """Return the linear map of an entry of a joint map.
+    """Return the linear map of an entry of a joint map, not yet checked.
 
-    Args:
-        joint: name of the joint, and default name of the column.
-        entry: the entry, not yet checked.
-        where: start of error messages.
-
-    Raises:
-        CameraError: the entry is invalid.
+    ``joint``: the joint's name, and the default of the column's. Raises CameraError, begun by
+    ``where``: the entry is invalid.
     """
     units = {**UNITS, "m": 1.0, "mm": 1e-3}
     ways = [{"from", "to"}, {"scale", "offset"}, {"scale"}, {"offset"}, {"unit"}, set[str]()]

@@ -209,20 +209,12 @@ def _count(path: Path, info: Mapping[str, Any], field: str, default: int) -> int
 
 
 def _file(path: Path, info: Mapping[str, Any], rows: _Rows, number: int, key: str = "") -> Path:
-    """Return the file of an episode's data, or of a camera's video; it may be missing.
+    """Return the file of an episode's data, or of the video of a camera; it may be missing.
 
     The words in the templates of `meta/info.json` may be those of either version. Without a
-    template it is the version's own.
-
-    Args:
-        path: folder of the data set.
-        info: content of `meta/info.json`.
-        rows: metadata by episode, see ``_Rows``.
-        number: number of the episode.
-        key: the camera's key in the features; "": the data.
-
-    Raises:
-        SceneError: the template has an unknown word, or one whose value is not known.
+    template it is the version's own. ``info``: content of that file. ``number``: of the episode.
+    ``key``: the camera's feature; "": the data. Raises SceneError: the template has an unknown
+    word, or one whose value is not known.
     """
     is_v3, which = info["codebase_version"].startswith("3."), "video_path" if key else "data_path"
     # The templates of versions 2 and 3.
@@ -270,15 +262,9 @@ def _file(path: Path, info: Mapping[str, Any], rows: _Rows, number: int, key: st
 def _choose_episode(path: Path, info: Mapping[str, Any], rows: _Rows, wanted: int | None) -> int:
     """Return the number of the wanted episode, or of the only one whose data are present.
 
-    Args:
-        path: folder of the data set.
-        info: content of `meta/info.json`.
-        rows: metadata by episode, see ``_Rows``.
-        wanted: number of the wanted episode; None: the only one.
-
-    Raises:
-        UnknownNameError: the data of the wanted episode are not present.
-        SceneError: none was wanted, and the data of none or of several episodes are present.
+    ``info``: content of `meta/info.json`. ``wanted``: None: the only one. Raises UnknownNameError:
+    the data of the wanted episode are not present; SceneError: none was wanted, and the data of
+    none or of several episodes are present.
     """
     numbers = list(rows)
     candidates = numbers if wanted is None else [one for one in numbers if one == wanted]
@@ -299,18 +285,10 @@ def _choose_episode(path: Path, info: Mapping[str, Any], rows: _Rows, wanted: in
 def _read_table(
     path: Path, info: Mapping[str, Any], rows: _Rows, number: int, parquet: Any, warnings: list[str]
 ) -> tuple[Any, Path]:
-    """Return the table (pyarrow.Table) of an episode, and its file.
+    """Return the table (pyarrow.Table) of an episode, and its file; ``parquet`` is the module.
 
-    Args:
-        path: folder of the data set.
-        info: content of `meta/info.json`.
-        rows: metadata by episode, see ``_Rows``.
-        number: number of the episode.
-        parquet: the module pyarrow.parquet.
-        warnings: list to which warnings are appended.
-
-    Raises:
-        SceneError: the table is damaged, or has no row of the episode.
+    ``info``: content of `meta/info.json`. ``number``: of the episode. ``warnings``: appended to.
+    Raises SceneError: the table is damaged, or has no row of the episode.
     """
     file, features = _file(path, info, rows, number), info["features"]
     try:
@@ -361,14 +339,9 @@ def _read_joints(
 ) -> tuple[JointLog | None, str]:
     """Return the joint log of an episode, None if there is none, and what is wrong with it.
 
-    Args:
-        path: folder of the data set.
-        info: content of `meta/info.json`.
-        table: the episode's table (pyarrow.Table).
-        file: the table's file, for messages.
-        stamps: (k,) times of the rows to use [s].
-        kept: (k,) indices of these rows.
-        warnings: list to which warnings are appended.
+    ``info``: content of `meta/info.json`. ``table``: the episode's (pyarrow.Table), of a ``file``
+    for messages. ``stamps``, ``kept``: (k,) times [s] and indices of the rows to use. ``warnings``:
+    appended to.
     """
     features = info["features"]
     keys = [key for key in find_states(features) if key in table.column_names]

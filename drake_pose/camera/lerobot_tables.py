@@ -305,12 +305,8 @@ class StoredPictures:
 def _array_picture(values: Any, where: str) -> Picture:
     """Return an image (H, W, 3) of an array (H, W), (H, W, c) or (c, H, W), c being 1, 3 or 4.
 
-    Args:
-        values: numbers of any type; floating-point numbers up to 1 are fractions of 255.
-        where: start of the error message.
-
-    Raises:
-        SceneError: it has another shape, or its numbers are no intensities.
+    Floating-point numbers up to 1 are fractions of 255. Raises SceneError, begun by ``where``: the
+    array has another shape, or its numbers are no intensities.
     """
     layers = values[:, :, None] if values.ndim == 2 else values
     if layers.ndim == 3 and layers.shape[2] not in (1, 3, 4) and layers.shape[0] in (1, 3, 4):

@@ -235,15 +235,8 @@ def _require_whole(
 ) -> tuple[int, int]:
     """Return width and height of a complete PNG or JPEG image [pixel]; pixels are not decoded.
 
-    Args:
-        data: content of the file.
-        path: the file, for messages.
-        error_type: class of the exceptions.
-        only_png: refuse JPEG.
-
-    Raises:
-        error_type: the content is no such image, damaged, or so large that it would fill the
-            memory.
+    ``only_png``: refuse JPEG. Raises ``error_type``, which names ``path``: the content is no such
+    image, damaged, or so large that it would fill the memory.
     """
     is_jpeg = data.startswith(b"\xff\xd8") and not only_png
     if is_jpeg and not data.rstrip(b"\0").endswith(b"\xff\xd9"):

@@ -401,14 +401,8 @@ class RecordedSource(FrameSource):
 def _times_from_rate(given: SourceSpecification, files: Mapping[str, Path]) -> dict[str, float]:
     """Return the times [s] of frames by name, from their order and rate; the first one is 0.
 
-    Frames of the folders ``beside`` are included.
-
-    Args:
-        given: source of the folder.
-        files: image files of the folder, by frame.
-
-    Raises:
-        SceneError: there is no rate, or the order of the names is unclear.
+    Frames of the folders ``beside`` are included. ``files``: image files by frame. Raises
+    SceneError: there is no rate, or the order of the names is unclear.
     """
     folder = Path(given.location)
     if given.rate_hz is None:

@@ -187,12 +187,8 @@ def _draw_camera(
 ) -> None:
     """Draw a camera's frustum; that of a parallel camera begins outside the object.
 
-    Args:
-        meshcat: the page.
-        camera: the camera.
-        p_WO: (3,) centre of the object in the world [m].
-        radius: radius of the object [m].
-        length: length of the frustum, in radii.
+    ``p_WO``, ``radius``: centre (3,) of the object in the world, and its radius [m]. ``length``:
+    length of the frustum, in radii.
     """
     parallel, f_x, f_y, c_x, c_y, *_ = camera.kernel_parameters()
     across, down = np.array([0, 1, 1, 0]), np.array([0, 0, 1, 1])

@@ -211,13 +211,9 @@ class ContourObservation(BodyState):
     ) -> tuple[Comparison, float] | None:
         """Compare the contours of the body at a state x (n,) with a frame.
 
-        Args:
-            width: scale of the robust cost [pixel].
-            iteration: number of measurements of this frame made before.
-
-        Returns:
-            The comparison, and the weighted root mean square distance [pixel]; None: no edge is
-            near the contour.
+        ``width``: scale of the robust cost [pixel]. ``iteration``: number of measurements made
+        before. Returns the comparison, and the weighted RMS distance [pixel]; None: no edge is
+        near.
         """
         step = AnnealingStage(width, CONTOUR.spacing)
         placed = self._body.place(self.parameters(x))

@@ -252,12 +252,8 @@ def _read_finger(
 ) -> tuple[tuple[Step, ...], list[float]]:
     """Return a finger's steps and radii [m], and add its lengths to ``sizes``.
 
-    Args:
-        model: the hand.
-        chain: joints of the finger, from the palm outwards.
-        frames: by joint, origin (3,) and rotation (3, 3) of its parent frame in the palm's link.
-        size: (3,) height, thickness and width of the palm [m].
-        sizes: receives the lengths [m].
+    ``chain``: joints from the palm outwards. ``frames``: by joint, origin (3,) and rotation (3, 3)
+    of its parent frame in the palm's link. ``size``: (3,) height, thickness, width of the palm [m].
     """
     base = _FROM_LINK @ frames[0][0] / size
     elements = ("palm_height", "palm_thickness", "palm_width")

@@ -242,12 +242,9 @@ def _compare_likeliest(
 ) -> None:
     """Write (f, H, W) whether frames look like the likeliest background of a pixel.
 
-    Args:
-        visible, sums: `visible` and `covered` of ``PixelSums``.
-        covered: (f, H, W) the pixels that the body covers.
-        pictures, colours, deviations: of ``Backgrounds``.
-        most: maximum deviation [standard deviations].
-        shows: (f, H, W) output.
+    ``visible``, ``sums``: `visible` and `covered` of ``PixelSums``. ``covered``: (f, H, W) the
+    body. ``most``: maximum deviation [standard deviations]. ``shows``: the output. Others:
+    ``Backgrounds``.
     """
     frames, height, width = covered.shape
     for row in range(height):

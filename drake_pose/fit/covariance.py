@@ -254,11 +254,7 @@ def _camera_motions(outlines: Sequence[Outline], one: ComparedMask) -> Array:
     """Return (12, 6) affine motions of the body that are equivalent to motions of a camera.
 
     They are three translations along and three rotations about the camera's axes, which move the
-    body by about the unit of errors.
-
-    Args:
-        outlines: surface of each node.
-        one: comparison with a mask of the camera.
+    body by about the unit of errors. ``one``: comparison with a mask of the camera.
     """
     placed = zip(outlines, one.X_WN, strict=True)
     moments = sum(len(own.vertices) * (X @ own.moments @ X.T) for own, X in placed)

@@ -304,13 +304,8 @@ def _damp(
 ) -> NDArray[np.bool_]:
     """Damp the equations [H ... -g] (n, columns) in place, and fix unknowns at limits.
 
-    Args:
-        M: the equations; the last column is -g.
-        x, lower, upper: (n,) unknowns and limits.
-        fractions: fractions of each diagonal element and of the diagonal's mean that are added.
-
-    Returns:
-        (n,) whether an unknown is at a limit that it would leave; its step is fixed at 0.
+    ``x``, ``lower``, ``upper``: (n,). ``fractions``: of each diagonal element and of the diagonal's
+    mean that are added. Returns (n,) whether an unknown is fixed at a limit that it would leave.
     """
     n, last = len(x), M.shape[1] - 1
     is_held = np.empty(n, dtype=np.bool_)

@@ -475,13 +475,9 @@ class Problem:
     ) -> Array:
         """Return (nodes, u, 12) motions of the nodes, as seen by a camera, caused by the unknowns.
 
-        Boundary biases move no node.
-
-        Args:
-            compared: comparison, whose placement is used.
-            motions: (cameras, 9, 12) affine motions of all nodes caused by camera parameters.
-            camera: index of the camera.
-            rates: (m,) velocities of the tree's values; None: the time offset moves no node.
+        Boundary biases move no node. ``motions``: (cameras, 9, 12) of all nodes by camera
+        parameters. ``rates``: (m,) velocities of the tree's values; None: the time offset moves no
+        node.
         """
         entries, placement = self.entries, compared.placement
         moves = np.zeros((len(placement.X_WN), len(entries), 12))

@@ -268,12 +268,8 @@ def _pixels_apart(
 ) -> float:
     """Return the number of a line's pixel centres covered by exactly one of body and silhouette.
 
-    Args:
-        places: positions of the contour's crossings, ascending [pixel]; the first ``count`` are
-            used.
-        border: positions of the silhouette's crossings; those of this line are ``first`` to
-            ``end``.
-        width: the line's length [pixel].
+    ``places``: ascending crossings of the contour [pixel], the first ``count`` of them. ``border``:
+    those of the silhouette, ``first`` to ``end`` of this line. ``width``: its length [pixel].
     """
     length, open_at, inside = 0.0, -0.5, False
     i, j = 0, first

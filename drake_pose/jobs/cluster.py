@@ -102,14 +102,9 @@ def open_cluster(
 
 
 def _connect(address: str, timeout: float) -> Client:
-    """Return a client of a running scheduler.
+    """Return a client of a running scheduler at an address such as tcp://10.0.0.7:8786.
 
-    Args:
-        address: address of the scheduler, such as tcp://10.0.0.7:8786.
-        timeout: timeout of the connection [s].
-
-    Raises:
-        ClusterError: the address is malformed, or no scheduler answers.
+    ``timeout``: [s]. Raises ClusterError: the address is malformed, or no scheduler answers.
     """
     from distributed import Client
     from distributed.comm import connect, get_address_host_port

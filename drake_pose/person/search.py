@@ -455,13 +455,9 @@ class PersonSearch:
     ) -> tuple[Array, float]:
         """Score a limb's poses by the unexplained silhouette that they cover, -1 to 1.
 
-        Args:
-            values: (m,) pose of the rest of the body.
-            limb, frame: the limb, and silhouettes.
-            placed: (nodes,) nodes that explain silhouettes; None: all but the limb's.
-
-        Returns:
-            (n,) scores of the limb's poses, and that of the pose in `values`.
+        ``values``: (m,) pose of the rest of the body. ``placed``: (nodes,) nodes that explain
+        silhouettes; None: all but the limb's. Returns (n,) scores of the limb's poses, and that in
+        `values`.
         """
         X_WN = self._fit.kinematics.poses(values)
         others = np.ones(len(X_WN), dtype=np.bool_) if placed is None else placed.copy()

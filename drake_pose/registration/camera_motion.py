@@ -328,11 +328,7 @@ def _track(
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the places (n, 2) of a picture's corners in another, and which corners were found.
 
-    A corner is found if it can be tracked back to its place.
-
-    Args:
-        picture, other: (h, w) grey pictures.
-        corners: (n, 2) places in the first one [pixel].
+    A corner (n, 2) [pixel] is found if it can be tracked back. Pictures are (h, w) and grey.
     """
     window, levels, start = (15, 15), 3, corners[:, None]
     found, there, _ = cv2.calcOpticalFlowPyrLK(

@@ -455,14 +455,10 @@ class _Diagnoser:
 def _name(
     residual: _Residual, causes: Sequence[_Cause], least: float
 ) -> tuple[_Residual, list[list[_Cause]]]:
-    """Select significant causes one after another.
+    """Select significant causes, of untested ones, one after another.
 
-    Args:
-        causes: candidates, untested.
-        least: minimum motion of outlines by a cause [pixel].
-
-    Returns:
-        the residual without the selected causes; and for each a list of it and its alternatives.
+    ``least``: minimum motion of outlines by a cause [pixel]. Returns the residual without the
+    selected causes; and for each a list of it and its alternatives.
     """
     left, named = list(causes), list[list[_Cause]]()
     while left:

@@ -281,15 +281,8 @@ class _BranchAndBound:
     def _pruned_pairs(self, partial: PartialPoses, node: int, waiting: Sequence[int]) -> np.ndarray:
         """Return the pairs of partial pose and node's pose that can still lead to the limit of J.
 
-        Unlike the bound of a partial pose, this uses the poses that the waiting nodes can take.
-
-        Args:
-            partial: the partial poses.
-            node: index of the node that is placed.
-            waiting: indices of all nodes that can be placed next, with ``node`` or without.
-
-        Returns:
-            (p, 2) int32 pairs, as of ``PoseStore.pairs``.
+        Unlike the bound of a partial pose, this uses the poses that the waiting nodes can take: all
+        that can be placed next. The pairs are (p, 2) int32, as of ``PoseStore.pairs``.
         """
         pairs = self.store.pairs(partial, node)
         below = self.reaches.child_rows(node, pairs[:, 1])

@@ -96,13 +96,9 @@ def _project_ball(
 ) -> None:
     """Project a ball at all samples, in single precision and without branches, for SIMD.
 
-    Args:
-        view: the camera and its cells.
-        X_CP: (4, 4) pose of the node's parent in the camera.
-        p_PB: (3, n) the ball's centre in the parent's frame at all samples [m].
-        columns, rows: (n,) written: the centre's projection [cell].
-        scales: (n,) written: image scale at the centre [pixel/m]; 0 if it is outside the image or
-            behind the camera.
+    ``X_CP``: (4, 4) of the node's parent. ``p_PB``: (3, n) the ball's centre at all samples [m].
+    Written: ``columns``, ``rows`` (n,), the centre's projection [cell], and ``scales`` (n,), the
+    scale there [pixel/m]; 0 if it is outside the image or behind the camera.
     """
     camera, one, least = view.camera, np.float32(1.0), np.float32(view.camera[5])
     focal_x = np.float32(camera[1] / view.cell)

@@ -83,15 +83,10 @@ class ExactSearch:
     def _descend(
         self, problem: RefinementProblem, poses: Sequence[np.ndarray], deadline: float
     ) -> ExactPose | None:
-        """Refine some starts by the coarse passes, and the best of them by ``refine``.
+        """Refine starts (m + 4,) by the coarse passes, and the best of them by ``refine``.
 
-        Args:
-            problem: the silhouettes and the body.
-            poses: (m + 4,) parameters of each start, as in ``RefinementBody``.
-            deadline: time.perf_counter() at which the search ends [s].
-
-        Returns:
-            The refined pose; None if J is hopelessly large after the coarse passes.
+        ``deadline``: time.perf_counter() at which the search ends [s]. Returns the refined pose;
+        None if J is hopelessly large after the coarse passes.
         """
         freedom, length = self.body.freedom(), problem.border_length
         coarse = [descend(problem, pose, freedom, PASSES.coarse) for pose in poses]

@@ -254,12 +254,9 @@ class PaperRun:
     def _patterns(self, leaves: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """Group the pixels that no inner node covers by the leaves' candidates that cover them.
 
-        ``leaves``: indices of the nodes without children.
-
-        Returns:
-            (n, candidates) bool the distinct sets of candidates of each view, with a column for
-            each candidate, leaf after leaf; and (n,) for each set the number of its pixels in the
-            silhouette minus the number outside.
+        Returns (n, candidates) bool the distinct sets of candidates of each view, with a column for
+        each candidate, leaf after leaf; and (n,) for each set the number of its pixels in the
+        silhouette minus the number outside.
         """
         inner = [i for i, node in enumerate(self.nodes) if node.children]
         adopted = [array[inner] for array in self._adopted()]

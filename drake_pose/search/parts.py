@@ -315,13 +315,10 @@ class PartSearch:
         return self._restore(moved, X_WN, part.held)
 
     def _exchanged(self, parameters: np.ndarray, part: Part, wanted: np.ndarray) -> np.ndarray:
-        """Return parameters with a part's left and right exchanged, and its first node turned.
+        """Return parameters (m + 4,) with a part's sides exchanged, and its first node turned.
 
-        Args:
-            parameters: (m + 4,) the pose, as in ``RefinementBody``.
-            part: the part, of k nodes.
-            wanted: (k, 3) the wanted centres of its nodes in the world [m]. The first node takes
-                the sample that comes nearest to these.
+        ``wanted``: (k, 3) wanted centres of the part's k nodes in the world [m]. The first node
+        takes the sample that comes nearest to these.
         """
         moved, first = parameters.copy(), part.nodes[0]
         for node, source in zip(part.nodes[1:], part.sources[1:], strict=True):

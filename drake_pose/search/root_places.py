@@ -229,11 +229,8 @@ def _places_in_space(
 ) -> RootPlaces:
     """Return the points of a grid in space that project into or near all silhouettes.
 
-    Args:
-        views: the silhouettes, one per camera.
-        main: the view with the largest silhouette.
-        middle: (3,) centre of the grid in the world [m].
-        size: likeliest number of pixels per metre at the body in ``main``.
+    ``main``: the view with the largest one. ``middle``: (3,) centre of the grid in the world [m].
+    ``size``: likeliest number of pixels per metre at the body in ``main``.
     """
     settings, extent = RootPlacementSettings(), _extent(main.mask) / size
     half = 0.75 * extent * (settings.cut_off if _touches_edge(main.mask) else 1.0)

@@ -429,16 +429,10 @@ class RobustModes:
     ) -> list[np.ndarray]:
         """Move one value step by step, with the others fitted, while the pose fits as well.
 
-        Args:
-            values: (m,) the pose from which the value is moved [rad or m].
-            index: index of the value that is moved.
-            along: (m,) change of all values per unit of the moved one; its sign is the direction.
-            width: first step [rad or m].
-
-        Returns:
-            Values (m,) of the poses, the first the given one. The last is interpolated to where the
-            increase of the cost becomes significant, unless the value's limit or the end of the
-            time comes first.
+        ``values``: (m,) the start [rad or m]. ``along``: (m,) change of all values per unit of the
+        moved one; its sign is the direction. ``width``: first step [rad or m]. Returns the poses'
+        values, the given ones first. The last is interpolated to where the increase of the cost
+        becomes significant, unless the value's limit or the end of the time comes first.
         """
         settings = self._settings
         longest = settings.longest_steps[0 if self._kinematics.is_angle[index] else 1]

@@ -389,11 +389,8 @@ def _read_truth(
 ) -> tuple[MeasuredPositions | None, tuple[str, ...]]:
     """Return the measured positions of a scene's folder, None if there are none, and warnings.
 
-    Args:
-        scene: the scene's folder.
-        given: the table; None: joint_angles.csv, ignored if it belongs to another model.
-        model: the model with the positions.
-        frames: names of the frames to be estimated; there is a warning if none has a row.
+    ``given``: the table; None: joint_angles.csv, ignored if it belongs to another model. There is a
+    warning if none of ``frames`` has a row.
     """
     path = given or scene / JOINT_TABLE
     if given is None and not os.path.lexists(path):

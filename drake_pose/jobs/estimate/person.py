@@ -197,17 +197,9 @@ def _record_frame(
 ) -> tuple[FrameRecord, Drawn]:
     """Return the record and overlays of a frame of a captured person.
 
-    Args:
-        inputs: the inputs.
-        captured: the capture, with poses of all frames.
-        index: index of the frame.
-        X_WN: (nodes, 4, 4) poses of the body's nodes in the world [m].
-        masks: masks by camera, of the cameras used.
-        reader: reads all masks of the frame.
-        distance: mean distance of the contours [pixel], if the frame was tracked by colour; else
-            nan.
-        seconds: time per frame [s].
-        overlay: whether overlays are drawn.
+    ``index``: of the frame. ``X_WN``: (nodes, 4, 4) the body's nodes in the world [m]. ``masks``:
+    by camera, of those used. ``distance``: of the contours [pixel], if the frame was tracked by
+    colour; else nan. ``seconds``: time per frame [s]. ``overlay``: whether overlays are drawn.
     """
     scene, frame, q = inputs.scene, inputs.frames[index], captured.q[index]
     shown: dict[str, NDArray[np.generic]] = inputs.pictures(frame) if overlay else {}

@@ -160,19 +160,10 @@ def _fit_first_frames(
 ) -> KnownShape | None:
     """Fit link lengths and radius scales to the first frames in which two cameras see somebody.
 
-    Args:
-        scene: cameras, sources and backgrounds.
-        settings: tolerance of synchronised pictures.
-        tree: the person's pose tree.
-        on_report: called with messages about live cameras.
-        count: number of frames; fewer if recordings end before, or live cameras are read for a
-            minute.
-
-    Returns:
-        Link lengths and radius scales; None for a model without shape joints.
-
-    Raises:
-        SettingsError: two cameras never saw a person at the same time.
+    ``settings``: tolerance of synchronised pictures. ``on_report``: gets messages about live
+    cameras. ``count``: number of frames; fewer if recordings end before, or live cameras are read
+    for a minute. Returns both; None for a model without shape joints. Raises SettingsError: two
+    cameras never saw a person at the same time.
     """
     if not shape_values(tree).any():
         return None
@@ -279,16 +270,11 @@ def _best_registered_frame(
 ) -> tuple[tuple[Array, float] | None, dict[str, Picture]]:
     """Find the frame most like the registered pose.
 
-    Args:
-        setup: setup without registered pose.
-        ring: cameras around the person.
-        sensors: sensors of the cameras; they are closed.
-        on_report: called with messages about cameras.
-        more_frames: number of frames after a good one that may still be better.
-
-    Returns:
-        Positions (nq,) [rad or m] and similarity (1: equal), None if no frame had two whole
-        silhouettes; and the frame's pictures (H, W, 3) by camera, {} for None.
+    ``setup``: without registered pose. ``ring``: cameras around the person. ``sensors``: are
+    closed. ``on_report``: gets messages about cameras. ``more_frames``: number of frames after a
+    good one that may still be better. Returns positions (nq,) [rad or m] and similarity (1: equal),
+    None if no frame had two whole silhouettes; and the frame's pictures (H, W, 3) by camera, {} for
+    None.
     """
     diagram = build_paper_capture(setup, sensors, sensors.period).diagram
     registered: RegisteredPose | None = None
@@ -418,13 +404,8 @@ class _FrameWriter:
     ) -> None:
         """Record doubts about the result of the paper's stages in a frame.
 
-        Args:
-            context: context of the diagram.
-            frame: the frame's name.
-            q: (nq,) positions; nan before the registered pose.
-            ious: intersection over union by camera.
-            min_iou: mean IoU below which the pose is doubtful; tracked simulated persons have
-                about 0.8.
+        ``q``: (nq,) positions; nan before the registered pose. ``min_iou``: mean of ``ious`` by
+        camera below which the pose is doubtful; tracked simulated persons have about 0.8.
         """
         doubts = []
         if not np.isfinite(q).all():

@@ -150,13 +150,10 @@ def frame_ranges(frames: Iterable[str], known: Sequence[str], max_ranges: int = 
 
 
 def _find_repeats(scene: Scene, min_change: float = 0.02) -> tuple[dict[str, list[str]], list[str]]:
-    """Return the frames of a scene in which cameras show their last picture again.
+    """Return the frames in which a camera alone repeats, by camera; and those in which all do.
 
     ``min_change``: change of the other cameras' silhouettes, as a fraction of their area, from
     which a camera that shows no change is frozen.
-
-    Returns:
-        By camera, the frames in which it alone repeats; and the frames in which all cameras repeat.
     """
     repeats = _repeated_files(scene)
     frozen: dict[str, list[str]] = {}
@@ -198,11 +195,8 @@ def _repeated_files(scene: Scene) -> set[tuple[str, str]]:
 def _check_gaps(frames: Sequence[str], max_gaps: int = 6) -> list[str]:
     """Return one warning about numbers missing between consecutively numbered frames, or none.
 
-    Numbers are missing where a step between frames is larger than the median step.
-
-    Args:
-        frames: names of the frames, in order.
-        max_gaps: largest number of gaps that are listed.
+    Numbers are missing where a step between frames is larger than the median step. ``max_gaps``:
+    largest number of gaps that are listed.
     """
     keys = [natural_key(frame) for frame in frames]
     if len(keys) < 3 or any(key[:-2] != keys[0][:-2] or key[-1][0] for key in keys):

@@ -525,12 +525,8 @@ def _join_frames(
 ) -> tuple[dict[tuple[str, str], Path], list[str]]:
     """Merge the cameras' frames; a frame is named by its longest spelling.
 
-    If several cameras have masks, frames of equal number are the same.
-
-    ``files``: mask files by camera, named by frame.
-
-    Returns:
-        Mask files by (camera, frame), and warnings about duplicates.
+    If several cameras have masks, frames of equal number are the same. ``files``: by camera, named
+    by frame. Returns mask files by (camera, frame), and warnings about duplicates.
     """
     spellings = {file.stem for own_files in files.values() for file in own_files}
     several = sum(map(bool, files.values())) > 1

@@ -91,7 +91,7 @@ class PersonSettings:
         return self.headings // self.headings_per_frame
 
     def headings_of(self, frame: int) -> list[int]:
-        """Return the indices of headings tried in a troubled frame, spread over a `cycle`."""
+        """Return the indices of headings tried in troubled `frame` (modulo `cycle`), all around."""
         # The bit-reversed order puts neighbouring headings late.
         order = sorted(range(self.cycle), key=lambda k: f"{k:032b}"[::-1])
         return list(range(order[frame % self.cycle], self.headings, self.cycle))

@@ -205,7 +205,7 @@ class MultiViewFrame:
     def edges(self, cameras: Sequence[Camera], spacing: float) -> Evidence:
         """Return the edge points of each camera's mask; none for a camera without a mask.
 
-        ``spacing``: an integer of 1 or more [pixel]. Raises MaskError: a mask has a wrong size.
+        ``spacing``: rounded, 1 or more [pixel]. Raises MaskError: a mask has a wrong size.
         """
         edges = [NO_EDGE] * len(cameras)
         for k, camera in enumerate(cameras):

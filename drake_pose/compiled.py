@@ -49,8 +49,7 @@ def compiled(function: Any = None, **options: Any) -> Any:
         function: the kernel, if the decorator is used without parentheses; None: with them.
         options: options of ``numba.njit``; they override the defaults.
 
-    Returns:
-        The compiled kernel, or, with parentheses, a decorator.
+    Returns the compiled kernel, or, with parentheses, a decorator.
     """
     if function is None:
         return functools.partial(compiled, **options)

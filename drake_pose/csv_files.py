@@ -19,9 +19,8 @@ def csv_text(rows: Iterable[Sequence[object]]) -> str:
 def read_number(cell: str) -> float:
     """Return the number in a cell; nan if the cell is empty.
 
-    Raises:
-        ValueError: the cell is not a number. Digit separators (1_8), which Python accepts, are
-            refused.
+    Raises ValueError: the cell is not a number. Digit separators (1_8), which Python accepts, are
+    refused.
     """
     if "_" in cell:
         raise ValueError(f"'{cell[:40]}' is not a number")
@@ -39,9 +38,8 @@ def read_csv(
         error_type: class of the exceptions.
         whole_lines: ignore text after the last line break, which an interrupted writer left.
 
-    Raises:
-        error_type: the file is unreadable or empty, its columns are not separated by commas, or a
-            line has a different number of cells than the header. The message names the file.
+    Raises error_type: the file is unreadable or empty, its columns are not separated by commas, or
+    a line has a different number of cells than the header. The message names the file.
     """
     try:
         text = read_regular(path).decode("utf-8-sig")

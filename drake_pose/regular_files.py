@@ -12,9 +12,8 @@ def read_regular(path: Path, limit: int = -1) -> bytes:
     Args:
         limit: maximum number of bytes that are read; negative: the whole file.
 
-    Raises:
-        OSError: the file is unreadable, not a regular file, or, without limit, larger than 2 GiB;
-            its strerror gives the reason.
+    Raises OSError: the file is unreadable, not a regular file, or, without limit, larger than 2
+    GiB; its strerror gives the reason.
     """
     if require_regular(path) > 1 << 31 and limit < 0:
         raise OSError(errno.EFBIG, "it is larger than 2 GiB", str(path))
@@ -27,8 +26,7 @@ def digest(path: Path) -> str:
 
     Large PNG files are identified too, because their last bytes are a checksum of the whole file.
 
-    Raises:
-        OSError: the file is unreadable or not a regular file.
+    Raises OSError: the file is unreadable or not a regular file.
     """
     size, end = require_regular(path), 1 << 20
     found = hashlib.sha256(str(size).encode())
@@ -51,8 +49,7 @@ def pointer_hint(path: Path) -> str:
 def require_regular(path: Path) -> int:
     """Return a file's size [byte] without opening the file, since opening a pipe blocks.
 
-    Raises:
-        OSError: it is not a regular file; strerror names its kind.
+    Raises OSError: it is not a regular file; strerror names its kind.
     """
     kinds = {stat.S_IFDIR: "folder", stat.S_IFIFO: "named pipe", stat.S_IFSOCK: "socket"}
     kinds |= dict.fromkeys((stat.S_IFCHR, stat.S_IFBLK), "device")

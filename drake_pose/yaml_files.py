@@ -63,8 +63,7 @@ def read_yaml(
             else such a file is refused.
         largest: maximum size of the file [byte].
 
-    Raises:
-        error_type: the file is unreadable, too large or invalid. The message names the file.
+    Raises error_type: the file is unreadable, too large or invalid. The message names the file.
     """
     try:
         data = read_regular(path, largest + 1)
@@ -92,8 +91,7 @@ def typed_entry(
         where: start of the error message.
         error_type: class of the exception.
 
-    Raises:
-        error_type: a field is unknown or has the wrong type.
+    Raises error_type: a field is unknown or has the wrong type.
     """
     try:
         return yaml_load_typed(schema=schema, data=yaml.safe_dump(entry))

@@ -137,8 +137,7 @@ def place_bands(
         placed: (n, v, 3) vertices of all bands in their nodes' frames [m]; the vertices of changed
             bands are overwritten, the others keep their positions of the previous call.
 
-    Returns:
-        (n, b) bool, whether each band was placed anew at each pose.
+    Returns (n, b) bool, whether each band was placed anew at each pose.
     """
     basis, joint, product = np.empty((3, 4)), np.empty((3, 4)), np.empty((3, 4))
     max_count, x = 0, np.empty(3)

@@ -81,9 +81,8 @@ def landmark_positions(
         q: (nq,) the plant's positions [rad or m].
         X_WB: (4, 4) pose of the plant's world frame in the world; None: the identity.
 
-    Raises:
-        SettingsError: q has the wrong size or is not finite.
-        UnknownNameError: a landmark's link does not exist.
+    Raises SettingsError: q has the wrong size or is not finite; UnknownNameError: a landmark's link
+    does not exist.
     """
     positions = np.asarray(q, dtype=np.float64)
     count = len(model.position_names)
@@ -103,9 +102,8 @@ def landmarks_of_nodes(tree: PoseTree, landmarks: Mapping[str, Landmark]) -> Nod
 
     ``landmarks``: the landmarks by name (``load_landmarks``).
 
-    Raises:
-        UnknownNameError: a landmark's link does not exist.
-        ModelError: a landmark's link moves with no node, because it has no geometry.
+    Raises UnknownNameError: a landmark's link does not exist; ModelError: a landmark's link moves
+    with no node, because it has no geometry.
     """
     model = tree.model
     graph = build_link_graph(model, tree.root if tree.root in model.link_meshes else None)

@@ -271,9 +271,8 @@ def sanitise_sdf(
         warn: receives a message for each part that is not read or not enforced.
         sanitise_file: returns the path of a sanitised copy of an included model file.
 
-    Returns:
-        The text, and the limits (lower, upper) [rad] of universal and screw joints by position
-        name, which Drake's parser does not read.
+    Returns the text, and the limits (lower, upper) [rad] of universal and screw joints by position
+    name, which Drake's parser does not read.
 
     Raises ModelError: the file is invalid; the message names the link, joint or mesh.
     """

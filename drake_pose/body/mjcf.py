@@ -37,8 +37,7 @@ def sanitise_mjcf(path: Path, warn: Warn) -> tuple[str, list[MjcfCoupling]]:
         path: the MJCF file.
         warn: receives a message for each constraint that is not enforced.
 
-    Returns:
-        The text, and the couplings between joints, which Drake's parser does not read.
+    Returns the text, and the couplings between joints, which Drake's parser does not read.
 
     Raises ModelError: the file is no MJCF, or MuJoCo refuses it; the message says why.
     """

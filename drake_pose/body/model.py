@@ -353,8 +353,7 @@ def _parse(
 
     ``path`` names the model in messages.
 
-    Returns:
-        The plant, its SceneGraph, the model instances, and warnings about the file.
+    Returns the plant, its SceneGraph, the model instances, and warnings about the file.
     """
     plant = MultibodyPlant(time_step=0.0)
     scene_graph = SceneGraph()

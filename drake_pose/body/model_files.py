@@ -218,8 +218,7 @@ def take_mimic(
         leaders: names of the joints that can be followed.
         warn: receives a message for a <mimic> that is not enforced.
 
-    Returns:
-        The attributes joint, multiplier and offset of a <mimic>; None: none can be enforced.
+    Returns the attributes joint, multiplier and offset of a <mimic>; None: none can be enforced.
     """
     found, defaults = None, {"multiplier": "1", "offset": "0", "reference": "0"}
     for mimic in parent.findall("mimic"):

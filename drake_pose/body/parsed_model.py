@@ -60,9 +60,8 @@ def load_skin(model_path: Path, link_names: Sequence[str]) -> tuple[SkinBand, ..
       vertex rises smoothly from 0 at ``begin`` to 1 at ``end``.
     - ``colour``: (r, g, b), optional.
 
-    Raises:
-        ModelError: the file or a mesh cannot be used.
-        UnknownNameError: a band names a link that does not exist.
+    Raises ModelError: the file or a mesh cannot be used; UnknownNameError: a band names a link that
+    does not exist.
     """
     path = skin_file(model_path)
     if not path.is_file():
@@ -186,12 +185,10 @@ def describe_positions(
         given: limits (lower, upper) [rad or m] by position name that replace the plant's limits.
         where: the model file, for messages.
 
-    Returns:
-        The attributes of ``ParsedModel`` that describe positions, by name, and the warnings.
+    Returns the attributes of ``ParsedModel`` that describe positions, by name, and the warnings.
 
-    Raises:
-        UnknownNameError: ``given`` names a position that does not exist.
-        ModelError: a joint has an unknown type, or limits that cannot be searched.
+    Raises UnknownNameError: ``given`` names a position that does not exist; ModelError: a joint has
+    an unknown type, or limits that cannot be searched.
     """
     names = plant.GetPositionNames(add_model_instance_prefix=False, always_add_suffix=False)
     scoped = plant.GetPositionNames(add_model_instance_prefix=True, always_add_suffix=False)
@@ -324,9 +321,8 @@ def _search_limits(
         default: the default position [rad or m].
         given: limits (lower, upper) [rad or m] that replace the joint's; None: the joint's.
 
-    Returns:
-        The lower and the upper limit [rad or m], whether the position counts as unlimited, and a
-        warning ("": none). An unlimited length has infinite limits.
+    Returns the lower and the upper limit [rad or m], whether the position counts as unlimited, and
+    a warning ("": none). An unlimited length has infinite limits.
 
     Raises ModelError: limits are NaN or crossed, an angle's are one-sided, or a screw's too wide.
     """

@@ -376,9 +376,8 @@ def _check_in_fork(read: Reader, path: str, packages: str, limits: str) -> str:
 
     The arguments are those of ``why_unusable``: packages and limits are JSON.
 
-    Raises:
-        TimeoutError: the fork did not answer in time.
-        ChildProcessError: the fork ended without an answer; the message says how.
+    Raises TimeoutError: the fork did not answer in time; ChildProcessError: the fork ended without
+    an answer; the message says how.
     """
     fork = multiprocessing.get_context("fork")
     receiver, sender = fork.Pipe(duplex=False)

@@ -130,8 +130,7 @@ class PlantSource:
                 already or gets no geometry.
             prefix: put before the names of model instances.
 
-        Returns:
-            The model instances of the copy, and no warnings.
+        Returns the model instances of the copy, and no warnings.
 
         Raises ModelError: a joint has a type that cannot be copied.
         """

@@ -187,9 +187,8 @@ class PoseTree:
     def with_root_position(self, root_position: Array) -> "PoseTree":
         """Return the tree with the root's origin at another position (3,) in the world [m].
 
-        Raises:
-            SettingsError: the tree has several roots, or was not made by ``pose_tree``.
-            ModelError: the base joints cannot move the root there.
+        Raises SettingsError: the tree has several roots, or was not made by ``pose_tree``;
+        ModelError: the base joints cannot move the root there.
         """
         if self._rebuild is None:
             raise SettingsError("only a tree made by ArticulatedModel.pose_tree can be moved")
@@ -224,9 +223,8 @@ class PoseTree:
             intervals: intervals [rad or m] of single positions or root values, by name; None: none.
             length_interval: sampling interval of lengths [m].
 
-        Raises:
-            SettingsError: an interval is not positive, or the grid is too large.
-            UnknownNameError: a name in ``intervals`` does not exist.
+        Raises SettingsError: an interval is not positive, or the grid is too large;
+        UnknownNameError: a name in ``intervals`` does not exist.
         """
         intervals = intervals or {}
         known = [name for node in self.nodes for name in node.value_names]
@@ -336,9 +334,8 @@ class PoseTree:
 
         ``values``: each node's values (k_i,) [rad or m].
 
-        Returns:
-            q (nq,), and X_WB (4, 4), the pose of the plant's world frame B in the world W. X_WB is
-            the identity where the plant's base joints can take up the root's pose.
+        Returns q (nq,), and X_WB (4, 4), the pose of the plant's world frame B in the world W. X_WB
+        is the identity where the plant's base joints can take up the root's pose.
 
         Raises ModelError: the base joints cannot reach the root's pose.
         """

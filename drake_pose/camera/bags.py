@@ -60,8 +60,7 @@ def open_bag(path: Path, joints: JointLog | None) -> Episode:
     Args:
         joints: joint log to use instead of the bag's; None: the bag's, if it has any.
 
-    Raises:
-        SceneError: the bag is unreadable, truncated, or has no images.
+    Raises SceneError: the bag is unreadable, truncated, or has no images.
     """
     pictures, states, infos, parents, ignored, kinds = _scan(path)
     warnings = [
@@ -117,8 +116,7 @@ def _scan(path: Path) -> tuple[Any, Any, Any, Any, Any, Any]:
         pose (4, 4) in it [m]) of each static frame by name; the reason why a topic is ignored, by
         topic; and the type of message by topic.
 
-    Raises:
-        SceneError: the bag is damaged, or has no images.
+    Raises SceneError: the bag is damaged, or has no images.
     """
     pictures, states = defaultdict[str, list[_Row]](list), defaultdict[Any, list[_Row]](list)
     infos, parents, ignored = {}, {}, dict[str, str]()
@@ -310,8 +308,7 @@ def _ordered_times(
         what: name of the rows, for messages.
         warnings: list to which warnings are appended.
 
-    Raises:
-        SceneError: too many rows are out of order, see ``ascending_indices``.
+    Raises SceneError: too many rows are out of order, see ``ascending_indices``.
     """
     stamps = np.array([row[:2] for row in rows])
     times = 1e-9 * stamps[:, 1]
@@ -372,8 +369,7 @@ def _read_camera(
         infos: CameraInfo messages by topic.
         warnings: list to which warnings are appended.
 
-    Raises:
-        SceneError: the first image is damaged, times run backwards, or the lens is unknown.
+    Raises SceneError: the first image is damaged, times run backwards, or the lens is unknown.
     """
     times, kept = _ordered_times(rows, shift, f"{topic}: pictures", warnings)
     source = _TopicPictures(path, topic, [row[1] for row in rows], kept)
@@ -416,8 +412,7 @@ def _lens(info: Any, *, is_rectified: bool, where: str) -> Lens:
         is_rectified: whether the images are rectified.
         where: start of error messages.
 
-    Raises:
-        SceneError: the distortion model is unknown.
+    Raises SceneError: the distortion model is unknown.
     """
     size, K, D, P = (info.width, info.height), *(_field(info, one) for one in ("k", "d", "p"))
     K = P.reshape(3, 4)[:, :3] if is_rectified and P.any() else K
@@ -459,8 +454,7 @@ class _TopicPictures:
     def read(self, k: int) -> Picture:
         """Return image k, from 0 in the order of ``kept``, (H, W, 3) red, green, blue.
 
-        Raises:
-            SceneError: it is damaged, or the bag's index is wrong.
+        Raises SceneError: it is damaged, or the bag's index is wrong.
         """
         wanted, where = self._places[k], f"{self._path}: {self._topic}, picture {k}"
         with _translate_errors(self._path):

@@ -54,8 +54,7 @@ def read_camera_content(
         largest_json: the same for `.json` and `.jsonl` [byte].
         episode_ids: of a `.jsonl`, only the lines that hold one of these names are read, if any do.
 
-    Raises:
-        CameraError: the file cannot be read.
+    Raises CameraError: the file cannot be read.
     """
     is_json = path.suffix in (".json", ".jsonl")
     try:
@@ -104,9 +103,8 @@ def calibrated_cameras(
     Returns:
         By name, the lens and the pose X_WC (4, 4) [m] of each camera; None: the file has no pose.
 
-    Raises:
-        CameraError: a field is missing or invalid, OpenCV does not have the lens model, or a camera
-            is so far away that lengths cannot be in metres.
+    Raises CameraError: a field is missing or invalid, OpenCV does not have the lens model, or a
+    camera is so far away that lengths cannot be in metres.
     """
     if isinstance(content, list):
         return _droid_3d(content, path)
@@ -242,8 +240,7 @@ def lens_of(size: Any, matrix: Any, distortion: Any, model: str, where: str) -> 
         model: name of the distortion model.
         where: start of error messages.
 
-    Raises:
-        CameraError: the model is unknown, or a value is invalid.
+    Raises CameraError: the model is unknown, or a value is invalid.
     """
     kinds = {"plumb_bob": False, "rational_polynomial": False, "radtan": False, "none": False}
     kinds |= {"equidistant": True, "fisheye": True}  # OpenCV's fisheye.
@@ -300,8 +297,7 @@ def _lens(
         largest_skew: maximum skew that is ignored [f_x]; it amounts to half a pixel at the edge of
             an image.
 
-    Raises:
-        CameraError: a value is missing or invalid.
+    Raises CameraError: a value is missing or invalid.
     """
     sides, K, D = (_numbers(one) for one in (size, matrix, distortion))
     if sides is None or sides.size != 2:

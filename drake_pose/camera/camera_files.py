@@ -148,8 +148,7 @@ def load_camera_file(
         recording: the recording, which says what episode it is in DROID's files of many; None:
             unknown.
 
-    Raises:
-        CameraError: names the file, the camera and the field at fault.
+    Raises CameraError: names the file, the camera and the field at fault.
     """
     path = Path(path)
     episode_ids, serials = recording_names(recording)
@@ -285,8 +284,7 @@ def dump_cameras(
 def _find_configs(content: dict[Any, Any], path: Path) -> dict[str, Any] | None:
     """Return unchecked CameraConfigs of a file's content by name; None if it is not one of Drake's.
 
-    Raises:
-        CameraError: there are several scenarios, or one without a mapping of cameras.
+    Raises CameraError: there are several scenarios, or one without a mapping of cameras.
     """
     if _is_config(content):
         # Drake's default name of a camera.
@@ -350,8 +348,7 @@ def _read_camera(name: str, entry: Any, path: Path) -> Camera:
         entry: the entry, not yet checked.
         path: the file, for messages.
 
-    Raises:
-        CameraError: a field is missing, unknown or invalid.
+    Raises CameraError: a field is missing, unknown or invalid.
     """
     where = f"{path}: camera '{name}'"
     if not isinstance(entry, dict):

@@ -119,9 +119,8 @@ def _pinhole(
 def camera_from_config(config: CameraConfig) -> PinholeCamera:
     """Return the camera of a CameraConfig's colour and label sensor, with X_WC = X_PB X_BC.
 
-    Raises:
-        CameraError: the camera is attached to a frame other than the world, a pose is stochastic,
-            or a value is invalid.
+    Raises CameraError: the camera is attached to a frame other than the world, a pose is
+    stochastic, or a value is invalid.
     """
     where = f"camera '{config.name}'"
     frame = config.X_PB.base_frame
@@ -145,8 +144,7 @@ def camera_to_config(camera: Camera) -> CameraConfig:
     Its depth range and far clipping plane are Drake's defaults, or larger if the near plane is far
     away; all else that a camera does not say is Drake's default.
 
-    Raises:
-        CameraError: a parallel camera, or a principal point outside the image.
+    Raises CameraError: a parallel camera, or a principal point outside the image.
     """
     if not isinstance(camera, PinholeCamera):
         raise CameraError(f"camera '{camera.name}': a CameraConfig is a pinhole, not parallel")
@@ -184,8 +182,7 @@ def read_configs(entries: Mapping[str, Any], path: Path) -> dict[str, PinholeCam
         entries: entries by key, not yet checked; None: all defaults.
         path: the file, for messages.
 
-    Raises:
-        CameraError: names the file, the camera and the problem.
+    Raises CameraError: names the file, the camera and the problem.
     """
     cameras: dict[str, PinholeCamera] = {}
     for key, entry in entries.items():
@@ -225,8 +222,7 @@ def dump_scenario(
         links: link of each camera that is mounted on one, by the camera's name; its pose is in the
             link's frame. None: all poses are in the world.
 
-    Raises:
-        CameraError: a parallel camera, or a principal point outside the image.
+    Raises CameraError: a parallel camera, or a principal point outside the image.
     """
     content = {}
     for camera in camera_tuple(cameras):

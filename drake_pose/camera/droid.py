@@ -33,8 +33,7 @@ def open_droid(path: Path, joints: JointLog | None) -> Episode:
         path: the folder.
         joints: joint log to use instead of the trajectory's; None: the trajectory's.
 
-    Raises:
-        SceneError: names the file that is missing or damaged.
+    Raises SceneError: names the file that is missing or damaged.
     """
     h5py = import_reader("h5py", path)
     where, folder = path / TRAJECTORY, path / "recordings" / "MP4"

@@ -30,8 +30,7 @@ class JointLog:
 
         Times more than half the median step outside the log give nan.
 
-        Raises:
-            SceneError: the log has no times.
+        Raises SceneError: the log has no times.
         """
         if self.times is None:
             raise SceneError("the joint log's rows have frames, but no times [s]")
@@ -86,8 +85,7 @@ class EpisodeCamera:
     def read(self, k: int) -> Picture:
         """Return image k (H, W, 3), red, green, blue, without distortion.
 
-        Raises:
-            SceneError: there is no such image, it is unreadable, or it has another size.
+        Raises SceneError: there is no such image, it is unreadable, or it has another size.
         """
         where, last = f"camera '{self.name}'", len(self.times) - 1
         if not 0 <= k <= last:
@@ -138,8 +136,7 @@ class Episode:
             lacking: what the recording has instead of joint positions, and what is wanted; "": no
                 more is known. It is the last warning if there is no log.
 
-        Raises:
-            SceneError: there is no camera or no row, or images cannot be associated with rows.
+        Raises SceneError: there is no camera or no row, or images cannot be associated with rows.
         """
         found, warnings = {camera.name: camera for camera in cameras}, list(reader_warnings)
         if not found:
@@ -174,8 +171,7 @@ class Episode:
     def camera(self, name: str) -> EpisodeCamera:
         """Return a camera by name.
 
-        Raises:
-            UnknownNameError: there is no such camera.
+        Raises UnknownNameError: there is no such camera.
         """
         if name not in self.cameras:
             raise UnknownNameError("camera", name, self.cameras, str(self.path))
@@ -194,8 +190,7 @@ def ascending_indices(
         what: what has these times, for messages.
         max_fraction: maximum fraction of all time stamps that may be left out.
 
-    Raises:
-        SceneError: there are no time stamps, or more than this fraction are out of order.
+    Raises SceneError: there are no time stamps, or more than this fraction are out of order.
     """
     stamps = np.where(np.isfinite(times), times, np.nan)
     before = np.fmax.accumulate(np.concatenate([[-np.inf], stamps]))[:-1]
@@ -250,8 +245,7 @@ def _comparison_warnings(path: Path, camera: EpisodeCamera, joints: JointLog) ->
         camera: the camera.
         joints: the joint log.
 
-    Raises:
-        SceneError: no frame is in both, or they have neither frames nor times in common.
+    Raises SceneError: no frame is in both, or they have neither frames nor times in common.
     """
     count, where = len(camera.times), f"camera '{camera.name}'"
     if joints.frames and camera.frames:

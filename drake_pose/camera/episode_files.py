@@ -42,9 +42,8 @@ def read_joint_table(path: Path) -> tuple[JointLog, list[str]]:
     The table has a column `time` [s] or `frame`, or both, and one column per joint. Empty cells
     become nan.
 
-    Raises:
-        SceneError: the table is unreadable or empty, has neither column or no joint, a duplicate
-            column or frame, a cell that is not a number, or times that run backwards.
+    Raises SceneError: the table is unreadable or empty, has neither column or no joint, a duplicate
+    column or frame, a cell that is not a number, or times that run backwards.
     """
     header, rows = read_csv(path, SceneError)
     columns = dict(zip(header, zip(*(cells for _, cells in rows), strict=True), strict=False))
@@ -83,9 +82,7 @@ def open_folder(path: Path, joints: JointLog | None) -> Episode:
         joints: joint log to use instead of the folder's `joint_angles.csv`; None: that, if it
             exists.
 
-    Raises:
-        SceneError: images or the table are unusable.
-        CameraError: the camera file is unusable.
+    Raises SceneError: images or the table are unusable; CameraError: the camera file is unusable.
     """
     warnings: list[str] = []
     if joints is None and (path / JOINT_TABLE).exists():
@@ -164,8 +161,7 @@ def _image_camera(
         scene: path of the scene.yaml, which may be missing.
         joints: joint log of the recording; None: none.
 
-    Raises:
-        SceneError: there is no image, or a file is unusable.
+    Raises SceneError: there is no image, or a file is unusable.
     """
     files, stamps, warnings = find_pictures(folder, name), folder / TIME_STAMPS, list[str]()
     frames = in_order(files)
@@ -204,8 +200,7 @@ def picture_times(files: Mapping[str, Path] | Path, scene: Path) -> dict[str, fl
         files: picture files by frame, or a video, whose frames are named 000000 and so on.
         scene: path of the scene.yaml with the rate, which may be missing.
 
-    Raises:
-        SceneError: a file is unreadable.
+    Raises SceneError: a file is unreadable.
     """
     if isinstance(files, Path):
         return {f"{k:06d}": float(time) for k, time in enumerate(TimedVideo(files).times)}
@@ -225,8 +220,7 @@ def read_sequence(path: Path, sequence: bool = False) -> tuple[bool, float | Non
         path: the file, which may be missing.
         sequence: whether frames are a sequence if the file does not say.
 
-    Raises:
-        SceneError: the file is unreadable or has other content.
+    Raises SceneError: the file is unreadable or has other content.
     """
     if not os.path.lexists(path):
         return sequence, None

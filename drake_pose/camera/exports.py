@@ -23,8 +23,7 @@ def ros_camera_info(camera: Camera) -> str:
 
     The images have no distortion: D is 0, R the identity, and P is K.
 
-    Raises:
-        CameraError: a parallel camera.
+    Raises CameraError: a parallel camera.
     """
     one = _pinhole(camera, "a CameraInfo")
     K = np.array([[one.focal_x, 0.0, one.center_x], [0.0, one.focal_y, one.center_y], [0, 0, 1.0]])
@@ -67,8 +66,7 @@ def mujoco_cameras(cameras: Mapping[str, Camera] | Iterable[Camera]) -> str:
 
     Cameras whose X_WC is the pose in a link belong into that link's <body> instead.
 
-    Raises:
-        CameraError: a parallel camera.
+    Raises CameraError: a parallel camera.
     """
     root = ElementTree.Element("mujocoinclude")
     pixel = 1e-5  # Size of a sensor pixel [m]; arbitrary, because focal lengths are in pixels.

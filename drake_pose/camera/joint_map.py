@@ -67,8 +67,7 @@ def map_joints(
         table: linear maps of some joints by name, as from `read_joint_map`; the columns of other
             joints are found by `match_names`. None: no maps are given.
 
-    Returns:
-        the mapped log. Readings outside the joints' limits are kept, with a warning.
+    Returns the mapped log. Readings outside the joints' limits are kept, with a warning.
 
     Raises:
         SceneError: no column is a joint, or the readings fit neither radians nor degrees.
@@ -299,8 +298,7 @@ def _without_openings(
         slack: tolerance of the limits, the smaller of this [rad or m] and this fraction of their
             range.
 
-    Returns:
-        the joint of each column that is kept, and warnings about the other columns.
+    Returns the joint of each column that is kept, and warnings about the other columns.
     """
     kept, warnings = dict(matched), list[str]()
     for column, joint in matched.items():
@@ -335,8 +333,7 @@ def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str,
         logged: names of the log's columns.
         wanted: names of the model's joints.
 
-    Returns:
-        the wanted name of each matched logged name, and the warnings.
+    Returns the wanted name of each matched logged name, and the warnings.
     """
     matched = {name: name for name in logged if name in wanted}
     guesses: dict[str, str] = {}
@@ -425,8 +422,7 @@ def _find_unit(
         moves: range of a column's readings above which readings that may be radians are radians:
             as degrees the robot would stand still.
 
-    Raises:
-        SceneError: the readings fit neither radians nor degrees, or seem to be normalised.
+    Raises SceneError: the readings fit neither radians nor degrees, or seem to be normalised.
     """
     low, high = np.maximum(lower, -2.0 * full_turn), np.minimum(upper, 2.0 * full_turn)
     # fmin and fmax ignore missing readings (nan).
@@ -511,8 +507,7 @@ def read_joint_map(path: Path) -> dict[str, Column]:
     the positions there [rad or m]), or `scale` and `offset` (position = scale * reading + offset),
     or `unit` (rad, deg, m, mm).
 
-    Raises:
-        SceneError: names the file, the joint and the field at fault.
+    Raises SceneError: names the file, the joint and the field at fault.
     """
     content = read_yaml(path, SceneError)
     if not isinstance(content, dict) or not content:

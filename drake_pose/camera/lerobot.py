@@ -117,8 +117,7 @@ def camera_key(features: Iterable[str], name: str) -> str:
 def _read_info(path: Path) -> Mapping[str, Any]:
     """Return the content of `meta/info.json`.
 
-    Raises:
-        SceneError: it is no JSON, has no features, or the data set has another version.
+    Raises SceneError: it is no JSON, has no features, or the data set has another version.
     """
     file = path / INFO
     try:
@@ -166,8 +165,7 @@ def _episode_rows(path: Path, info: Mapping[str, Any], parquet: Any) -> _Rows:
         info: content of `meta/info.json`.
         parquet: the module pyarrow.parquet.
 
-    Raises:
-        SceneError: the metadata are damaged.
+    Raises SceneError: the metadata are damaged.
     """
     rows: dict[int, Mapping[str, Any]] = {}
     for file in sorted(path.glob("meta/episodes/*/*.parquet")):
@@ -198,8 +196,7 @@ def _episode_rows(path: Path, info: Mapping[str, Any], parquet: Any) -> _Rows:
 def _count(path: Path, info: Mapping[str, Any], field: str, default: int) -> int:
     """Return a number of `meta/info.json`; ``default`` if there is none.
 
-    Raises:
-        SceneError: it is no whole number.
+    Raises SceneError: it is no whole number.
     """
     found = info.get(field)
     try:
@@ -387,8 +384,7 @@ def _read_camera(
         file: the table's file, for messages.
         warnings: list to which warnings are appended.
 
-    Raises:
-        SceneError: the camera's images are missing or damaged.
+    Raises SceneError: the camera's images are missing or damaged.
     """
     feature, count = info["features"][key], table.num_rows
     if feature.get("dtype") == "video":
@@ -432,8 +428,7 @@ def _video_camera(
         count: number of rows of the episode.
         warnings: list to which warnings are appended.
 
-    Raises:
-        SceneError: the video is unreadable, or has no image in the episode.
+    Raises SceneError: the video is unreadable, or has no image in the episode.
     """
     video, name = TimedVideo(file), key.removeprefix("observation.").removeprefix("images.")
     where = f"videos/{key}"

@@ -37,8 +37,7 @@ def with_fields(camera: EpisodeCamera, fields: Mapping[str, Any], where: str) ->
         fields: fields of its feature and of the feature's `info`, as of `camera_fields`.
         where: the file, for messages.
 
-    Raises:
-        CameraError: a field is invalid, or there is a pose without intrinsics.
+    Raises CameraError: a field is invalid, or there is a pose without intrinsics.
     """
     matrix, pose = fields.get("camera_intrinsics"), fields.get("camera_extrinsics")
     if matrix is None and pose is None:

@@ -26,8 +26,7 @@ def read_numbers(table: Any, key: str, where: str) -> Array:
         key: name of the column.
         where: the table's file, for messages.
 
-    Raises:
-        SceneError: the column has other content, or rows of different lengths.
+    Raises SceneError: the column has other content, or rows of different lengths.
     """
     column = table[key]
     if import_reader("pyarrow", Path(where)).types.is_temporal(column.type):
@@ -66,8 +65,7 @@ def row_times(table: Any, rate_hz: float | None, where: str, warnings: list[str]
         where: the table's file, for messages.
         warnings: list to which warnings are appended.
 
-    Raises:
-        SceneError: there are neither times nor a rate.
+    Raises SceneError: there are neither times nor a rate.
     """
     count, names = table.num_rows, table.column_names
     times = np.full(count, np.nan)
@@ -239,8 +237,7 @@ class StoredPictures:
     def read(self, k: int) -> Picture:
         """Return the image (H, W, 3) of row k, red, green, blue.
 
-        Raises:
-            SceneError: it is missing or damaged.
+        Raises SceneError: it is missing or damaged.
         """
         where = Path(f"{self._file}: '{self._key}', row {k}")
         cell: Any = None

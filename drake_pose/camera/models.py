@@ -63,9 +63,8 @@ def check_pose(value: Any, field: str, where: str) -> np.ndarray:
         value: the transform.
         field, where: field and start of the error message.
 
-    Raises:
-        CameraError: not a finite 4 x 4 matrix, its last row is not 0 0 0 1, or it is not a
-            rotation.
+    Raises CameraError: not a finite 4 x 4 matrix, its last row is not 0 0 0 1, or it is not a
+    rotation.
     """
     value = value.GetAsMatrix4() if hasattr(value, "GetAsMatrix4") else value
     rows = value.tolist() if isinstance(value, np.ndarray) else value
@@ -260,8 +259,7 @@ Camera = PinholeCamera | ParallelCamera
 def camera_tuple(cameras: Mapping[str, Camera] | Iterable[Camera]) -> tuple[Camera, ...]:
     """Return cameras, given by name or as a sequence, as a tuple.
 
-    Raises:
-        CameraError: an element is not a camera, or a single camera is given.
+    Raises CameraError: an element is not a camera, or a single camera is given.
     """
     if isinstance(cameras, Camera):
         raise CameraError(
@@ -316,8 +314,7 @@ def circle_of_cameras(
         size: width and height of the images [pixel].
         face_camera: whether there is a camera for the face.
 
-    Raises:
-        CameraError: there is no camera, or a number is out of range.
+    Raises CameraError: there is no camera, or a number is out of range.
     """
     if count < 1 and not face_camera:
         raise CameraError("a rig needs at least one camera")

@@ -59,8 +59,7 @@ class Servos:
 def parse_motors(content: Any, path: Path) -> dict[str, Motor] | None:
     """Return the motors in a calibration file's content; None: it is no such file.
 
-    Raises:
-        SceneError: an entry is damaged.
+    Raises SceneError: an entry is damaged.
     """
     lists = ("motor_names", "homing_offset", "drive_mode")
     keys, found = {"homing_offset", "range_min", "range_max"}, dict[str, Motor]()
@@ -102,8 +101,7 @@ def read_motors(path: Path, robot: str = "", largest: int = 1 << 20) -> Servos |
         robot: type of the robot, if it is known.
         largest: maximum size of the file [byte]; larger files are none.
 
-    Raises:
-        SceneError: the file cannot be read, or an entry is damaged.
+    Raises SceneError: the file cannot be read, or an entry is damaged.
     """
     try:
         data = read_regular(path, largest + 1)
@@ -129,8 +127,7 @@ def find_motors(folder: Path, robot: str, columns: Iterable[str]) -> tuple[Servo
         columns: names of the recorded columns. A file must have a motor of one of them, or as many
             motors as there are columns if these are only numbered.
 
-    Raises:
-        SceneError: there are several files, and none is clearly the robot's.
+    Raises SceneError: there are several files, and none is clearly the robot's.
     """
     columns, warnings = [*columns], list[str]()
     names = {name.removesuffix(".pos").removeprefix("main_") for name in columns} | {*columns}

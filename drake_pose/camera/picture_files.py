@@ -49,8 +49,7 @@ def frame_key(cell: str) -> int | str:
 def read_picture(path: Path, error_type: type[DrakePoseError]) -> Picture:
     """Return a PNG or JPEG image (H, W, 3) red, green, blue.
 
-    Raises:
-        error_type: the file is unreadable; the message names it.
+    Raises error_type: the file is unreadable; the message names it.
     """
     try:
         return decode_colours(_read(path, error_type), path, error_type)
@@ -98,9 +97,8 @@ def read_binary_mask(
         may_be_empty: accept a mask without any object.
         lossy: accept JPEG files, too; their pixels of 128 or brighter are the object.
 
-    Raises:
-        error_type: the file is unreadable, damaged, of another size, empty or full, or has more
-            than two values; the message names it.
+    Raises error_type: the file is unreadable, damaged, of another size, empty or full, or has more
+    than two values; the message names it.
     """
     data = _read(path, error_type)
     picture = _decode(data, cv2.IMREAD_UNCHANGED, path, error_type, only_png=not lossy)
@@ -146,8 +144,7 @@ def read_binary_mask(
 def list_pictures(folder: Path, error_type: type[DrakePoseError]) -> dict[str, Path]:
     """Return a folder's PNG and JPEG files by frame, the name without suffix, sorted by name.
 
-    Raises:
-        error_type: a frame occurs twice, with different suffixes.
+    Raises error_type: a frame occurs twice, with different suffixes.
     """
     files: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
@@ -162,8 +159,7 @@ def list_pictures(folder: Path, error_type: type[DrakePoseError]) -> dict[str, P
 def find_pictures(folder: Path, camera: str) -> dict[str, Path]:
     """Return the image files of a camera's folder by frame, sorted by name, at least one.
 
-    Raises:
-        SceneError: there is no such folder or no image, or a frame occurs twice.
+    Raises SceneError: there is no such folder or no image, or a frame occurs twice.
     """
     if not folder.is_dir():
         raise SceneError(f"{folder}: no such folder of camera '{camera}'s pictures")
@@ -339,8 +335,7 @@ class VideoPictures:
     def read(self, number: int) -> Picture:
         """Return an image (H, W, 3) by its number from 0, red, green, blue, and set ``time``.
 
-        Raises:
-            SceneError: the video ends before it.
+        Raises SceneError: the video ends before it.
         """
         if self._timed is not None:
             timed = self._timed.read(number)
@@ -369,8 +364,7 @@ class VideoPictures:
 
         OpenCV has decoded them on its way.
 
-        Raises:
-            SceneError: an image cannot be decoded.
+        Raises SceneError: an image cannot be decoded.
         """
         for earlier in range(number if self._timed is not None else 0):
             self.read(earlier)
@@ -440,8 +434,7 @@ class TimedVideo:
     def read(self, number: int) -> Picture:
         """Return an image (H, W, 3) by its number from 0, red, green, blue.
 
-        Raises:
-            SceneError: it is missing or damaged.
+        Raises SceneError: it is missing or damaged.
         """
         if not 0 <= number < len(self._stamps):
             cut = "is truncated: it " if self._promised > len(self._stamps) else ""

@@ -43,8 +43,7 @@ def recorded_poses(
         path: the file, for messages and a camera without a name.
         episode_ids: names by which the recording may be known in a file of many episodes.
 
-    Raises:
-        CameraError: a rotation is none, or it is unclear which of many episodes is meant.
+    Raises CameraError: a rotation is none, or it is unclear which of many episodes is meant.
     """
     if isinstance(content, dict) and isinstance(content.get("transforms"), list):
         content = content["transforms"]
@@ -80,8 +79,7 @@ def episode_entry(
         path: the file, for messages.
         episode_ids: names by which the recording may be known.
 
-    Raises:
-        CameraError: there are several, and none belongs to the recording.
+    Raises CameraError: there are several, and none belongs to the recording.
     """
     held = {
         key: one
@@ -131,8 +129,7 @@ def read_launch(text: str) -> list[dict[str, Any]] | None:
 def read_lines(text: str, episode_ids: Collection[str]) -> list[dict[str, Any]]:
     """Return the records of a JSON Lines file that hold one of the episodes' names; all if none.
 
-    Raises:
-        ValueError: a line is not a JSON object.
+    Raises ValueError: a line is not a JSON object.
     """
     lines = [line for line in text.splitlines() if line.strip()]
     own = [line for line in lines if any(f'"{one}"' in line for one in episode_ids)]

@@ -76,8 +76,7 @@ def servo_encoding(
         units: the encoding as the user says; None: it is inferred.
         slack: tolerance of the joints' limits [rad].
 
-    Raises:
-        SceneError: the readings seem to be normalised, and their ranges are not known.
+    Raises SceneError: the readings seem to be normalised, and their ranges are not known.
     """
     known, is_named = servos or Servos(), any(joint.column.endswith(".pos") for joint in joints)
     is_arm = known.is_so or known.is_dynamixel or any(joint.motor is not None for joint in joints)

@@ -430,8 +430,7 @@ def _times_from_rate(given: SourceSpecification, files: Mapping[str, Path]) -> d
 def read_time_stamps(path: Path) -> dict[str, float]:
     """Return the times [s] by frame, in the order of the lines of a `timestamps.csv`.
 
-    Raises:
-        SceneError: a column is missing, a frame occurs twice, or a time is not a finite number.
+    Raises SceneError: a column is missing, a frame occurs twice, or a time is not a finite number.
     """
     header, rows = read_csv(path, SceneError)
     if not {"frame", "time"} <= set(header):
@@ -463,9 +462,8 @@ def load_sources(
         path: a `sources.yaml`, or its folder.
         cameras: the calibrated cameras; None: those of the `cameras.yaml` in the same folder.
 
-    Raises:
-        SceneError: names the file, the camera and the field at fault.
-        CameraError: the camera file is invalid.
+    Raises SceneError: names the file, the camera and the field at fault; CameraError: the camera
+    file is invalid.
     """
     path = Path(path)
     path = path / SOURCES if path.is_dir() else path
@@ -513,8 +511,7 @@ def open_source(specification: SourceSpecification, clock: Clock = time.monotoni
 def load_background_pictures(specification: SourceSpecification) -> list[Picture]:
     """Return the images (H, W, 3) of the empty room from a specification's folder.
 
-    Raises:
-        SceneError: there is none, or one is unreadable or not of the calibrated size.
+    Raises SceneError: there is none, or one is unreadable or not of the calibrated size.
     """
     camera = specification.camera
     if specification.background is None:
@@ -541,8 +538,7 @@ def _read_entry(camera: Camera, entry: Any, path: Path) -> SourceSpecification:
         entry: the entry, not yet checked.
         path: the sources.yaml.
 
-    Raises:
-        SceneError: a field is missing, unknown or invalid.
+    Raises SceneError: a field is missing, unknown or invalid.
     """
     where = f"{path}: camera '{camera.name}'"
     if not isinstance(entry, dict):

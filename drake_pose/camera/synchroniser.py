@@ -73,8 +73,7 @@ class Synchroniser(Generic[Item]):
             time: time stamp [s].
             item: the image, or anything else that ``take`` shall return for it.
 
-        Raises:
-            UnknownNameError: there is no such camera.
+        Raises UnknownNameError: there is no such camera.
         """
         if camera not in self._queues:
             raise UnknownNameError("camera", camera, self.cameras, "the synchroniser")

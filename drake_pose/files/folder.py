@@ -157,8 +157,7 @@ def require_no_file(path: Path) -> None:
 def read_summary(path: Path) -> dict[str, Any]:
     """Return the content of summary.json in the result folder ``path``.
 
-    Raises:
-        OutputError: the file is missing or damaged.
+    Raises OutputError: the file is missing or damaged.
     """
     require_no_file(path)
     file = path / SUMMARY

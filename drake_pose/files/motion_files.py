@@ -56,9 +56,7 @@ def write_motion(
         rate_hz: frame rate [Hz]; None if the frames are not a sequence: only joint_centres.csv is
             written.
 
-    Raises:
-        ModelError: the landmarks cannot be read.
-        OutputError: a file cannot be written.
+    Raises ModelError: the landmarks cannot be read; OutputError: a file cannot be written.
     """
     has_landmarks = landmarks_file(model.path).is_file()
     landmarks = load_landmarks(model.path) if has_landmarks else {}
@@ -239,8 +237,7 @@ def motion_as_bvh(
         rate_hz: frame rate [Hz].
         stays: displacement below which a joint is fixed in its parent [m].
 
-    Raises:
-        SettingsError: no frame has a pose.
+    Raises SettingsError: no frame has a pose.
     """
     known = np.flatnonzero(np.isfinite(q).all(axis=1))
     if not len(known):

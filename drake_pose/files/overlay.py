@@ -69,9 +69,8 @@ def draw_overlay(
             None: no borders.
         title: text above the picture.
 
-    Returns:
-        (h, w, 3) uint8 RGB over a picture; (h, w) uint8 indices into PALETTE, with a legend, over a
-        silhouette. Small pictures are enlarged by an integer.
+    Returns (h, w, 3) uint8 RGB over a picture; (h, w) uint8 indices into PALETTE, with a legend,
+    over a silhouette. Small pictures are enlarged by an integer.
     """
     width = max(1, len(observed) // 500)
     window = _surroundings(body if observed.ndim == 3 else observed | body)
@@ -107,8 +106,7 @@ def draw_shapes(
         names: their names in the legend.
         title: text above the picture.
 
-    Returns:
-        (h, w, 3) uint8 RGB.
+    Returns (h, w, 3) uint8 RGB.
     """
     colours, legend = (MISSING_RGB, EXCESS_RGB)[: len(shapes)], []
     window, picture = (slice(None), slice(None)), observed

@@ -166,8 +166,7 @@ class PoseTable:
             known: ``frames`` of its summary.json, content of `FrameRecord.as_json` by frame. Other
                 frames' records have the values of poses.csv only.
 
-        Raises:
-            OutputError: the table cannot be read, or belongs to another model.
+        Raises OutputError: the table cannot be read, or belongs to another model.
         """
         path = self._folder / POSES
         if not path.is_file():
@@ -399,10 +398,8 @@ def read_earlier_summary(
         folder: the result folder; None if there is none.
         job: the present job, from `describe_job`.
 
-    Raises:
-        SettingsError: no folder is given.
-        OutputError: the summary cannot be read, or model file, camera file or settings (other than
-            ``frames``) differ.
+    Raises SettingsError: no folder is given; OutputError: the summary cannot be read, or model
+    file, camera file or settings (other than ``frames``) differ.
     """
     if not resume:
         return None

@@ -215,8 +215,7 @@ Pictures = Mapping[str, Mapping[str, NDArray[np.uint8]]]
 def import_rerun() -> Any:
     """Return the module rerun.
 
-    Raises:
-        OutputError: rerun-sdk is not installed.
+    Raises OutputError: rerun-sdk is not installed.
     """
     try:
         return import_module("rerun")
@@ -238,8 +237,7 @@ def make_recording(
             `frame`.
         pictures: pictures by camera and frame; pictures may be missing.
 
-    Raises:
-        OutputError: rerun-sdk is not installed.
+    Raises OutputError: rerun-sdk is not installed.
     """
     rr = import_rerun()
     recording = rr.RecordingStream("drake_pose")

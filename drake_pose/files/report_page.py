@@ -170,8 +170,7 @@ def _joint_rows(
         estimate: the estimate.
         joined: whether frames are a sequence, whose plots join neighbouring frames by a line.
 
-    Returns:
-        The variables of each row for report_template.html.j2.
+    Returns the variables of each row for report_template.html.j2.
     """
     records, frames = list(estimate.records.values()), list(estimate.records)
     if not records:
@@ -359,9 +358,8 @@ def overlay_picture(
         overlay: the overlays' folder in the result folder.
         height: maximum height of the embedded picture [pixel].
 
-    Returns:
-        Entries for a template: ``camera``, ``frame``, ``E_total``, ``uri`` (data URI) and ``link``
-        (to the file); None if the file does not exist or is not a picture.
+    Returns entries for a template: ``camera``, ``frame``, ``E_total``, ``uri`` (data URI) and
+    ``link`` (to the file); None if the file does not exist or is not a picture.
     """
     place = f"{overlay}/{camera}/{frame}.png"
     if not (folder / place).is_file():

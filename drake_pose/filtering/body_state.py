@@ -137,8 +137,7 @@ class BodyState:
         Angles that turn around have no limits. Inequalities that use other elements are left out.
         Warn (UserWarning) if there are none.
 
-        Raises:
-            ModelError: the couplings file cannot be read.
+        Raises ModelError: the couplings file cannot be read.
         """
         kinematics, names, model = self._kinematics, self._element_names, self.tree.model
         lower, upper = (
@@ -195,8 +194,7 @@ class BodyState:
     def positions(self, x: Array) -> tuple[Array, Array]:
         """Return the plant's q (nq,) and X_WB (4, 4) at a state (n,), for the unscaled body.
 
-        Raises:
-            ModelError: the base joints cannot reach the root's pose.
+        Raises ModelError: the base joints cannot reach the root's pose.
         """
         values = self.node_values(x)
         if np.any(self._split(x)[1]):
@@ -259,8 +257,7 @@ class BodyState:
         Args:
             views: pairs of a camera and its mask (H, W).
 
-        Returns:
-            The number of pixels that differ, and the number of mask pixels, over all masks.
+        Returns the number of pixels that differ, and the number of mask pixels, over all masks.
         """
         wrong, area = 0, 0
         for camera, mask in views:

@@ -118,8 +118,7 @@ class ContourObservation(BodyState):
                 no pictures.
             colours: colour histograms of the body; None: pictures are not used.
 
-        Raises:
-            SettingsError: the number or size of masks or pictures does not fit the cameras.
+        Raises SettingsError: the number or size of masks or pictures does not fit the cameras.
         """
         pictures = [None] * len(masks) if pictures is None else pictures
         for kind, given in (("masks", masks), ("pictures", pictures)):
@@ -159,8 +158,7 @@ class ContourObservation(BodyState):
             pose_is_known: whether the state is certain, so that the old histograms are discarded.
             excluded_parts: (nodes,) parts whose histograms stay unchanged; None: none.
 
-        Raises:
-            SettingsError: a picture does not fit its camera.
+        Raises SettingsError: a picture does not fit its camera.
         """
         checked = [
             None if picture is None else check_picture(camera, picture)
@@ -191,8 +189,7 @@ class ContourObservation(BodyState):
                 become finer with it.
             excluded_parts: (nodes,) parts that are not measured in pictures; None: none.
 
-        Returns:
-            The measurement; None if no edge is near the contour in any mask or picture.
+        Returns the measurement; None if no edge is near the contour in any mask or picture.
         """
         width = CONTOUR.reach / REACH
         if distance is not None:
@@ -462,8 +459,7 @@ class ContourTracker:
                 the contour are used for cameras without a mask; they are learned from each frame,
                 at first at the start.
 
-        Raises:
-            SettingsError: the number or size of masks or pictures does not fit the cameras.
+        Raises SettingsError: the number or size of masks or pictures does not fit the cameras.
         """
         observation = self.observation
         if root_position is not None:

@@ -193,10 +193,9 @@ def read_hand(model: ArticulatedModel, palm: str = "palm") -> HandModel:
             of the palm.
         palm: name of the palm's link.
 
-    Raises:
-        UnknownNameError: the model has no such link.
-        ModelError: a joint on the palm begins no finger, fingers have different numbers of
-            segments, or a mesh has no vertices where a thickness is measured.
+    Raises UnknownNameError: the model has no such link; ModelError: a joint on the palm begins no
+    finger, fingers have different numbers of segments, or a mesh has no vertices where a thickness
+    is measured.
     """
     model.link_index(palm)
     plant, context = model.plant, model.plant.CreateDefaultContext()
@@ -287,8 +286,7 @@ def _radius(model: ArticulatedModel, link: str, low: float, high: float) -> floa
 def _band(model: ArticulatedModel, link: str, low: float, high: float) -> Array:
     """Return the vertices (n, 3) of a link's mesh with low <= y <= high in its frame [m].
 
-    Raises:
-        ModelError: there is none.
+    Raises ModelError: there is none.
     """
     vertices = model.link_meshes[link].vertices
     band = vertices[(vertices[:, 1] >= low) & (vertices[:, 1] <= high)]

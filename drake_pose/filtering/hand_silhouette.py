@@ -207,8 +207,7 @@ def _solve(
         count: number F of features.
         gate: initial scale of the Geman-McClure weight [pixel].
 
-    Returns:
-        The unknowns (F, 2), their covariances (F, 2, 2), and the weights (F, 2) of both sides.
+    Returns the unknowns (F, 2), their covariances (F, 2, 2), and the weights (F, 2) of both sides.
     """
 
     def total(values: Array) -> Array:
@@ -325,8 +324,7 @@ class HandSilhouette:
             prediction: belief of the state before the measurement.
             scale: known image scale, the squared norm of the quaternion; None: unknown.
 
-        Raises:
-            MaskError: the mask has another size.
+        Raises MaskError: the mask has another size.
         """
         if mask.shape != (self.height, self.width):
             raise MaskError(

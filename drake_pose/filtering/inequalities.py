@@ -45,8 +45,7 @@ class Inequalities:
     def for_columns(self, columns: Sequence[str]) -> "Inequalities":
         """Return the same inequalities over other columns, for example with rates added.
 
-        Raises:
-            UnknownNameError: an inequality uses an element that is not among the columns.
+        Raises UnknownNameError: an inequality uses an element that is not among the columns.
         """
         known = list(columns)
         phi = np.zeros((len(self), len(known)))
@@ -77,8 +76,7 @@ def make_inequalities(
         phi: (K, n) coefficients.
         b: (K,) bounds.
 
-    Raises:
-        SettingsError: the sizes do not fit, a number is not finite, or a row of phi is zero.
+    Raises SettingsError: the sizes do not fit, a number is not finite, or a row of phi is zero.
     """
     matrix = np.array(phi, dtype=np.float64).reshape(-1, len(columns))
     bounds = np.array(b, dtype=np.float64).ravel()
@@ -106,8 +104,7 @@ def two_sided(
         name: begins the text of both inequalities.
         phi: (n,) coefficients.
 
-    Raises:
-        SettingsError: lower > upper, a bound is NaN, or phi is zero.
+    Raises SettingsError: lower > upper, a bound is NaN, or phi is zero.
     """
     if np.isnan(lower) or np.isnan(upper) or lower > upper:
         raise SettingsError(
@@ -132,8 +129,7 @@ def stack(parts: Sequence[Inequalities], columns: Sequence[str] | None = None) -
 
     ``columns``: names of its elements; None: the union of the parts' columns.
 
-    Raises:
-        UnknownNameError: a row uses an element that is not among ``columns``.
+    Raises UnknownNameError: a row uses an element that is not among ``columns``.
     """
     union = dict.fromkeys(name for part in parts for name in part.columns)
     names = list(union if columns is None else columns)
@@ -213,9 +209,8 @@ def inner_point(inequalities: Inequalities) -> Array:
     It is the centre of the largest ball inside the rows (at most of radius 1), by a linear program.
     If there is none, the program's dual names the rows that exclude each other.
 
-    Raises:
-        SettingsError: no point lies strictly inside all rows; the message names the conflicting
-            rows.
+    Raises SettingsError: no point lies strictly inside all rows; the message names the conflicting
+    rows.
     """
     count, n = inequalities.phi.shape
     if count == 0:
@@ -327,9 +322,8 @@ def load_couplings(path: Path | str, columns: Sequence[str]) -> Inequalities:
         path: the couplings file.
         columns: (n) names of the elements that the inequalities are over.
 
-    Raises:
-        ModelError: the file cannot be read or an entry is invalid.
-        UnknownNameError: an entry names an unknown joint.
+    Raises ModelError: the file cannot be read or an entry is invalid; UnknownNameError: an entry
+    names an unknown joint.
     """
     file = Path(path)
     content = _read(file)
@@ -377,8 +371,7 @@ def load_joint_prior(path: Path | str, columns: Sequence[str]) -> JointPrior:
 
     Entries that use other elements than ``columns`` (n) are skipped.
 
-    Raises:
-        ModelError: the file cannot be read or an entry is invalid.
+    Raises ModelError: the file cannot be read or an entry is invalid.
     """
     file = Path(path)
     phi, moments = [], []

@@ -134,9 +134,8 @@ def require_jacobian(
         is_angle: (m,) which values are angles [rad].
         subject: begins messages.
 
-    Raises:
-        SettingsError: a shape is wrong, or an entry of the Jacobian differs from central
-            differences; the message names the value and the element.
+    Raises SettingsError: a shape is wrong, or an entry of the Jacobian differs from central
+    differences; the message names the value and the element.
     """
     m, n = len(names), len(elements)
     value, slope = function(x)

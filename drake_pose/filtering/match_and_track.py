@@ -136,8 +136,7 @@ class MatchAndTrack:
                 the prediction, or ``start`` if given. A track lost in pictures without masks is
                 continued with ``found`` false until its contour fits again.
 
-        Raises:
-            SettingsError: masks or pictures do not fit the cameras.
+        Raises SettingsError: masks or pictures do not fit the cameras.
         """
         begin, observation = time.perf_counter(), self.tracker.observation
         names = [camera.name for camera in observation.cameras]

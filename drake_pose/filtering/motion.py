@@ -119,9 +119,8 @@ def constant_velocity(
 def require_models(layout: StateLayout, observation: object, motion: object) -> None:
     """Check that an observation and a motion are models whose sizes fit a state layout.
 
-    Raises:
-        SettingsError: a model lacks an attribute of its protocol, or an array has the wrong shape
-            or is not finite.
+    Raises SettingsError: a model lacks an attribute of its protocol, or an array has the wrong
+    shape or is not finite.
     """
     n = len(layout)
     needed = {

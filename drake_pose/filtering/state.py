@@ -23,9 +23,8 @@ def factor_of(covariance: Array, names: Sequence[str] = (), subject: str = "the 
         names: (n) names of the elements, for messages; their indices if empty.
         subject: begins messages.
 
-    Raises:
-        SettingsError: the covariance is indefinite; the message names the element that contributes
-            most to the negative eigenvalue.
+    Raises SettingsError: the covariance is indefinite; the message names the element that
+    contributes most to the negative eigenvalue.
     """
     try:
         return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
@@ -179,9 +178,8 @@ def make_belief(
         layout: the state's elements, for messages; None: elements are named by their indices.
         subject: begins messages.
 
-    Raises:
-        SettingsError: the shapes do not fit, a number is not finite, or the covariance is not
-            symmetric or is indefinite.
+    Raises SettingsError: the shapes do not fit, a number is not finite, or the covariance is not
+    symmetric or is indefinite.
     """
     q = np.array(mean, dtype=np.float64)
     Q = np.array(covariance, dtype=np.float64, order="C")

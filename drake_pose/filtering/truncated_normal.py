@@ -37,8 +37,7 @@ def interval_moments(lower: float, upper: float) -> tuple[float, float, float]:
     Args:
         lower, upper: the interval, lower < upper; may be infinite.
 
-    Returns:
-        The logarithm of the interval's probability, and the mean and the variance inside it.
+    Returns the logarithm of the interval's probability, and the mean and the variance inside it.
     """
     if lower < -_FAR and upper > _FAR:
         return 0.0, 0.0, 1.0
@@ -95,8 +94,7 @@ def apply_sites(
         left_out: index of a site that is skipped; -1: none.
         scale: factor on tau and nu.
 
-    Returns:
-        The logarithm of the product's integral.
+    Returns the logarithm of the product's integral.
     """
     total = 0.0
     n, k = factor.shape
@@ -170,8 +168,7 @@ def propagate(
             relative, of its variance.
         sweep_limit: largest number of sweeps; steps are halved in the second half of them.
 
-    Returns:
-        The logarithm of the probability that all bounds hold, and the number of sweeps made.
+    Returns the logarithm of the probability that all bounds hold, and the number of sweeps made.
     """
     count = sites.shape[0]
     corrections = np.zeros(count)
@@ -238,8 +235,7 @@ def cut_one_by_one(
         skip_above: rows with a larger c_k are skipped.
         c: (K,) receives (24) of each row before it is used; infinite for rows without variance.
 
-    Returns:
-        The logarithm of the probability that all rows hold: the product over the sequence.
+    Returns the logarithm of the probability that all rows hold: the product over the sequence.
     """
     total, site = 0.0, np.empty((1, 2))
     for row in range(phi.shape[0]):
@@ -301,8 +297,7 @@ class MergedRows:
 def merge_rows(inequalities: Inequalities) -> MergedRows:
     """Merge parallel rows for ``truncate_joint``; keep the result if it is used repeatedly.
 
-    Raises:
-        SettingsError: two parallel rows exclude each other; the message names them.
+    Raises SettingsError: two parallel rows exclude each other; the message names them.
     """
     phi = inequalities.phi
     used = np.flatnonzero(phi.any(axis=0))
@@ -338,8 +333,7 @@ def _margins(belief: Belief, inequalities: Inequalities) -> Array:
 
     It is negative where the row is violated, and infinite for rows without variance.
 
-    Raises:
-        SettingsError: the belief has another size, or a row without variance is violated.
+    Raises SettingsError: the belief has another size, or a row without variance is violated.
     """
     mean, covariance = belief.mean, belief.covariance
     if inequalities.phi.shape[1] != mean.size:
@@ -373,9 +367,8 @@ def truncate_sequential(belief: Belief, inequalities: Inequalities) -> Truncated
     update is applied to the covariance's factor, which keeps it positive definite. The result
     depends on the order of the rows. Rows with a c_k above SKIP_ABOVE are skipped.
 
-    Raises:
-        SettingsError: the sizes do not fit, the covariance is indefinite, or a row without variance
-            is violated.
+    Raises SettingsError: the sizes do not fit, the covariance is indefinite, or a row without
+    variance is violated.
     """
     c = _margins(belief, inequalities)
     q, factor = belief.mean.copy(), belief.root.copy()
@@ -402,8 +395,7 @@ def truncate_joint(
         start: (S, 2) final ``sites`` of a similar problem with the same rows, which saves sweeps;
             None or empty: no initial sites.
 
-    Raises:
-        SettingsError: as for ``truncate_sequential``, or parallel rows exclude each other.
+    Raises SettingsError: as for ``truncate_sequential``, or parallel rows exclude each other.
     """
     joint = merge_rows(rows) if isinstance(rows, Inequalities) else rows
     inequalities = joint.inequalities
@@ -442,8 +434,7 @@ def clip(belief: Belief, inequalities: Inequalities) -> Truncated:
     violated row, until no row is violated or 100 projections are made. ``active`` are the rows that
     were violated.
 
-    Raises:
-        SettingsError: as for ``truncate_sequential``.
+    Raises SettingsError: as for ``truncate_sequential``.
     """
     c, q = _margins(belief, inequalities), belief.mean
     for _ in range(100):

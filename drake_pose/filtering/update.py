@@ -171,9 +171,8 @@ def make_measurement(
         y: (m,) NaN where occluded.
         variances: noise variances (m,) or covariance (m, m), finite where y is; None: the model's.
 
-    Raises:
-        SettingsError: a wrong shape, an infinite number, or a variance of a finite measurement that
-            is not positive.
+    Raises SettingsError: a wrong shape, an infinite number, or a variance of a finite measurement
+    that is not positive.
     """
     m = len(model.names)
     for values, shapes in ((y, [(m,)]), (variances, [(m,), (m, m)])):
@@ -229,9 +228,8 @@ def update(
             ``start`` is given), and add this multiple of the remainder's covariance to the noise;
             more than 1, as the remainder repeats from frame to frame. See ``linearise_over``.
 
-    Raises:
-        SettingsError: the belief violates a row along which it has no variance, or a noise variance
-            is not positive.
+    Raises SettingsError: the belief violates a row along which it has no variance, or a noise
+    variance is not positive.
     """
     sites, temperature = np.zeros((0, 2)) if sites is None else sites, 1.0
     x, range_covariance = prediction.mean if start is None else start, None

@@ -86,8 +86,7 @@ def estimate_gain(picture: Picture | Floats, reference: Floats, rounds: int = 4)
         rounds: number of fits; each uses the pixels that deviate from the previous one by no more
             than three median deviations plus 2 [of 255].
 
-    Returns:
-        (3, 4) slopes and offsets of the channels, as ``cv2.transform`` takes them.
+    Returns (3, 4) slopes and offsets of the channels, as ``cv2.transform`` takes them.
     """
     gain = np.zeros((3, 4), np.float32)
     step = max(1, picture.shape[1] // 80)

@@ -203,8 +203,7 @@ def check_picture(camera: Camera, picture: Picture) -> Picture:
         camera: the camera that took the image.
         picture: the image.
 
-    Raises:
-        SettingsError: it is not (H, W, 3) or (H, W, 4) bytes of the camera's size.
+    Raises SettingsError: it is not (H, W, 3) or (H, W, 4) bytes of the camera's size.
     """
     shape = (camera.height, camera.width)
     if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] not in (3, 4):

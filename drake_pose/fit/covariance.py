@@ -179,10 +179,9 @@ def _known_directions(
         pictures: comparisons with the masks.
         max_count: maximum number of motions; there are fewer if fewer are determined.
 
-    Returns:
-        (n, 2) index of the mask and of the node of each; (n, 12) the affine motion, scaled to unit
-        curvature of the cost; and (n, 12) derivatives of its residual by the part's
-        ``surface_deformations`` of one unit of errors.
+    Returns (n, 2) index of the mask and of the node of each; (n, 12) the affine motion, scaled to
+    unit curvature of the cost; and (n, 12) derivatives of its residual by the part's
+    ``surface_deformations`` of one unit of errors.
     """
     mean_size = float(np.mean([picture.size for picture in pictures]))
     found: list[tuple[Array, Indices, Indices, Array, Array]] = []

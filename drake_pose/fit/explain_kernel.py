@@ -242,8 +242,7 @@ def explain(
         always_covered: factor of the positive gain of pixels that the body covers in all frames,
             whose background is unknown; a negative gain there counts 0.
 
-    Returns:
-        (4,) sums by ``Explained``, and (t, t) the gain of each tile (row, column).
+    Returns (4,) sums by ``Explained``, and (t, t) the gain of each tile (row, column).
     """
     totals, tiles = np.zeros(4), np.zeros((tiles_per_side, tiles_per_side))
     scratch, crossings = make_words(packed, camera)
@@ -276,8 +275,7 @@ def explain_pose(
 
     The other arguments are those of ``explain``.
 
-    Returns:
-        the crossings, reallocated if need be.
+    Returns the crossings, reallocated if need be.
     """
     frames = X_WN.shape[0]
     for f in range(frames):

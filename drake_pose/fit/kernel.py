@@ -55,8 +55,7 @@ def match_points(
         min_cosine: minimum cosine of the angle between matched normals.
         max_cells: maximum number of cells along a side of the grid.
 
-    Returns:
-        (n,) indices of the matched points; -1: no match.
+    Returns (n,) indices of the matched points; -1: no match.
     """
     found = np.full(len(uv), -1, dtype=np.int64)
     if len(other_uv) == 0:
@@ -136,13 +135,10 @@ def compare_contours(
         side: side of a tile [pixel]; tile indices are taken modulo k.
         with_bias: compute derivatives by the silhouettes' boundary bias.
 
-    Returns:
-        A (c, nodes, 12, 12), lower triangles.
-        b (c, nodes, 12).
-        Sums (c, nodes + 1, 6) by ``Sum`` of each node's contour, and of the camera's edge in the
-        last row.
-        Cost (c, k, k) in tiles (row, column) of the image.
-        Derivatives (c, nodes, 13) of b (12,) and of half the cost by the boundary bias [pixel].
+    Returns a (c, nodes, 12, 12), lower triangles. b (c, nodes, 12). Sums (c, nodes + 1, 6) by
+    ``Sum`` of each node's contour, and of the camera's edge in the last row. Cost (c, k, k) in
+    tiles (row, column) of the image. Derivatives (c, nodes, 13) of b (12,) and of half the cost by
+    the boundary bias [pixel].
     """
     count, nodes = len(weights), len(X_WN)
     A, b = np.zeros((count, nodes, 12, 12)), np.zeros((count, nodes, 12))
@@ -220,8 +216,7 @@ def robust_weight(
         length: length of contour that the point represents [pixel].
         r: the residual [pixel].
 
-    Returns:
-        The weight of the squared residual, and the cost.
+    Returns the weight of the squared residual, and the cost.
     """
     unit, scale, length_weight = weights[0], weights[1], weights[3]
     t = (r / scale) ** 2

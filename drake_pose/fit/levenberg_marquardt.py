@@ -112,10 +112,9 @@ def minimise(
         settings: settings of the steps; None: ``StepSettings()``.
         coupling: prior that couples the own unknowns of several frames; None: none.
 
-    Returns:
-        (frames, p) own and (q,) shared unknowns; their cost, or that before the last step if the
-        last stage has a single one, which is taken without checking the cost; and the number of
-        evaluations.
+    Returns (frames, p) own and (q,) shared unknowns; their cost, or that before the last step if
+    the last stage has a single one, which is taken without checking the cost; and the number of
+    evaluations.
     """
     settings = settings or StepSettings()
     curvature = None if coupling is None else coupling.curvature()

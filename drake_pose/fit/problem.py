@@ -216,8 +216,7 @@ class Problem:
                 unknowns, with the same mean; None: none.
             coupling: prior that couples all frames' own unknowns; None: none.
 
-        Raises:
-            SettingsError: shapes do not match.
+        Raises SettingsError: shapes do not match.
         """
         frames, p, q = len(observations), self.own_count, len(self.names) - self.own_count
         own, shared = (np.zeros((frames, p)), np.zeros(q)) if start is None else start
@@ -368,9 +367,8 @@ class Problem:
             theta: (n,) all parameters of the frame.
             stage: scale of the residuals.
 
-        Returns:
-            The comparison with both, and the cameras: X_CW (c, 4, 4), kernel parameters (c, 8), and
-            affine motions (c, 9, 12) of all nodes caused by each camera parameter.
+        Returns the comparison with both, and the cameras: X_CW (c, 4, 4), kernel parameters (c, 8),
+        and affine motions (c, 9, 12) of all nodes caused by each camera parameter.
         """
         packed_cameras = self.place_cameras(theta)
         views = self._views(frame, theta)

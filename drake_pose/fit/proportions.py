@@ -145,8 +145,7 @@ class ProportionedBody(BodyParameters):
             model: the tree's model, or another one with the same links and joints.
             theta: (n,) all parameters; only the proportions are used.
 
-        Raises:
-            ModelError: the model's file is not a URDF.
+        Raises ModelError: the model's file is not a URDF.
         """
         nodes, joint_shifts = self.kinematics.tree.nodes, self.relative_joint_shifts(theta)
         factors = zip(nodes, self.factors(theta).tolist(), strict=True)
@@ -280,10 +279,9 @@ def fit_proportions(
         limits: lower and upper (p,) limits of the free tree values, then of ROOT_NAMES.
         prior: prior of these p unknowns in all frames, see ``sequence_prior``.
 
-    Returns:
-        The solution, whose own unknowns are the free tree values and ROOT_NAMES, and whose shared
-        ones are the proportions; and the standard deviations (frames, k) of the tree's values and
-        ROOT_NAMES, 0 for fixed values.
+    Returns the solution, whose own unknowns are the free tree values and ROOT_NAMES, and whose
+    shared ones are the proportions; and the standard deviations (frames, k) of the tree's values
+    and ROOT_NAMES, 0 for fixed values.
     """
     kinematics = body.kinematics
     moving = np.array(kinematics.names)[kinematics.lower < kinematics.upper].tolist()

@@ -106,9 +106,8 @@ def compare_raster(
         A, b: (nodes, 12, 12), lower triangles, and (nodes, 12), added to: the cost
             x^T A x - 2 b^T x of each node's affine motion x (12,), the rows of (M v).
 
-    Returns:
-        Number of pixels covered by exactly one of body and silhouette, estimated from the rows; sum
-        of all weights; weighted sum of squared residuals.
+    Returns number of pixels covered by exactly one of body and silhouette, estimated from the rows;
+    sum of all weights; weighted sum of squared residuals.
     """
     stride, offset = lines
     segments = find_segments(packed, poses_in_camera(camera[0], X_WN), camera[1], is_moving)
@@ -243,8 +242,7 @@ def _unite_line(
         places, chosen: output (count,): positions along the line, ascending and alternately
             entering and leaving [pixel], and index of the moving crossing, or -1 if it is static.
 
-    Returns:
-        Number of positions; the rest of the output is unchanged.
+    Returns number of positions; the rest of the output is unchanged.
     """
     count, depth, i, j = 0, 0, 0, first
     while i < 2 * found or j < end:

@@ -76,8 +76,7 @@ def _read(path: Path) -> Outline | None:
 def _write(path: Path, outline: Outline) -> None:
     """Store a surface atomically, so that processes storing the same one do not interfere.
 
-    Raises:
-        OSError: the file cannot be written.
+    Raises OSError: the file cannot be written.
     """
     buffer = io.BytesIO()
     np.savez(buffer, vertices=outline.vertices, triangles=outline.triangles)

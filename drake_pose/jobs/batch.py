@@ -124,12 +124,10 @@ def run_batch(
         work: runs a task and returns its outcome; picklable if there is a client.
         tries: number of attempts for a task that kills its process; used with a client only.
 
-    Returns:
-        The batch, in which scenes may have failed.
+    Returns the batch, in which scenes may have failed.
 
-    Raises:
-        OutputError: the folder cannot be used, or holds another batch.
-        ClusterError: the connection to the workers is lost.
+    Raises OutputError: the folder cannot be used, or holds another batch; ClusterError: the
+    connection to the workers is lost.
     """
     out = out.absolute()
     if resume:
@@ -189,8 +187,7 @@ class Batch:
     def write(self) -> None:
         """Write batch.json; for audits also findings.csv, episodes.csv and camera files.
 
-        Raises:
-            OutputError: a file cannot be written.
+        Raises OutputError: a file cannot be written.
         """
         self.seconds = time.monotonic() - self._begin
         text = json.dumps(without_nan(self.as_json()), indent=2, ensure_ascii=False)
@@ -251,8 +248,7 @@ class Batch:
         No task waits at a worker, where it would be blamed for the worker's death. ``work`` and
         ``tries`` are as in `run_batch`.
 
-        Raises:
-            ClusterError: the connection to the scheduler is lost.
+        Raises ClusterError: the connection to the scheduler is lost.
         """
         from distributed import KilledWorker, as_completed
 

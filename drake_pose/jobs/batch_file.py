@@ -57,8 +57,7 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
             episode, NAME_000000 and so on.
         chunk: number of frames in a chunk; None: the file's, else 100.
 
-    Raises:
-        SettingsError: the message names the file, scene and setting at fault.
+    Raises SettingsError: the message names the file, scene and setting at fault.
     """
     content = _checked_mapping(
         read_yaml(path, SettingsError), str(path), ("chunk", "defaults", "scenes")
@@ -105,8 +104,7 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
 def _checked_mapping(value: Any, where: str, known: tuple[str, ...]) -> dict[str, Any]:
     """Return a value of a YAML file, checked to be a mapping with no other keys than ``known``.
 
-    Raises:
-        SettingsError: it is not a mapping, or has other keys; the message begins with ``where``.
+    Raises SettingsError: it is not a mapping, or has other keys; the message begins with ``where``.
     """
     if not isinstance(value, dict):
         raise SettingsError(f"{where}: expected NAME: VALUE lines")
@@ -131,8 +129,7 @@ def _scene_job(
         where: file and scene, for messages.
         base: folder of relative paths.
 
-    Raises:
-        SettingsError: a key is missing or belongs to the other job, or a value cannot be used.
+    Raises SettingsError: a key is missing or belongs to the other job, or a value cannot be used.
     """
     values = {key: value for key, value in values.items() if value is not None}
     is_audit = "audit" in values
@@ -174,8 +171,7 @@ def _convert(value: Any, hint: Any, where: str, base: Path) -> Any:
         where: file, scene and field, for messages.
         base: folder of relative paths.
 
-    Raises:
-        SettingsError: the value cannot be converted.
+    Raises SettingsError: the value cannot be converted.
     """
     reader = None
     while get_origin(hint) is Annotated:

@@ -82,8 +82,7 @@ def plan_scene(job: SceneJob, out: Path) -> tuple[Task, ...]:
         job: the scene's job.
         out: folder of the batch.
 
-    Raises:
-        DrakePoseError: the scene cannot be read.
+    Raises DrakePoseError: the scene cannot be read.
     """
     settings = job.settings
     if isinstance(settings, AuditSettings) and uses_pictures(job.scene, settings):

@@ -45,8 +45,7 @@ def open_cluster(
         tries: number of workers that a task may kill before it fails; not used with ``scheduler``.
         timeout: timeout of the connection to a scheduler [s].
 
-    Raises:
-        ClusterError: distributed is not installed, or the scheduler cannot be reached.
+    Raises ClusterError: distributed is not installed, or the scheduler cannot be reached.
     """
     if not has_dask():
         raise ClusterError(
@@ -205,11 +204,9 @@ def call_in_child(payload: bytes) -> bytes:
     Args:
         payload: pickled pair of a function and its argument.
 
-    Returns:
-        The pickled result.
+    Returns the pickled result.
 
-    Raises:
-        ClusterError: the child died.
+    Raises ClusterError: the child died.
     """
     child = getattr(_local, "child", None)
     if child is None:

@@ -15,8 +15,7 @@ from drake_pose.jobs.estimate.scene import estimate_scene
 def stored_scene(name: str) -> Path:
     """Return the folder of a bundled scene, in a checkout or in the installed package.
 
-    Raises:
-        SceneError: the scene is in neither.
+    Raises SceneError: the scene is in neither.
     """
     package = Path(__file__).resolve().parents[1]
     for root in (package.parent, package):
@@ -52,8 +51,7 @@ def run_demo(out: Path, on_frame: OnFrame | None = None) -> SceneEstimate:
         out: folder for the result; the result of an earlier demonstration is replaced.
         on_frame: called before and after the only frame; None: not called.
 
-    Raises:
-        OutputError: the folder holds other files.
+    Raises OutputError: the folder holds other files.
     """
     scene = demo_scene()
     with claimed(out, resume=True):

@@ -72,8 +72,7 @@ class Source:
     def read(self, camera: str) -> Iterator[tuple[str, str, Picture]]:
         """Yield each frame of a camera: name, origin for messages, and picture (H, W, 3) uint8 RGB.
 
-        Raises:
-            SceneError: a picture cannot be read, or differs in size from its camera.
+        Raises SceneError: a picture cannot be read, or differs in size from its camera.
         """
         for frame, path in self.pictures.get(camera, {}).items():
             picture = read_picture(path, SceneError)
@@ -123,8 +122,7 @@ class Source:
         the COCO file's folder, else the last folder in the picture's path, or "" if all pictures
         lie in one folder.
 
-        Raises:
-            SceneError: the camera is unknown, or a frame occurs twice.
+        Raises SceneError: the camera is unknown, or a frame occurs twice.
         """
         known = [] if self.cameras is None else list(self.cameras.cameras)
         listed = [(folder, coco, one) for folder, coco in self.annotated for one in coco.pictures]
@@ -218,9 +216,8 @@ def _open_file(path: Path) -> Source:
 def _open_folder(path: Path) -> Source:
     """Return the source of a folder: its pictures, videos or COCO files by camera, "" without one.
 
-    Raises:
-        SceneError: the folder's pictures and videos are ambiguous.
-        MaskError: a COCO file cannot be used.
+    Raises SceneError: the folder's pictures and videos are ambiguous; MaskError: a COCO file cannot
+    be used.
     """
     places = [path / name for name in ("images", "videos") if (path / name).is_dir()]
     # Without pictures to segment, masks of another tool are read.

@@ -263,8 +263,7 @@ def largest_patch(mask: Mask) -> Mask:
 def find_masks(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
     """Yield the masks of a source by camera and frame, read or segmented as the settings say.
 
-    Raises:
-        DrakePoseError: the message names the file, camera or frame at fault.
+    Raises DrakePoseError: the message names the file, camera or frame at fault.
     """
     background = settings.background
     way = replace(settings, largest=False, cameras=None, episode=None)
@@ -343,8 +342,7 @@ def _by_box(
         usual: minimum and maximum fraction of its box that an object fills.
         margins: enlargements of the box for comparison, as fractions of its sides.
 
-    Returns:
-        Mask, agreement and warnings, as in FoundMask.
+    Returns mask, agreement and warnings, as in FoundMask.
     """
     mask, (x, y, w, h) = grab_cut_box(picture, box), box
     part = mask.sum() / (w * h)

@@ -21,8 +21,7 @@ def undistort_pictures(
         cameras: camera file of any supported format, with distortion.
         out: folder for `images/<camera>/<frame>.png` and `cameras.yaml`.
 
-    Returns:
-        The written pictures by (camera, frame).
+    Returns the written pictures by (camera, frame).
 
     Raises:
         CameraError: a camera is not in the file, or a picture cannot be read or has another size.

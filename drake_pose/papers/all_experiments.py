@@ -267,8 +267,7 @@ def reproduce_all(out: Path, short: bool, count: Count, say: Callable[[str], Non
         count: reports the progress of each experiment.
         say: called with messages.
 
-    Raises:
-        OutputError: the folder cannot be written, or holds a run with other settings.
+    Raises OutputError: the folder cannot be written, or holds a run with other settings.
     """
     settings, made = out / "settings.json", json.dumps({"short": short, "version": VERSION})
     try:

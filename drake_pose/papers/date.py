@@ -288,8 +288,7 @@ def run_experiment(
         count: reports progress.
         size: width and height of the pictures [pixel].
 
-    Raises:
-        SettingsError: an argument is out of range.
+    Raises SettingsError: an argument is out of range.
     """
     require_choice("method", method, ("silhouette", "paper"))
     with one_core():

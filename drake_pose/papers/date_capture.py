@@ -84,8 +84,7 @@ class Studio:
             size: width and height of the pictures [pixel].
             generator: of the pictures' noise.
 
-        Raises:
-            SettingsError: there are fewer than three cameras.
+        Raises SettingsError: there are fewer than three cameras.
         """
         if cameras < 3:
             raise SettingsError(f"cameras must be 3 or more, not {cameras}")
@@ -196,8 +195,7 @@ class PaperTrack(_StagedRun):
     def step(self, images: Images) -> Array:
         """Process a frame's images, by camera; return its positions (nq,) [rad, m].
 
-        Raises:
-            SettingsError: the registered pose was not recognised in the first frame.
+        Raises SettingsError: the registered pose was not recognised in the first frame.
         """
         self._begin_frame()
         self._fix(images)
@@ -286,8 +284,7 @@ class SilhouetteTrack(_StagedRun):
     def step(self, images: Images) -> Array:
         """Process a frame's images, by camera; return its positions (nq,), even if lost.
 
-        Raises:
-            SettingsError: fewer than two cameras saw the person in the first frame.
+        Raises SettingsError: fewer than two cameras saw the person in the first frame.
         """
         self._begin_frame()
         if self._shared is None:

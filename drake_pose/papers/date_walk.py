@@ -121,9 +121,8 @@ def active_frames(commands: Array) -> dict[str, Mask]:
 def walk_by(model: ArticulatedModel, q: Array) -> tuple[Array, Array, Array]:
     """Simulate a Walker on positions q (n, nq), one frame per PERIOD, walking on the spot.
 
-    Returns:
-        (n, 2) commands, as of `recognise_command`; (n, 3) the walker's poses, x, y [m] and heading
-        [rad]; and (n, 5) rest stances, as of `stance_of`.
+    Returns (n, 2) commands, as of `recognise_command`; (n, 3) the walker's poses, x, y [m] and
+    heading [rad]; and (n, 5) rest stances, as of `stance_of`.
     """
     builder = DiagramBuilder()
     source = builder.AddSystem(TrajectorySource(held_positions(q, PERIOD)))

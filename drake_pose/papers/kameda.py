@@ -212,8 +212,7 @@ def run_experiment(
         views: number of cameras, 180 degrees / views apart: a silhouette from behind is the mirror
             image of that from the front.
 
-    Raises:
-        SettingsError: if ``images`` or ``views`` is below 1.
+    Raises SettingsError: if ``images`` or ``views`` is below 1.
     """
     require_counts(images=images, views=views)
     cameras = tuple(experiment_camera(math.pi * k / views) for k in range(views))
@@ -513,11 +512,9 @@ def run_real_experiment(
         out: folder for the poses and overlays of each method; None: write nothing.
         count: reports progress.
 
-    Returns:
-        The figures by method. Mean E_total is over the pictures in which a pose was found.
+    Returns the figures by method. Mean E_total is over the pictures in which a pose was found.
 
-    Raises:
-        OutputError: the folder is not empty or cannot be written.
+    Raises OutputError: the folder is not empty or cannot be written.
     """
     pictures = REAL_EXPERIMENTS[experiment]
     scene, model = stored_scene(pictures.scene), bundled_model(pictures.model)

@@ -31,8 +31,7 @@ def save_pictures(
         examples: largest number of poses per outcome.
         most_sets: largest number of pose sets.
 
-    Returns:
-        The PNG files.
+    Returns the PNG files.
     """
     matched = "silhouette matched exactly"
     kinds: dict[str, tuple[str, Callable[[RandomPose], bool]]] = {

@@ -155,8 +155,7 @@ def run_experiment(
         noise: factor on the noise, known to the filter.
         acceleration: factor on the accelerations that the filter expects.
 
-    Raises:
-        SettingsError: an argument is not one of these.
+    Raises SettingsError: an argument is not one of these.
     """
     require_counts(runs=runs)
     require_choice("observed", observed, (*OBSERVED, PICTURES))
@@ -195,8 +194,7 @@ def experiment_filter(
         settings: None: ``experiment_settings("joint")``.
         noise, acceleration: factors as of ``run_experiment``.
 
-    Raises:
-        SettingsError: a factor is not positive.
+    Raises SettingsError: a factor is not positive.
     """
     for name, factor in (("noise", noise), ("acceleration", acceleration)):
         if not 0 < factor < math.inf:

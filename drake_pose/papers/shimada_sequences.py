@@ -164,8 +164,7 @@ def first_guess(x: Array, generator: np.random.Generator) -> Belief:
             norm being the scale, angles [rad] and lengths, then their rates.
         generator: draws the errors, which are uniform up to table 2's values.
 
-    Returns:
-        the mean, with scale 1 and rates 0, and a diagonal covariance.
+    Returns the mean, with scale 1 and rates 0, and a diagonal covariance.
     """
     mean = x.copy()
     moving = len(HAND_STATE.moving)
@@ -391,8 +390,7 @@ def run_sequence(
         acceleration: factor on the accelerations that the filter expects.
         count: reports progress.
 
-    Raises:
-        DrakePoseError: the scene has several cameras, or no hand in it can be matched.
+    Raises DrakePoseError: the scene has several cameras, or no hand in it can be matched.
     """
     file = bundled_model("hand").with_name("right_hand.urdf")
     inputs = read_inputs(folder, file, EstimateSettings(unseen=("forearm",)), None)

@@ -103,9 +103,8 @@ def capture_person(
         is_sequence: whether frames follow each other; if not, each is searched by itself.
         on_frame: called after each frame with its index.
 
-    Raises:
-        ModelError: the model has no landmarks of trunk, arms and legs.
-        SettingsError: there are no frames, or two cameras see a person in none of those tried.
+    Raises ModelError: the model has no landmarks of trunk, arms and legs; SettingsError: there are
+    no frames, or two cameras see a person in none of those tried.
     """
     if not len(frames):
         raise SettingsError("a recording needs one frame or more")
@@ -164,9 +163,8 @@ class _Capture:
     ) -> tuple[PersonShape | None, dict[int, TrackState]]:
         """Fit the shape to `fitted` of the first `first` frames, and give it to the tracker.
 
-        Returns:
-            The shape, and the tracker states in the fitted frames by frame; None and {} where the
-            model has no shape joints.
+        Returns the shape, and the tracker states in the fitted frames by frame; None and {} where
+        the model has no shape joints.
         """
         if not self._has_shape:
             return None, {}
@@ -361,9 +359,8 @@ def capture_by_colour(
             the shape; None: there are no masks, and shape joints stay as in the start.
         on_frame: called after each frame with its index.
 
-    Returns:
-        The capture, nan where the person is lost; and (frames,) RMS distances of the contours over
-        all cameras [pixel], nan in frames that were not tracked by colour.
+    Returns the capture, nan where the person is lost; and (frames,) RMS distances of the contours
+    over all cameras [pixel], nan in frames that were not tracked by colour.
     """
     shape = None if known is None else known.shape
     fit = ContourFit(tree, None if known is None else known.outlines, NOISE)

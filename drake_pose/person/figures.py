@@ -182,9 +182,8 @@ def _support(
         covers: score of a figure whose box only covers the position.
         misses: score of a camera that sees the position, but no figure there.
 
-    Returns:
-        (n,) sums of the scores over the cameras whose picture contains the position; (n, cameras)
-        index of the nearest free figure, -1 where no ray passes within 0.35 m.
+    Returns (n,) sums of the scores over the cameras whose picture contains the position; (n,
+    cameras) index of the nearest free figure, -1 where no ray passes within 0.35 m.
     """
     scores = np.zeros(len(positions))
     taken = np.full((len(positions), len(cameras)), -1)
@@ -320,10 +319,9 @@ def keep_person(
         position: (3,) where the person was in the last frame [m]. None: the person with the largest
             figures is kept, of equal ones the nearer one to the middle of the cameras' view.
 
-    Returns:
-        The masks without other persons, by camera; the person, None where fewer than two cameras
-        see anybody, and masks stay as they are; the cameras whose masks others were cut out of; and
-        the cameras in which the person and another are one figure, which is left whole.
+    Returns the masks without other persons, by camera; the person, None where fewer than two
+    cameras see anybody, and masks stay as they are; the cameras whose masks others were cut out of;
+    and the cameras in which the person and another are one figure, which is left whole.
     """
     used = {name: cameras[name] for name in masks}
     figures = {name: find_figures(mask) for name, mask in masks.items()}
@@ -351,9 +349,8 @@ def keep_views(
 
     `position` is where the person was in the last frame (3,) [m]; None: the largest is kept.
 
-    Returns:
-        The views; the names of the cameras whose regions others were cut out of; and of those in
-        which the person and another are one figure.
+    Returns the views; the names of the cameras whose regions others were cut out of; and of those
+    in which the person and another are one figure.
     """
     cameras = {camera.name: camera for camera in frame.cameras}
     regions = {one.name: view.region for one, view in frame.pairs}
@@ -375,8 +372,7 @@ def follow_one(
         middle: (3,) middle of the cameras' view [m]; of equally large persons the nearer is chosen.
         is_sequence: whether the frames follow each other; if not, the largest in each is chosen.
 
-    Returns:
-        The person in each frame: without figures where hidden for a while, None where absent.
+    Returns the person in each frame: without figures where hidden for a while, None where absent.
     """
     if not is_sequence:
         return [max(own, key=lambda one: _prominence(one, middle), default=None) for own in frames]
@@ -407,8 +403,7 @@ def find_tracks(
         step: largest movement of a person's middle from one frame to the next [m].
         more: added to `step` for each frame in which the person is hidden [m].
 
-    Returns:
-        The track of each person: positions and figures by index of the frame.
+    Returns the track of each person: positions and figures by index of the frame.
     """
     tracks: list[dict[int, Person]] = []
     for k, persons in enumerate(frames):

@@ -250,8 +250,7 @@ class PersonPoseTracker:
             last: state after the last frame; None: the person is searched in all headings.
             frame: silhouettes of the frame.
 
-        Returns:
-            The state; None if `last` is None and fewer than two cameras see a person.
+        Returns the state; None if `last` is None and fewer than two cameras see a person.
         """
         settings = self.settings
         if last is None:

@@ -96,9 +96,8 @@ def find_rig_fault(
             the silhouettes and less than `remaining_fraction` of the unfilled part stay unfilled.
         faulty_above: above this unfilled fraction a rig is at fault, even if no change helps.
 
-    Returns:
-        The fault, without `mirrored` and `exchanged` if no change explains it; None if the rig is
-        sound, or no change explains an unfilled fraction of at most `faulty_above`.
+    Returns the fault, without `mirrored` and `exchanged` if no change explains it; None if the rig
+    is sound, or no change explains an unfilled fraction of at most `faulty_above`.
     """
     frames = [masks for masks in frames if len(masks) >= 2]
     if not frames:

@@ -84,9 +84,8 @@ def tracker_of_person(tree: PoseTree, shape: KnownShape | None) -> PersonPoseTra
 
     `shape` None: the model's own shape.
 
-    Raises:
-        ModelError: the model has no landmarks of trunk, arms and legs.
-        UnknownNameError: the shape names a length or a part that the model lacks.
+    Raises ModelError: the model has no landmarks of trunk, arms and legs; UnknownNameError: the
+    shape names a length or a part that the model lacks.
     """
     shape = shape or KnownShape({}, {})
     fit, held = ContourFit(tree, noise=NOISE), shape_values(tree)
@@ -115,8 +114,7 @@ def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
         frames: cameras and edge points of each frame.
         poses: (frames, m) initial values [rad, m].
 
-    Raises:
-        ModelError: the model has no shape joints, unlike urdf/person/person_shape.urdf.
+    Raises ModelError: the model has no shape joints, unlike urdf/person/person_shape.urdf.
     """
     is_shape = shape_values(fit.tree)
     if not is_shape.any():

@@ -79,8 +79,7 @@ class ColourViews:
             step: its scale is the reach of search lines [m]; its spacing is not used, but theirs.
             offset: distance between candidate edges on a search line, as a fraction of the scale.
 
-        Returns:
-            The comparison; 0 for cameras without known colours.
+        Returns the comparison; 0 for cameras without known colours.
         """
         count, nodes = len(self.cameras), len(placement.X_WN)
         weights = fit.weights(self._packed, placement, replace(step, spacing=self._spacing))
@@ -353,9 +352,8 @@ def sum_at_points(
         points: (n, m, 3) n sets of m points in the world [m].
         weights: (n, m) weights of the points.
 
-    Returns:
-        (n,) weighted sums of the picture's values, and (n,) summed weights of the points inside
-        the picture.
+    Returns (n,) weighted sums of the picture's values, and (n,) summed weights of the points inside
+    the picture.
     """
     X_CW = np.ascontiguousarray(camera.X_CW)
     total: tuple[Array, Array] = _sum_at_points(

@@ -46,13 +46,11 @@ def adjust_bundle(
         groups: (nodes,) index in `parts` of each node's part, or -1; None: no parts.
         covariance_frames: number of frames from which covariances are estimated.
 
-    Returns:
-        the unknown cameras at their fitted poses, in the order of `cameras`; their (c, 6, 6)
-        covariances, see ``RegisteredCamera``; the tree's fitted values (frames, m) [rad or m]; and
-        the radius scales (nodes,), 1 for nodes without a part.
+    Returns the unknown cameras at their fitted poses, in the order of `cameras`; their (c, 6, 6)
+    covariances, see ``RegisteredCamera``; the tree's fitted values (frames, m) [rad or m]; and the
+    radius scales (nodes,), 1 for nodes without a part.
 
-    Raises:
-        MaskError: a mask's size differs from its camera's, or no mask shows the body.
+    Raises MaskError: a mask's size differs from its camera's, or no mask shows the body.
     """
     values, size = np.array([frame.values for frame in frames]), common_size(cameras, frames)
     body = BodyParameters(kinematics, outlines, groups, parts)

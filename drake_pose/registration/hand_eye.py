@@ -66,8 +66,7 @@ def _of_three(
         most: maximum number of combinations, those with the most similar angles of A and B first.
         angle: maximum difference of the rotation angles of A and B [rad].
 
-    Returns:
-        (n, 2, 4, 4) X_LC and X_WT, the latter the mean of three frames.
+    Returns (n, 2, 4, 4) X_LC and X_WT, the latter the mean of three frames.
     """
     pairs = ((0, 1), (0, 2), (1, 2))
     A = np.array([np.linalg.inv(X_WL[j]) @ X_WL[i] for i, j in pairs])

@@ -151,9 +151,8 @@ def calibrate_joints(
         static: offsets that look like a rotation of a camera, as edges of static parts show them,
             and standard deviations [rad], by name (``locate_base``); uncertain ones are held at 0.
 
-    Raises:
-        UnknownNameError: the body has no such position, or no such scalable link.
-        RegistrationError: there are fewer frames than parameters, or the fit lost the robot.
+    Raises UnknownNameError: the body has no such position, or no such scalable link;
+    RegistrationError: there are fewer frames than parameters, or the fit lost the robot.
     """
     require_parameters(body.tree, joints, links)
     require_frame_count(sum(len(one) for one in frames), len(joints), len(links))
@@ -317,9 +316,8 @@ def shrink_measured(
             in quadrature, at least the measured deviation [rad]; errors of 0.1 to 3 standard
             deviations were seen in ten rooms.
 
-    Returns:
-        the shrunk values; their covariance; and by name of each of these constants the names of the
-        cameras' unknowns that it is correlated with.
+    Returns the shrunk values; their covariance; and by name of each of these constants the names of
+    the cameras' unknowns that it is correlated with.
     """
     C, shared, gauges = covariance.copy(), found.shared.copy(), dict[str, tuple[str, ...]]()
     cameras = len(fit.names) - len(fit.constants)

@@ -48,8 +48,7 @@ def search_offsets(
         deviation, weight: standard deviation of an offset [rad], and by how much the score
             falls at that offset. A joint that hardly shows stays near 0.
 
-    Returns:
-        the pose X_CW (4, 4), and the offsets (m,).
+    Returns the pose X_CW (4, 4), and the offsets (m,).
     """
     from scipy.optimize import minimize  # Slow to import, and seldom needed.
 

@@ -257,8 +257,7 @@ class PyramidLevel:
             turn: size of the first simplex in rotation [rad]. In picture shift [focal lengths] it
                 is 0.4 times, in logarithm of the depth 0.6 times as large.
 
-        Returns:
-            the scores (n,), highest first, and the improved poses.
+        Returns the scores (n,), highest first, and the improved poses.
         """
         count = len(X_CW)
         signs = [np.random.default_rng(k).choice([-1.0, 1.0], 6) for k in range(count)]

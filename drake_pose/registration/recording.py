@@ -133,9 +133,8 @@ def choose_pictures(
         slow_fraction: quantile of the speed up to which a frame is slow.
         min_motion: minimum motion of the link that moves most, over the whole recording [m].
 
-    Returns:
-        the pictures' indices of the slow and of the fast frames, the most dissimilar first. Without
-        logged times no frame counts as fast.
+    Returns the pictures' indices of the slow and of the fast frames, the most dissimilar first.
+    Without logged times no frame counts as fast.
 
     Raises RegistrationError: too few pictures have joint positions, or the robot does not move.
     """

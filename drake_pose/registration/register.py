@@ -211,9 +211,8 @@ class CameraSearch:
     def register(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
         """Return the camera at its estimated pose; its current pose is not used.
 
-        Raises:
-            MaskError: a mask is empty, or its size differs from the camera's.
-            RegistrationError: there are no frames.
+        Raises MaskError: a mask is empty, or its size differs from the camera's; RegistrationError:
+        there are no frames.
         """
         if not frames:
             raise RegistrationError(
@@ -295,10 +294,9 @@ def select_best(
     Args:
         fitted: the fits, each of this camera only, with their fitted values.
 
-    Returns:
-        the camera, with distinct poses that fit equally well as alternatives; the (u, u) covariance
-        of the best fit's shared unknowns; and the indices in `fitted` of all equally good fits,
-        best first.
+    Returns the camera, with distinct poses that fit equally well as alternatives; the (u, u)
+    covariance of the best fit's shared unknowns; and the indices in `fitted` of all equally good
+    fits, best first.
     """
     side = max(1.0, SEARCH.tile_side * fitted[0][0].views[0].size)
     costs = [fit.tile_costs(found, side) for fit, found in fitted]
@@ -404,10 +402,9 @@ def suggest_pose(
         seed: of the random numbers.
         width: approximate width of the pictures in which silhouettes are compared [pixel].
 
-    Returns:
-        the pose tree's values (m,) [rad or m], and the area in which the two most similar
-        silhouettes differ, over their mean area. None: no position is visible from all camera poses
-        and free of the boxes.
+    Returns the pose tree's values (m,) [rad or m], and the area in which the two most similar
+    silhouettes differ, over their mean area. None: no position is visible from all camera poses and
+    free of the boxes.
     """
     generator, kinematics = np.random.default_rng(seed), body.kinematics
     lower = np.where(np.isfinite(kinematics.lower), kinematics.lower, -np.pi)
@@ -541,8 +538,7 @@ def overlap_areas(frames: PosedFrames, X_CW: Array, side: float) -> Array:
         side: square root of the silhouettes' area in the downscaled pictures that are compared
             [pixel]; pictures are never enlarged.
 
-    Returns:
-        (n, frames, 3) [pixel of the downscaled pictures].
+    Returns (n, frames, 3) [pixel of the downscaled pictures].
     """
     camera = frames.downscaled(side)
     found = np.empty((len(X_CW), len(frames.frames), 3))

@@ -216,8 +216,7 @@ class SharedFit:
     def from_found(self, found: SharedValues) -> tuple["SharedFit", SharedValues]:
         """Return the same fit with the cameras' unknowns counted from their found poses.
 
-        Returns:
-            the fit; and the found values with 0 for each camera's POSE_NAMES.
+        Returns the fit; and the found values with 0 for each camera's POSE_NAMES.
         """
         X_CW = [camera.X_CW for camera in self.cameras(found)]
         count = self.per_camera * len(X_CW)
@@ -243,8 +242,7 @@ class SharedFit:
 
         The other arguments are those of `equations`, with `found` for `at`.
 
-        Returns:
-            by^T H by from differences of the gradient at +-by, and from the normal equations.
+        Returns by^T H by from differences of the gradient at +-by, and from the normal equations.
         """
         p = self.problem.own_count
         less, here, more = (
@@ -312,9 +310,8 @@ class SharedFit:
 
         included: None: all masks.
 
-        Returns:
-            two (u, u) parts, whose sum is the covariance: from contour errors, and from nuisance
-            parameters and errors of the cameras' intrinsics.
+        Returns two (u, u) parts, whose sum is the covariance: from contour errors, and from
+        nuisance parameters and errors of the cameras' intrinsics.
         """
         distances = self._distances_with_nuisances(found, SHARED.final_stage, included)
         is_angle = np.zeros(distances.X.shape[1], bool)
@@ -355,8 +352,7 @@ class SharedFit:
             min_score: minimum ratio of a value to its standard deviation.
             smallest: minimum value [half a degree or two millimetres].
 
-        Returns:
-            value and standard deviation by joint [rad or m], highest score first; {}: none.
+        Returns value and standard deviation by joint [rad or m], highest score first; {}: none.
         """
         distances = self._distances_with_nuisances(found, SHARED.inlier_stage, included)
         angles = np.zeros(distances.X.shape[1], bool)
@@ -425,9 +421,8 @@ class SharedFit:
     ) -> tuple[list[Observation], tuple[Array, Array], tuple[Array, Array], Mask]:
         """Return the arguments of ``Problem.solve`` for values and included masks.
 
-        Returns:
-            the n included observations; their own unknowns (n, cameras) and the shared ones (u,) at
-            the values; the prior means of both; and which masks (rows,) are included.
+        Returns the n included observations; their own unknowns (n, cameras) and the shared ones
+        (u,) at the values; the prior means of both; and which masks (rows,) are included.
         """
         included = np.ones(len(self.rows), bool) if included is None else included
         own = self._own(at)[included]

@@ -164,9 +164,8 @@ class CalibrationTarget:
     def symmetry(self) -> tuple[Array, Array]:
         """The target's symmetries in frame T, searched about the principal axes of its surface.
 
-        Returns:
-            (n, 4, 4) motions that leave its shape unchanged, the identity first, in steps of 15
-            degrees about a rotational symmetry axis; (k, 3) the rotational symmetry axes.
+        Returns (n, 4, 4) motions that leave its shape unchanged, the identity first, in steps of 15
+        degrees about a rotational symmetry axis; (k, 3) the rotational symmetry axes.
         """
         simplified = simplify_surfaces(TreeSurfaces(self._bodies.tree), FEW)
         outline = simplified[self._bodies.tree.node_index(TARGET)]
@@ -288,10 +287,8 @@ class TargetSearch:
             camera: its pose is not used.
             frames: with values of the target's tree.
 
-        Raises:
-            MaskError: a mask is empty, or its size differs from the camera's.
-            RegistrationError: the link rotates about one axis only in all frames, or in those that
-                agree.
+        Raises MaskError: a mask is empty, or its size differs from the camera's; RegistrationError:
+        the link rotates about one axis only in all frames, or in those that agree.
         """
         require_rotation(camera.name, self._target, frames)
         poses = self._search(camera, [[one] for one in evenly_spaced(frames)])
@@ -343,8 +340,7 @@ class TargetSearch:
             choices: for each picture the masks of regions that may be the target; may be empty.
             explained: maximum E_total of a region that is taken for the target.
 
-        Returns:
-            the poses, and the number of pictures in which they explain a region.
+        Returns the poses, and the number of pictures in which they explain a region.
 
         Raises RegistrationError: no three frames have regions that rotate as the link does.
         """
@@ -527,8 +523,7 @@ def find_target_frames(
         most: maximum number of regions of a picture that may be the target.
         min_iou: minimum intersection over union of a mask by colours and the target as found.
 
-    Returns:
-        the frames that show the target, with masks and values; without log-odds.
+    Returns the frames that show the target, with masks and values; without log-odds.
 
     Raises RegistrationError: the link hardly rotates, or no pose explains enough pictures.
     """

@@ -49,9 +49,8 @@ def grow(
             infinite: none is dropped for it.
         spare: number of candidates from which distinct ones are chosen, as a multiple of ``width``.
 
-    Returns:
-        The new partial poses, best first, or None if there is none within the limit; and whether a
-        partial pose within the limit may have been dropped.
+    Returns the new partial poses, best first, or None if there is none within the limit; and
+    whether a partial pose within the limit may have been dropped.
     """
     pairs = store.pairs(partial, node)
     areas, added = store.score(partial, node, pairs)
@@ -116,12 +115,10 @@ class BeamSearch:
             views: the silhouettes, one per camera.
             root_position: (3,) the root's position in the world [m]; None: that of the tree.
 
-        Returns:
-            The best pose found; ``stopped_by`` is "exact" (J is within the tolerance), "end" or
-            "time_limit".
+        Returns the best pose found; ``stopped_by`` is "exact" (J is within the tolerance), "end" or
+        "time_limit".
 
-        Raises:
-            SettingsError: if there is no view.
+        Raises SettingsError: if there is no view.
         """
         start = time.perf_counter()
         examined = self.examination is not None
@@ -169,8 +166,7 @@ class BeamSearch:
         Returns:
             For each pose the values (k,) of each node [rad or m].
 
-        Raises:
-            SettingsError: if there is no view.
+        Raises SettingsError: if there is no view.
         """
         limits = [one for one in (time_limit, self.settings.time_limit) if one is not None]
         settings = replace(self.settings, time_limit=min(limits))
@@ -332,9 +328,8 @@ class _BeamRun:
                 [pixel].
             limited: whether the time limit ends the search.
 
-        Returns:
-            The partial poses with all nodes placed (None: none was left, or the time is up), and
-            whether certainly no partial pose within the limit was dropped.
+        Returns the partial poses with all nodes placed (None: none was left, or the time is up),
+        and whether certainly no partial pose within the limit was dropped.
         """
         complete = True
         for node in order:
@@ -350,9 +345,8 @@ class _BeamRun:
     def _run_stage(self, stage: Stage) -> bool:
         """Run one stage and keep its best pose.
 
-        Returns:
-            Whether certainly no partial pose within the stage's limit was dropped, so that an exact
-            stage without a result proves that there is no exact pose.
+        Returns whether certainly no partial pose within the stage's limit was dropped, so that an
+        exact stage without a result proves that there is no exact pose.
         """
         exact = stage.outside_fraction == 0.0
         store = self._store(stage.outside_fraction)
@@ -386,8 +380,7 @@ class _BeamRun:
             poses: (nodes,) index of each node's pose in the store.
             J: the objective of these poses at the store's resolution [pixel].
 
-        Returns:
-            (nodes,) index in the store of each node's pose of least J found.
+        Returns (nodes,) index in the store of each node's pose of least J found.
         """
         nodes, subtrees = store.tree_nodes, self._body.sampled.tree.subtrees
         limbs = [
@@ -520,9 +513,8 @@ class _BeamRun:
     def _draw(self, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Draw each node of poses with samples (n, nodes), at coarse resolution.
 
-        Returns:
-            (n, nodes, W) uint64 bit masks of the nodes, (n, nodes) their areas [pixel], and
-            (n, nodes) bool whether the other nodes of the pose cover all of a node's projection.
+        Returns (n, nodes, W) uint64 bit masks of the nodes, (n, nodes) their areas [pixel], and (n,
+        nodes) bool whether the other nodes of the pose cover all of a node's projection.
         """
         bits, X_WN = self._bits_of(exact=False), self.scoring.sampled.poses(samples)
         poses, nodes = samples.shape

@@ -136,8 +136,7 @@ class PartialPoseGraph:
     def central(self) -> np.ndarray:
         """Return samples (nodes,) of a pose of least J, going back along the states of most paths.
 
-        Raises:
-            ValueError: if the set is empty.
+        Raises ValueError: if the set is empty.
         """
         if not self.size:
             raise ValueError("an empty set has no central pose")
@@ -252,9 +251,8 @@ class _BranchAndBound:
     def _choose(self, partial: PartialPoses) -> tuple[PartialPoses, int, np.ndarray]:
         """Choose the node to place next.
 
-        Returns:
-            The partial poses, perhaps fewer; the node; and (p, 2) int32 pairs of a partial pose and
-            a pose of the node that are to be evaluated.
+        Returns the partial poses, perhaps fewer; the node; and (p, 2) int32 pairs of a partial pose
+        and a pose of the node that are to be evaluated.
         """
         placed = {layer.node for layer in self._layers}
         waiting = [
@@ -303,8 +301,7 @@ class _BranchAndBound:
     def _place(self, partial: PartialPoses, node: int, pairs: np.ndarray) -> PartialPoses:
         """Place a node at the pairs (p, 2) of partial pose and node's pose, and add the layer.
 
-        Returns:
-            The distinct partial poses, with masks, which are the states after the layer.
+        Returns the distinct partial poses, with masks, which are the states after the layer.
         """
         store = self.store
         made = store.make(partial, node, pairs, store.score(partial, node, pairs))

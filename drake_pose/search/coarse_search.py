@@ -199,8 +199,7 @@ def score_samples(
         outside_weight: cost of a pixel outside, relative to the gain of a newly covered one.
         scores: (B, n) the costs, to which those of the node are added [pixel].
 
-    Returns:
-        (B, n, 4) uint64 the points that the hypotheses cover with the node.
+    Returns (B, n, 4) uint64 the points that the hypotheses cover with the node.
     """
     count = scores.shape[1]
     scratch = (
@@ -432,8 +431,7 @@ class CoarseSearch:
             placed: the nodes that are placed, this one included.
             hypotheses: greatest number that is kept.
 
-        Returns:
-            The new hypotheses, best first, and the points that they cover, like ``masks``.
+        Returns the new hypotheses, best first, and the points that they cover, like ``masks``.
         """
         settings, balls, X_PN = self._settings, self.balls[node], self.body.sampled.X_PN[node]
         parent = self._nodes[node].parent

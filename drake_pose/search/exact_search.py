@@ -168,8 +168,7 @@ def find_intervals(
         tree: the pose tree, with its root where the body is; None: the body's.
         settings: parameters of the intervals; None: the defaults.
 
-    Returns:
-        The set, with the best pose as the representative of the first mode.
+    Returns the set, with the best pose as the representative of the first mode.
     """
     settings = settings or ExactSearchSettings()
     body, kinematics = problem.body, problem.body.kinematics

@@ -53,11 +53,9 @@ class PaperSearch:
             views: the silhouettes, one per camera.
             root_position: (3,) the root's position in the world [m]; None: that of the tree.
 
-        Returns:
-            The best pose found; ``stopped_by`` is "end" or "run_limit".
+        Returns the best pose found; ``stopped_by`` is "end" or "run_limit".
 
-        Raises:
-            SettingsError: there is no view.
+        Raises SettingsError: there is no view.
         """
         require_views(views)
         start = time.perf_counter()
@@ -170,8 +168,7 @@ class PaperRun:
             node: index of the node.
             uncovered: the part of the silhouette that no placed node covers.
 
-        Returns:
-            The candidate list; None if no pose satisfies (4).
+        Returns the candidate list; None if no pose satisfies (4).
         """
         parent = self.nodes[node].parent
         X_WN = self.scoring.candidate_poses(

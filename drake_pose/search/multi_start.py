@@ -258,9 +258,8 @@ class _MultiStartRun:
             found: the pose of the search by pixels; None: that search found none.
             values: (m,) values of the best pose by robust costs [rad or m].
 
-        Returns:
-            The better pose; None if J of neither is below ``settings.plausible``, or if J at the
-            values as they are is smaller.
+        Returns the better pose; None if J of neither is below ``settings.plausible``, or if J at
+        the values as they are is smaller.
         """
         exact, settings, J = self._search.exact, self._search.exact_settings, self._J(values)
         length = self._problem.border_length

@@ -86,9 +86,8 @@ def score_pairs(
         silhouettes: number of parts that are silhouettes, which come first; the others are bands.
         keys: (2 W,) uint64 keys of the hashes.
 
-    Returns:
-        (p, 2) int64 newly covered area of silhouettes and of bands [pixel], and (p,) uint64 the
-        increase of the hash.
+    Returns (p, 2) int64 newly covered area of silhouettes and of bands [pixel], and (p,) uint64 the
+    increase of the hash.
     """
     areas = np.zeros((pairs.shape[0], 2), dtype=np.int64)
     codes = np.zeros(pairs.shape[0], dtype=np.uint64)

@@ -268,8 +268,7 @@ class PoseStore:
     def reserve(self, size: int = 0) -> None:
         """Add ``size`` [byte] to the memory in use, and check the limits.
 
-        Raises:
-            LimitReached: if memory, time or the number of drawn poses exceeds its limit.
+        Raises LimitReached: if memory, time or the number of drawn poses exceeds its limit.
         """
         self._reserved += size
         if self.limits is None:
@@ -448,9 +447,8 @@ class PoseStore:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the areas added by pairs (p, 2) (see ``pairs``) of partial pose and node's pose.
 
-        Returns:
-            (p, 2) newly covered area of silhouettes and of bands [pixel]; (p,) uint64 the increase
-            of the hash.
+        Returns (p, 2) newly covered area of silhouettes and of bands [pixel]; (p,) uint64 the
+        increase of the hash.
         """
         stored, views = self.nodes[node], len(self.bits.views)
         return score_pairs(partial.masks, pairs, stored.runs, stored.words, views, self._mask_keys)
@@ -510,9 +508,8 @@ class PoseStore:
             keep_beyond: whether partial poses that differ only in the area beyond the bands are
                 kept apart.
 
-        Returns:
-            Indices (n,) of the chosen pairs; their partial poses, without masks; and for each
-            examined pair its index among the chosen ones, -1 if it was dropped.
+        Returns indices (n,) of the chosen pairs; their partial poses, without masks; and for each
+        examined pair its index among the chosen ones, -1 if it was dropped.
         """
         placed = np.flatnonzero(partial.poses[0] >= 0).tolist() if len(partial) else ()
         open_nodes, waiting = self.body.frontier(frozenset((*placed, node)))
@@ -546,8 +543,7 @@ class PoseStore:
 def expand_groups(begins: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices in all of n groups, the ranges [begins (n,), ends (n,)).
 
-    Returns:
-        (m,) the number of the group of each index, and (m,) the indices, group after group.
+    Returns (m,) the number of the group of each index, and (m,) the indices, group after group.
     """
     counts = ends - begins
     groups = np.repeat(np.arange(len(counts)), counts)

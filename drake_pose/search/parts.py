@@ -185,8 +185,7 @@ class PartSearch:
                 the nodes] and the entries of their rotation matrices than twice this.
             coarse_pixels: approximate area of the reduced silhouettes [pixel].
 
-        Returns:
-            (m + 4,) parameters of each placement.
+        Returns (m + 4,) parameters of each placement.
         """
         X_WN = self.body.poses(parameters)
         others = problem.fixed_borders(parameters, np.isin(np.arange(len(X_WN)), part.nodes))
@@ -443,8 +442,7 @@ class NeighbourhoodSearch:
             everywhere: whether each part is tried at least once, even without an error near it.
             tries: greatest number of tries; None: no limit.
 
-        Returns:
-            Parameters (m + 4,) of the best pose, and its J [pixel].
+        Returns parameters (m + 4,) of the best pose, and its J [pixel].
         """
         J, settings = float(self.problem.J(parameters)), self._settings
         rounds = settings.rounds * (2 if everywhere else 1)
@@ -527,9 +525,8 @@ class NeighbourhoodSearch:
             chosen: index of the part.
             erring: whether there is an error near the part; if not, the part is only mirrored.
 
-        Returns:
-            The parameters of the best pose and its J [pixel]; the given parameters and infinity if
-            J does not decrease by more than ``least_decrease``.
+        Returns the parameters of the best pose and its J [pixel]; the given parameters and infinity
+        if J does not decrease by more than ``least_decrease``.
         """
         problem, length, settings = self.problem, self.problem.border_length, self._settings
         part, freedom = self._parts[chosen], self._freedoms[chosen]

@@ -205,9 +205,8 @@ def find_modes(
         within: all exact poses, if they are known; they are then the set, up to their limit of J,
             and ``tolerance`` is ignored. None: the set is searched.
 
-    Returns:
-        The set. If a better pose than the known one is found, the set holds the poses within the
-        tolerance of the better one.
+    Returns the set. If a better pose than the known one is found, the set holds the poses within
+    the tolerance of the better one.
     """
     if within is not None:
         tolerance = within.J_limit - J
@@ -348,12 +347,10 @@ def examine(
         within: all exact poses, if they are known; no proof is then tried, and they are the pose
             set unless the settings have a tolerance.
 
-    Returns:
-        The result with ``lower_bound``, ``budget_spent`` and ``pose_set``; with a better pose, if
-        one was found. A result without a pose is returned unchanged.
+    Returns the result with ``lower_bound``, ``budget_spent`` and ``pose_set``; with a better pose,
+    if one was found. A result without a pose is returned unchanged.
 
-    Raises:
-        SettingsError: if the result is not on the body's grid.
+    Raises SettingsError: if the result is not on the body's grid.
     """
     if not result.found:
         return result

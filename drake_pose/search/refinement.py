@@ -192,9 +192,8 @@ class RefinementProblem:
             fixed_borders: the border in each view of the nodes that do not move; None: computed
                 here.
 
-        Returns:
-            The equations, H (1, k, k) and g (1, k), whose cost is approximately J [pixel]; and the
-            mean of the weighted squared distances [pixel^2].
+        Returns the equations, H (1, k, k) and g (1, k), whose cost is approximately J [pixel]; and
+        the mean of the weighted squared distances [pixel^2].
         """
         free, moved = freedom
         if fixed_borders is None:
@@ -238,9 +237,8 @@ def descend(
         standstill: a pass ends when no parameter changes by more in a step [rad or m].
         damping: relative damping d of the normal equations, which makes them solvable.
 
-    Returns:
-        The parameters (m + 4,) of least cost in the last pass; this cost, an estimate of J from the
-        compared lines [pixel]; and the number of steps of all passes.
+    Returns the parameters (m + 4,) of least cost in the last pass; this cost, an estimate of J from
+    the compared lines [pixel]; and the number of steps of all passes.
     """
     free = freedom.columns
     limits = problem.body.lower[free], problem.body.upper[free]

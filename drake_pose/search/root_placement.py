@@ -111,8 +111,7 @@ def choose_root_samples(
         outside_weight: cost of a pixel outside, relative to the gain of a covered one.
         farthest: the root is drawn only up to this distance from its origin [pixel].
 
-    Returns:
-        (m,) chosen combinations, in increasing order: i is rotation i % r at position i // r.
+    Returns (m,) chosen combinations, in increasing order: i is rotation i % r at position i // r.
     """
     rotations = len(body.sampled.X_PN[0])
     if len(views) > 1 or count >= rotations:
@@ -217,13 +216,10 @@ class RootPlacementSearch:
             root_position: (3,) the root's position in the world [m], if it is known; None: it is
                 estimated.
 
-        Returns:
-            The best pose found, with ``root_position`` and ``scale``; ``stopped_by`` is "end" or
-            "time_limit".
+        Returns the best pose found, with ``root_position`` and ``scale``; ``stopped_by`` is "end"
+        or "time_limit".
 
-        Raises:
-            SettingsError: if there is no view, or a scale cannot be searched with these
-                cameras.
+        Raises SettingsError: if there is no view, or a scale cannot be searched with these cameras.
         """
         if not views:
             raise SettingsError("a match needs at least one view, but none was given")

@@ -49,8 +49,7 @@ def find_root_places(
     Returns:
         One entry for each scale or depth; a single one if neither is unknown.
 
-    Raises:
-        SettingsError: if the scale is unknown, but the views are not one parallel view.
+    Raises SettingsError: if the scale is unknown, but the views are not one parallel view.
     """
     main, settings = max(views, key=lambda view: int(view.mask.sum())), RootPlacementSettings()
     camera = main.camera

@@ -174,9 +174,8 @@ class Scoring:
             X_WN: (n, 4, 4) its poses at these samples.
             regions: the uncovered part of the silhouette in each view.
 
-        Returns:
-            (views, n) area of P_i outside S in each view, equation (4) [pixel]; and (n,) area of
-            P_i in the uncovered part of S, summed over the views, equations (5) and (7) [pixel].
+        Returns (views, n) area of P_i outside S in each view, equation (4) [pixel]; and (n,) area
+        of P_i in the uncovered part of S, summed over the views, equations (5) and (7) [pixel].
         """
         outside, covered = [], np.zeros(len(X_WN))
         for view, (_, prefixes), X_CW in zip(self.views, regions, self.X_CW, strict=True):
@@ -316,9 +315,8 @@ class SampledBody:
     def frontier(self, placed: frozenset[int]) -> tuple[np.ndarray, list[int]]:
         """Return the open nodes, and the nodes that can be placed next, for a set of placed nodes.
 
-        Returns:
-            (m,) int64 indices of placed nodes with a child that is not placed; and the indices of
-            the nodes that are not placed and are roots or have a placed parent.
+        Returns (m,) int64 indices of placed nodes with a child that is not placed; and the indices
+        of the nodes that are not placed and are roots or have a placed parent.
         """
         if placed not in self._frontiers:
             nodes = self.sampled.tree.nodes

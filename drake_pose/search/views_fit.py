@@ -169,8 +169,7 @@ def refine_best(
         passes: for each pass its stages, and the number of poses kept after it.
         proceed: returns whether there is time left; if not, only the first pose is refined.
 
-    Returns:
-        The poses kept after the last pass, best first; at least one.
+    Returns the poses kept after the last pass, best first; at least one.
     """
     values = list(starts)
     kept: list[FittedPose] = []

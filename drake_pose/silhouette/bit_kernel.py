@@ -194,8 +194,7 @@ def _walk_cell(
         rows: scratch of the span kernel; ``counts`` and ``row_range`` are updated.
         scratch: (4, e + 1) int32 and (e + 1, 4) float64 scratch, for e edges of the surface.
 
-    Returns:
-        Whether the cells are valid at this pose; if not, nothing is written.
+    Returns whether the cells are valid at this pose; if not, nothing is written.
     """
     counts, row_range = rows.counts, rows.row_range
     if celled.edges.shape[0] == 0:
@@ -292,8 +291,7 @@ def _gather_spans(
         spans: (k, 3) output: row and columns [a, b) in the window; grown as needed.
         areas: (3,) output: area inside the silhouette, in the margin, and outside both [pixel].
 
-    Returns:
-        The number of spans, or -1 if the limit is exceeded, and the spans.
+    Returns the number of spans, or -1 if the limit is exceeded, and the spans.
     """
     window, inside, margin = view.window, view.inside, view.margin
     first_row, end_row = window[0], window[0] + window[2]

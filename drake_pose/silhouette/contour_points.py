@@ -131,9 +131,8 @@ def find_crossings(
         spacing: distance between lines [pixel].
         lines: number of lines.
 
-    Returns:
-        starts (lines + 1,) index of each line's first crossing, places (n,) of the crossings along
-        their lines [pixel], and indices (n,) of their edges.
+    Returns starts (lines + 1,) index of each line's first crossing, places (n,) of the crossings
+    along their lines [pixel], and indices (n,) of their edges.
     """
     ends = segments.ends
     starts = np.zeros(lines + 1, dtype=np.int64)

@@ -184,9 +184,8 @@ def decode_run_lengths(counts: Sequence[int] | str, height: int, width: int) -> 
     ``counts``: lengths of alternate runs of 0 and 1, column after column, or COCO's compressed
     text.
 
-    Raises:
-        ValueError: the run lengths do not fill the picture.
-        MaskError: pycocotools is not installed.
+    Raises ValueError: the run lengths do not fill the picture; MaskError: pycocotools is not
+    installed.
     """
     try:
         from pycocotools import mask as coco

@@ -325,8 +325,7 @@ def clip_triangle(
         t: index of the triangle within its surface.
         corners: (4, 3) output, one corner a row.
 
-    Returns:
-        The number of corners: 0, 3 or 4.
+    Returns the number of corners: 0, 3 or 4.
     """
     X, near, size = X_CN[node], camera[5], 0
     begin, first = packed.starts[node, 0], packed.starts[node, 1]

@@ -50,9 +50,8 @@ def score_bodies(
         bands: for each BendingOutline, (n, v, 3) vertices of its band in its frame N at each pose
             [m]; empty if there is none.
 
-    Returns:
-        (n, 1 + k) int64 the body's area inside the image, then its area (or the sum of weights) in
-        each set [pixel].
+    Returns (n, 1 + k) int64 the body's area inside the image, then its area (or the sum of weights)
+    in each set [pixel].
 
     Raises ValueError: poses, bands or sums have the wrong shape or are not finite.
     """
@@ -139,8 +138,7 @@ def _check_body(
 ) -> tuple[PackedOutlines, np.ndarray]:
     """Check poses X_CN (n, nodes, 4, 4) of a body's surfaces.
 
-    Returns:
-        The packed surfaces, with bands at rest, and the poses (n, nodes, 3, 4).
+    Returns the packed surfaces, with bands at rest, and the poses (n, nodes, 3, 4).
 
     Raises ValueError: the poses have another shape or are not finite.
     """

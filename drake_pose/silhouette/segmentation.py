@@ -204,9 +204,8 @@ def foreground_log_ratios(
         bounds: bounds of the log-likelihood ratio, against shadows, reflections, and a body that is
             coloured like the background.
 
-    Returns:
-        (H, W) float32 log-likelihood ratio of each chosen picture: 0 where too few pictures show
-        the background; at skipped pixels the lower bound, or 0 if there are too few pictures.
+    Returns (H, W) float32 log-likelihood ratio of each chosen picture: 0 where too few pictures
+    show the background; at skipped pixels the lower bound, or 0 if there are too few pictures.
     """
     relevant = np.max([probabilities[k] for k in indices], axis=0) >= min_probability
     # Exposure gains (n, 3) of the channels, from pixels that are background in all pictures.
@@ -256,8 +255,7 @@ def grab_cut_box(picture: Picture, box: Sequence[float]) -> Mask:
 
     ``box``: x, y, width, height [pixel].
 
-    Returns:
-        (H, W) the object's mask.
+    Returns (H, W) the object's mask.
 
     Raises SettingsError: the box is outside the picture or is the whole picture.
     """
@@ -291,8 +289,7 @@ def grab_cut(
             once with these colours; 1: all uncertain pixels are cut in each iteration.
         seed: seed of GrabCut's random initial clusters.
 
-    Returns:
-        (H, W) the object's mask.
+    Returns (H, W) the object's mask.
     """
     found = labels.copy()
     is_uncertain = np.isin(labels, (cv2.GC_PR_FGD, cv2.GC_PR_BGD))
@@ -387,8 +384,7 @@ def _strength(mask: Mask, change: Floats, quantile: float = 0.25) -> float:
         change: (h, w) gradient magnitude of the channel.
         quantile: the quantile, 0 to 1.
 
-    Returns:
-        The strength; 0 if the mask has no pixel on its edge.
+    Returns the strength; 0 if the mask has no pixel on its edge.
     """
     inside = cv2.erode(mask.view(np.uint8), np.ones((3, 3), np.uint8), borderValue=1) > 0
     edge = change[mask & ~inside]

@@ -217,8 +217,7 @@ def fill_rows(
 
     The other arguments are those of ``add_surface``.
 
-    Returns:
-        The crossings, reallocated until every row has room.
+    Returns the crossings, reallocated until every row has room.
     """
     counts, row_range = rows.counts, rows.row_range
     while True:
@@ -247,8 +246,7 @@ def find_spans(
         changes: (width + 1,) zeros, used as scratch.
         spans: (width + 1, 2) output, first columns and columns after the last.
 
-    Returns:
-        The number of spans.
+    Returns the number of spans.
     """
     count = counts[row]
     counts[row] = 0
@@ -351,8 +349,7 @@ def paint(
         mask: (H, W) uint8, changed in place; pixels outside the body are kept.
         value: the value, 0 to 255.
 
-    Returns:
-        (2,) int64 first row touched, and row after the last one.
+    Returns (2,) int64 first row touched, and row after the last one.
     """
     rows, crossings = make_rows(packed, camera)
     crossings = fill_rows(packed, 0, X_CN.shape[0], X_CN, camera, crossings, rows)

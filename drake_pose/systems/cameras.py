@@ -52,8 +52,7 @@ class CameraRig:
 
         ``context``: the diagram's.
 
-        Raises:
-            UnknownNameError: the rig has no such camera.
+        Raises UnknownNameError: the rig has no such camera.
         """
         return colour_image_to_picture(self._port("color_image", camera).Eval(context))
 
@@ -62,8 +61,7 @@ class CameraRig:
 
         ``context``: the diagram's.
 
-        Raises:
-            UnknownNameError: the rig has no such camera.
+        Raises UnknownNameError: the rig has no such camera.
         """
         return label_image_to_mask(self._port("label_image", camera).Eval(context))
 
@@ -87,8 +85,7 @@ def build_camera_rig(
         true_positions: positions (nq,) [rad or m] over time; None: the diagram has the input port
             ``positions``.
 
-    Raises:
-        CameraError: there is no camera, or one is not a pinhole camera.
+    Raises CameraError: there is no camera, or one is not a pinhole camera.
     """
     if not cameras:
         raise CameraError("a rig needs at least one camera")

@@ -438,8 +438,7 @@ class PaperPoseEstimator(MemorySystem):
             q: (nq,) positions [rad or m].
             features: (5, 3) head, hands and feet [m]; None: those at q.
 
-        Raises:
-            SettingsError: the number of positions or features is wrong, or one is not finite.
+        Raises SettingsError: the number of positions or features is wrong, or one is not finite.
         """
         checked: list[tuple[str, Array, tuple[int, ...]]] = [
             ("positions", q, (len(self.setup.skeleton.lower),))
@@ -527,8 +526,7 @@ def build_paper_capture(
         period: time between two frames [s].
         meshcat: where to show the avatar; None: nowhere.
 
-    Raises:
-        SettingsError: the source lacks an output port, or the period is not positive.
+    Raises SettingsError: the source lacks an output port, or the period is not positive.
     """
     builder = DiagramBuilder()
     if source is not None:

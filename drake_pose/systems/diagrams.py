@@ -301,8 +301,7 @@ def add_simulated_cameras(
         cameras: the cameras to simulate.
         true_positions: the body's positions (nq,) [rad or m], constant or over time.
 
-    Returns:
-        The port of the positions, and that of each camera's label image.
+    Returns the port of the positions, and that of each camera's label image.
     """
     if isinstance(true_positions, np.ndarray):
         true_positions = PiecewisePolynomial(true_positions.reshape(-1, 1))

@@ -358,9 +358,8 @@ def add_silhouette_sensors(
         backgrounds: background models by name of the camera.
         edge_points: as in SilhouetteSensor.
 
-    Raises:
-        SettingsError: a camera has neither a background nor a source, or the source lacks an output
-            port.
+    Raises SettingsError: a camera has neither a background nor a source, or the source lacks an
+    output port.
     """
     for name in cameras:
         if source is None and name not in backgrounds:
@@ -406,9 +405,8 @@ def build_silhouette_capture(
         meshcat: where to show the person; None: nowhere.
         with_deviations: whether there is an output port ``deviations``.
 
-    Raises:
-        SettingsError: there are fewer than two cameras, one has no background, or the period is not
-            positive.
+    Raises SettingsError: there are fewer than two cameras, one has no background, or the period is
+    not positive.
     """
     builder = DiagramBuilder()
     person, sensors = add_person_tracker(

@@ -313,8 +313,7 @@ class PersonRegion(PortedSystem):
     def _image(self, context: Context, name: str) -> Any:
         """Return the image at the input port ``name``; None if the camera has no picture.
 
-        Raises:
-            CameraError: the image has another size than the camera.
+        Raises CameraError: the image has another size than the camera.
         """
         image, camera = self.eval_input(context, name), self._camera
         if image is None or not image.size():
@@ -359,8 +358,7 @@ def connect_images(
         source: source of images; None: the input ports become inputs of the diagram.
         wanted: input ports by the name of the source's output port, or of the diagram's input.
 
-    Raises:
-        SettingsError: the source lacks an output port.
+    Raises SettingsError: the source lacks an output port.
     """
     for name, ports in wanted.items():
         if source is None:

@@ -297,8 +297,7 @@ def _require_loss(patience: float, probability: float) -> None:
 def _period_of(motion: MotionModel, period: float | None) -> float:
     """Return the time between two updates [s]: ``period``, or the motion's if that is None.
 
-    Raises:
-        SettingsError: no period is known, or the given one differs from the motion's.
+    Raises SettingsError: no period is known, or the given one differs from the motion's.
     """
     if period is None and motion.period is None:
         raise SettingsError("the motion's rates are per step: give TruncatedEkf a period")
@@ -395,8 +394,7 @@ def build_hand_estimation(
         true_positions: the true hand's positions (nq,) [rad or m] over time.
         period: time between two images [s].
 
-    Returns:
-        The diagram, the filter and the sensor.
+    Returns the diagram, the filter and the sensor.
     """
     builder = DiagramBuilder()
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
@@ -414,8 +412,7 @@ def build_recorded_hand_estimation(
         silhouette: makes the measurements, and has the filter.
         start: belief before the first image.
 
-    Returns:
-        The diagram, the filter and the sensor.
+    Returns the diagram, the filter and the sensor.
     """
     builder, player = DiagramBuilder(), MaskPlayer(scene, scene.cameras)
     builder.AddNamedSystem("mask_player", player)

@@ -80,8 +80,7 @@ def fit_body(
         settings: settings of the estimate.
         on_stage: called when the fit begins; None: not called.
 
-    Raises:
-        DrakePoseError: as for an estimate.
+    Raises DrakePoseError: as for an estimate.
     """
     search, tracking = inputs.search, inputs.tracking()
     if (

@@ -106,8 +106,7 @@ def make_placement_search(
         interval_deg: sampling interval of joint angles [deg].
         free_interval_deg: sampling interval of a freely turning root [deg].
 
-    Raises:
-        SettingsError: the method is "paper".
+    Raises SettingsError: the method is "paper".
     """
     if settings.method == "paper":
         raise SettingsError(
@@ -133,8 +132,7 @@ def make_tree(
 
     ``position``: (3,) position of the root in the world [m]; None: as the model has it.
 
-    Raises:
-        SettingsError: the root cannot be rotated.
+    Raises SettingsError: the root cannot be rotated.
     """
     held = _in_plant_units(model, settings.hold)
     root, turns = settings.root, settings.root_rotation
@@ -167,9 +165,8 @@ def leave_out_links(
 ) -> tuple[ArticulatedModel, EstimateSettings]:
     """Return model and settings without ``settings.unseen``; the joints of these links are held.
 
-    Raises:
-        ModelError: the model is not a URDF, or no link would be left.
-        UnknownNameError: a link does not exist.
+    Raises ModelError: the model is not a URDF, or no link would be left; UnknownNameError: a link
+    does not exist.
     """
     centre = model.pose_tree(
         most_connected_node(model.pose_tree()),
@@ -251,9 +248,8 @@ class EstimateInputs:
             shown: masks or pictures by camera over which the body is drawn.
             more: other fields of FrameRecord by name.
 
-        Returns:
-            The record, without pose if none was found; and by camera of ``shown`` the mask or
-            picture, and its ``parts`` or None.
+        Returns the record, without pose if none was found; and by camera of ``shown`` the mask or
+        picture, and its ``parts`` or None.
         """
         q, base, E_total = np.full(len(pose.q), np.nan), None, None
         if pose.found:
@@ -310,8 +306,7 @@ def read_inputs(
             the episode's joint log.
         camera_path: camera file; None: the scene's own.
 
-    Raises:
-        DrakePoseError: the message names the file, camera, frame, link or joint at fault.
+    Raises DrakePoseError: the message names the file, camera, frame, link or joint at fault.
     """
     model = load_model(model_path, package_paths=settings.packages)
     # A sequence of pictures starts at a mask, at settings.start, or at its logged positions.
@@ -416,8 +411,7 @@ def _read_starts(
     Of ``frames`` those without a row are left out; columns that are missing get the defaults. A
     table with a column `time` is read at the times of the scene's frames.
 
-    Raises:
-        SceneError: the table cannot be read, or has no row of the first frame.
+    Raises SceneError: the table cannot be read, or has no row of the first frame.
     """
     file = settings.start
     if file is None:
@@ -450,8 +444,7 @@ def _check_start(
 
     ``starts`` are the known positions by frame, ``track`` is that of the settings.
 
-    Raises:
-        SettingsError, SceneError: a check fails.
+    Raises SettingsError, SceneError: a check fails.
     """
     if starts and not (scene.sequence and track):
         raise SettingsError(

@@ -63,9 +63,8 @@ def read_joint_centres(path: Path, joint: str, frames: Sequence[str]) -> dict[st
     Each name in ``frames`` must have a row. Frames are compared as numbers: frame 3 is
     ``0003.png``.
 
-    Raises:
-        SceneError: the table cannot be read, or a frame has no row.
-        UnknownNameError: the table does not have the joint.
+    Raises SceneError: the table cannot be read, or a frame has no row; UnknownNameError: the table
+    does not have the joint.
     """
     header, rows = read_csv(path, SceneError)
     if header != ["frame", "joint", "x", "y", "z"]:
@@ -95,9 +94,8 @@ def read_measured_positions(path: Path, position_names: Sequence[str]) -> Measur
     as numbers if they are numbers: frame 3 is ``0003.png``. Rows of poses.csv without a pose are
     skipped.
 
-    Raises:
-        SceneError: the table cannot be read, or has a column or frame twice.
-        UnknownNameError: the model does not have the position of a column.
+    Raises SceneError: the table cannot be read, or has a column or frame twice; UnknownNameError:
+    the model does not have the position of a column.
     """
     header, rows = read_csv(path, SceneError)
     if len(header) < 2 or header[0] != "frame":
@@ -137,8 +135,7 @@ def frame_times(scene: Scene) -> dict[str, float]:
 
     They are the scene's own, or those of the first camera's pictures.
 
-    Raises:
-        SceneError: a file is unreadable.
+    Raises SceneError: a file is unreadable.
     """
     if len(scene.times) or not scene.images:
         times = scene.times if len(scene.times) else np.full(len(scene.frames), np.nan)
@@ -168,9 +165,8 @@ def timed_positions(
     Returns:
         As `logged_positions`.
 
-    Raises:
-        DrakePoseError: the message names the table, and columns, joints or units at fault; or the
-            times are needed and none is known.
+    Raises DrakePoseError: the message names the table, and columns, joints or units at fault; or
+    the times are needed and none is known.
     """
     log, warnings = read_joint_table(path)
     own = np.array([*times.values()], dtype=np.float64)
@@ -210,8 +206,7 @@ def check_units(
             angle may be in degrees if it is more than a full turn beyond its limits.
         largest: largest absolute value of any position [rad or m].
 
-    Raises:
-        SceneError: values are in degrees or millimetres, or too large for positions.
+    Raises SceneError: values are in degrees or millimetres, or too large for positions.
     """
     warnings = []
     for frame, row in known.items():
@@ -266,8 +261,7 @@ def check_units(
 def _numbers(cells: Sequence[str], path: Path, line: int) -> np.ndarray:
     """Return the finite numbers (n,) in cells of a table's line.
 
-    Raises:
-        SceneError: a cell is no finite number; the message names ``path`` and ``line``.
+    Raises SceneError: a cell is no finite number; the message names ``path`` and ``line``.
     """
     try:
         numbers = np.array([read_number(cell) for cell in cells])
@@ -317,9 +311,8 @@ def cameras_of(
             poses that were recorded with the episode.
         settings: names of the cameras; all if none are given.
 
-    Raises:
-        UnknownNameError: a camera does not exist.
-        CameraError: the file cannot be used, or is for pictures of another size.
+    Raises UnknownNameError: a camera does not exist; CameraError: the file cannot be used, or is
+    for pictures of another size.
     """
     for name in settings.cameras:
         if name not in episode.cameras:
@@ -358,8 +351,7 @@ def map_log(path: Path, joints: JointLog, tree: PoseTree, settings: EpisodeSetti
         tree: the pose tree, whose held values are left out.
         settings: joint map and units; None: inferred.
 
-    Raises:
-        DrakePoseError: the message names columns, joints or units at fault.
+    Raises DrakePoseError: the message names columns, joints or units at fault.
     """
     kinematics = TreeKinematics(tree)
     held = {tree.model.position_names[index] for index in tree.held}
@@ -460,9 +452,8 @@ def read_episode_scene(
         joints: table of joint positions; None: the episode's own.
         cameras: camera file; None: the episode's own.
 
-    Raises:
-        DrakePoseError: the message names the file, camera or frame at fault; or no camera's pose is
-            known.
+    Raises DrakePoseError: the message names the file, camera or frame at fault; or no camera's pose
+    is known.
     """
     episode = open_episode(path, joints=joints, episode=settings.episode)
     chosen, placed, read = cameras_of(episode, cameras, settings)
@@ -535,8 +526,7 @@ def logged_positions(
         tree: the pose tree, with its held values.
         settings: joint map and units.
 
-    Raises:
-        DrakePoseError: the message names columns, joints or units at fault.
+    Raises DrakePoseError: the message names columns, joints or units at fault.
     """
     if scene.joints is None:
         return None, {}, ()

@@ -47,9 +47,8 @@ def follow_person(
         overlay: whether overlays are drawn.
         on_stage: called with the progress of each stage; None: not called.
 
-    Returns:
-        The inputs with all frames to be written, and an iterator of their records and overlays. If
-        all frames are finished already: the given inputs, and an empty iterator.
+    Returns the inputs with all frames to be written, and an iterator of their records and overlays.
+    If all frames are finished already: the given inputs, and an empty iterator.
 
     Raises:
         ModelError: the model has no landmarks of a person.
@@ -103,9 +102,8 @@ def _follow_colours(
         inputs: the inputs, of a scene with pictures.
         reader: reads the masks of each frame.
 
-    Returns:
-        The capture, a reader of masks, warnings, and the mean distance (frames,) of the contours
-        [pixel].
+    Returns the capture, a reader of masks, warnings, and the mean distance (frames,) of the
+    contours [pixel].
     """
     scene, frames = inputs.scene, inputs.frames
     masked = [k for k, frame in enumerate(frames) if len(scene.cameras_of(frame)) > 1]

@@ -123,8 +123,7 @@ def estimate_frames(
         search: the search, with which the diagram matches or tracks the body.
         missing: names of the frames to be estimated, in the order of ``inputs.frames``.
 
-    Raises:
-        SettingsError: a frame has no picture.
+    Raises SettingsError: a frame has no picture.
     """
     track_start: PoseEstimate | None = None
     for frame, track_start in inputs.known.items():

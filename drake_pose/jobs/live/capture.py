@@ -80,10 +80,8 @@ def capture_live(
         method: "person": fit to all silhouettes at once; "paper": the stages of Date et al. (skin,
             rays, inverse kinematics, search; see find_registered_pose).
 
-    Raises:
-        SceneError, CameraError, ModelError, SettingsError, UnknownNameError: the inputs do not
-            allow a capture.
-        OutputError: the result cannot be written.
+    Raises SceneError, CameraError, ModelError, SettingsError, UnknownNameError: the inputs do not
+    allow a capture; OutputError: the result cannot be written.
     """
     settings = settings or LiveSettings()
     usual = bundled_person() if method == "person" else bundled_model("person")
@@ -136,8 +134,7 @@ def capture_live(
 def shape_of_result(result: Path) -> KnownShape:
     """Return the link lengths [m] and radius scales of an earlier capture.
 
-    Raises:
-        OutputError: the result does not exist, or has none.
+    Raises OutputError: the result does not exist, or has none.
     """
     summary = read_summary(result)
     found = []
@@ -212,13 +209,11 @@ def find_registered_pose(
             found by inverse kinematics only.
         on_report: called when a camera stops, returns, or is left out.
 
-    Returns:
-        The cameras used, the registered pose with its silhouettes, and all else that
-        `build_paper_capture` needs.
+    Returns the cameras used, the registered pose with its silhouettes, and all else that
+    `build_paper_capture` needs.
 
-    Raises:
-        SceneError, CameraError, ModelError, SettingsError, UnknownNameError: the inputs do not
-            allow such a capture, or no picture shows the registered pose.
+    Raises SceneError, CameraError, ModelError, SettingsError, UnknownNameError: the inputs do not
+    allow such a capture, or no picture shows the registered pose.
     """
     if settings.shape is not None:
         raise SettingsError("the method paper uses the model's lengths; leave shape out")

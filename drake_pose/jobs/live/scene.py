@@ -66,8 +66,7 @@ def _open_sources(
 ) -> dict[str, FrameSource]:
     """Return the opened sources by camera; ``opened`` closes them.
 
-    Raises:
-        SceneError: a source cannot be opened.
+    Raises SceneError: a source cannot be opened.
     """
     return {name: opened.enter_context(closing(open_source(one))) for name, one in given.items()}
 
@@ -82,8 +81,7 @@ def hush_opencv() -> None:
 def load_live_scene(path: Path) -> LiveScene:
     """Return the live scene of a folder with cameras.yaml, sources.yaml and background pictures.
 
-    Raises:
-        SceneError, CameraError: the message names a missing or damaged file.
+    Raises SceneError, CameraError: the message names a missing or damaged file.
     """
     if not path.is_dir():
         raise SceneError(f"{path}: no such folder; it needs {CAMERAS} and {SOURCES}")
@@ -111,9 +109,8 @@ def take_empty_room(folder: Path, count: int, patience: float = 30.0) -> dict[st
         count: number of pictures of each camera.
         patience: timeout for the pictures [s].
 
-    Raises:
-        SceneError: a camera gives too few pictures, or no camera needs a background.
-        OutputError: a background folder is not empty, or cannot be written.
+    Raises SceneError: a camera gives too few pictures, or no camera needs a background;
+    OutputError: a background folder is not empty, or cannot be written.
     """
     specifications = {
         name: one for name, one in load_sources(folder).items() if one.background is not None
@@ -170,8 +167,7 @@ def run_live(
         speed: simulated time per real time without live cameras; 0: as fast as possible.
         largest_lag: delay to the clock beyond which a simulation skips ahead [s].
 
-    Returns:
-        Whether Ctrl-C ended the run.
+    Returns whether Ctrl-C ended the run.
     """
     simulator = Simulator(diagram)
     if monitor is not None:
@@ -219,8 +215,7 @@ def look_until(
         on_report: called with messages about live cameras.
         patience: timeout with live cameras [s].
 
-    Raises:
-        KeyboardInterrupt: Ctrl-C ended the run.
+    Raises KeyboardInterrupt: Ctrl-C ended the run.
     """
 
     def look(context: Context) -> EventStatus:

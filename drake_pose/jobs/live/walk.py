@@ -74,9 +74,8 @@ def recorded_player(
         rate_hz: frame rate [Hz]; None: that of its summary.
         packages: folders of the packages in the model's ``package://`` addresses, by name.
 
-    Raises:
-        OutputError: the result does not exist, or belongs to another model.
-        SettingsError: the rate is not positive.
+    Raises OutputError: the result does not exist, or belongs to another model; SettingsError: the
+    rate is not positive.
     """
     summary = read_summary(result)
     rate_hz = float(summary.get("frame_rate_hz") or RATE_HZ) if rate_hz is None else rate_hz
@@ -114,9 +113,8 @@ def live_player(
         settings: shape and packages; None: the model's shape.
         open_sensors: opens the sensor system; None: the scene's, in this process.
 
-    Raises:
-        SceneError, ModelError, SettingsError: the inputs do not allow a walk.
-        OutputError: the result of the shape does not exist or has none.
+    Raises SceneError, ModelError, SettingsError: the inputs do not allow a walk; OutputError: the
+    result of the shape does not exist or has none.
     """
     settings = settings or LiveSettings()
     model = load_model(model_path or bundled_person(), package_paths=settings.packages)
@@ -177,8 +175,7 @@ def walk(
         the time [s] of each command. With cameras also ``found_share``, the fraction of periods in
         which the person was found, and ``warnings``.
 
-    Raises:
-        SettingsError: time or speed is out of range.
+    Raises SettingsError: time or speed is out of range.
     """
     if seconds is not None and not 0.0 < seconds < math.inf:
         raise SettingsError(f"the walk's length must be a positive number, not {seconds} s")
@@ -258,8 +255,7 @@ def open_page(port: int | None = None) -> Meshcat:
     Args:
         port: the port; None: any free one.
 
-    Raises:
-        SettingsError: the port cannot be used.
+    Raises SettingsError: the port cannot be used.
     """
     logger = logging.getLogger("drake")
     level = logger.level

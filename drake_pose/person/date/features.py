@@ -106,8 +106,7 @@ class PersonView:
 def see_person(picture: Picture, region: Mask, skin: SkinColour) -> PersonView:
     """Find skin and contour of the person's region (H, W) in one camera's picture (H, W, 3).
 
-    Raises:
-        SettingsError: the region has another size than the picture.
+    Raises SettingsError: the region has another size than the picture.
     """
     if region.shape != picture.shape[:2]:
         raise SettingsError(f"the region is {region.shape}, but the picture {picture.shape}")
@@ -283,9 +282,8 @@ def recognise(
         contours: of each camera; None where the person is not whole. Two are needed.
         threshold: least similarity of a template, in the mean of the cameras.
 
-    Returns:
-        (nq,) positions, at the place and heading that the cameras see, and the mean similarity, 0
-        to 1; None if the pose is not recognised.
+    Returns (nq,) positions, at the place and heading that the cameras see, and the mean similarity,
+    0 to 1; None if the pose is not recognised.
     """
     scores, used, middles = [], [], []
     for camera, contour in zip(cameras, contours, strict=True):
@@ -351,8 +349,7 @@ def learn_faces(faces: Sequence[Picture], directions: Array, dimensions: int = 6
         directions: (n, 2) turn and nod of each, as in FaceTemplates [rad].
         dimensions: largest number of eigenvectors; 60 in section 3.2.2.
 
-    Raises:
-        SettingsError: fewer than three faces, or not one direction for each.
+    Raises SettingsError: fewer than three faces, or not one direction for each.
     """
     known = np.asarray(directions, dtype=np.float64).reshape(-1, 2)
     if len(faces) < 3 or len(known) != len(faces):

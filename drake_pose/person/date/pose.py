@@ -68,8 +68,7 @@ def move_upper_body(skeleton: Skeleton, q: Array, features: Array, *, face_known
         features: (5, 3) positions of FEATURES; only the hands count.
         face_known: whether the head's angles were measured and stay.
 
-    Returns:
-        (nq,) positions; a hand out of reach is only near its target.
+    Returns (nq,) positions; a hand out of reach is only near its target.
     """
     shared = () if face_known else skeleton.head_angles
     for name in LIMBS[:2]:
@@ -123,8 +122,7 @@ def reach(
         part: index of a node, and the point (3,) in the node's frame [m].
         max_steps: largest number of steps.
 
-    Returns:
-        (nq,) positions, and the remaining distance [m].
+    Returns (nq,) positions, and the remaining distance [m].
     """
     node, point = part
     packed, order = skeleton.chains[node]
@@ -161,8 +159,7 @@ def _reach(
         steps: largest number of steps.
         numbers: damping [m^2], max_step [rad], tolerance [m] and min_step [rad] of the settings.
 
-    Returns:
-        The values, and the remaining distance [m].
+    Returns the values, and the remaining distance [m].
     """
     damping, max_step, tolerance, min_step = numbers
     n, distance = len(index), np.inf
@@ -223,9 +220,8 @@ def estimate_pose(
             inverse kinematics puts them.
         waist: (3,) half-way between the hips [m]; None: by the formula of section 4.2.
 
-    Returns:
-        (nq,) positions inside their limits; and by limb (3, 3) positions of shoulder, elbow and
-        hand, or hip, knee and foot, before the model is fitted to them [m].
+    Returns (nq,) positions inside their limits; and by limb (3, 3) positions of shoulder, elbow and
+    hand, or hip, knee and foot, before the model is fitted to them [m].
     """
     q = np.array(last, dtype=np.float64)
     if head_angles is not None:
@@ -360,9 +356,8 @@ def limb_angles(
         root, middles, end: (3,), (n, 3) and (3,) the limb's joints [m].
         last: (4,) angles to stay near where several solutions exist [rad].
 
-    Returns:
-        (n, 4) angles, three at the root and the bend; and (n,) how far the worst of the root's
-        angles exceeds its limits, 0 if none does [rad]. The bend is inside its limits.
+    Returns (n, 4) angles, three at the root and the bend; and (n,) how far the worst of the root's
+    angles exceeds its limits, 0 if none does [rad]. The bend is inside its limits.
     """
     letters = "".join("XYZ"[axis] for axis in limb.axes)
     towards, distances = _directions(root, np.broadcast_to(end, middles.shape))

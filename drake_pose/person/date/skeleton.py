@@ -134,8 +134,7 @@ class Skeleton:
 def load_skeleton(model: ArticulatedModel) -> Skeleton:
     """Read the skeleton of a model that has the segments of the bundled person.
 
-    Raises:
-        ModelError: a segment is missing or hangs on another one; the message names it.
+    Raises ModelError: a segment is missing or hangs on another one; the message names it.
     """
     kinematics = TreeKinematics(model.pose_tree())
     tree = kinematics.tree
@@ -217,8 +216,7 @@ def _limb(
         name: one of LIMBS.
         upper, lower, end: names of upper and lower segment and of the hand's or foot's link.
 
-    Raises:
-        ModelError: positions or links are not those of a limb.
+    Raises ModelError: positions or links are not those of a limb.
     """
     tree = kinematics.tree
     model = tree.model

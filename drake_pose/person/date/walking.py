@@ -82,8 +82,7 @@ def count_steps(lift: float, steps: Array, seconds: float) -> Array:
             on the spot.
         seconds: time since the last frame [s].
 
-    Returns:
-        (3,) the new steps.
+    Returns (3,) the new steps.
     """
     foot, since, count = steps[0], steps[1] + seconds, steps[2]
     if since > WALK.pause:
@@ -201,8 +200,7 @@ def make_motion(skeleton: Skeleton, frames: int, seed: int) -> Motion:
         frames: number of frames.
         seed: draws the size of each motion, 0.85 to 1.15, and where the person stands.
 
-    Raises:
-        SettingsError: there are fewer than FEWEST_FRAMES frames.
+    Raises SettingsError: there are fewer than FEWEST_FRAMES frames.
     """
     if frames < FEWEST_FRAMES:
         raise SettingsError(f"Date's experiment needs {FEWEST_FRAMES} frames or more, not {frames}")

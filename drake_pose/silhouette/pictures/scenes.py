@@ -120,9 +120,7 @@ class Scene:
 
         ``wanted``: names of frames, or ranges ``FIRST:LAST``; empty: all.
 
-        Raises:
-            SettingsError: the step is below 1.
-            UnknownNameError: there is no such frame.
+        Raises SettingsError: the step is below 1; UnknownNameError: there is no such frame.
         """
         if step < 1:
             raise SettingsError(f"every must be 1 or more, not {step}")
@@ -151,9 +149,8 @@ class Scene:
 
         ``may_be_empty``: whether a mask without an object is accepted.
 
-        Raises:
-            UnknownNameError: there is no such camera, or it has no such frame.
-            MaskError: the file is not a mask of the camera's size, or has no object.
+        Raises UnknownNameError: there is no such camera, or it has no such frame; MaskError: the
+        file is not a mask of the camera's size, or has no object.
         """
         path, size = self.mask_path(camera, frame), self.cameras[camera]
         key = path, size.width, size.height
@@ -175,9 +172,8 @@ class Scene:
     def read_image(self, camera: str, frame: str) -> np.ndarray:
         """Return the picture (H, W, 3), RGB, of a camera's frame.
 
-        Raises:
-            UnknownNameError: there is no such camera, or it has no such picture.
-            SceneError: the file is not a picture of the camera's size.
+        Raises UnknownNameError: there is no such camera, or it has no such picture; SceneError: the
+        file is not a picture of the camera's size.
         """
         file, size = self._file(self.images, camera, frame), self.cameras[camera]
         if self._latest.get(camera, ("",))[0] == frame:
@@ -204,8 +200,7 @@ class Scene:
 
         Of PNG and JPEG files size and structure are checked, videos are decoded.
 
-        Raises:
-            SceneError: the file is not a picture of the camera's size.
+        Raises SceneError: the file is not a picture of the camera's size.
         """
         last: dict[str, str] = {}
         for (name, frame), file in self.images.items():
@@ -372,9 +367,7 @@ def select_frames(known: Sequence[str], wanted: Sequence[str], where: str) -> tu
             stands for the frame with that number, with or without leading zeros.
         where: the scene, for messages.
 
-    Raises:
-        UnknownNameError: there is no such frame.
-        SettingsError: a range ends before it begins.
+    Raises UnknownNameError: there is no such frame; SettingsError: a range ends before it begins.
     """
     places = {frame: k for k, frame in enumerate(known)}
 
@@ -408,9 +401,8 @@ def find_masks(
 
     ``cameras``: names of the cameras.
 
-    Returns:
-        Mask files by (camera, frame); folders that belong to no camera; warnings about unused
-        files.
+    Returns mask files by (camera, frame); folders that belong to no camera; warnings about unused
+    files.
 
     Raises SceneError: a folder cannot be read, or no camera has masks.
     """

@@ -45,11 +45,9 @@ def compiled(**options: Any) -> Callable[[_Function], _Function]: ...
 def compiled(function: Any = None, **options: Any) -> Any:
     """Decorate a kernel with ``numba.njit``, without the GIL, with numpy's division, and cached.
 
-    Args:
-        function: the kernel, if the decorator is used without parentheses; None: with them.
-        options: options of ``numba.njit``; they override the defaults.
-
-    Returns the compiled kernel, or, with parentheses, a decorator.
+    ``function``: the kernel, if the decorator is used without parentheses; None: with them.
+    ``options``: options of ``numba.njit``; they override the defaults. Returns the compiled kernel,
+    or, with parentheses, a decorator.
     """
     if function is None:
         return functools.partial(compiled, **options)

@@ -9,11 +9,9 @@ from pathlib import Path
 def read_regular(path: Path, limit: int = -1) -> bytes:
     """Return the content of a file; links are followed.
 
-    Args:
-        limit: maximum number of bytes that are read; negative: the whole file.
-
-    Raises OSError: the file is unreadable, not a regular file, or, without limit, larger than 2
-    GiB; its strerror gives the reason.
+    ``limit``: maximum number of bytes that are read; negative: the whole file. Raises OSError: the
+    file is unreadable, not a regular file, or, without limit, larger than 2 GiB; its strerror gives
+    the reason.
     """
     if require_regular(path) > 1 << 31 and limit < 0:
         raise OSError(errno.EFBIG, "it is larger than 2 GiB", str(path))

@@ -37,11 +37,9 @@ def map_ordered(
 ) -> list[_Result]:
     """Return the function's result for each item, in the order of the items.
 
-    Args:
-        function: the function, which several threads call at the same time.
-        items: its arguments.
-        workers: number of threads; None: as set by ``use_workers``. Nested calls, and calls in
-            child processes of ``multiprocessing``, use a single thread.
+    ``function``: the function, which several threads call at the same time. ``items``: its
+    arguments. ``workers``: number of threads; None: as set by ``use_workers``. Nested calls, and
+    calls in child processes of ``multiprocessing``, use a single thread.
     """
     listed = list(items)
     count = min(len(listed), workers or _CHOSEN.get() or _cores())

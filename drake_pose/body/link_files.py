@@ -74,12 +74,9 @@ Limits = dict[str, tuple[float, float]]
 def sanitise_urdf(path: Path, finder: FileFinder, warn: Warn) -> str:
     """Return the text of a URDF file, without relative paths, that Drake reads as URDF defines.
 
-    Args:
-        path: the URDF file.
-        finder: finds the files that the URDF names.
-        warn: receives a message for each part that is not read or not enforced.
-
-    Raises ModelError: the file is invalid; the message names the link, joint or mesh.
+    ``path``: the URDF file. ``finder``: finds the files that the URDF names. ``warn``: receives a
+    message for each part that is not read or not enforced. Raises ModelError: the file is invalid;
+    the message names the link, joint or mesh.
     """
     root = read_xml(path)
     if root.tag != "robot":
@@ -148,10 +145,8 @@ def _check_urdf_visual(
 ) -> None:
     """Refuse a URDF <visual> that cannot be drawn, and make its file names absolute, in place.
 
-    Args:
-        where: the link, at the beginning of messages.
-        path: the URDF file.
-        finder: finds the mesh files.
+    ``where``: the link, at the beginning of messages. ``path``: the URDF file. ``finder``: finds
+    the mesh files.
     """
     _check_origin(visual, where)
     shapes = visual.findall("geometry/*")

@@ -44,12 +44,9 @@ class JointMap:
     def measure(pose: Callable[[Array], Array], position_count: int, name: str) -> "JointMap":
         """Fit the map to poses of the plant.
 
-        Args:
-            pose: returns X_AC (4, 4) of the plant at values (k,) [rad or m].
-            position_count: number of positions k, at most three.
-            name: the joint's name, for messages.
-
-        Raises ModelError: the joint does not move as a combination of the basis functions.
+        ``pose``: returns X_AC (4, 4) of the plant at values (k,) [rad or m]. ``position_count``:
+        number of positions k, at most three. ``name``: the joint's name, for messages. Raises
+        ModelError: the joint does not move as a combination of the basis functions.
         """
         nodes = np.array([0.0, np.pi / 2.0, np.pi, -np.pi / 2.0])
         samples = np.array(list(itertools.product(nodes, repeat=position_count)))
@@ -177,12 +174,9 @@ class PlantKinematics:
 def build_link_graph(model: ParsedModel, preferred_frame: str | None) -> LinkGraph:
     """Build the graph by traversing the plant outwards from the world.
 
-    Args:
-        model: the model whose plant is traversed.
-        preferred_frame: a link whose frame its group takes; None: each group takes the frame of its
-            first link with geometry.
-
-    Raises ModelError: the joints form a loop.
+    ``model``: the model whose plant is traversed. ``preferred_frame``: a link whose frame its group
+    takes; None: each group takes the frame of its first link with geometry. Raises ModelError: the
+    joints form a loop.
     """
     plant = model.plant
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
@@ -225,10 +219,8 @@ def _make_group(
 ) -> LinkGroup:
     """Return the group of welded bodies, their meshes joined in one frame.
 
-    Args:
-        kinematics: forward kinematics of the model.
-        bodies: indices of the bodies in the plant, the one nearest to the world first.
-        preferred_frame: as for ``build_link_graph``.
+    ``kinematics``: forward kinematics of the model. ``bodies``: indices of the bodies in the plant,
+    the one nearest to the world first. ``preferred_frame``: as for ``build_link_graph``.
     """
     names = link_names(model.plant)
     links = tuple(names[body] for body in bodies)

@@ -33,13 +33,9 @@ MjcfCoupling = tuple[str, str, float, float]
 def sanitise_mjcf(path: Path, warn: Warn) -> tuple[str, list[MjcfCoupling]]:
     """Return the text of an MJCF file, with absolute paths, that Drake reads as MuJoCo does.
 
-    Args:
-        path: the MJCF file.
-        warn: receives a message for each constraint that is not enforced.
-
-    Returns the text, and the couplings between joints, which Drake's parser does not read.
-
-    Raises ModelError: the file is no MJCF, or MuJoCo refuses it; the message says why.
+    ``path``: the MJCF file. ``warn``: receives a message for each constraint that is not enforced.
+    Returns the text, and the couplings between joints, which Drake's parser does not read. Raises
+    ModelError: the file is no MJCF, or MuJoCo refuses it; the message says why.
     """
     root = read_xml(path)
     if root.tag != "mujoco":

@@ -112,11 +112,9 @@ def read_limits(
 ) -> tuple[float | None, float | None]:
     """Return a joint's lower and upper limit; None for a limit that is missing or infinite.
 
-    Args:
-        lower_text, upper_text: the limits as the file has them; None: missing.
-        name: the joint's name, for messages.
-
-    Raises ModelError: a limit is no number or NaN, or the lower one is above the upper one.
+    ``lower_text``, ``upper_text``: the limits as the file has them; None: missing. ``name``: the
+    joint's name, for messages. Raises ModelError: a limit is no number or NaN, or the lower one is
+    above the upper one.
     """
     texts = (lower_text, upper_text)
     try:
@@ -306,11 +304,8 @@ class FileFinder:
     def resolve(self, name: str, file: Path, what: str) -> Path:
         """Return the absolute path of a file or folder that a model file names.
 
-        Args:
-            name: the URI or path, as the model file has it.
-            file: the model file; other names than URIs are relative to its folder.
-            what: what the name stands for, for messages.
-
+        ``name``: the URI or path, as the model file has it. ``file``: the model file; other names
+        than URIs are relative to its folder. ``what``: what the name stands for, for messages.
         Raises ModelError: the package is unknown, or the file does not exist or is not local.
         """
         uri = re.fullmatch(r"(?s)(?P<scheme>[A-Za-z][\w+.-]*)://(?P<rest>.*)", name.strip())

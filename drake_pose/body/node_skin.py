@@ -101,10 +101,8 @@ def find_skin(
 ) -> NodeSkin | None:
     """Return the skin band between a node and its parent; None if the model declares none.
 
-    Args:
-        parent: index of the parent's link group.
-        group: index of the node's link group.
-        steps: the joints from the parent to the node.
+    ``parent``: index of the parent's link group. ``group``: index of the node's link group.
+    ``steps``: the joints from the parent to the node.
     """
     for band in model.skin:
         ends = (graph.group_of(band.parent), graph.group_of(band.child))

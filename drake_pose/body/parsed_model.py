@@ -274,12 +274,9 @@ def _intersect_limits(
     these limits (PR2's have the wrong sign). A leader stays periodic if all its followers'
     multipliers are whole numbers.
 
-    Args:
-        couplings: couplings whose leaders follow no other position.
-        names: the position names, for messages.
-        arrays: lower, upper, periodic and is_unlimited_angle of ``ParsedModel``, changed in place.
-
-    Raises ModelError: the limits of a leader and a follower exclude each other.
+    ``couplings``: couplings whose leaders follow no other position. ``names``: the position names,
+    for messages. ``arrays``: lower, upper, periodic and is_unlimited_angle of ``ParsedModel``,
+    changed in place. Raises ModelError: the limits of a leader and a follower exclude each other.
     """
     lower, upper, periodic, free = arrays
     warnings = []
@@ -435,12 +432,9 @@ class ParsedModel:
         SceneGraph after this call, because Drake's VTK renderer rejects an OBJ file without normals
         as soon as it is parsed.
 
-        Args:
-            plant: a plant that is not finalized.
-            scene_graph: the SceneGraph to register the plant with; None: add no geometry.
-            prefix: put before the model's name, so that several copies have different names.
-
-        Raises ModelError: Drake refuses the model in that plant.
+        ``plant``: a plant that is not finalized. ``scene_graph``: the SceneGraph to register the
+        plant with; None: add no geometry. ``prefix``: put before the model's name, so that several
+        copies have different names. Raises ModelError: Drake refuses the model in that plant.
         """
         instances, _ = self._source.parse(plant, scene_graph, prefix)
         if plant.geometry_source_is_registered():

@@ -77,13 +77,9 @@ class ModelSource:
     ) -> tuple[list[ModelInstanceIndex], list[str]]:
         """Add the model to a plant; return its model instances and the warnings about the file.
 
-        Args:
-            plant: a plant that is not finalized.
-            scene_graph: the SceneGraph to register the plant with; None: the plant is registered
-                already or gets no geometry.
-            prefix: put before the model's name.
-
-        Raises ModelError: Drake cannot read the model.
+        ``plant``: a plant that is not finalized. ``scene_graph``: the SceneGraph to register the
+        plant with; None: the plant is registered already or gets no geometry. ``prefix``: put
+        before the model's name. Raises ModelError: Drake cannot read the model.
         """
         parser = (
             Parser(plant, prefix) if scene_graph is None else Parser(plant, scene_graph, prefix)
@@ -232,10 +228,8 @@ def _sanitise_directives(
 
     YAML tags and aliases are kept.
 
-    Args:
-        path: the file of model directives.
-        finder: finds the files that it names.
-        sanitise_file: returns the path of a file's sanitised copy.
+    ``path``: the file of model directives. ``finder``: finds the files that it names.
+    ``sanitise_file``: returns the path of a file's sanitised copy.
     """
     try:
         node = top = yaml.compose(path.read_bytes(), Loader=yaml.SafeLoader)
@@ -290,13 +284,9 @@ def check_in_child(
     A process of one thread forks the child, which then needs no imports; others start a new
     process.
 
-    Args:
-        read: reads the model; its results in the child are discarded, except meshes.
-        path: the model file.
-        packages, limits: passed to ``read``.
-
-    Raises ModelError: the model cannot be used, or reading crashed, timed out or took too much
-    memory.
+    ``read``: reads the model; its results in the child are discarded, except meshes. ``path``: the
+    model file. ``packages``, ``limits``: passed to ``read``. Raises ModelError: the model cannot be
+    used, or reading crashed, timed out or took too much memory.
     """
     try:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()

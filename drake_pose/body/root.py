@@ -148,10 +148,8 @@ def _root_rotation(
 ) -> RootRotation:
     """Check the arguments and return a RootRotation with read-only copies of the arrays.
 
-    Args:
-        limits_deg: (lower, upper) [deg] of each value.
-        rotation: R_W0 (3, 3); None: the identity.
-        interval_deg: sampling interval [deg]; None: the search's own interval.
+    ``limits_deg``: (lower, upper) [deg] of each value. ``rotation``: R_W0 (3, 3); None: the
+    identity. ``interval_deg``: sampling interval [deg]; None: the search's own interval.
     """
     R = np.eye(3) if rotation is None else np.array(rotation, dtype=np.float64)
     orthonormal = R.shape == (3, 3) and np.allclose(R @ R.T, np.eye(3), atol=1e-6)
@@ -214,12 +212,9 @@ class BasePose:
     def solve(self, model: ParsedModel, q: Array, X_WN: Array) -> tuple[Array, Array]:
         """Complete the base positions in q (nq,) and return q and X_WB (4, 4).
 
-        Args:
-            model: the model whose plant has the positions q.
-            q: (nq,) the plant's positions [rad or m]; the base positions are overwritten.
-            X_WN: (nodes, 4, 4) poses of all nodes in the world.
-
-        Raises ModelError: no values of the base joints reach the root's pose.
+        ``model``: the model whose plant has the positions q. ``q``: (nq,) the plant's positions
+        [rad or m]; the base positions are overwritten. ``X_WN``: (nodes, 4, 4) poses of all nodes
+        in the world. Raises ModelError: no values of the base joints reach the root's pose.
         """
         if self.kind == "constant":
             return q, np.array(self.X_WB)

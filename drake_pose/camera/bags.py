@@ -57,10 +57,8 @@ def open_bag(path: Path, joints: JointLog | None) -> Episode:
     Joints published separately are interpolated at the times of the publisher with most messages.
     A camera whose frame is attached to others by `/tf_static` is mounted on the last of these.
 
-    Args:
-        joints: joint log to use instead of the bag's; None: the bag's, if it has any.
-
-    Raises SceneError: the bag is unreadable, truncated, or has no images.
+    ``joints``: joint log to use instead of the bag's; None: the bag's, if it has any. Raises
+    SceneError: the bag is unreadable, truncated, or has no images.
     """
     pictures, states, infos, parents, ignored, kinds = _scan(path)
     warnings = [
@@ -407,12 +405,8 @@ def _lens(info: Any, *, is_rectified: bool, where: str) -> Lens:
     The distortion applies to raw images. Rectified images have no distortion, and their camera
     matrix is in P, or in K if P is 0.
 
-    Args:
-        info: the CameraInfo message.
-        is_rectified: whether the images are rectified.
-        where: start of error messages.
-
-    Raises SceneError: the distortion model is unknown.
+    ``info``: the CameraInfo message. ``is_rectified``: whether the images are rectified. ``where``:
+    start of error messages. Raises SceneError: the distortion model is unknown.
     """
     size, K, D, P = (info.width, info.height), *(_field(info, one) for one in ("k", "d", "p"))
     K = P.reshape(3, 4)[:, :3] if is_rectified and P.any() else K

@@ -49,12 +49,9 @@ def read_camera_content(
 
     Matrices of a FileStorage are arrays. A launch file is a list of its static transforms.
 
-    Args:
-        largest: maximum size of the file [byte].
-        largest_json: the same for `.json` and `.jsonl` [byte].
-        episode_ids: of a `.jsonl`, only the lines that hold one of these names are read, if any do.
-
-    Raises CameraError: the file cannot be read.
+    ``largest``: maximum size of the file [byte]. ``largest_json``: the same for `.json` and
+    `.jsonl` [byte]. ``episode_ids``: of a `.jsonl`, only the lines that hold one of these names are
+    read, if any do. Raises CameraError: the file cannot be read.
     """
     is_json = path.suffix in (".json", ".jsonl")
     try:
@@ -260,9 +257,7 @@ def _kalibr(
     camera. The pose is None for all cameras if none has it, and else for a later camera that lacks
     it and those after it.
 
-    Args:
-        chain: entries of the file by camera, in order.
-        path: the file, for messages.
+    ``chain``: entries of the file by camera, in order. ``path``: the file, for messages.
     """
     is_chain = any("T_cn_cnm1" in entry for entry in chain.values())
     X_CW: Array | None = np.eye(4) if is_chain else None

@@ -343,12 +343,8 @@ def _read_camera(name: str, entry: Any, path: Path) -> Camera:
 
     Its X_WC is the entry's X_WC or X_LC, or else the identity.
 
-    Args:
-        name: the camera's name.
-        entry: the entry, not yet checked.
-        path: the file, for messages.
-
-    Raises CameraError: a field is missing, unknown or invalid.
+    ``name``: the camera's name. ``entry``: the entry, not yet checked. ``path``: the file, for
+    messages. Raises CameraError: a field is missing, unknown or invalid.
     """
     where = f"{path}: camera '{name}'"
     if not isinstance(entry, dict):

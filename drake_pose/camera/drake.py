@@ -85,11 +85,9 @@ def camera_from_drake(
 ) -> PinholeCamera:
     """Return the camera of a Drake CameraInfo or RenderCameraCore.
 
-    Args:
-        name: name of the returned camera.
-        source: the intrinsics; a RenderCameraCore also provides the near plane and the sensor's
-            pose X_BS in its body.
-        X_WC: pose of the camera in the world; with a RenderCameraCore the pose of its body B.
+    ``name``: name of the returned camera. ``source``: the intrinsics; a RenderCameraCore also
+    provides the near plane and the sensor's pose X_BS in its body. ``X_WC``: pose of the camera in
+    the world; with a RenderCameraCore the pose of its body B.
     """
     pose = X_WC.GetAsMatrix4() if isinstance(X_WC, RigidTransform) else np.asarray(X_WC)
     if isinstance(source, CameraInfo):
@@ -178,11 +176,8 @@ def read_configs(entries: Mapping[str, Any], path: Path) -> dict[str, PinholeCam
 
     A camera's name is its ``name``, or else the entry's key.
 
-    Args:
-        entries: entries by key, not yet checked; None: all defaults.
-        path: the file, for messages.
-
-    Raises CameraError: names the file, the camera and the problem.
+    ``entries``: entries by key, not yet checked; None: all defaults. ``path``: the file, for
+    messages. Raises CameraError: names the file, the camera and the problem.
     """
     cameras: dict[str, PinholeCamera] = {}
     for key, entry in entries.items():
@@ -217,11 +212,8 @@ def dump_scenario(
 ) -> str:
     """Return the text of a Scenario, for ``LoadScenario``, with cameras that render label images.
 
-    Args:
-        cameras: the cameras, by name or in sequence.
-        links: link of each camera that is mounted on one, by the camera's name; its pose is in the
-            link's frame. None: all poses are in the world.
-
+    ``cameras``: the cameras, by name or in sequence. ``links``: link of each camera that is mounted
+    on one, by the camera's name; its pose is in the link's frame. None: all poses are in the world.
     Raises CameraError: a parallel camera, or a principal point outside the image.
     """
     content = {}

@@ -29,11 +29,8 @@ def open_droid(path: Path, joints: JointLog | None) -> Episode:
     `<serial>_timestamps.json` beside the video. The arm's joints are joint1 to joint7 [rad];
     gripper_position is 0 for open and 1 for closed.
 
-    Args:
-        path: the folder.
-        joints: joint log to use instead of the trajectory's; None: the trajectory's.
-
-    Raises SceneError: names the file that is missing or damaged.
+    ``path``: the folder. ``joints``: joint log to use instead of the trajectory's; None: the
+    trajectory's. Raises SceneError: names the file that is missing or damaged.
     """
     h5py = import_reader("h5py", path)
     where, folder = path / TRAJECTORY, path / "recordings" / "MP4"

@@ -185,12 +185,9 @@ def ascending_indices(
 
     There is one warning if others were left out, else none; nan is left out, too.
 
-    Args:
-        times: (n,) time stamps [s].
-        what: what has these times, for messages.
-        max_fraction: maximum fraction of all time stamps that may be left out.
-
-    Raises SceneError: there are no time stamps, or more than this fraction are out of order.
+    ``times``: (n,) time stamps [s]. ``what``: what has these times, for messages. ``max_fraction``:
+    maximum fraction of all time stamps that may be left out. Raises SceneError: there are no time
+    stamps, or more than this fraction are out of order.
     """
     stamps = np.where(np.isfinite(times), times, np.nan)
     before = np.fmax.accumulate(np.concatenate([[-np.inf], stamps]))[:-1]
@@ -240,12 +237,8 @@ def _comparison_warnings(path: Path, camera: EpisodeCamera, joints: JointLog) ->
     They are compared by frames if both have them, else by times: images outside the log's time
     span, or else a span of images shorter than 3/4 of the log's.
 
-    Args:
-        path: the recording, for messages.
-        camera: the camera.
-        joints: the joint log.
-
-    Raises SceneError: no frame is in both, or they have neither frames nor times in common.
+    ``path``: the recording, for messages. ``camera``: the camera. ``joints``: the joint log. Raises
+    SceneError: no frame is in both, or they have neither frames nor times in common.
     """
     count, where = len(camera.times), f"camera '{camera.name}'"
     if joints.frames and camera.frames:

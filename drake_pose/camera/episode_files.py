@@ -78,11 +78,9 @@ def open_folder(path: Path, joints: JointLog | None) -> Episode:
 
     The cameras are those of the folders, the videos and `cameras.yaml`, which may be missing.
 
-    Args:
-        joints: joint log to use instead of the folder's `joint_angles.csv`; None: that, if it
-            exists.
-
-    Raises SceneError: images or the table are unusable; CameraError: the camera file is unusable.
+    ``joints``: joint log to use instead of the folder's `joint_angles.csv`; None: that, if it
+    exists. Raises SceneError: images or the table are unusable; CameraError: the camera file is
+    unusable.
     """
     warnings: list[str] = []
     if joints is None and (path / JOINT_TABLE).exists():
@@ -196,11 +194,9 @@ def picture_times(files: Mapping[str, Path] | Path, scene: Path) -> dict[str, fl
     They are a video's own, or those in `timestamps.csv` beside picture files, or follow from the
     frame rate.
 
-    Args:
-        files: picture files by frame, or a video, whose frames are named 000000 and so on.
-        scene: path of the scene.yaml with the rate, which may be missing.
-
-    Raises SceneError: a file is unreadable.
+    ``files``: picture files by frame, or a video, whose frames are named 000000 and so on.
+    ``scene``: path of the scene.yaml with the rate, which may be missing. Raises SceneError: a file
+    is unreadable.
     """
     if isinstance(files, Path):
         return {f"{k:06d}": float(time) for k, time in enumerate(TimedVideo(files).times)}
@@ -216,11 +212,8 @@ def picture_times(files: Mapping[str, Path] | Path, scene: Path) -> dict[str, fl
 def read_sequence(path: Path, sequence: bool = False) -> tuple[bool, float | None]:
     """Return whether frames are a sequence, and their rate [Hz] or None, by a scene.yaml.
 
-    Args:
-        path: the file, which may be missing.
-        sequence: whether frames are a sequence if the file does not say.
-
-    Raises SceneError: the file is unreadable or has other content.
+    ``path``: the file, which may be missing. ``sequence``: whether frames are a sequence if the
+    file does not say. Raises SceneError: the file is unreadable or has other content.
     """
     if not os.path.lexists(path):
         return sequence, None
@@ -270,10 +263,8 @@ def recorded_intrinsics(
 
     Those of a file for pictures of another size but the same shape are scaled.
 
-    Args:
-        cameras: the cameras that are used.
-        path: the episode's folder or file.
-        intrinsics: a camera file; None: the episode's cameras.yaml, or else its recorded ones.
+    ``cameras``: the cameras that are used. ``path``: the episode's folder or file. ``intrinsics``:
+    a camera file; None: the episode's cameras.yaml, or else its recorded ones.
     """
     read = intrinsics_of(path / CAMERAS, intrinsics, distorted=True)()
     if read is None:

@@ -329,11 +329,8 @@ def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str,
     to the model's free joints in order, if there are as many of these, or as many with numbered
     names that begin alike.
 
-    Args:
-        logged: names of the log's columns.
-        wanted: names of the model's joints.
-
-    Returns the wanted name of each matched logged name, and the warnings.
+    ``logged``: names of the log's columns. ``wanted``: names of the model's joints. Returns the
+    wanted name of each matched logged name, and the warnings.
     """
     matched = {name: name for name in logged if name in wanted}
     guesses: dict[str, str] = {}

@@ -160,12 +160,8 @@ def _episode_rows(path: Path, info: Mapping[str, Any], parquet: Any) -> _Rows:
     They are in `meta/episodes/*/*.parquet` (version 3) or `meta/episodes.jsonl` (version 2).
     Without either file the episodes are numbered from 0 to `total_episodes` - 1.
 
-    Args:
-        path: folder of the data set.
-        info: content of `meta/info.json`.
-        parquet: the module pyarrow.parquet.
-
-    Raises SceneError: the metadata are damaged.
+    ``path``: folder of the data set. ``info``: content of `meta/info.json`. ``parquet``: the module
+    pyarrow.parquet. Raises SceneError: the metadata are damaged.
     """
     rows: dict[int, Mapping[str, Any]] = {}
     for file in sorted(path.glob("meta/episodes/*/*.parquet")):

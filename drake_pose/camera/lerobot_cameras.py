@@ -32,12 +32,9 @@ def camera_fields(camera: PinholeCamera, link: str | None = None) -> dict[str, A
 def with_fields(camera: EpisodeCamera, fields: Mapping[str, Any], where: str) -> EpisodeCamera:
     """Return a recorded camera with the intrinsics and pose in its feature's fields, if any.
 
-    Args:
-        camera: the recorded camera.
-        fields: fields of its feature and of the feature's `info`, as of `camera_fields`.
-        where: the file, for messages.
-
-    Raises CameraError: a field is invalid, or there is a pose without intrinsics.
+    ``camera``: the recorded camera. ``fields``: fields of its feature and of the feature's `info`,
+    as of `camera_fields`. ``where``: the file, for messages. Raises CameraError: a field is
+    invalid, or there is a pose without intrinsics.
     """
     matrix, pose = fields.get("camera_intrinsics"), fields.get("camera_extrinsics")
     if matrix is None and pose is None:

@@ -21,12 +21,8 @@ Features = Mapping[str, Mapping[str, Any]]
 def read_numbers(table: Any, key: str, where: str) -> Array:
     """Return a column (n, m) of numbers or of lists of m numbers; missing rows are nan.
 
-    Args:
-        table: the table (pyarrow.Table).
-        key: name of the column.
-        where: the table's file, for messages.
-
-    Raises SceneError: the column has other content, or rows of different lengths.
+    ``table``: the table (pyarrow.Table). ``key``: name of the column. ``where``: the table's file,
+    for messages. Raises SceneError: the column has other content, or rows of different lengths.
     """
     column = table[key]
     if import_reader("pyarrow", Path(where)).types.is_temporal(column.type):
@@ -167,10 +163,8 @@ def feature_names(key: str, feature: Mapping[str, Any]) -> list[str]:
     Otherwise they are the last part of the key, or "joint", and a number from 0; a single entry has
     no number.
 
-    Args:
-        key: the feature's key.
-        feature: the feature in `meta/info.json`: its shape and, if any, its names, which may be
-            nested lists or a mapping of lists.
+    ``key``: the feature's key. ``feature``: the feature in `meta/info.json`: its shape and, if any,
+    its names, which may be nested lists or a mapping of lists.
     """
     size, names = int(np.prod(feature["shape"])), feature.get("names")
     if isinstance(names, dict):

@@ -34,10 +34,8 @@ def check_number(value: Any, field: str, where: str, *, positive: bool = False) 
 
     Text that spells a number is accepted, because YAML 1.1 reads ``1e-3`` as text.
 
-    Args:
-        value: the number, not yet checked.
-        field, where: field and start of the error message.
-        positive: refuse 0 and negative numbers.
+    ``value``: the number, not yet checked. ``field``, ``where``: field and start of the error
+    message. ``positive``: refuse 0 and negative numbers.
     """
     try:
         if isinstance(value, bool) or not isinstance(
@@ -59,12 +57,8 @@ def check_pose(value: Any, field: str, where: str) -> np.ndarray:
     A rounded rotation R, with R R^T within 1e-4 of the identity, is replaced by the nearest exact
     one, as Drake requires.
 
-    Args:
-        value: the transform.
-        field, where: field and start of the error message.
-
-    Raises CameraError: not a finite 4 x 4 matrix, its last row is not 0 0 0 1, or it is not a
-    rotation.
+    ``value``: the transform. ``field``, ``where``: field and start of the error message. Raises
+    CameraError: not a finite 4 x 4 matrix, its last row is not 0 0 0 1, or it is not a rotation.
     """
     value = value.GetAsMatrix4() if hasattr(value, "GetAsMatrix4") else value
     rows = value.tolist() if isinstance(value, np.ndarray) else value

@@ -96,12 +96,9 @@ def parse_motors(content: Any, path: Path) -> dict[str, Motor] | None:
 def read_motors(path: Path, robot: str = "", largest: int = 1 << 20) -> Servos | None:
     """Return a calibration file's motors; None: the file is not one.
 
-    Args:
-        path: a JSON file.
-        robot: type of the robot, if it is known.
-        largest: maximum size of the file [byte]; larger files are none.
-
-    Raises SceneError: the file cannot be read, or an entry is damaged.
+    ``path``: a JSON file. ``robot``: type of the robot, if it is known. ``largest``: maximum size
+    of the file [byte]; larger files are none. Raises SceneError: the file cannot be read, or an
+    entry is damaged.
     """
     try:
         data = read_regular(path, largest + 1)

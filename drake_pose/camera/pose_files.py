@@ -74,12 +74,9 @@ def episode_entry(
 ) -> Mapping[Any, Any] | None:
     """Return the entry of one episode of a file that is keyed by episodes; None: it has none.
 
-    Args:
-        entries: entries of the file by key.
-        path: the file, for messages.
-        episode_ids: names by which the recording may be known.
-
-    Raises CameraError: there are several, and none belongs to the recording.
+    ``entries``: entries of the file by key. ``path``: the file, for messages. ``episode_ids``:
+    names by which the recording may be known. Raises CameraError: there are several, and none
+    belongs to the recording.
     """
     held = {
         key: one
@@ -310,10 +307,8 @@ def finite_numbers(value: Any) -> Array | None:
 def _is_small(value: Any, depth: int = 3, count: int = 100) -> bool:
     """Return whether nested lists have few levels and entries; aliases of YAML may hold billions.
 
-    Args:
-        value: the lists; anything else is small.
-        depth: maximum number of levels.
-        count: maximum length of a list: several times a pose's 16 numbers.
+    ``value``: the lists; anything else is small. ``depth``: maximum number of levels. ``count``:
+    maximum length of a list: several times a pose's 16 numbers.
     """
     if not isinstance(value, list | tuple):
         return True

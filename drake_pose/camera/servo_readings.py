@@ -214,10 +214,8 @@ def servo_columns(
     LeRobot. The low end of a gripper's range is its joint's lower limit. Steps without a range have
     their zero at half a turn. A joint whose position does not follow has no map.
 
-    Args:
-        joints: the joints, each with a column.
-        servos: the robot's motors.
-        encoding: of the readings.
+    ``joints``: the joints, each with a column. ``servos``: the robot's motors. ``encoding``: of the
+    readings.
     """
     columns, warnings, assumed = dict[str, Column](), list[str](), list[str]()
     inner = {joint.name: _as_counted(joint, servos, encoding) for joint in joints}

@@ -458,12 +458,9 @@ def load_sources(
     device's number or address), and either `masks: true`, if the source provides masks, or
     `background`, a folder of images of the empty room. `rate_hz` and `offset` [s] are optional.
 
-    Args:
-        path: a `sources.yaml`, or its folder.
-        cameras: the calibrated cameras; None: those of the `cameras.yaml` in the same folder.
-
-    Raises SceneError: names the file, the camera and the field at fault; CameraError: the camera
-    file is invalid.
+    ``path``: a `sources.yaml`, or its folder. ``cameras``: the calibrated cameras; None: those of
+    the `cameras.yaml` in the same folder. Raises SceneError: names the file, the camera and the
+    field at fault; CameraError: the camera file is invalid.
     """
     path = Path(path)
     path = path / SOURCES if path.is_dir() else path
@@ -533,12 +530,8 @@ def load_background_pictures(specification: SourceSpecification) -> list[Picture
 def _read_entry(camera: Camera, entry: Any, path: Path) -> SourceSpecification:
     """Return the specification of a camera's entry in a sources.yaml, with paths from its folder.
 
-    Args:
-        camera: the calibrated camera.
-        entry: the entry, not yet checked.
-        path: the sources.yaml.
-
-    Raises SceneError: a field is missing, unknown or invalid.
+    ``camera``: the calibrated camera. ``entry``: the entry, not yet checked. ``path``: the
+    sources.yaml. Raises SceneError: a field is missing, unknown or invalid.
     """
     where = f"{path}: camera '{camera.name}'"
     if not isinstance(entry, dict):

@@ -69,11 +69,8 @@ class Synchroniser(Generic[Item]):
         If not, because its group was taken or its time stamp is not later than the camera's last
         one, the image is dropped and counted in `late`.
 
-        Args:
-            time: time stamp [s].
-            item: the image, or anything else that ``take`` shall return for it.
-
-        Raises UnknownNameError: there is no such camera.
+        ``time``: time stamp [s]. ``item``: the image, or anything else that ``take`` shall return
+        for it. Raises UnknownNameError: there is no such camera.
         """
         if camera not in self._queues:
             raise UnknownNameError("camera", camera, self.cameras, "the synchroniser")

@@ -64,10 +64,8 @@ def _json_text(value: Any, levels: int = 2, indent: str = "\n") -> str:
     What lies deeper, such as the content of a frame, takes one line, which is written ten times as
     fast.
 
-    Args:
-        value: plain JSON value, as of `without_nan`.
-        levels: number of levels that are broken.
-        indent: end of line, and spaces of the present level.
+    ``value``: plain JSON value, as of `without_nan`. ``levels``: number of levels that are broken.
+    ``indent``: end of line, and spaces of the present level.
     """
     if not (levels and isinstance(value, dict) and value):
         return json.dumps(value, allow_nan=False, ensure_ascii=False)

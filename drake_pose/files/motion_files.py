@@ -121,10 +121,8 @@ def centres_as_csv(frames: Sequence[str], names: Sequence[str], places: Array) -
 def centres_as_trc(names: Sequence[str], places: Array, rate_hz: float) -> str:
     """Return the text of a TRC file of joint centres: millimetres, y up, frames counted from 1.
 
-    Args:
-        names: (joints,) names of the markers.
-        places: (frames, joints, 3) positions in the world, z up [m]; nan becomes an empty field.
-        rate_hz: frame rate [Hz].
+    ``names``: (joints,) names of the markers. ``places``: (frames, joints, 3) positions in the
+    world, z up [m]; nan becomes an empty field. ``rate_hz``: frame rate [Hz].
     """
     count = len(places)
     head = ["DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units", "OrigDataRate",
@@ -186,10 +184,8 @@ the parent joint in the skeleton, -1 for the root."""
 def skeleton_of(model: ArticulatedModel, q: Array, stays: float = 1e-5) -> Skeleton:
     """Return the joints of a model's BVH skeleton, parents before children.
 
-    Args:
-        model: the model.
-        q: (frames, nq) positions [rad or m], in which constant lengths are detected.
-        stays: range of a prismatic joint below which it is constant [m].
+    ``model``: the model. ``q``: (frames, nq) positions [rad or m], in which constant lengths are
+    detected. ``stays``: range of a prismatic joint below which it is constant [m].
     """
     plant, names, seen = model.plant, model.link_names, model.link_meshes
     # Children of each body: (body, whether by a constant length, whether by a moving joint).

@@ -162,11 +162,9 @@ class PoseTable:
     def read(self, known: Mapping[str, Mapping[str, Any]] | None = None) -> list[FrameRecord]:
         """Return the records of an interrupted job, in the file's order; [] without poses.csv.
 
-        Args:
-            known: ``frames`` of its summary.json, content of `FrameRecord.as_json` by frame. Other
-                frames' records have the values of poses.csv only.
-
-        Raises OutputError: the table cannot be read, or belongs to another model.
+        ``known``: ``frames`` of its summary.json, content of `FrameRecord.as_json` by frame. Other
+        frames' records have the values of poses.csv only. Raises OutputError: the table cannot be
+        read, or belongs to another model.
         """
         path = self._folder / POSES
         if not path.is_file():
@@ -257,10 +255,8 @@ def record_deviations(model: ArticulatedModel, q: Array, deviations: Array) -> J
     It is not if its deviation is unknown: the interval is then the whole range. Positions with an
     infinite interval are left out; the result is {} if q is not finite.
 
-    Args:
-        model: the model of the positions.
-        q: (nq,) positions [rad or m].
-        deviations: (nq,) standard deviations [rad or m]; nan where unknown.
+    ``model``: the model of the positions. ``q``: (nq,) positions [rad or m]. ``deviations``: (nq,)
+    standard deviations [rad or m]; nan where unknown.
     """
     if not np.isfinite(q).all():
         return {}
@@ -394,12 +390,9 @@ def read_earlier_summary(
 
     Without ``resume`` nothing is read, and the result is None.
 
-    Args:
-        folder: the result folder; None if there is none.
-        job: the present job, from `describe_job`.
-
-    Raises SettingsError: no folder is given; OutputError: the summary cannot be read, or model
-    file, camera file or settings (other than ``frames``) differ.
+    ``folder``: the result folder; None if there is none. ``job``: the present job, from
+    `describe_job`. Raises SettingsError: no folder is given; OutputError: the summary cannot be
+    read, or model file, camera file or settings (other than ``frames``) differ.
     """
     if not resume:
         return None
@@ -480,10 +473,8 @@ def camera_warnings(
 ) -> tuple[str, ...]:
     """Return a warning for each of three or more cameras whose IoU is much lower than the others'.
 
-    Args:
-        records: estimates by frame.
-        known: earlier warnings; cameras that these name get no other one.
-        suspicious: minimum difference of the mean IoU to the cameras' median.
+    ``records``: estimates by frame. ``known``: earlier warnings; cameras that these name get no
+    other one. ``suspicious``: minimum difference of the mean IoU to the cameras' median.
     """
     means = {name: float(one["mean_iou"]) for name, one in describe_cameras(records).items()}
     if len(means) < 3:

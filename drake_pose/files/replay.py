@@ -132,10 +132,8 @@ def _record(
     Frame k is at k times ``period``; from a period of 1 s on it is repeated just before the next
     frame. positions, X_WB, period, model and measured are as in `make_replay`.
 
-    Args:
-        meshcat: the page.
-        diagram: diagram that publishes the body to the page.
-        source: the diagram's source of positions (nq,).
+    ``meshcat``: the page. ``diagram``: diagram that publishes the body to the page. ``source``: the
+    diagram's source of positions (nq,).
     """
     context = diagram.CreateDefaultContext()
     value = source.get_mutable_source_value(source.GetMyMutableContextFromRoot(context))

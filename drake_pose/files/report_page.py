@@ -165,12 +165,9 @@ def _joint_rows(
     Positions are in degrees or mm. Joints without an estimate, and those of a fixed base, have no
     row; without records there is none.
 
-    Args:
-        model: the model of the positions.
-        estimate: the estimate.
-        joined: whether frames are a sequence, whose plots join neighbouring frames by a line.
-
-    Returns the variables of each row for report_template.html.j2.
+    ``model``: the model of the positions. ``estimate``: the estimate. ``joined``: whether frames
+    are a sequence, whose plots join neighbouring frames by a line. Returns the variables of each
+    row for report_template.html.j2.
     """
     records, frames = list(estimate.records.values()), list(estimate.records)
     if not records:
@@ -281,10 +278,8 @@ def _ends(*values: Array) -> tuple[float, float]:
 def _camera_row(estimate: SceneEstimate, camera: str, states: Sequence[str]) -> dict[str, Any]:
     """Return a row of the table of cameras: number of pictures, of those used, IoU, warnings.
 
-    Args:
-        estimate: the estimate.
-        camera: the camera's name.
-        states: (frames,) result of `_picture_use`.
+    ``estimate``: the estimate. ``camera``: the camera's name. ``states``: (frames,) result of
+    `_picture_use`.
     """
     records = estimate.records
     ious = {f: one.ious[camera] for f, one in records.items() if camera in one.ious}
@@ -482,10 +477,8 @@ def _mark_frames(axes: "Axes", frames: Sequence[str], count: int = 6) -> None:
 def draw_grid(frames: Sequence[str], rows: Sequence[tuple[str, Sequence[str]]]) -> "Figure":
     """Plot states over frames: a row of bars for each name; equal neighbours are one bar.
 
-    Args:
-        frames: names of the frames.
-        rows: name and (frames,) states of each row. "used" and "found" are blue, "no-picture" is
-            grey, other states are orange.
+    ``frames``: names of the frames. ``rows``: name and (frames,) states of each row. "used" and
+    "found" are blue, "no-picture" is grey, other states are orange.
     """
     colours = {"used": "#0072b2", "found": "#0072b2", "no-picture": "#d8dee4"}
     figure, axes = new_plot(0.4 + 0.2 * len(rows), 0.2)

@@ -203,9 +203,7 @@ class ResultWriter:
     def _replay(self, found: Sequence[FrameRecord], period: float) -> str:
         """Return the page replay.html of the frames with a pose; a ghost shows measured positions.
 
-        Args:
-            found: records with a pose.
-            period: time between two frames [s].
+        ``found``: records with a pose. ``period``: time between two frames [s].
         """
         q, measured = np.array([one.q for one in found]), measured_positions(self.model, found)
         ghost = None if np.isnan(measured).all() else np.where(np.isnan(measured), q, measured)

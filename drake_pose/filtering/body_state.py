@@ -206,10 +206,8 @@ class BodyState:
 
         If the root does not move, its position in the pose is ignored.
 
-        Args:
-            q: (nq,) plant positions.
-            X_WB: (4, 4) pose of the plant's world in the world; None: identity.
-            scale: image scale relative to the camera's.
+        ``q``: (nq,) plant positions. ``X_WB``: (4, 4) pose of the plant's world in the world; None:
+        identity. ``scale``: image scale relative to the camera's.
         """
         values = self._kinematics.flatten(self.tree.values_from_positions(q, X_WB))
         root = np.append(self._known_shift, math.log(scale))
@@ -254,10 +252,8 @@ class BodyState:
     def difference(self, x: Array, views: Iterable[tuple[Camera, Mask]]) -> tuple[int, int]:
         """Compare the silhouettes of the body at a state x (n,) with masks.
 
-        Args:
-            views: pairs of a camera and its mask (H, W).
-
-        Returns the number of pixels that differ, and the number of mask pixels, over all masks.
+        ``views``: pairs of a camera and its mask (H, W). Returns the number of pixels that differ,
+        and the number of mask pixels, over all masks.
         """
         wrong, area = 0, 0
         for camera, mask in views:

@@ -274,9 +274,7 @@ class ContourObservation(BodyState):
         It is 0 for values that are not free. Errors of surfaces, masks and cameras are correlated,
         see ``fit.covariance``.
 
-        Args:
-            measured: the measurement.
-            area: total area of all silhouettes [pixel].
+        ``measured``: the measurement. ``area``: total area of all silhouettes [pixel].
         """
         unit = error_unit(math.sqrt(area / len(self.cameras)))
         index, size = self._parameter_index, len(self._body.names)

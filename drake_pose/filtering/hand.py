@@ -183,9 +183,7 @@ def _place_finger(x: Array, chains: Chains, finger: int, p: Array, dp: Array) ->
 
     p and dp are written in place, in the palm's frame. dp must be 0 before.
 
-    Args:
-        x: (n,) as for ``project_hand``.
-        finger: index of the finger.
+    ``x``: (n,) as for ``project_hand``. ``finger``: index of the finger.
     """
     first, last = chains.firsts[finger], chains.firsts[finger + 1]
     R, origin, point = np.eye(3), np.zeros(3), 0

@@ -319,12 +319,9 @@ class HandSilhouette:
 
         All measurements are NaN if the mask is empty or differs too much from the best rough pose.
 
-        Args:
-            mask: (H, W) the hand's silhouette.
-            prediction: belief of the state before the measurement.
-            scale: known image scale, the squared norm of the quaternion; None: unknown.
-
-        Raises MaskError: the mask has another size.
+        ``mask``: (H, W) the hand's silhouette. ``prediction``: belief of the state before the
+        measurement. ``scale``: known image scale, the squared norm of the quaternion; None:
+        unknown. Raises MaskError: the mask has another size.
         """
         if mask.shape != (self.height, self.width):
             raise MaskError(
@@ -466,10 +463,8 @@ class HandSilhouette:
 
         At most ``SEARCH.tracked`` states, best first, with the prediction's scale.
 
-        Args:
-            mask: (H, W) the silhouette.
-            prediction: belief of the state, from which the first poses are drawn.
-            seed: seed of the random numbers.
+        ``mask``: (H, W) the silhouette. ``prediction``: belief of the state, from which the first
+        poses are drawn. ``seed``: seed of the random numbers.
         """
         size = (round(SEARCH.zoom * self.width), round(SEARCH.zoom * self.height))
         small = cv2.resize(mask.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)

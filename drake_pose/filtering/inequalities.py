@@ -99,12 +99,8 @@ def two_sided(
 ) -> Inequalities:
     """Return lower <= phi^T x <= upper as two inequalities; infinite bounds are left out.
 
-    Args:
-        columns: (n) names of the elements of x.
-        name: begins the text of both inequalities.
-        phi: (n,) coefficients.
-
-    Raises SettingsError: lower > upper, a bound is NaN, or phi is zero.
+    ``columns``: (n) names of the elements of x. ``name``: begins the text of both inequalities.
+    ``phi``: (n,) coefficients. Raises SettingsError: lower > upper, a bound is NaN, or phi is zero.
     """
     if np.isnan(lower) or np.isnan(upper) or lower > upper:
         raise SettingsError(
@@ -318,12 +314,9 @@ def load_couplings(path: Path | str, columns: Sequence[str]) -> Inequalities:
         rows:
           - {name: curl, terms: {flexion_11: 1, flexion_12: 1}, upper: 150, unit: deg}
 
-    Args:
-        path: the couplings file.
-        columns: (n) names of the elements that the inequalities are over.
-
-    Raises ModelError: the file cannot be read or an entry is invalid; UnknownNameError: an entry
-    names an unknown joint.
+    ``path``: the couplings file. ``columns``: (n) names of the elements that the inequalities are
+    over. Raises ModelError: the file cannot be read or an entry is invalid; UnknownNameError: an
+    entry names an unknown joint.
     """
     file = Path(path)
     content = _read(file)

@@ -109,10 +109,8 @@ def find_start(
     Nine tilted starts are fitted to the first frame. The best different ones are tracked through
     the following frames.
 
-    Args:
-        tracker: tracker of the body, and its cameras.
-        x: (n,) state in the first frame about which starts are tilted.
-        masks: for each frame, for each camera the mask (H, W) or None.
+    ``tracker``: tracker of the body, and its cameras. ``x``: (n,) state in the first frame about
+    which starts are tilted. ``masks``: for each frame, for each camera the mask (H, W) or None.
     """
     observation = tracker.observation
     steps = (0.0, SEQUENCE.tilt, -SEQUENCE.tilt)
@@ -148,10 +146,8 @@ def _evaluated(
 ) -> TrackedStart:
     """Return a start extended by one frame, evaluated on its masks.
 
-    Args:
-        track: the track after the frame.
-        masks: the frame's mask (H, W) or None for each camera.
-        before: the start up to the frame before; None: this is the first frame.
+    ``track``: the track after the frame. ``masks``: the frame's mask (H, W) or None for each
+    camera. ``before``: the start up to the frame before; None: this is the first frame.
     """
     x = track.state.best.mean
     pairs = zip(observation.cameras, masks, strict=True)
@@ -247,11 +243,8 @@ def pose_set(
 ) -> PoseSet:
     """Return the pose set of a frame: one mode per explanation, and joint intervals.
 
-    Args:
-        explanations: the result of ``fit_sequence``, best first.
-        poses: for each explanation q (nq,), X_WB (4, 4) and the objective (1) J [pixel] in this
-            frame.
-        frame: index of the frame.
+    ``explanations``: the result of ``fit_sequence``, best first. ``poses``: for each explanation q
+    (nq,), X_WB (4, 4) and the objective (1) J [pixel] in this frame. ``frame``: index of the frame.
     """
     modes = []
     for one, (q, X_WB, J) in zip(explanations, poses, strict=True):

@@ -98,11 +98,9 @@ def merge_duplicates(
 ) -> tuple[list[Hypothesis], list[Rejection]]:
     """Merge hypotheses whose means are close, and return those kept and the rejections.
 
-    Args:
-        hypotheses: sorted by weight, descending. Of two close ones the first is kept with the sum
-            of their weights.
-        distance: largest difference in any element at which two are the same [standard deviations].
-        step: number of the step, for the rejections.
+    ``hypotheses``: sorted by weight, descending. Of two close ones the first is kept with the sum
+    of their weights. ``distance``: largest difference in any element at which two are the same
+    [standard deviations]. ``step``: number of the step, for the rejections.
     """
     kept: list[Hypothesis] = []
     rejected = []

@@ -34,10 +34,8 @@ def interval_moments(lower: float, upper: float) -> tuple[float, float, float]:
     Gauss-Legendre quadrature, over the part that matters, so that all terms are positive. The
     result has 13 digits for bounds 1e7 standard deviations away or 1e-12 apart.
 
-    Args:
-        lower, upper: the interval, lower < upper; may be infinite.
-
-    Returns the logarithm of the interval's probability, and the mean and the variance inside it.
+    ``lower``, ``upper``: the interval, lower < upper; may be infinite. Returns the logarithm of the
+    interval's probability, and the mean and the variance inside it.
     """
     if lower < -_FAR and upper > _FAR:
         return 0.0, 0.0, 1.0

@@ -166,13 +166,9 @@ def make_measurement(
 ) -> Measurement:
     """Return a checked measurement.
 
-    Args:
-        model: the observation that predicts y.
-        y: (m,) NaN where occluded.
-        variances: noise variances (m,) or covariance (m, m), finite where y is; None: the model's.
-
-    Raises SettingsError: a wrong shape, an infinite number, or a variance of a finite measurement
-    that is not positive.
+    ``model``: the observation that predicts y. ``y``: (m,) NaN where occluded. ``variances``: noise
+    variances (m,) or covariance (m, m), finite where y is; None: the model's. Raises SettingsError:
+    a wrong shape, an infinite number, or a variance of a finite measurement that is not positive.
     """
     m = len(model.names)
     for values, shapes in ((y, [(m,)]), (variances, [(m,), (m, m)])):

@@ -33,11 +33,9 @@ def next_view(view: StaticView | None, measurement: Measurement, significance: f
     A view is new if a measurement becomes visible, if no measurement is visible in both frames, or
     if the difference from the view's reference is significant.
 
-    Args:
-        view: the current view; None: there is none.
-        measurement: the next frame's measurement.
-        significance: p-value of the difference, under noise alone, below which a view is new; 0:
-            every view is new.
+    ``view``: the current view; None: there is none. ``measurement``: the next frame's measurement.
+    ``significance``: p-value of the difference, under noise alone, below which a view is new; 0:
+    every view is new.
     """
     y = measurement.y
     if view is None or significance == 0 or len(view.reference) != len(y):

@@ -341,10 +341,8 @@ class KnownBackground:
         In the first, each pixel counts as it is; it yields complete masks. The second allows for
         the noise of compressed images near large differences, which would shift contours outwards.
 
-        Args:
-            picture: (H, W, 3) image.
-            gain: (3, 4) its photometric gain.
-            window: h rows and w columns of the first log-odds.
+        ``picture``: (H, W, 3) image. ``gain``: (3, 4) its photometric gain. ``window``: h rows and
+        w columns of the first log-odds.
         """
         even = apply_gain(picture, gain)
         numbers = colour_numbers(np.clip(even, 0.0, 255.0).astype(np.uint8))
@@ -498,10 +496,8 @@ def _find_colours(pictures: Floats, deviations: Floats, rows: int = 8) -> Floats
 
     The colours of all pairs of frames are compared, in strips of rows that fit in the cache.
 
-    Args:
-        pictures: (f, H, W, 3) images after photometric correction.
-        deviations: (H, W) standard deviations of a background's colours.
-        rows: height of a strip [pixel].
+    ``pictures``: (f, H, W, 3) images after photometric correction. ``deviations``: (H, W) standard
+    deviations of a background's colours. ``rows``: height of a strip [pixel].
     """
 
     def find(k: int) -> Floats:

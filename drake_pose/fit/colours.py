@@ -199,11 +199,8 @@ def uninformed_histograms(cameras: int, nodes: int) -> Floats:
 def check_picture(camera: Camera, picture: Picture) -> Picture:
     """Return an image as kernels take it; a copy unless it is contiguous and writeable.
 
-    Args:
-        camera: the camera that took the image.
-        picture: the image.
-
-    Raises SettingsError: it is not (H, W, 3) or (H, W, 4) bytes of the camera's size.
+    ``camera``: the camera that took the image. ``picture``: the image. Raises SettingsError: it is
+    not (H, W, 3) or (H, W, 4) bytes of the camera's size.
     """
     shape = (camera.height, camera.width)
     if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] not in (3, 4):

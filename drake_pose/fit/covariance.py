@@ -211,9 +211,7 @@ def _views(outlines: Sequence[Outline], pictures: Sequence[ComparedMask]) -> Ind
     That is the mask's own index if none before it has. Poses relative to the camera are the same if
     the root mean square distance of the part's vertices is less than half the unit of errors.
 
-    Args:
-        outlines: surface of each node.
-        pictures: comparisons with the masks.
+    ``outlines``: surface of each node. ``pictures``: comparisons with the masks.
     """
     X_CN = np.array([one.X_CW @ one.X_WN for one in pictures])[:, :, :3]
     found = np.tile(np.arange(len(pictures))[:, None], len(outlines))
@@ -233,9 +231,7 @@ def surface_deformations(outlines: Sequence[Outline], X_WN: Array) -> Array:
     The first three columns are shifts along the part's axes; the other nine stretch, shear and
     rotate the part about the mean of its vertices.
 
-    Args:
-        outlines: surface of each part.
-        X_WN: (n, 4, 4) poses of the parts.
+    ``outlines``: surface of each part. ``X_WN``: (n, 4, 4) poses of the parts.
     """
     R, moments = X_WN[:, :3, :3], np.array([one.moments for one in outlines]).reshape(-1, 4, 4)
     middles = moments[:, 3, :3]

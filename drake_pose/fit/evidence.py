@@ -85,10 +85,8 @@ def find_edge_points(region: Mask, spacing: float, chord: int = 3) -> EdgePoints
 
     The result is NO_EDGE if no contour has more than 2 chord + 1 pixels.
 
-    Args:
-        region: (H, W) the silhouette.
-        spacing: distance between points along the edge [pixel].
-        chord: the edge's direction is that of a chord to this many pixels on both sides.
+    ``region``: (H, W) the silhouette. ``spacing``: distance between points along the edge [pixel].
+    ``chord``: the edge's direction is that of a chord to this many pixels on both sides.
     """
     contours, _ = cv2.findContours(region.view(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     chains = [chain.reshape(-1, 2) for chain in contours if len(chain) > 2 * chord + 1]

@@ -237,9 +237,7 @@ def carried_joints(tree: PoseTree, links: Collection[str] | None = None) -> list
     Vectors of at most a millimetre, and joints that position a target (TARGET_POSITIONS), are left
     out.
 
-    Args:
-        tree: the pose tree.
-        links: names of the carrying links; None: all.
+    ``tree``: the pose tree. ``links``: names of the carrying links; None: all.
     """
     return [
         one

@@ -321,10 +321,8 @@ class Problem:
         The results are H (u, u) and g (u,), without priors, and sums (cameras, nodes + 1, 6) by
         ``Sum`` of each node's contour and, last, the silhouette's edge.
 
-        Args:
-            frame: evidence of the frame.
-            theta: (n,) all parameters of the frame.
-            stage: scale of the residuals.
+        ``frame``: evidence of the frame. ``theta``: (n,) all parameters of the frame. ``stage``:
+        scale of the residuals.
         """
         compared, (_, _, motions) = self.compare(frame, theta, stage)
         if self._cameras_fixed:
@@ -444,10 +442,8 @@ class Problem:
         The values of a ``ComparedMask`` are here the unknowns except boundary biases: the own ones
         of all frames, frame by frame, then the shared ones. The unit of errors is a pixel.
 
-        Args:
-            observations: the frames.
-            parameters: (frames, n) all parameters of each.
-            stage: scale of the residuals.
+        ``observations``: the frames. ``parameters``: (frames, n) all parameters of each. ``stage``:
+        scale of the residuals.
         """
         chosen, frames = self.entries < self._first_bias, len(observations)
         p = int(np.count_nonzero(chosen[: self.own_count]))

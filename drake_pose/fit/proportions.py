@@ -141,11 +141,9 @@ class ProportionedBody(BodyParameters):
     def applied_to(self, model: ArticulatedModel, theta: Array) -> ArticulatedModel:
         """Return a model with the proportions of all parameters.
 
-        Args:
-            model: the tree's model, or another one with the same links and joints.
-            theta: (n,) all parameters; only the proportions are used.
-
-        Raises ModelError: the model's file is not a URDF.
+        ``model``: the tree's model, or another one with the same links and joints. ``theta``: (n,)
+        all parameters; only the proportions are used. Raises ModelError: the model's file is not a
+        URDF.
         """
         nodes, joint_shifts = self.kinematics.tree.nodes, self.relative_joint_shifts(theta)
         factors = zip(nodes, self.factors(theta).tolist(), strict=True)

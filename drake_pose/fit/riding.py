@@ -172,10 +172,8 @@ class RidingColours(KnownBackground):
     def of(riding: RidingPictures, pictures: Sequence[Picture], covered: Mask) -> "RidingColours":
         """Estimate the colours.
 
-        Args:
-            riding: estimates from the same frames, at any picture size.
-            pictures: RGB images (H, W, 3) of the f frames.
-            covered: (f, H, W) approximate silhouettes of the body.
+        ``riding``: estimates from the same frames, at any picture size. ``pictures``: RGB images
+        (H, W, 3) of the f frames. ``covered``: (f, H, W) approximate silhouettes of the body.
         """
         size = covered.shape[:0:-1]
         colours, deviations = (

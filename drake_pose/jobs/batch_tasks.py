@@ -78,11 +78,8 @@ class Outcome(NamedTuple):
 def plan_scene(job: SceneJob, out: Path) -> tuple[Task, ...]:
     """Return the tasks of a scene: its chunks in order; one task for a person or an audit.
 
-    Args:
-        job: the scene's job.
-        out: folder of the batch.
-
-    Raises DrakePoseError: the scene cannot be read.
+    ``job``: the scene's job. ``out``: folder of the batch. Raises DrakePoseError: the scene cannot
+    be read.
     """
     settings = job.settings
     if isinstance(settings, AuditSettings) and uses_pictures(job.scene, settings):

@@ -201,12 +201,8 @@ def call_in_child(payload: bytes) -> bytes:
     Drake's renderer and Meshcat must be destroyed in the thread that made them, so that the work is
     done in the main thread of a child. A crash ends the child, not the worker.
 
-    Args:
-        payload: pickled pair of a function and its argument.
-
-    Returns the pickled result.
-
-    Raises ClusterError: the child died.
+    ``payload``: pickled pair of a function and its argument. Returns the pickled result. Raises
+    ClusterError: the child died.
     """
     child = getattr(_local, "child", None)
     if child is None:

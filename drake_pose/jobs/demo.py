@@ -47,11 +47,9 @@ def demo_settings(scene: Path) -> EstimateSettings:
 def run_demo(out: Path, on_frame: OnFrame | None = None) -> SceneEstimate:
     """Estimate the demonstration's scene.
 
-    Args:
-        out: folder for the result; the result of an earlier demonstration is replaced.
-        on_frame: called before and after the only frame; None: not called.
-
-    Raises OutputError: the folder holds other files.
+    ``out``: folder for the result; the result of an earlier demonstration is replaced.
+    ``on_frame``: called before and after the only frame; None: not called. Raises OutputError: the
+    folder holds other files.
     """
     scene = demo_scene()
     with claimed(out, resume=True):

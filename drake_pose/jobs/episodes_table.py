@@ -55,10 +55,8 @@ def episodes_table(
     episodes with that pose combined; else the most likely of the poses before; else it has a new
     one. A new camera file begins at each episode in which a camera has moved.
 
-    Args:
-        episodes: totals of audits (`batch.Outcome`) by scene, in the order of the job; scenes
-            without ``cameras`` are skipped.
-        is_drawn: whether the picture is drawn.
+    ``episodes``: totals of audits (`batch.Outcome`) by scene, in the order of the job; scenes
+    without ``cameras`` are skipped. ``is_drawn``: whether the picture is drawn.
     """
     rows = list[list[Any]]()
     poses, files = dict[str, list[_CombinedPose]](), list[dict[str, _CombinedPose]]([{}])
@@ -120,9 +118,7 @@ def _shared_pose(
 def _describe_moves(rows: Sequence[Sequence[Any]], most: int = 8) -> tuple[str, ...]:
     """Return sentences about each camera's poses over the episodes.
 
-    Args:
-        rows: rows of the table.
-        most: maximum number of episodes that are named for each pose.
+    ``rows``: rows of the table. ``most``: maximum number of episodes that are named for each pose.
     """
     sentences, columns = list[str](), {name: k for k, name in enumerate(COLUMNS)}
     for camera in dict.fromkeys(row[columns["camera"]] for row in rows):
@@ -156,10 +152,8 @@ def _draw(
 
     Displacements are those from the first episode; bars are 95 % intervals.
 
-    Args:
-        episodes: totals by scene.
-        moved: names of the scenes before which a camera has moved, which get a line.
-        normal: half the width of a 95 % interval in standard deviations.
+    ``episodes``: totals by scene. ``moved``: names of the scenes before which a camera has moved,
+    which get a line. ``normal``: half the width of a 95 % interval in standard deviations.
     """
     scenes = [name for name, totals in episodes.items() if totals.get("cameras")]
     curves = dict[tuple[str, str], list[tuple[int, float, float]]]()

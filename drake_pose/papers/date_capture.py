@@ -79,12 +79,9 @@ class Studio:
     def build(cameras: int, size: tuple[int, int], generator: np.random.Generator) -> "Studio":
         """Build a studio.
 
-        Args:
-            cameras: number of cameras, including the face camera.
-            size: width and height of the pictures [pixel].
-            generator: of the pictures' noise.
-
-        Raises SettingsError: there are fewer than three cameras.
+        ``cameras``: number of cameras, including the face camera. ``size``: width and height of the
+        pictures [pixel]. ``generator``: of the pictures' noise. Raises SettingsError: there are
+        fewer than three cameras.
         """
         if cameras < 3:
             raise SettingsError(f"cameras must be 3 or more, not {cameras}")

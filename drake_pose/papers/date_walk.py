@@ -140,10 +140,8 @@ def walk_by(model: ArticulatedModel, q: Array) -> tuple[Array, Array, Array]:
 def draw_walk(model: ArticulatedModel, q: Array, pose: Array, rest: Array) -> Picture:
     """Render the virtual place from behind the avatar; return the picture (360, 480, 3).
 
-    Args:
-        model: of the avatar.
-        q: (nq,) its positions [rad, m].
-        pose, rest: (3,) pose of the walker and (5,) rest stance, as of `walk_by`.
+    ``model``: of the avatar. ``q``: (nq,) its positions [rad, m]. ``pose``, ``rest``: (3,) pose of
+    the walker and (5,) rest stance, as of `walk_by`.
     """
     X_RP = walker_transform(pose, rest).inverse()
     builder = DiagramBuilder()

@@ -174,11 +174,9 @@ def draw_values(
 ) -> list[np.ndarray]:
     """Draw the values (k_i,) of each node of a search's tree [rad, m].
 
-    Args:
-        search: whose grid and limits are used.
-        angles: "grid": samples of the search's grid; "continuous": uniformly between the limits,
-            where the grid has several samples.
-        generator: draws them.
+    ``search``: whose grid and limits are used. ``angles``: "grid": samples of the search's grid;
+    "continuous": uniformly between the limits, where the grid has several samples. ``generator``:
+    draws them.
     """
     values = []
     tree = search.tree

@@ -190,11 +190,8 @@ def experiment_filter(
 
     The filter's inequalities are table 1's, read from the bundled hand.
 
-    Args:
-        settings: None: ``experiment_settings("joint")``.
-        noise, acceleration: factors as of ``run_experiment``.
-
-    Raises SettingsError: a factor is not positive.
+    ``settings``: None: ``experiment_settings("joint")``. ``noise``, ``acceleration``: factors as of
+    ``run_experiment``. Raises SettingsError: a factor is not positive.
     """
     for name, factor in (("noise", noise), ("acceleration", acceleration)):
         if not 0 < factor < math.inf:
@@ -499,10 +496,8 @@ def run_hypotheses_experiment(
 def _histories(run: int, truths: Array, states: Sequence[FilterState]) -> list[HypothesisHistory]:
     """Return all hypotheses of one run; those that outlived the sequence come last.
 
-    Args:
-        run: index of the run.
-        truths: (frames, n) true states.
-        states: of the filter after each frame.
+    ``run``: index of the run. ``truths``: (frames, n) true states. ``states``: of the filter after
+    each frame.
     """
     histories: list[HypothesisHistory] = []
     believed: dict[tuple[int, int], list[tuple[int, Array, float]]] = {}

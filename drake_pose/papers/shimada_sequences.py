@@ -85,11 +85,9 @@ class SyntheticSequence:
 def true_states(r_13: float, phase: Array, yaw_middle: float = 0.0) -> Array:
     """Return the states (55, n) of a hand that moves, turns, flexes, and changes its distance.
 
-    Args:
-        r_13: length of finger 1's last segment [mm].
-        phase: (6,) phase shifts of wrist x, wrist y, roll, yaw, pitch with the first flexions, and
-            spreads with the other flexions [rad].
-        yaw_middle: mean yaw of the fingers away from the camera [rad]; negative: towards it.
+    ``r_13``: length of finger 1's last segment [mm]. ``phase``: (6,) phase shifts of wrist x, wrist
+    y, roll, yaw, pitch with the first flexions, and spreads with the other flexions [rad].
+    ``yaw_middle``: mean yaw of the fingers away from the camera [rad]; negative: towards it.
     """
     frames = np.arange(FRAMES)
     turn = 2 * np.pi * frames / FRAMES

@@ -398,12 +398,9 @@ def find_tracks(
 ) -> list[dict[int, Person]]:
     """Link persons from frame to frame, nearest ones first.
 
-    Args:
-        frames: persons found in each frame.
-        step: largest movement of a person's middle from one frame to the next [m].
-        more: added to `step` for each frame in which the person is hidden [m].
-
-    Returns the track of each person: positions and figures by index of the frame.
+    ``frames``: persons found in each frame. ``step``: largest movement of a person's middle from
+    one frame to the next [m]. ``more``: added to `step` for each frame in which the person is
+    hidden [m]. Returns the track of each person: positions and figures by index of the frame.
     """
     tracks: list[dict[int, Person]] = []
     for k, persons in enumerate(frames):

@@ -246,11 +246,9 @@ class PersonPoseTracker:
         help after the first frame, and while a newly found person is unconfirmed, the person is
         also searched anew in a few headings, and replaced if that fits better.
 
-        Args:
-            last: state after the last frame; None: the person is searched in all headings.
-            frame: silhouettes of the frame.
-
-        Returns the state; None if `last` is None and fewer than two cameras see a person.
+        ``last``: state after the last frame; None: the person is searched in all headings.
+        ``frame``: silhouettes of the frame. Returns the state; None if `last` is None and fewer
+        than two cameras see a person.
         """
         settings = self.settings
         if last is None:

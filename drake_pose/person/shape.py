@@ -109,12 +109,9 @@ def tracker_of_person(tree: PoseTree, shape: KnownShape | None) -> PersonPoseTra
 def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
     """Fit lengths, radius scales and the poses of all frames.
 
-    Args:
-        fit: the model's body, without radius scales, and the noise of its contours.
-        frames: cameras and edge points of each frame.
-        poses: (frames, m) initial values [rad, m].
-
-    Raises ModelError: the model has no shape joints, unlike urdf/person/person_shape.urdf.
+    ``fit``: the model's body, without radius scales, and the noise of its contours. ``frames``:
+    cameras and edge points of each frame. ``poses``: (frames, m) initial values [rad, m]. Raises
+    ModelError: the model has no shape joints, unlike urdf/person/person_shape.urdf.
     """
     is_shape = shape_values(fit.tree)
     if not is_shape.any():

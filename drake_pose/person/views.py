@@ -347,13 +347,9 @@ def sum_at_points(
 ) -> tuple[Array, Array]:
     """Sum a picture's values at projected points.
 
-    Args:
-        picture: (H, W) values of the camera's pixels.
-        points: (n, m, 3) n sets of m points in the world [m].
-        weights: (n, m) weights of the points.
-
-    Returns (n,) weighted sums of the picture's values, and (n,) summed weights of the points inside
-    the picture.
+    ``picture``: (H, W) values of the camera's pixels. ``points``: (n, m, 3) n sets of m points in
+    the world [m]. ``weights``: (n, m) weights of the points. Returns (n,) weighted sums of the
+    picture's values, and (n,) summed weights of the points inside the picture.
     """
     X_CW = np.ascontiguousarray(camera.X_CW)
     total: tuple[Array, Array] = _sum_at_points(

@@ -113,10 +113,8 @@ def find_camera_motion(
 ) -> PictureMotion:
     """Return how a camera moved while it took pictures.
 
-    Args:
-        read: returns picture k (H, W, 3).
-        count: number of pictures, in the order of their times.
-        camera: its intrinsics; its pose is not used.
+    ``read``: returns picture k (H, W, 3). ``count``: number of pictures, in the order of their
+    times. ``camera``: its intrinsics; its pose is not used.
     """
     if count < 4:
         return PictureMotion(())

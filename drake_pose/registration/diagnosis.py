@@ -168,12 +168,9 @@ def diagnose_frames(
 ) -> Diagnosis:
     """Diagnose fitted frames, in time linear in their number.
 
-    Args:
-        fit: the fit with which the frames were fitted.
-        requested: (kind, name) of causes, as of ``Finding``, that are always among the findings
-            common to all inlier frames.
-        moved: whether cameras or the base may be far from their given poses, and intrinsics are
-            right.
+    ``fit``: the fit with which the frames were fitted. ``requested``: (kind, name) of causes, as of
+    ``Finding``, that are always among the findings common to all inlier frames. ``moved``: whether
+    cameras or the base may be far from their given poses, and intrinsics are right.
     """
     return _Diagnoser(fit, frames, requested, moved).diagnose()
 

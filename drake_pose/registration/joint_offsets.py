@@ -92,11 +92,8 @@ def require_parameters(tree: PoseTree, joints: Sequence[str], links: Sequence[st
 def require_frame_count(count: int, joints: int, links: int) -> None:
     """Refuse fewer frames than parameters, or fewer than two.
 
-    Args:
-        count: number of frames, all cameras together.
-        joints, links: number of joints with an offset, and of links with a scale.
-
-    Raises RegistrationError: states the numbers.
+    ``count``: number of frames, all cameras together. ``joints``, ``links``: number of joints with
+    an offset, and of links with a scale. Raises RegistrationError: states the numbers.
     """
     if count < max(2, joints + links):
         raise RegistrationError(
@@ -276,10 +273,8 @@ def _unknown_rotations(
 
     An offset that looks like a rotation of the camera has its prior's standard deviation.
 
-    Args:
-        views: for each camera its frames.
-        cameras: at their poses.
-        held: names of the joints whose offsets are held.
+    ``views``: for each camera its frames. ``cameras``: at their poses. ``held``: names of the
+    joints whose offsets are held.
     """
     missing = np.zeros((len(views), 6, 6))
     for k, (view, camera) in enumerate(zip(views, cameras, strict=True)):
@@ -468,10 +463,8 @@ def fit_cameras_alone(
     Shrunk offsets move the cameras by the covariance, which has parts for errors that are not
     fitted. Contours then fit badly.
 
-    Args:
-        fit, found: the fit, and its values after ``shrink_constants``.
-        included: (rows,) which masks enter.
-        steps: number of Gauss-Newton steps at each of two scales.
+    ``fit``, ``found``: the fit, and its values after ``shrink_constants``. ``included``: (rows,)
+    which masks enter. ``steps``: number of Gauss-Newton steps at each of two scales.
     """
     first = fit.problem.own_count
     rows = slice(first, first + fit.per_camera * len(fit.views))

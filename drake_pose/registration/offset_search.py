@@ -99,10 +99,8 @@ def joints_like_cameras(kinematics: TreeKinematics, values: Array, shown: Mask) 
     Such a joint, usually the first, moves all parts that move at all, about an axis that is fixed
     in the world. Only static parts then separate its offset from the camera's pose.
 
-    Args:
-        kinematics: of the body's pose tree.
-        values: (f, m) values in f frames [rad or m].
-        shown: (nodes,) which nodes are visible.
+    ``kinematics``: of the body's pose tree. ``values``: (f, m) values in f frames [rad or m].
+    ``shown``: (nodes,) which nodes are visible.
     """
     motions = [kinematics.motions(one) for one in values]
     count = len(kinematics.names)

@@ -291,12 +291,9 @@ def select_best(
 ) -> tuple[RegisteredCamera, Array, list[int]]:
     """Select the best of one or more fits of a camera's pose to the same frames.
 
-    Args:
-        fitted: the fits, each of this camera only, with their fitted values.
-
-    Returns the camera, with distinct poses that fit equally well as alternatives; the (u, u)
-    covariance of the best fit's shared unknowns; and the indices in `fitted` of all equally good
-    fits, best first.
+    ``fitted``: the fits, each of this camera only, with their fitted values. Returns the camera,
+    with distinct poses that fit equally well as alternatives; the (u, u) covariance of the best
+    fit's shared unknowns; and the indices in `fitted` of all equally good fits, best first.
     """
     side = max(1.0, SEARCH.tile_side * fitted[0][0].views[0].size)
     costs = [fit.tile_costs(found, side) for fit, found in fitted]
@@ -342,11 +339,9 @@ def evenly_spaced(frames: Sequence[T], most: int = 8) -> list[T]:
 def distinct_poses(frames: PosedFrames, X_CW: Sequence[Array], apart: float = 0.03) -> list[Array]:
     """Return the poses X_CW (4, 4) that place the body apart from every pose kept before.
 
-    Args:
-        frames: frames of the camera, in which the body's points are compared.
-        X_CW: the poses, the preferred ones first.
-        apart: minimum root mean square distance of the body's points in the picture
-            [square root of the silhouettes' area].
+    ``frames``: frames of the camera, in which the body's points are compared. ``X_CW``: the poses,
+    the preferred ones first. ``apart``: minimum root mean square distance of the body's points in
+    the picture [square root of the silhouettes' area].
     """
     points = frames.some_points
     uv = [frames.camera.with_pose(np.linalg.inv(X)).project(points)[0] for X in X_CW]
@@ -362,11 +357,8 @@ def distinct_poses(frames: PosedFrames, X_CW: Sequence[Array], apart: float = 0.
 def fit_to_inliers(fit: SharedFit, most: int = 5, settled: float = 1e-4) -> SharedValues:
     """Fit camera and boundary biases to the inlier frames, reselecting them after each fit.
 
-    Args:
-        fit: the fit, whose unknowns start from 0.
-        most: maximum number of fits.
-        settled: fits end once the inliers stay the same and no shared unknown changes by more
-            [rad, m].
+    ``fit``: the fit, whose unknowns start from 0. ``most``: maximum number of fits. ``settled``:
+    fits end once the inliers stay the same and no shared unknown changes by more [rad, m].
     """
     inliers, found = fit.inliers(fit.inlier_ratios(fit.start)), fit.start
     for k in range(most):

@@ -519,11 +519,9 @@ def fit_pose(view: PosedFrames, X_CW: Array, rounds: Sequence[AnnealingStage]) -
 def pose_covariance(X_CW: Array, motions: Array, covariance: Array) -> Array:
     """Return the (6, 6) covariance of a camera's pose X_WC in the world [rad, m].
 
-    Args:
-        X_CW: (4, 4) the world's pose in the camera.
-        motions: (6, 12) affine motions of the scene for each unknown of the pose, see
-            ``CameraParameters.place``.
-        covariance: (6, 6) of these unknowns.
+    ``X_CW``: (4, 4) the world's pose in the camera. ``motions``: (6, 12) affine motions of the
+    scene for each unknown of the pose, see ``CameraParameters.place``. ``covariance``: (6, 6) of
+    these unknowns.
     """
     # The camera moves opposite to the scene.
     by = -motions.reshape(6, 3, 4)

@@ -283,12 +283,9 @@ class TargetSearch:
     def register(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
         """Return the camera at its pose X_LC on the link, with the target's pose in the world.
 
-        Args:
-            camera: its pose is not used.
-            frames: with values of the target's tree.
-
-        Raises MaskError: a mask is empty, or its size differs from the camera's; RegistrationError:
-        the link rotates about one axis only in all frames, or in those that agree.
+        ``camera``: its pose is not used. ``frames``: with values of the target's tree. Raises
+        MaskError: a mask is empty, or its size differs from the camera's; RegistrationError: the
+        link rotates about one axis only in all frames, or in those that agree.
         """
         require_rotation(camera.name, self._target, frames)
         poses = self._search(camera, [[one] for one in evenly_spaced(frames)])

@@ -413,10 +413,8 @@ class _BeamRun:
 
         The result is kept by ``_keep_if_better``.
 
-        Args:
-            current: (nodes,) samples of the pose.
-            scored: number of a node's samples, the best at coarse resolution, that are scored at
-                full resolution.
+        ``current``: (nodes,) samples of the pose. ``scored``: number of a node's samples, the best
+        at coarse resolution, that are scored at full resolution.
         """
         scoring, bits = self.scoring, self._bits_of(exact=False)
         sampled, words = scoring.sampled, int(bits.part_starts[-1])

@@ -348,10 +348,8 @@ class _BranchAndBound:
         Those whose bound exceeds the limit of J are dropped. If the others' sum of ``counts``
         exceeds ``limit``, only the best are kept, up to this sum but at least one.
 
-        Args:
-            partial: the B partial poses.
-            counts: (B,) number of pairs, or 1, that each needs.
-            limit: greatest sum of the counts.
+        ``partial``: the B partial poses. ``counts``: (B,) number of pairs, or 1, that each needs.
+        ``limit``: greatest sum of the counts.
         """
         alive = partial.bounds <= self.J_limit
         if counts[alive].sum() <= limit:

@@ -49,13 +49,9 @@ class PaperSearch:
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
         """Estimate the pose that the views show.
 
-        Args:
-            views: the silhouettes, one per camera.
-            root_position: (3,) the root's position in the world [m]; None: that of the tree.
-
-        Returns the best pose found; ``stopped_by`` is "end" or "run_limit".
-
-        Raises SettingsError: there is no view.
+        ``views``: the silhouettes, one per camera. ``root_position``: (3,) the root's position in
+        the world [m]; None: that of the tree. Returns the best pose found; ``stopped_by`` is "end"
+        or "run_limit". Raises SettingsError: there is no view.
         """
         require_views(views)
         start = time.perf_counter()
@@ -164,11 +160,8 @@ class PaperRun:
         uncovered silhouette that they cover, score (5), and the best K are kept (all for a node
         without geometry).
 
-        Args:
-            node: index of the node.
-            uncovered: the part of the silhouette that no placed node covers.
-
-        Returns the candidate list; None if no pose satisfies (4).
+        ``node``: index of the node. ``uncovered``: the part of the silhouette that no placed node
+        covers. Returns the candidate list; None if no pose satisfies (4).
         """
         parent = self.nodes[node].parent
         X_WN = self.scoring.candidate_poses(
@@ -203,11 +196,9 @@ class PaperRun:
 
         This is section 5.2.1.
 
-        Args:
-            combinations: if there are more combinations, the candidates of one leaf after another
-                are tried, until J does not decrease any further.
-            block: greatest number of array entries (combinations times pixel patterns) that are
-                processed at a time.
+        ``combinations``: if there are more combinations, the candidates of one leaf after another
+        are tried, until J does not decrease any further. ``block``: greatest number of array
+        entries (combinations times pixel patterns) that are processed at a time.
         """
         leaves = [i for i, node in enumerate(self.nodes) if not node.children]
         counts = [len(self.lists[leaf].samples) for leaf in leaves]

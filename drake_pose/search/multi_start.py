@@ -254,12 +254,9 @@ class _MultiStartRun:
     def _refine_by_pixels(self, found: ExactPose | None, values: np.ndarray) -> ExactPose | None:
         """Refine values (m,) by pixels, and return the better of the result and ``found``.
 
-        Args:
-            found: the pose of the search by pixels; None: that search found none.
-            values: (m,) values of the best pose by robust costs [rad or m].
-
-        Returns the better pose; None if J of neither is below ``settings.plausible``, or if J at
-        the values as they are is smaller.
+        ``found``: the pose of the search by pixels; None: that search found none. ``values``: (m,)
+        values of the best pose by robust costs [rad or m]. Returns the better pose; None if J of
+        neither is below ``settings.plausible``, or if J at the values as they are is smaller.
         """
         exact, settings, J = self._search.exact, self._search.exact_settings, self._J(values)
         length = self._problem.border_length

@@ -296,10 +296,8 @@ class PartSearch:
         The centre of each node is brought near to its mirror image, which under parallel projection
         is at the same place in the image.
 
-        Args:
-            parameters: (m + 4,) the pose, as in ``RefinementBody``.
-            view: the view whose optical axis is the direction of depth.
-            steps: greatest number of Gauss-Newton steps.
+        ``parameters``: (m + 4,) the pose, as in ``RefinementBody``. ``view``: the view whose
+        optical axis is the direction of depth. ``steps``: greatest number of Gauss-Newton steps.
         """
         X_WN = self.body.poses(parameters)
         depth = view.camera.X_WC[:3, 2]
@@ -474,10 +472,8 @@ class NeighbourhoodSearch:
     def others(self, parameters: np.ndarray, limit: float, same: float) -> list[np.ndarray]:
         """Return alternative poses with J up to a limit, refined to the end, best first.
 
-        Args:
-            parameters: (m + 4,) the best pose, as in ``RefinementBody``.
-            limit: greatest J [pixel].
-            same: poses are equal if no parameter differs by more [rad or m].
+        ``parameters``: (m + 4,) the best pose, as in ``RefinementBody``. ``limit``: greatest J
+        [pixel]. ``same``: poses are equal if no parameter differs by more [rad or m].
         """
         problem, settings, J = self.problem, self._settings, float(self.problem.J(parameters))
         # Until now reflections were tried at other poses, or not at all.

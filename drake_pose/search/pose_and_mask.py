@@ -220,10 +220,8 @@ class PoseAndMask:
     def _round(self, level: PictureLevel, frames: Sequence[_Progress], searches: bool) -> None:
         """Run one round: update pose, masks and error of all frames that are not settled.
 
-        Args:
-            level: the pyramid level whose images are used.
-            frames: the estimates of all frames, changed in place.
-            searches: whether the cross-entropy search is run before the fit.
+        ``level``: the pyramid level whose images are used. ``frames``: the estimates of all frames,
+        changed in place. ``searches``: whether the cross-entropy search is run before the fit.
         """
         moving = [k for k, one in enumerate(frames) if not one.settled]
 

@@ -88,10 +88,8 @@ def estimate_joints(
 def cluster_samples(sampled: SampledTree, node: int, samples: np.ndarray) -> np.ndarray:
     """Return the cluster of each sample of a node, (all samples,) int64; -1 if it does not occur.
 
-    Args:
-        sampled: the tree and its grids.
-        node: index of the node.
-        samples: (n,) the node's samples that occur in a set of poses.
+    ``sampled``: the tree and its grids. ``node``: index of the node. ``samples``: (n,) the node's
+    samples that occur in a set of poses.
     """
     grid = sampled.values[node]
     labels = np.full(len(grid), -1, dtype=np.int64)
@@ -248,10 +246,8 @@ def find_modes(
 def samples_at(sampled: SampledTree, node_values: Sequence[np.ndarray]) -> np.ndarray | None:
     """Return the index (nodes,) of each node's sample in its grid; None for a pose not on the grid.
 
-    Args:
-        sampled: the tree and its grids.
-        node_values: for each node (k,) the pose's values [rad or m]. They may differ from the
-            grid's by 1e-6.
+    ``sampled``: the tree and its grids. ``node_values``: for each node (k,) the pose's values [rad
+    or m]. They may differ from the grid's by 1e-6.
     """
     samples = np.zeros(len(sampled.values), dtype=np.int64)
     for i, (grid, values) in enumerate(zip(sampled.values, node_values, strict=True)):

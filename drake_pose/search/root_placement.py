@@ -279,11 +279,9 @@ class RootPlacementSearch:
     ) -> list[_PlacedPose]:
         """Return the best whole poses of one scale or depth, at most one for each root sample.
 
-        Args:
-            layer: the candidate positions, and the views with the scale that is tried.
-            width: beam width.
-            outside_fraction: greatest area of a node outside the silhouettes, as a fraction of its
-                mean projected area; infinite: no limit.
+        ``layer``: the candidate positions, and the views with the scale that is tried. ``width``:
+        beam width. ``outside_fraction``: greatest area of a node outside the silhouettes, as a
+        fraction of its mean projected area; infinite: no limit.
         """
         if len(layer.positions) == 0:
             return []

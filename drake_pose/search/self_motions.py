@@ -60,10 +60,8 @@ def counter_turns(
 def flips(kinematics: TreeKinematics, values: np.ndarray, count: int = 16) -> list[Flip]:
     """Return flipped poses within the limits in which the links behind the flipped joints stay.
 
-    Args:
-        kinematics: kinematics of the pose tree, with m values.
-        values: (m,) the pose [rad or m].
-        count: greatest number of flips that are examined, those outside the limits included.
+    ``kinematics``: kinematics of the pose tree, with m values. ``values``: (m,) the pose [rad or
+    m]. ``count``: greatest number of flips that are examined, those outside the limits included.
     """
     untouched = np.zeros(len(values), dtype=np.bool_)
     known = [Flip(values, untouched, untouched)]

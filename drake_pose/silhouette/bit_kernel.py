@@ -438,10 +438,8 @@ def _square_outside(
 ) -> int:
     """Return the number of image pixels in a square that are outside the silhouette.
 
-    Args:
-        sums, window, camera: the silhouette's fields of ``BitView``.
-        u, v: middle of the square [pixel].
-        half: half its side [pixel].
+    ``sums``, ``window``, ``camera``: the silhouette's fields of ``BitView``. ``u``, ``v``: middle
+    of the square [pixel]. ``half``: half its side [pixel].
     """
     a, b = max(0, int(np.ceil(u - half))), min(int(camera[6]), int(np.ceil(u + half)))
     c, d = max(0, int(np.ceil(v - half))), min(int(camera[7]), int(np.ceil(v + half)))

@@ -159,11 +159,9 @@ def _draw(segmentation: Any, height: int, width: int) -> Mask:
 def fill_polygon(corners: Array, height: int, width: int) -> Mask:
     """Return the pixels (H, W) whose centres lie in a polygon by the even-odd rule.
 
-    Args:
-        corners: (n, 2) x, y [pixel]; the centre of pixel (row, column) is column + 0.5, row + 0.5.
-        height, width: size of the picture [pixel].
-
-    Raises ValueError: there are fewer than three corners, or one is not finite.
+    ``corners``: (n, 2) x, y [pixel]; the centre of pixel (row, column) is column + 0.5, row + 0.5.
+    ``height``, ``width``: size of the picture [pixel]. Raises ValueError: there are fewer than
+    three corners, or one is not finite.
     """
     if len(corners) < 3 or not np.isfinite(corners).all():
         raise ValueError("a polygon needs three or more finite corners (x, y)")

@@ -360,11 +360,9 @@ def clip_triangle(
 def bend(packed: PackedOutlines, parts: np.ndarray, band: np.ndarray) -> None:
     """Move the vertices of skin bands in place and update planes and balls; balls only grow.
 
-    Args:
-        packed: the surfaces, changed in place.
-        parts: (k, 4) int64, for each band: its surface, its first vertex and its first triangle,
-            both counted from the surface's own first, and its first row in ``band``.
-        band: (v, 3) positions of the vertices of all bands [m].
+    ``packed``: the surfaces, changed in place. ``parts``: (k, 4) int64, for each band: its surface,
+    its first vertex and its first triangle, both counted from the surface's own first, and its
+    first row in ``band``. ``band``: (v, 3) positions of the vertices of all bands [m].
     """
     for part in parts:
         node, row = part[0], part[3]

@@ -157,10 +157,8 @@ class VisualHull:
     def __init__(self, outline: Outline, side: int = 96, directions: int = 72) -> None:
         """Draw the images of a surface.
 
-        Args:
-            outline: the surface, in its frame N.
-            side: width and height of each image [pixel].
-            directions: number of viewing directions.
+        ``outline``: the surface, in its frame N. ``side``: width and height of each image [pixel].
+        ``directions``: number of viewing directions.
         """
         self._center, self._side = outline.ball[:3], side
         self._size = float(outline.ball[3])

@@ -379,12 +379,8 @@ def find_regions(
 def _strength(mask: Mask, change: Floats, quantile: float = 0.25) -> float:
     """Return the strength of a mask's outline: a quantile of the change along it, times sqrt(area).
 
-    Args:
-        mask: (h, w) the region.
-        change: (h, w) gradient magnitude of the channel.
-        quantile: the quantile, 0 to 1.
-
-    Returns the strength; 0 if the mask has no pixel on its edge.
+    ``mask``: (h, w) the region. ``change``: (h, w) gradient magnitude of the channel. ``quantile``:
+    the quantile, 0 to 1. Returns the strength; 0 if the mask has no pixel on its edge.
     """
     inside = cv2.erode(mask.view(np.uint8), np.ones((3, 3), np.uint8), borderValue=1) > 0
     edge = change[mask & ~inside]

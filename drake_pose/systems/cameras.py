@@ -79,13 +79,9 @@ def build_camera_rig(
 ) -> CameraRig:
     """Build a diagram of a body and the cameras that see it.
 
-    Args:
-        model: the body.
-        cameras: cameras by name, from circle_of_cameras or load_cameras.
-        true_positions: positions (nq,) [rad or m] over time; None: the diagram has the input port
-            ``positions``.
-
-    Raises CameraError: there is no camera, or one is not a pinhole camera.
+    ``model``: the body. ``cameras``: cameras by name, from circle_of_cameras or load_cameras.
+    ``true_positions``: positions (nq,) [rad or m] over time; None: the diagram has the input port
+    ``positions``. Raises CameraError: there is no camera, or one is not a pinhole camera.
     """
     if not cameras:
         raise CameraError("a rig needs at least one camera")

@@ -434,11 +434,9 @@ class PaperPoseEstimator(MemorySystem):
     def set_person(self, context: Context, q: Array, features: Array | None = None) -> None:
         """Set the person's pose in a context.
 
-        Args:
-            q: (nq,) positions [rad or m].
-            features: (5, 3) head, hands and feet [m]; None: those at q.
-
-        Raises SettingsError: the number of positions or features is wrong, or one is not finite.
+        ``q``: (nq,) positions [rad or m]. ``features``: (5, 3) head, hands and feet [m]; None:
+        those at q. Raises SettingsError: the number of positions or features is wrong, or one is
+        not finite.
         """
         checked: list[tuple[str, Array, tuple[int, ...]]] = [
             ("positions", q, (len(self.setup.skeleton.lower),))

@@ -407,12 +407,9 @@ def build_recorded_hand_estimation(
 ) -> tuple[Diagram, TruncatedEkf, HandSensor]:
     """Build the diagram of ``build_hand_estimation`` for recorded silhouettes, with a MaskPlayer.
 
-    Args:
-        scene: recorded masks of one camera.
-        silhouette: makes the measurements, and has the filter.
-        start: belief before the first image.
-
-    Returns the diagram, the filter and the sensor.
+    ``scene``: recorded masks of one camera. ``silhouette``: makes the measurements, and has the
+    filter. ``start``: belief before the first image. Returns the diagram, the filter and the
+    sensor.
     """
     builder, player = DiagramBuilder(), MaskPlayer(scene, scene.cameras)
     builder.AddNamedSystem("mask_player", player)

@@ -75,12 +75,8 @@ def fit_body(
     Other inputs are returned unchanged, with {} and None: those of a calibrated camera, of a single
     frame, without tracking, or of a body that cannot change its shape or turn freely.
 
-    Args:
-        inputs: the inputs.
-        settings: settings of the estimate.
-        on_stage: called when the fit begins; None: not called.
-
-    Raises DrakePoseError: as for an estimate.
+    ``inputs``: the inputs. ``settings``: settings of the estimate. ``on_stage``: called when the
+    fit begins; None: not called. Raises DrakePoseError: as for an estimate.
     """
     search, tracking = inputs.search, inputs.tracking()
     if (

@@ -521,12 +521,9 @@ def logged_positions(
     Frames at which the log has no value are left out. Without a log (``scene.joints``) the result
     is (None, {}, ()).
 
-    Args:
-        scene: scene of `read_episode_scene`.
-        tree: the pose tree, with its held values.
-        settings: joint map and units.
-
-    Raises DrakePoseError: the message names columns, joints or units at fault.
+    ``scene``: scene of `read_episode_scene`. ``tree``: the pose tree, with its held values.
+    ``settings``: joint map and units. Raises DrakePoseError: the message names columns, joints or
+    units at fault.
     """
     if scene.joints is None:
         return None, {}, ()

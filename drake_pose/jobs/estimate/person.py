@@ -98,10 +98,7 @@ def _follow_colours(
 ) -> tuple[PersonCapture, ReadFrame, tuple[str, ...], Array]:
     """Track a person by colour through pictures with few masks.
 
-    Args:
-        inputs: the inputs, of a scene with pictures.
-        reader: reads the masks of each frame.
-
+    ``inputs``: the inputs, of a scene with pictures. ``reader``: reads the masks of each frame.
     Returns the capture, a reader of masks, warnings, and the mean distance (frames,) of the
     contours [pixel].
     """

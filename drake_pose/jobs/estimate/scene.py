@@ -118,11 +118,8 @@ def estimate_frames(
 
     Poses of a MultiStartSearch have intervals of their joints.
 
-    Args:
-        inputs: the inputs.
-        search: the search, with which the diagram matches or tracks the body.
-        missing: names of the frames to be estimated, in the order of ``inputs.frames``.
-
+    ``inputs``: the inputs. ``search``: the search, with which the diagram matches or tracks the
+    body. ``missing``: names of the frames to be estimated, in the order of ``inputs.frames``.
     Raises SettingsError: a frame has no picture.
     """
     track_start: PoseEstimate | None = None

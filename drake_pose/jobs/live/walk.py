@@ -252,10 +252,7 @@ class _WalkLog:
 def open_page(port: int | None = None) -> Meshcat:
     """Return a Meshcat server that listens on the loopback address only; Drake logs no address.
 
-    Args:
-        port: the port; None: any free one.
-
-    Raises SettingsError: the port cannot be used.
+    ``port``: the port; None: any free one. Raises SettingsError: the port cannot be used.
     """
     logger = logging.getLogger("drake")
     level = logger.level

@@ -65,10 +65,8 @@ def skin_blobs(
 ) -> Blobs:
     """Find skin-coloured blobs of a picture (H, W, 3) in the person's region (H, W) (3.1.1).
 
-    Args:
-        colour: range of skin colours.
-        min_area: least area of a blob [pixel^2].
-        max_count: largest number of blobs; the largest blobs are kept.
+    ``colour``: range of skin colours. ``min_area``: least area of a blob [pixel^2]. ``max_count``:
+    largest number of blobs; the largest blobs are kept.
     """
     # The bounding box of an empty region is empty; one pixel keeps OpenCV's functions working.
     left, top, width, height = cv2.boundingRect(np.ascontiguousarray(region).view(np.uint8))
@@ -344,11 +342,8 @@ def cut_face(picture: Picture, blobs: Blobs) -> Picture | None:
 def learn_faces(faces: Sequence[Picture], directions: Array, dimensions: int = 60) -> FaceTemplates:
     """Return the eigenspace of n faces of known directions.
 
-    Args:
-        faces: (130, 80, 3) pictures, as of `cut_face`.
-        directions: (n, 2) turn and nod of each, as in FaceTemplates [rad].
-        dimensions: largest number of eigenvectors; 60 in section 3.2.2.
-
+    ``faces``: (130, 80, 3) pictures, as of `cut_face`. ``directions``: (n, 2) turn and nod of each,
+    as in FaceTemplates [rad]. ``dimensions``: largest number of eigenvectors; 60 in section 3.2.2.
     Raises SettingsError: fewer than three faces, or not one direction for each.
     """
     known = np.asarray(directions, dtype=np.float64).reshape(-1, 2)

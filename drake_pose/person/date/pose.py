@@ -64,11 +64,9 @@ def move_upper_body(skeleton: Skeleton, q: Array, features: Array, *, face_known
     base, 3 of the shoulder and 1 of the elbow (4.1.1). Both chains share head and neck base, so
     they take turns of a few steps each.
 
-    Args:
-        features: (5, 3) positions of FEATURES; only the hands count.
-        face_known: whether the head's angles were measured and stay.
-
-    Returns (nq,) positions; a hand out of reach is only near its target.
+    ``features``: (5, 3) positions of FEATURES; only the hands count. ``face_known``: whether the
+    head's angles were measured and stay. Returns (nq,) positions; a hand out of reach is only near
+    its target.
     """
     shared = () if face_known else skeleton.head_angles
     for name in LIMBS[:2]:
@@ -117,12 +115,9 @@ def reach(
     and gap (3,) the vector to the target. It is scaled so that no angle changes by more than
     `max_step`, then clipped to the limits. Damping makes all joints take part.
 
-    Args:
-        index: (n,) indices in q of the angles that may change; they must move the point.
-        part: index of a node, and the point (3,) in the node's frame [m].
-        max_steps: largest number of steps.
-
-    Returns (nq,) positions, and the remaining distance [m].
+    ``index``: (n,) indices in q of the angles that may change; they must move the point. ``part``:
+    index of a node, and the point (3,) in the node's frame [m]. ``max_steps``: largest number of
+    steps. Returns (nq,) positions, and the remaining distance [m].
     """
     node, point = part
     packed, order = skeleton.chains[node]
@@ -284,10 +279,8 @@ def joint_circle(limb: Limb, root: Array, end: Array, outward: Array, degrees: A
     shoulder to hand. The right arm and the legs are mirrored, so that j points behind an arm and in
     front of a leg. A limb whose end is out of reach is stretched or folded in proportion.
 
-    Args:
-        root, end: (3,) shoulder and hand, or hip and foot [m].
-        outward: (3,) from neck base to shoulder, or from waist to hip [m].
-        degrees: (n,) theta of each place.
+    ``root``, ``end``: (3,) shoulder and hand, or hip and foot [m]. ``outward``: (3,) from neck base
+    to shoulder, or from waist to hip [m]. ``degrees``: (n,) theta of each place.
     """
     z, distance = _directions(root, end)
     a, b = limb.lengths

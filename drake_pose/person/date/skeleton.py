@@ -211,12 +211,9 @@ def _limb(
 ) -> Limb:
     """Read a limb from its two segments and its end, which the lower segment carries.
 
-    Args:
-        nodes: indices of the tree's nodes by name.
-        name: one of LIMBS.
-        upper, lower, end: names of upper and lower segment and of the hand's or foot's link.
-
-    Raises ModelError: positions or links are not those of a limb.
+    ``nodes``: indices of the tree's nodes by name. ``name``: one of LIMBS. ``upper``, ``lower``,
+    ``end``: names of upper and lower segment and of the hand's or foot's link. Raises ModelError:
+    positions or links are not those of a limb.
     """
     tree = kinematics.tree
     model = tree.model

@@ -195,12 +195,9 @@ def make_motion(skeleton: Skeleton, frames: int, seed: int) -> Motion:
     The lower foot stands on the floor in every frame. The whole takes 120 frames or more; if fewer
     are asked for, the first ones are returned.
 
-    Args:
-        skeleton: of the person.
-        frames: number of frames.
-        seed: draws the size of each motion, 0.85 to 1.15, and where the person stands.
-
-    Raises SettingsError: there are fewer than FEWEST_FRAMES frames.
+    ``skeleton``: of the person. ``frames``: number of frames. ``seed``: draws the size of each
+    motion, 0.85 to 1.15, and where the person stands. Raises SettingsError: there are fewer than
+    FEWEST_FRAMES frames.
     """
     if frames < FEWEST_FRAMES:
         raise SettingsError(f"Date's experiment needs {FEWEST_FRAMES} frames or more, not {frames}")

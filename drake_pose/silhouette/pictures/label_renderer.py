@@ -85,11 +85,9 @@ class DeformableSkin:
 def _apexes(vertices: np.ndarray, triangles: np.ndarray, depth: float = 0.05) -> np.ndarray:
     """Return a point (m, 3) [m] just inside the middle of each triangle.
 
-    Args:
-        vertices: (v, 3) the surface's vertices [m].
-        triangles: (m, 3) vertex indices, counter-clockwise from outside.
-        depth: depth of the point as a fraction of sqrt(2 area): large enough to be hidden, small
-            enough to stay inside thin bands.
+    ``vertices``: (v, 3) the surface's vertices [m]. ``triangles``: (m, 3) vertex indices,
+    counter-clockwise from outside. ``depth``: depth of the point as a fraction of sqrt(2 area):
+    large enough to be hidden, small enough to stay inside thin bands.
     """
     a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
     normals = np.cross(b - a, c - a)

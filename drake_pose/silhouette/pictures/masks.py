@@ -23,12 +23,9 @@ def read_mask(
 ) -> np.ndarray:
     """Return the mask (H, W) of a PNG picture with black (0) and one other colour, the object's.
 
-    Args:
-        width, height: required size [pixel]; None: any.
-        may_be_empty: whether a picture without an object is accepted.
-
-    Raises MaskError, which names the file: it cannot be read, is no complete PNG picture, has the
-    wrong size, is empty or full, or has more than two colours.
+    ``width``, ``height``: required size [pixel]; None: any. ``may_be_empty``: whether a picture
+    without an object is accepted. Raises MaskError, which names the file: it cannot be read, is no
+    complete PNG picture, has the wrong size, is empty or full, or has more than two colours.
     """
     size = width, height
     return read_binary_mask(Path(path), MaskError, size, may_be_empty=may_be_empty)

@@ -334,11 +334,8 @@ def common_rate(
     The rate is None if no video has one. There is a warning if videos are a picture or more apart
     at the end of the shortest; otherwise the tuple is empty.
 
-    Args:
-        videos: video files by camera.
-        max_ratio: largest ratio of the highest to the lowest rate.
-
-    Raises SceneError: a video cannot be read, or the ratio is larger.
+    ``videos``: video files by camera. ``max_ratio``: largest ratio of the highest to the lowest
+    rate. Raises SceneError: a video cannot be read, or the ratio is larger.
     """
     opened = {name: VideoPictures(path) for name, path in videos.items()}
     rates = {name: video.rate_hz for name, video in opened.items() if video.rate_hz is not None}

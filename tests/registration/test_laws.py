@@ -15,7 +15,7 @@ from scipy.stats import t as scipy_t
 from drake_pose.body import TARGET_POSITIONS, ArticulatedModel, RootRotation, load_model
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import MaskError, RegistrationError
-from drake_pose.fit.covariance import estimate_sizes
+from drake_pose.fit.covariance import estimate_sizes, nuisance_covariance
 from drake_pose.fit.evidence import Observation
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import BodyParameters
@@ -109,6 +109,23 @@ def test_camera_covariance_matches_derivatives(posed: PosedFrames) -> None:
     covariance = np.diag([1.0, 4.0, 9.0, 0.1, 0.2, 0.3])
     found = fit.camera_covariances(SharedValues(at, np.zeros(2)), covariance)[0]
     np.testing.assert_allclose(found, (J / 1e-6) @ covariance @ (J / 1e-6).T, atol=1e-4)
+
+
+def test_errors_of_intrinsics_move_the_outline_alike_as_rotation_shift_and_depth(
+    posed: PosedFrames,
+) -> None:
+    """They are added to what nuisance parameters cause."""
+    fit = SharedFit([posed], [posed.camera.X_CW])
+    distances = fit._distances_with_nuisances(fit.start, SHARED.final_stage, None)
+    angles = np.zeros(distances.X.shape[1], bool)
+    sizes = estimate_sizes(distances, angles, 0.0, SHARED.prior_deviation)
+    without, _ = nuisance_covariance(distances, sizes, angles)
+    added = np.sqrt(np.diag(fit.covariances(fit.start)[1] - without[:6, :6]))
+    depth = float(posed.camera.X_CW[2, :3] @ posed.middle + posed.camera.X_CW[2, 3])
+    # A pixel at most, seen at the body's distance.
+    assert 0.0 < added[3] <= depth / posed.camera.focal_x
+    turn = added[3] / posed.extent
+    np.testing.assert_allclose(added, [turn] * 3 + [added[3]] * 2 + [turn * depth])
 
 
 def test_scatter_measures_disagreement_of_frames_only(posed: PosedFrames) -> None:

@@ -16,6 +16,7 @@ from drake_pose.fit.problem import TIME_OFFSET
 from drake_pose.registration.picture_acceptance import (
     PictureRegistration,
     PictureStart,
+    accept_fit,
     evaluate_pictures,
     exchange_values,
     opposite_pose,
@@ -345,6 +346,12 @@ def test_time_offset_and_camera_are_fitted_within_their_deviations(registered, e
     np.testing.assert_allclose([one.values for one in registered.frames], values)
     np.testing.assert_array_equal(registered.pictures["0003"], episode.pictures[3])
     assert registered.focal_deviation == 0.0
+    # A registration has the logged values, without the offsets that its frames were fitted with.
+    offsets = np.arange(5.0)
+    again = accept_fit(
+        registered.fit, registered.recording, PictureStart.of(registered), offsets, 0.0
+    )
+    np.testing.assert_allclose([one.values for one in again.frames], values - offsets)
 
 
 def test_pictures_are_evaluated_with_the_registered_camera(registered, episode) -> None:

@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from drake_pose.camera.camera_files import load_camera_file
+from drake_pose.camera.camera_files import load_camera_file, save_cameras
 from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending_indices
-from drake_pose.camera.episode_files import open_episode
+from drake_pose.camera.episode_files import open_episode, recorded_intrinsics
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import (
     CameraError,
     DrakePoseError,
@@ -283,3 +284,19 @@ def test_unusable_episodes_are_refused():
         camera(TIMES).read(20)
     with pytest.raises(SceneError, match=r"picture 1: has 5 x 3 pixels .* the first one 4 x 3"):
         camera(TIMES).read(1)
+
+
+def test_intrinsics_are_scaled_to_each_cameras_pictures(tmp_path):
+    sizes = {"left": (160, 120), "right": (320, 240)}
+    cameras = [
+        EpisodeCamera(name, *size, TIMES, None, None, lambda k: np.zeros((1, 1, 3), np.uint8))
+        for name, size in sizes.items()
+    ]
+    given = {
+        name: PinholeCamera(name, 640, 480, 600.0, 610.0, 319.5, 239.5, np.eye(4)) for name in sizes
+    }
+    save_cameras(tmp_path / "cameras.yaml", given.values())
+    found = recorded_intrinsics(cameras, tmp_path, None).cameras
+    for name, size in sizes.items():
+        assert (found[name].width, found[name].height) == size
+        assert found[name].focal_x == pytest.approx(600.0 * size[0] / 640)

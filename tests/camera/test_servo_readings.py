@@ -122,6 +122,15 @@ def test_readings_that_are_not_whole_steps_are_told_by_their_range(tmp_path):
     found = map_arm(smooth)
     np.testing.assert_allclose(found.log.positions, angles, atol=3 * STEP)
     assert "could be degrees" in found.warnings[0]
+    # Two degrees beyond the motor's range cannot be degrees.
+    j = int(np.argmin(UPPER[:5] - LOWER[:5]))
+    half = 180.0 * (arm[NAMES[j]].high - arm[NAMES[j]].low) / 4096
+    for beyond, said in ((1.5, "could be degrees"), (2.5, "would leave its range")):
+        readings = smooth.positions.copy()
+        readings[3, j] = half + beyond
+        found = map_arm(JointLog(log.names, log.times, readings, servos=servos))
+        assert found.encoding == "normalised"
+        assert said in found.warnings[0]
     wide = angles.copy()
     wide[3, 4] = 2.7
     log = log_of(arm, wide, "deg", servos=servos)

@@ -218,7 +218,7 @@ def test_parts_are_stretched_towards_their_children_or_centroid(stretched):
     np.testing.assert_allclose(stretched.factors(theta), 1.0 + long)
 
 
-def test_planes_match_the_stretched_surfaces(stretched):
+def test_planes_and_balls_match_the_stretched_surfaces(stretched):
     theta = np.random.default_rng(1).normal(0.0, 0.2, len(stretched.names))
     packed = stretched.place(theta).packed
     for node in range(3):
@@ -226,6 +226,8 @@ def test_planes_match_the_stretched_surfaces(stretched):
         nothing = np.zeros((0, 6), dtype=np.int32)
         own = Outline(packed.points[:, v:v_end].T, packed.triangles[t:t_end], nothing)
         np.testing.assert_allclose(packed.planes[:, t:t_end].T, own.planes, atol=1e-15)
+        away = np.linalg.norm(own.vertices - packed.balls[node, :3], axis=1)
+        assert away.max() <= packed.balls[node, 3] + 1e-12
 
 
 def test_a_stretched_model_has_the_poses_of_the_stretched_body(hand, stretched):

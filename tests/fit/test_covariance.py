@@ -170,6 +170,8 @@ def test_errors_are_correlated_within_a_mask_a_part_and_a_camera(kinematics):
     assert not camera[different_mask].any()
     np.testing.assert_array_equal(mask[~different_mask], surface[~different_mask])
     assert surface[different_mask].any()
+    derivatives = residuals.surface_derivatives
+    np.testing.assert_allclose(derivatives @ derivatives.T, surface, atol=1e-9)
     assert not repeated[different_mask & ~same_camera].any()
     np.testing.assert_allclose(repeated[different_mask & same_camera].max(), 1.0)
     np.testing.assert_allclose(np.diag(repeated), 1.0)

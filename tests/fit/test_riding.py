@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.stats import entropy
 
-from drake_pose.fit.explain_kernel import Explained, explain
+from drake_pose.fit.explain_kernel import Explained, PixelSums, explain
 from drake_pose.fit.riding import RidingColours, RidingPictures, silhouette_gains
 from drake_pose.silhouette.outline import pack
 from drake_pose.silhouette.scoring import draw_mask
@@ -54,6 +54,21 @@ def test_gain_is_the_information_of_silhouettes_about_kinds(wrist) -> None:
         0,
     )
     assert shifted[Explained.GAIN] < 0.7 * expected
+
+
+def test_kinds_that_no_silhouette_shows_have_a_finite_gain() -> None:
+    """Half a pixel of each kind is added to the counts."""
+    kinds = np.array([[0, 0, 1, 1, 1, 2]], np.uint8)[:, :, None]
+    nothing = np.zeros((1, 6, 3), np.float32)
+    sums = PixelSums(
+        nothing, nothing, nothing[..., 0], nothing, kinds, np.bincount(kinds.ravel()).astype(float)
+    )
+    covered = np.array([[[True, True, True, False, False, False]]])
+    inside, outside, both = np.array([2.5, 1.5, 0.5]), np.array([0.5, 2.5, 1.5]), [2.5, 3.5, 1.5]
+    logs = [np.log(one / np.sum(one)) for one in (inside, outside, both)]
+    expected = [logs[0][0] - logs[2][0]] * 2 + [logs[0][1] - logs[2][1]]
+    expected += [logs[1][1] - logs[2][1]] * 2 + [logs[1][2] - logs[2][2]]
+    np.testing.assert_allclose(silhouette_gains(sums, covered, squares=6)[0], expected)
 
 
 def test_only_edges_that_last_count(wrist) -> None:

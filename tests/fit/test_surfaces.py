@@ -6,12 +6,12 @@ import pytest
 import trimesh
 
 from drake_pose.body import TriangleMesh, bundled_model, load_model
-from drake_pose.fit import surface_store
-from drake_pose.fit.surface_store import load_or_make
+from drake_pose.fit import surfaces
 from drake_pose.fit.surfaces import (
     FEW,
     VERY_FEW,
     _simplify_cached,
+    load_or_make,
     simplify_surfaces,
     surface_distance,
 )
@@ -122,7 +122,7 @@ def test_simplification_is_thread_safe(monkeypatch):
     def simplified(ball):
         return simplify_surfaces(Rigid(ball), FEW)[0]
 
-    monkeypatch.setattr(surface_store, "kernel_folder", lambda: None)
+    monkeypatch.setattr(surfaces, "kernel_folder", lambda: None)
     together = map_ordered(simplified, balls, 4)
     _simplify_cached.cache_clear()
     for ball, one in zip(balls, together, strict=True):
@@ -132,7 +132,7 @@ def test_simplification_is_thread_safe(monkeypatch):
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """Folder of the stored surfaces."""
-    monkeypatch.setattr(surface_store, "kernel_folder", lambda: tmp_path)
+    monkeypatch.setattr(surfaces, "kernel_folder", lambda: tmp_path)
     return tmp_path / "surfaces"
 
 
@@ -157,7 +157,7 @@ def same(one, other):
 
 
 def test_stored_surfaces_are_exact(folder, monkeypatch):
-    monkeypatch.setattr(surface_store.load_or_make, "__defaults__", (0.0, 500))
+    monkeypatch.setattr(surfaces.load_or_make, "__defaults__", (0.0, 500))
     given = ball_and_tube(40)
     _simplify_cached.cache_clear()
     made = simplify_surfaces(Rigid(given), FEW)[0]
@@ -201,9 +201,9 @@ def test_without_a_writable_folder_surfaces_are_made(tmp_path, monkeypatch):
     make = Maker()
     (tmp_path / "file").touch()
     for folder in (None, tmp_path / "file", tmp_path / "none"):
-        monkeypatch.setattr(surface_store, "kernel_folder", lambda folder=folder: folder)
+        monkeypatch.setattr(surfaces, "kernel_folder", lambda folder=folder: folder)
         assert load_or_make((b"key",), make, 0.0) is make.outline
     quick = Maker()
-    monkeypatch.setattr(surface_store, "kernel_folder", lambda: tmp_path)
+    monkeypatch.setattr(surfaces, "kernel_folder", lambda: tmp_path)
     assert load_or_make((b"quick",), quick, 60.0) is quick.outline
     assert not (tmp_path / "surfaces").exists()

@@ -68,7 +68,7 @@ def decide(data: Path, name: str, kind: str, seed: int) -> Decision:
         # A Panda with another gripper is the same arm.
         other = next(one for one in after if not ("Panda" in one and "Panda" in name))
         shown = load_model(data / ARMS[other].file, check=False)
-        logged = _as_positions(model, logged, shown)
+        logged = as_positions(model, logged, shown)
     body = RegistrationBody(shown.pose_tree())
     columns = [shown.position_names.index(one) for one in body.kinematics.names]
 
@@ -111,7 +111,7 @@ def _episode(data: Path, name: str, seed: int) -> SimulatedEpisode:
     return replace(drawn, pictures=np.array(pictures))
 
 
-def _as_positions(model: ArticulatedModel, logged: Array, other: ArticulatedModel) -> Array:
+def as_positions(model: ArticulatedModel, logged: Array, other: ArticulatedModel) -> Array:
     """Return positions (n, nq) of a model as those of another one, joint by joint in order."""
     moving = [
         np.flatnonzero(np.isfinite(one.lower) & (one.upper - one.lower > 0.1))

@@ -70,8 +70,9 @@ class WristRoom(Room):
 
     def __init__(
         self, model: ArticulatedModel, gripper: Gripper, folder: Path, seed: int, *,
-        bare: bool, held: bool, things: int = 14,
+        held: bool, contrast: float, things: int,
     ) -> None:  # fmt: skip
+        """Build the room; held, contrast, things: as of ``simulate_wrist``."""
         self._gripper, self._held = gripper, held
         grey = np.random.default_rng([14, seed]).choice([0.1, 0.3, 0.6, 0.9])
         colour = (grey, grey, grey)
@@ -80,12 +81,11 @@ class WristRoom(Room):
         rng, source = np.random.default_rng([12, seed]), self._source
         table = folder / f"table{seed}.png"
         picture = texture_picture(rng, grey=False)
-        # A bare table has a faint grain.
-        picture = 205.0 + (0.02 if bare else 0.6) * (picture.astype(float) - 128.0)
+        picture = 205.0 + contrast * (picture.astype(float) - 128.0)
         write_texture(table, picture)
         height = gripper.height
         self._wall(source, (0.5, 0.0, height - 0.02), (1.4, 1.6, 0.04), table)
-        for _ in range(0 if bare else things):
+        for _ in range(things):
             place = rng.uniform((0.05, -0.45, 0.0), (0.75, 0.45, 0.0))
             size = rng.uniform(0.02, 0.08, 3)
             place[2] = height + 0.5 * size[2]
@@ -150,20 +150,22 @@ def _random_mount(rng: np.random.Generator, one: Gripper, width: int, height: in
 
 
 def simulate_wrist(
-    data: Path, folder: Path, one: Gripper, seed: int, *, bare: bool = False, held: bool = False,
-    motion: str = "free", opening: str = "moves", late: float = 0.03, drawn: Gripper | None = None,
-    count: int = 60, away: bool = False,
+    data: Path, folder: Path, one: Gripper, seed: int, *, contrast: float = 0.6, things: int = 14,
+    held: bool = False, motion: str = "free", opening: str = "moves", late: float = 0.03,
+    drawn: Gripper | None = None, count: int = 60, away: bool = False, stands: bool = False,
 ) -> tuple[ArticulatedModel, SimulatedEpisode]:  # fmt: skip
     """Simulate an episode; its camera has the pose X_LC on the gripper's link.
 
     Args:
         data: folder of the models.
         one: the arm and its gripper; drawn: those that are drawn in their place; None: the same.
-        bare: whether the table has hardly any texture. held: whether the hand holds a thing.
+        contrast: of the table's texture; 0.02: a faint grain. things: number of boxes on it.
+        held: whether the hand holds a thing.
         motion: "free": all joints swing; "upright": the hand turns about the vertical only.
         opening: "moves": the gripper opens and closes; "still": it does not.
         late: how late the pictures are [s]. count: of pictures, five a second.
         away: whether the camera looks away from the gripper.
+        stands: whether the camera stands half a metre behind the place where it would begin.
     """
     rng = np.random.default_rng([13, seed])
     model, (width, height) = load_model(data / one.file, check=False), (320, 240)
@@ -198,8 +200,8 @@ def simulate_wrist(
     shown, other = model, drawn or one
     if drawn:
         shown = load_model(data / other.file, check=False)
-    room = WristRoom(shown, other, folder, seed, bare=bare, held=held)
-    context, pictures = model.plant.CreateDefaultContext(), []
+    room = WristRoom(shown, other, folder, seed, held=held, contrast=contrast, things=things)
+    context, pictures, first = model.plant.CreateDefaultContext(), [], None
     for q in at(times + late):
         model.plant.SetPositions(context, q)
         X_WL = model.plant.GetBodyByName(one.link).EvalPoseInWorld(context).GetAsMatrix4()
@@ -212,6 +214,11 @@ def simulate_wrist(
             for joint, (low, high) in other.fingers.items():
                 q_shown[shown.position_index(joint)] = low + part * (high - low)
         placed = camera.with_pose(X_WL @ camera.X_WC)
+        if stands:
+            back = np.eye(4)
+            back[2, 3] = -0.5
+            first = first or placed.with_pose(placed.X_WC @ back)
+            placed = first
         picture = room.picture(q_shown, np.array([3.0, 3.0, 0.0]), placed)
         noisy = picture + rng.normal(0.0, 3.0, picture.shape)
         pictures.append(np.clip(noisy, 0, 255).astype(np.uint8))

@@ -84,7 +84,7 @@ def errors(found: SceneRegistration, X_LC: np.ndarray) -> np.ndarray:
 
 @pytest.mark.slow
 def test_the_gripper_gives_the_pose_above_a_bare_table(tmp_path: Path) -> None:
-    found, X_LC = register(tmp_path, tmp_path / "out", seed=1, bare=True)
+    found, X_LC = register(tmp_path, tmp_path / "out", seed=1, contrast=0.02, things=0)
     assert np.abs(errors(found, X_LC)).max() < 4.0
     one = found.summary["cameras"]["wrist"]
     assert one["evidence"] == "gripper"
@@ -100,7 +100,7 @@ def test_another_gripper_is_refused(tmp_path: Path) -> None:
     write_arm(tmp_path / "other.urdf", other=True)
     drawn = replace(GRIPPER, file="other.urdf")
     with pytest.raises(RegistrationError, match="Nor does the gripper in its pictures help"):
-        register(tmp_path, seed=2, bare=True, drawn=drawn)
+        register(tmp_path, seed=2, contrast=0.02, things=0, drawn=drawn)
 
 
 @pytest.mark.slow

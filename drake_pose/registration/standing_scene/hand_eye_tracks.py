@@ -7,7 +7,7 @@ fitted by bundle adjustment over all points. Points that move with the camera, s
 gripper's, contradict the scene's motion and are outliers.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 from drake_pose.arrays import Array, Indices
 from drake_pose.body import inverse_transforms
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.registration.register import uniform_rotations
+from drake_pose.registration.recording import Recording
+from drake_pose.registration.register import RegistrationBody, uniform_rotations
 from drake_pose.registration.standing_scene.picture_matches import Matches, Sightings, rays
 
 
@@ -171,6 +172,52 @@ class EpipolarSearch:
 
 LinkPoses = Callable[[Array], Array]
 """Returns the link's poses X_WL (frames, 4, 4) at constants (k,): time offset, joint offsets."""
+
+
+def recorded_link_poses(
+    body: RegistrationBody, base: int, recording: Recording, rows: Sequence[int]
+) -> LinkPoses:
+    """Return a function of (1 + m,) constants: a time offset [s], and an offset for each value.
+
+    It returns the link's poses (pictures, 4, 4) at pictures `rows`, in the frame of node `base`.
+    """
+    logged_values = recording.values_at(0.0)[rows]
+
+    def poses(constants: Array) -> Array:
+        values = recording.values_at(float(constants[0]))[rows]
+        # The log may end before the last picture's time.
+        values = np.where(np.isfinite(values), values, logged_values) + constants[1:]
+        return inverse_transforms(np.array([body.kinematics.poses(row)[base] for row in values]))
+
+    return poses
+
+
+def explaining_link(
+    body: RegistrationBody,
+    base: int,
+    values: Array,
+    search: EpipolarSearch,
+    *,
+    links: int = 4,
+    rotations: int = 300,
+) -> tuple[float, str]:
+    """Return the fraction of the matches that a camera on another link explains, and that link.
+
+    Args:
+        body, base: as of ``recorded_link_poses``; the tree's first link is left out.
+        values: (pictures, m) of the pose tree.
+        search: in the pictures.
+        links: number of links that are tried, the nearest ones in the tree.
+        rotations: as of ``EpipolarSearch.search``.
+    """
+    poses = np.array([body.kinematics.poses(row) for row in values])
+    X_WN = inverse_transforms(poses[:, [base]]) @ poses
+    gains = [
+        (search.search(X_WN[:, k], rotations)[0][0], node.name)
+        for k, node in enumerate(body.tree.nodes[: links + 1])
+        if k and np.ptp(X_WN[:, k], axis=0).max() > 0.01
+    ]
+    return max(gains, default=(0.0, ""))
 
 
 def pose_difference(X_LC: Array, other: Array) -> Array:

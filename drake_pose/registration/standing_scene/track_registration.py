@@ -1,16 +1,15 @@
 """Register a camera on a robot's link from pictures of a scene that stands still."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtr, stdtrit
 
 from drake_pose.arrays import Array, Picture
-from drake_pose.body import inverse_transforms
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, listed
 from drake_pose.registration.hand_eye import rotation_spread
@@ -22,12 +21,14 @@ from drake_pose.registration.standing_scene.hand_eye_tracks import (
     EpipolarSearch,
     TrackFit,
     TrackProblem,
+    explaining_link,
     fit_tracks,
     gauge_constants,
     intrinsics_effect,
     jackknife,
     poses_differ,
     prior_effect,
+    recorded_link_poses,
 )
 from drake_pose.registration.standing_scene.picture_matches import (
     Matches,
@@ -155,7 +156,7 @@ def register_tracks(
     settings, names = STANDING_SCENE, body.kinematics.names
     slow, fast = choose_pictures(body, camera, recording, settings.pictures, moving=settings.moving)
     rows = sorted({*slow, *fast})
-    link_poses = _link_poses(body, base, recording, rows)
+    link_poses = recorded_link_poses(body, base, recording, rows)
     pictures, timed = [recording.read(k) for k in rows], recording.times is not None
     matches, seen = match_pictures(pictures)
     asked = np.array([name in offset_joints for name in names])
@@ -168,7 +169,9 @@ def register_tracks(
         _require_motion(camera, link, link_poses(np.zeros(1 + len(names))))
         _require_matches(camera, matches, len(rows))
         start = scene.search()
-        _require_explained(camera, link, start)
+        if start.explained < settings.least_gain * start.chance:
+            search, values = EpipolarSearch(camera, matches), recording.values_at(0.0)[rows]
+            _refuse_unexplained(camera, link, start, *explaining_link(body, base, values, search))
         fitted = scene.fit(start, None)
     except RegistrationError as error:
         if gripper is None:
@@ -223,24 +226,6 @@ def register_tracks(
         view,
         why,
     )
-
-
-def _link_poses(
-    body: RegistrationBody, base: int, recording: Recording, rows: Sequence[int]
-) -> Callable[[Array], Array]:
-    """Return a function of (1 + m,) constants: a time offset [s], and an offset for each value.
-
-    It returns the link's poses (pictures, 4, 4) at pictures `rows`, in the frame of node `base`.
-    """
-    logged_values = recording.values_at(0.0)[rows]
-
-    def poses(constants: Array) -> Array:
-        values = recording.values_at(float(constants[0]))[rows]
-        # The log may end before the last picture's time.
-        values = np.where(np.isfinite(values), values, logged_values) + constants[1:]
-        return inverse_transforms(np.array([body.kinematics.poses(row)[base] for row in values]))
-
-    return poses
 
 
 class _Start(NamedTuple):
@@ -307,6 +292,14 @@ class _Scene(NamedTuple):
         )
         poses = [X for gain, X in candidates if gain > 0.7 * explained]
         return _Start(poses[:3], constants, explained, chance, len(self.matches.uv))
+
+    def rotations(self) -> Array:
+        """Return likely rotations R_LC (n, 3, 3), if a pose explains much but is not determined."""
+        if len(self.matches.uv) < STANDING_SCENE.deciding:
+            return np.zeros((0, 3, 3))
+        start = self.search()
+        helps = start.explained > STANDING_SCENE.least_gain * start.chance
+        return np.array(start.X_LC)[: None if helps else 0, :3, :3]
 
     def compare(self, X_LC: Array, offset: float) -> _Start:
         """Return a pose (4, 4) and about its time offset [s] as a start, and what they explain."""
@@ -390,7 +383,7 @@ def _start_at_gripper(
 
     Raises RegistrationError: the gripper does not determine it either.
     """
-    views, why = gripper.find()
+    views, why = gripper.find(scene.rotations())
     told = str(error).removesuffix(" Nothing was written")
     if not views:
         raise RegistrationError(
@@ -434,18 +427,24 @@ def _require_matches(camera: PinholeCamera, matches: Matches, count: int) -> Non
         )
 
 
-def _require_explained(camera: PinholeCamera, link: str, start: _Start) -> None:
-    """Raise RegistrationError if joint positions of other moments explain about as much."""
-    if start.explained < STANDING_SCENE.least_gain * start.chance:
-        raise RegistrationError(
-            f"camera '{camera.name}': no pose on link '{link}' explains how its pictures move: the "
-            f"best one explains {start.explained:.0%} of {start.matches} matched points, where "
-            f"joint positions of other moments explain {start.chance:.0%}; twice as much is "
-            f"needed. Does the camera ride on link '{link}' "
-            f"(name the one that does: --camera NAME), does the scene stand still, are the "
-            "joint positions those of these pictures, are the pictures not mirrored, and is the "
-            "focal length about right? Nothing was written"
-        )
+def _refuse_unexplained(
+    camera: PinholeCamera, link: str, start: _Start, explained: float, other: str
+) -> NoReturn:
+    """Raise RegistrationError because joint positions of other moments explain about as much.
+
+    explained, other: fraction that the best other link explains, and its name.
+    """
+    hint = f"Does the camera ride on link '{link}' (name the one that does: --camera NAME)"
+    if explained > STANDING_SCENE.least_gain * max(start.chance, 0.5 * start.explained):
+        hint = f"On link '{other}' a pose explains {explained:.0%}: give it (--on {other}). Else"
+    raise RegistrationError(
+        f"camera '{camera.name}': no pose on link '{link}' explains how its pictures move: the "
+        f"best one explains {start.explained:.0%} of {start.matches} matched points, where "
+        f"joint positions of other moments explain {start.chance:.0%}; twice as much is "
+        f"needed. {hint}, does the scene stand still, are the joint positions those of these "
+        "pictures, are the pictures not mirrored, and is the focal length about right? Nothing "
+        "was written"
+    )
 
 
 def _require_motion(camera: PinholeCamera, link: str, X_WL: Array) -> None:

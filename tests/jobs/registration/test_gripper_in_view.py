@@ -61,13 +61,13 @@ def write_arm(path: Path, *, other: bool = False) -> None:
 
 
 def register(
-    folder: Path, out: Path | None = None, **given
+    folder: Path, out: Path | None = None, on: str = "link5", **given
 ) -> tuple[SceneRegistration, np.ndarray]:
     """Simulate an episode, and register its camera; returns the true X_LC (4, 4), too."""
     write_arm(folder / "arm.urdf")
     model, episode = simulate_wrist(folder, folder, GRIPPER, **{"count": 40} | given)
     write_episode(folder / "scene", model, episode, 50.0, {}, (0.0, 0.0))
-    settings = RegistrationSettings(on="link5")
+    settings = RegistrationSettings(on=on)
     found = register_scene(folder / "scene", folder / "arm.urdf", out=out, settings=settings)
     return found, episode.camera.X_WC
 
@@ -108,3 +108,9 @@ def test_scene_and_gripper_agree(tmp_path: Path) -> None:
     found, X_LC = register(tmp_path, seed=3)
     assert np.abs(errors(found, X_LC)).max() < 4.0
     assert found.summary["cameras"]["wrist"]["evidence"] == "scene and gripper"
+
+
+@pytest.mark.slow
+def test_a_wrong_link_is_refused_and_the_right_one_named(tmp_path: Path) -> None:
+    with pytest.raises(RegistrationError, match="On link 'link5' a pose explains"):
+        register(tmp_path, seed=3, on="link4")

@@ -209,8 +209,7 @@ class PyramidLevel:
         if not isinstance(rotations, int):
             return self._starts_around(rotations)
         if changes is None:
-            order = np.random.default_rng(1).permutation(18 * rotations)
-            return self._starts_around(uniform_rotations(18 * rotations)[order])
+            return self._starts_around(uniform_rotations(18 * rotations))
         v, u = np.mgrid[: changes.shape[0], : changes.shape[1]]
         total = max(float(changes.sum()), 1e-9)
         middle = np.array([float((changes * axis).sum()) / total for axis in (u, v)])
@@ -240,7 +239,7 @@ class PyramidLevel:
 
         The middle is 0.5 to 4 times the body's size away from the camera.
 
-        R_CW: (n, 3, 3) their rotations.
+        R_CW: (n, 3, 3) their rotations, in any order.
         """
         rng, size = np.random.default_rng(0), (self.camera.width, self.camera.height)
         count = len(R_CW)
@@ -248,7 +247,7 @@ class PyramidLevel:
         ray = np.column_stack([place / self._parameters[1:3], np.ones(count)])
         away = self._size * np.exp(rng.uniform(np.log(0.5), np.log(4.0), count))
         X = np.tile(np.eye(4), (count, 1, 1))
-        X[:, :3, :3] = R_CW
+        X[:, :3, :3] = R_CW[rng.permutation(count)]
         p_CM = ray * (away / np.linalg.norm(ray, axis=1))[:, None]
         X[:, :3, 3] = p_CM - X[:, :3, :3] @ self._middle
         return list(X)

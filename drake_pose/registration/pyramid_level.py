@@ -209,7 +209,7 @@ class PyramidLevel:
         if not isinstance(rotations, int):
             return self._starts_around(rotations)
         if changes is None:
-            return self._starts_around(uniform_rotations(18 * rotations))
+            return self._starts_around(uniform_rotations(18 * rotations), shuffled=True)
         v, u = np.mgrid[: changes.shape[0], : changes.shape[1]]
         total = max(float(changes.sum()), 1e-9)
         middle = np.array([float((changes * axis).sum()) / total for axis in (u, v)])
@@ -234,12 +234,12 @@ class PyramidLevel:
                 starts += list(X)
         return starts
 
-    def _starts_around(self, R_CW: Array) -> list[Array]:
+    def _starts_around(self, R_CW: Array, *, shuffled: bool = False) -> list[Array]:
         """Return poses X_CW (4, 4) with the body's middle at random in or beside the picture.
 
         The middle is 0.5 to 4 times the body's size away from the camera.
 
-        R_CW: (n, 3, 3) their rotations, in any order.
+        R_CW: (n, 3, 3) their rotations. shuffled: whether they are put in a random order.
         """
         rng, size = np.random.default_rng(0), (self.camera.width, self.camera.height)
         count = len(R_CW)
@@ -247,7 +247,7 @@ class PyramidLevel:
         ray = np.column_stack([place / self._parameters[1:3], np.ones(count)])
         away = self._size * np.exp(rng.uniform(np.log(0.5), np.log(4.0), count))
         X = np.tile(np.eye(4), (count, 1, 1))
-        X[:, :3, :3] = R_CW[rng.permutation(count)]
+        X[:, :3, :3] = R_CW[rng.permutation(count)] if shuffled else R_CW
         p_CM = ray * (away / np.linalg.norm(ray, axis=1))[:, None]
         X[:, :3, 3] = p_CM - X[:, :3, :3] @ self._middle
         return list(X)

@@ -221,7 +221,7 @@ class PictureSearch:
             (80, 30, 50, 0.1),
             (160, 10, 80, 0.06),
         ),
-        rotations: int | Array = 1200,
+        rotations: int = 1200,
         least_width: int = 0,
         others: int = 8,
         apart: float = 1.0,
@@ -239,10 +239,8 @@ class PictureSearch:
         """
         level = self._level(max(rounds[0][0], least_width))
         poses = level.starts(rotations)
-        first = [(2, 0.12), (4, 0.3)] if self._riding else [(4, 0.25)]
-        if not isinstance(rotations, int):
-            first = []
         # A few frames, the most dissimilar, select starts for the scores in all frames.
+        first = ((2, 0.12), (4, 0.3)) if self._riding else ((4, 0.25),)
         for frames, fraction in (*first, (len(self.frames), 1.0)):
             poses = level.best(poses, frames, fraction)
         after = (*(kept for _, kept, _, _ in rounds[1:]), rounds[-1][1])

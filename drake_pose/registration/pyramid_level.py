@@ -194,7 +194,7 @@ class PyramidLevel:
         )  # fmt: skip
         return gains
 
-    def starts(self, rotations: int | Array = 1200) -> list[Array]:
+    def starts(self, rotations: int = 1200) -> list[Array]:
         """Return poses X_CW (4, 4) from which a search starts.
 
         They show the body where pictures change. Each rotation is combined with three depths, near
@@ -202,14 +202,11 @@ class PyramidLevel:
         the centre of the changes, and a random one. Where changes tell nothing
         (``RidingPictures``), places and depths are random.
 
-        rotations: number of rotations over the whole sphere, and of further ones near upright; or
-            a rotation R_CW (n, 3, 3) for each start, then places and depths are random.
+        rotations: number of rotations over the whole sphere, and of further ones near upright.
         """
         changes = self.backgrounds.changed_frames()
-        if not isinstance(rotations, int):
-            return self._starts_around(rotations)
         if changes is None:
-            return self._starts_around(uniform_rotations(18 * rotations), shuffled=True)
+            return self._starts_around(18 * rotations)
         v, u = np.mgrid[: changes.shape[0], : changes.shape[1]]
         total = max(float(changes.sum()), 1e-9)
         middle = np.array([float((changes * axis).sum()) / total for axis in (u, v)])
@@ -234,20 +231,17 @@ class PyramidLevel:
                 starts += list(X)
         return starts
 
-    def _starts_around(self, R_CW: Array, *, shuffled: bool = False) -> list[Array]:
-        """Return poses X_CW (4, 4) with the body's middle at random in or beside the picture.
+    def _starts_around(self, count: int) -> list[Array]:
+        """Return `count` random poses X_CW (4, 4) with the body's middle in or beside the picture.
 
         The middle is 0.5 to 4 times the body's size away from the camera.
-
-        R_CW: (n, 3, 3) their rotations. shuffled: whether they are put in a random order.
         """
         rng, size = np.random.default_rng(0), (self.camera.width, self.camera.height)
-        count = len(R_CW)
         place = rng.uniform(-0.7, 1.7, (count, 2)) * size - self._parameters[3:5]
         ray = np.column_stack([place / self._parameters[1:3], np.ones(count)])
         away = self._size * np.exp(rng.uniform(np.log(0.5), np.log(4.0), count))
         X = np.tile(np.eye(4), (count, 1, 1))
-        X[:, :3, :3] = R_CW[rng.permutation(count)] if shuffled else R_CW
+        X[:, :3, :3] = uniform_rotations(count)[rng.permutation(count)]
         p_CM = ray * (away / np.linalg.norm(ray, axis=1))[:, None]
         X[:, :3, 3] = p_CM - X[:, :3, :3] @ self._middle
         return list(X)

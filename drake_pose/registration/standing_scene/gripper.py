@@ -33,7 +33,6 @@ class GripperSettings(NamedTuple):
     Args:
         pictures: maximum number of pictures.
         rounds, starts: `rounds` and `rotations` of ``PictureSearch.search``.
-        places: number of starts for each rotation that the scene suggests.
         fitted: maximum number of poses that are fitted to contours.
         shown: minimum fraction of the pictures' pixels that the gripper covers.
         least_ratio: minimum mean inlier ratio of its contours, without a guess and near the pose
@@ -55,7 +54,6 @@ class GripperSettings(NamedTuple):
         (160, 6, 80, 0.06),
     )
     starts: int = 1000
-    places: int = 1500
     fitted: int = 4
     shown: float = 0.01
     least_ratio: tuple[float, float] = (0.7, 0.5)
@@ -142,13 +140,10 @@ class GripperSearch:
         fit = search.fit(self._camera.with_pose(X_LC))
         return None if fit is None else self._accepted(fit, math.nan, search)
 
-    def find(self, rotations: Array) -> tuple[list[GripperFit], str]:
+    def find(self) -> tuple[list[GripperFit], str]:
         """Search without a guess, and return the accepted fits, best first.
 
         Poses that explain significantly less than the best one are left out.
-
-        Args:
-            rotations: R_LC (n, 3, 3) that the scene suggests, which are searched first.
 
         Returns:
             the fits, and the reason in words that applies if there are none.
@@ -157,13 +152,7 @@ class GripperSearch:
             return [], "its fingers are not logged or do not move, and an outline may be anything's"
         search = self._search(0.0)
         constants = (TIME_OFFSET,) if self._recording.times is not None else ()
-        fits = list[PictureFit]()
-        if len(rotations):
-            R_CW = np.repeat(np.swapaxes(rotations, 1, 2), GRIPPER.places, axis=0)
-            fits = self._fits(search, search.search(GRIPPER.rounds, R_CW), constants)
-        if not any(fit.ratios.mean() > GRIPPER.least_ratio[0] for fit in fits):
-            poses = search.search(GRIPPER.rounds, GRIPPER.starts)
-            fits = self._fits(search, poses, constants, fits)
+        fits = self._fits(search, search.search(GRIPPER.rounds, GRIPPER.starts), constants)
         if fits:
             # Many grippers look nearly the same after half a turn about an axis of their link.
             X_LC, turns = fits[0].camera.X_WC, 1.0 - 2.0 * (1.0 - np.eye(3))

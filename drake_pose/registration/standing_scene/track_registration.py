@@ -293,14 +293,6 @@ class _Scene(NamedTuple):
         poses = [X for gain, X in candidates if gain > 0.7 * explained]
         return _Start(poses[:3], constants, explained, chance, len(self.matches.uv))
 
-    def rotations(self) -> Array:
-        """Return likely rotations R_LC (n, 3, 3), if a pose explains much but is not determined."""
-        if len(self.matches.uv) < STANDING_SCENE.deciding:
-            return np.zeros((0, 3, 3))
-        start = self.search()
-        helps = start.explained > STANDING_SCENE.least_gain * start.chance
-        return np.array(start.X_LC)[: None if helps else 0, :3, :3]
-
     def compare(self, X_LC: Array, offset: float) -> _Start:
         """Return a pose (4, 4) and about its time offset [s] as a start, and what they explain."""
         search = EpipolarSearch(self.problem.camera, self.matches)
@@ -383,7 +375,7 @@ def _start_at_gripper(
 
     Raises RegistrationError: the gripper does not determine it either.
     """
-    views, why = gripper.find(scene.rotations())
+    views, why = gripper.find()
     told = str(error).removesuffix(" Nothing was written")
     if not views:
         raise RegistrationError(

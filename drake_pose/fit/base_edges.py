@@ -24,39 +24,30 @@ from drake_pose.silhouette.scoring import draw_mask
 
 
 class BaseSettings(NamedTuple):
-    """Parameters of a search of the base; chosen on 15 simulated rooms with three arms.
+    """Parameters of a search of the base; chosen on 15 simulated rooms with three arms."""
 
-    Args:
-        within, step: bound and step of the angles at which the base is drawn [rad].
-        fine_step: step of the angles that are compared [rad].
-        most_pixels: maximum side of the picture's part around the base; a larger part is reduced
-            [pixel].
-        most_covered: a pixel counts if moving parts cover it in at most this fraction of pictures.
-        least_points: minimum number of visible edge points; points are a third of a pixel apart.
-        noise: gradient of an edge that is as likely noise [of 255 per pixel].
-        tiles: number of tiles along each side of the picture's part around the base. The tiles'
-            errors are taken as independent.
-        resamples: number of bootstrap samples of the tiles.
-        shifts: tried errors of the base's place in the picture, along u and along v [pixel].
-        floor: is added in quadrature to the bootstrap's standard deviation [rad]. Errors in 15
-            rooms with three arms are then 0.9 standard deviations at most.
-        max_deviation: an angle with a larger standard deviation is not determined [rad].
-        min_turn: a camera is not turned by smaller angles [rad].
-    """
-
+    # within, step: bound and step of the angles at which the base is drawn [rad].
     within: float = 0.45
     step: float = 0.0436
-    fine_step: float = 0.00291
+    fine_step: float = 0.00291  # Step of the angles that are compared [rad].
+    # Maximum side of the picture's part around the base; a larger part is reduced [pixel].
     most_pixels: int = 240
+    # A pixel counts if moving parts cover it in at most this fraction of pictures.
     most_covered: float = 0.7
+    # Minimum number of visible edge points; points are a third of a pixel apart.
     least_points: int = 120
-    noise: float = 2.0
+    noise: float = 2.0  # Gradient of an edge that is as likely noise [of 255 per pixel].
+    # Number of tiles along each side of the picture's part around the base. The tiles' errors are
+    # taken as independent.
     tiles: int = 8
-    resamples: int = 200
+    resamples: int = 200  # Number of bootstrap samples of the tiles.
+    # Tried errors of the base's place in the picture, along u and along v [pixel].
     shifts: tuple[float, ...] = (-0.6, -0.3, 0.0, 0.3, 0.6)
+    # Is added in quadrature to the bootstrap's standard deviation [rad]. Errors in 15 rooms with
+    # three arms are then 0.9 standard deviations at most.
     floor: float = 0.0035
-    max_deviation: float = 0.1
-    min_turn: float = 0.0175
+    max_deviation: float = 0.1  # An angle with a larger standard deviation is not determined [rad].
+    min_turn: float = 0.0175  # A camera is not turned by smaller angles [rad].
 
 
 BASE = BaseSettings()
@@ -125,9 +116,8 @@ def locate_base(
         values: (f, m) the tree's values in the pictures.
         joint: index of the first joint's value.
 
-    Returns:
-        the angle by which the world turns in the camera, see ``joint_rotation``, and its standard
-        deviation [rad]; 0 and infinity where too little of the base is visible.
+    Returns the angle by which the world turns in the camera, see ``joint_rotation``, and its
+    standard deviation [rad]; 0 and infinity where too little of the base is visible.
     """
     motions = kinematics.motions(values[0])
     moves, twist = motions.moves[:, joint], motions.twists[joint]
@@ -379,8 +369,7 @@ def _strengths(
         beside: (n,) angles from that of the drawing to those that are compared [rad].
         reach: maximum motion of a point along its normal [pixel].
 
-    Returns:
-        the sums (n, tiles), and the numbers of visible points (tiles,).
+    Returns the sums (n, tiles), and the numbers of visible points (tiles,).
     """
     size = np.array(slopes.seen.shape[::-1])
     inside = ((edges.points > reach + 2.0) & (edges.points < size - reach - 3.0)).all(axis=1)

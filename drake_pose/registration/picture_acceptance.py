@@ -41,31 +41,19 @@ from drake_pose.workers import map_ordered
 
 @dataclass(frozen=True, eq=False)
 class PictureRegistration:
-    """A camera registered from its pictures.
+    """A camera registered from its pictures."""
 
-    Args:
-        found: the camera.
-        frames: its frames, with masks and foreground log-odds, at the logged joint values.
-        pictures: the pictures of these frames, by name.
-        fit: the final fit.
-        time_offset: of the camera's clock; None: the log has no times.
-        focal_deviation: relative standard deviation of the focal length; 0: it was not fitted.
-        recording: the recording, with the drift of its clock removed.
-        joint_offsets: (m,) added to the frames' values for their masks and log-odds.
-        by_chance: fraction that a search explained with the joint positions of other pictures.
-        runner_up: as of ``PictureStart``.
-    """
-
-    found: RegisteredCamera
+    found: RegisteredCamera  # The camera.
+    # Its frames, with masks and foreground log-odds, at the logged joint values.
     frames: tuple[PosedFrame, ...]
-    pictures: dict[str, Picture]
-    fit: PictureFit
-    time_offset: TimeOffset | None
-    focal_deviation: float
-    recording: Recording
-    joint_offsets: Array
-    by_chance: float
-    runner_up: tuple[Array, float] | None
+    pictures: dict[str, Picture]  # The pictures of these frames, by name.
+    fit: PictureFit  # The final fit.
+    time_offset: TimeOffset | None  # Of the camera's clock; None: the log has no times.
+    focal_deviation: float  # Relative standard deviation of the focal length; 0: it was not fitted.
+    recording: Recording  # The recording, with the drift of its clock removed.
+    joint_offsets: Array  # (m,) added to the frames' values for their masks and log-odds.
+    by_chance: float  # Fraction that a search explained with the joint positions of other pictures.
+    runner_up: tuple[Array, float] | None  # As of ``PictureStart``.
 
     @property
     def ratios(self) -> dict[str, float]:
@@ -168,13 +156,9 @@ def opposite_pose(
     explained by a camera on the opposite side of the body, though less well, as near parts are
     shown larger. Fewer of the contours fit then; what both poses explain differs too little.
 
-    Args:
-        best: the pose in the pictures as they are.
-        evaluations, turn: of each local search, see ``PyramidLevel.improve``.
-        starts: number of local searches.
-
-    Returns:
-        The pose; None: the body leaves the pictures.
+    ``best``: the pose in the pictures as they are. ``evaluations``, ``turn``: of each local search,
+    see ``PyramidLevel.improve``. ``starts``: number of local searches. Returns the pose; None: the
+    body leaves the pictures.
     """
     mirrored = best.search.mirrored()
     X_CW = best.search.compared.opposite(best.camera.X_CW)
@@ -245,9 +229,7 @@ def accept_fit(
 
     The first four arguments are what `_fit_until_stable` returns.
 
-    Args:
-        focal: prior standard deviation of the focal length's logarithm; 0: it was not fitted.
-
+    ``focal``: prior standard deviation of the focal length's logarithm; 0: it was not fitted.
     Raises RegistrationError: a criterion of ACCEPTANCE is not met.
     """
     fit, (posed,) = best.fit, best.fit.views
@@ -343,9 +325,8 @@ def evaluate_pictures(
             fraction of the fit's median: dark and blurred contours fit badly even in correct poses.
         around: pictures are segmented up to this distance from the body [square root of its area].
 
-    Returns:
-        the frames that show the body, with masks and logged values; the misfit of each; and the
-        names of frames in which the body is not visible although it covers enough of the picture.
+    Returns the frames that show the body, with masks and logged values; the misfit of each; and the
+    names of frames in which the body is not visible although it covers enough of the picture.
     """
     count = len(one.recording.names)
     rows = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()

@@ -165,13 +165,9 @@ def _search_again(
 
     This finds poses that a first search missed, as it did in 2 of 3 drawn rooms with an SO-100.
 
-    Args:
-        begun: the first search.
-        near: its roughly fitted poses.
-
-    Returns:
-        The poses X_CW (4, 4) of this search; all roughly fitted poses, the best first; and those in
-        mirrored pictures, none if joint offsets are fitted.
+    ``begun``: the first search. ``near``: its roughly fitted poses. Returns the poses X_CW (4, 4)
+    of this search; all roughly fitted poses, the best first; and those in mirrored pictures, none
+    if joint offsets are fitted.
     """
     again = partial(PictureSearch.search, rotations=1700, least_width=150)
     more, seen = again(begun), list[RoughPose]()
@@ -306,13 +302,9 @@ def _scan_lenses(
 ) -> tuple[PictureSearch, list[Array]]:
     """Improve poses with other focal lengths and aspect ratios of the pixels.
 
-    Args:
-        search: a search with a camera whose focal length is a guess.
-        found: poses X_CW (4, 4) that it found.
-        factors: of the focal length.
-
-    Returns:
-        a search with the camera that scores best, and the poses improved with it, best first.
+    ``search``: a search with a camera whose focal length is a guess. ``found``: poses X_CW (4, 4)
+    that it found. ``factors``: of the focal length. Returns a search with the camera that scores
+    best, and the poses improved with it, best first.
     """
     results = []
     for squeezed in squeezed_cameras(search.camera):
@@ -408,9 +400,8 @@ def _fit_until_stable(
 
     start: the camera near its pose, and the clock, whose drift is held.
 
-    Returns:
-        the fit; the recording without drift; the start with the fitted camera and time offset; and
-        the joint offsets (m,) that the frames were segmented with.
+    Returns the fit; the recording without drift; the start with the fitted camera and time offset;
+    and the joint offsets (m,) that the frames were segmented with.
     """
     camera, offset, names = start.camera, start.clock.value, body.kinematics.names
     constants = ((TIME_OFFSET,) if recording.times is not None else ()) + tuple(offset_joints)
@@ -487,9 +478,8 @@ def base_rotation(
         frames: f pictures with the values that the camera was fitted with.
         offset_joints: joints whose offsets are fitted.
 
-    Returns:
-        index of the joint, the angle and its standard deviation [rad]; None: no offset of these
-        joints looks like a rotation of the camera.
+    Returns index of the joint, the angle and its standard deviation [rad]; None: no offset of these
+    joints looks like a rotation of the camera.
     """
     kinematics, values = body.kinematics, np.array([one.values for one in frames])
     shown = np.array([len(one.vertices) > 0 for one in body.full])
@@ -513,10 +503,9 @@ def offsets_in_pictures(
         found: registrations by camera.
         offset_joints: joints whose offsets are fitted.
 
-    Returns:
-        mean offsets by name [rad or m]; of these, those that look like a rotation of a camera, as
-        edges of static parts show them, with standard deviations; and the cameras, turned to these
-        offsets. All are empty without registrations.
+    Returns mean offsets by name [rad or m]; of these, those that look like a rotation of a camera,
+    as edges of static parts show them, with standard deviations; and the cameras, turned to these
+    offsets. All are empty without registrations.
     """
     if not found:
         return {}, {}, {}

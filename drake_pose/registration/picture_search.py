@@ -40,38 +40,23 @@ from drake_pose.workers import map_ordered
 
 @dataclass(frozen=True, eq=False)
 class PosedPicture:
-    """One picture of a body at known joint positions.
+    """One picture of a body at known joint positions."""
 
-    Args:
-        name: of the frame.
-        values: (m,) values of the body's pose tree [rad or m].
-        picture: (H, W, 3) uint8 RGB.
-        rates: (m,) velocities of the values [rad/s or m/s]; None: unknown.
-    """
-
-    name: str
-    values: Array
-    picture: Picture
-    rates: Array | None = None
+    name: str  # Of the frame.
+    values: Array  # (m,) values of the body's pose tree [rad or m].
+    picture: Picture  # (H, W, 3) uint8 RGB.
+    rates: Array | None = None  # (m,) velocities of the values [rad/s or m/s]; None: unknown.
 
 
 @dataclass(frozen=True, eq=False)
 class PictureFit:
-    """A camera fitted to pictures.
+    """A camera fitted to pictures."""
 
-    Args:
-        fit: the fit of frames with foreground log-odds, and masks derived from these.
-        found: the fitted values of the fit's u shared unknowns.
-        background: the estimated background, which segments further pictures.
-        explained: log-likelihood gain of the pose over the largest possible gain.
-        contour: mean strength of edges along the outlines, minus that along random lines.
-    """
-
-    fit: SharedFit
-    found: SharedValues
-    background: KnownBackground
-    explained: float
-    contour: float
+    fit: SharedFit  # The fit of frames with foreground log-odds, and masks derived from these.
+    found: SharedValues  # The fitted values of the fit's u shared unknowns.
+    background: KnownBackground  # The estimated background, which segments further pictures.
+    explained: float  # Log-likelihood gain of the pose over the largest possible gain.
+    contour: float  # Mean strength of edges along the outlines, minus that along random lines.
 
     @property
     def camera(self) -> PinholeCamera:
@@ -95,20 +80,14 @@ class PictureFit:
 
 
 class RoughPose(NamedTuple):
-    """A camera fitted roughly to pictures.
+    """A camera fitted roughly to pictures."""
 
-    Attributes:
-        search: the search in the pictures.
-        camera: at its pose, with the pictures' original size.
-        explained, contour: as of ``PictureFit``.
-        ratios: inlier ratios by frame name.
-    """
-
-    search: "PictureSearch"
-    camera: PinholeCamera
+    search: "PictureSearch"  # The search in the pictures.
+    camera: PinholeCamera  # At its pose, with the pictures' original size.
+    # explained, contour: as of ``PictureFit``.
     explained: float
     contour: float
-    ratios: Mapping[str, float]
+    ratios: Mapping[str, float]  # Inlier ratios by frame name.
 
     @property
     def agreement(self) -> float:
@@ -345,8 +324,7 @@ class PictureSearch:
             scales: for each successive fit the scales of its stages [pixel of a picture 320 wide].
                 Frames are segmented again before each fit.
 
-        Returns:
-            the search with the offsets added to its frames' values, and the pose X_CW (4, 4).
+        Returns the search with the offsets added to its frames' values, and the pose X_CW (4, 4).
         """
         kinematics = self._body.kinematics
         values = np.array([frame.values for frame in self.frames])
@@ -422,8 +400,7 @@ class PictureSearch:
                 offset, or TIME_OFFSET; see ``SharedFit``.
             focal: prior standard deviation of the focal length's logarithm; 0: it is not fitted.
 
-        Returns:
-            the fit; None if fewer than two frames show the body.
+        Returns the fit; None if fewer than two frames show the body.
         """
         lens: dict[str, Any] = {}
         if focal:

@@ -168,10 +168,8 @@ def _joint_rows(
     In each row "off" has the joint's errors common to all frames. If there are none, "detectable"
     is the joint's minimum detectable offset as text.
 
-    Args:
-        tree: the robot's pose tree; each of its joints in `kinds` has a row.
-        kinds: kind of each position by name: "angle", "length" or "quaternion".
-        summary: content of summary.json.
+    ``tree``: the robot's pose tree; each of its joints in `kinds` has a row. ``kinds``: kind of
+    each position by name: "angle", "length" or "quaternion". ``summary``: content of summary.json.
     """
     rows = []
     for name in (name for name in TreeKinematics(tree).names if name in kinds):
@@ -229,10 +227,8 @@ def _draw_outlines(folder: Path, inputs: RegistrationInputs, found: Diagnosis, m
 def corrected(values: Array, names: Sequence[str], finding: Finding) -> tuple[Array, ...]:
     """Return the joint values (m,) corrected by a finding, in a tuple; (): it corrects no joint.
 
-    Args:
-        values: (m,) joint values [rad or m].
-        names: (m,) names of the joints.
-        finding: its kind and joints tell the correction.
+    ``values``: (m,) joint values [rad or m]. ``names``: (m,) names of the joints. ``finding``: its
+    kind and joints tell the correction.
     """
     added = dict(finding.joints)
     if finding.kind == "joint":

@@ -52,11 +52,9 @@ Search = CameraSearch | TargetSearch
 def explain_misfit(found: RegisteredCamera, min_inlier_ratio: float = 0.65) -> str | None:
     """Return in words why a pose does not explain the masks; None: it does.
 
-    Args:
-        found: the registered camera.
-        min_inlier_ratio: minimum mean inlier ratio of the two best frames. A correct robot has 0.83
-            or more, even with holes and tools in the masks; mirrored masks, another robot's masks
-            or exchanged frames have 0.6 at most.
+    ``found``: the registered camera. ``min_inlier_ratio``: minimum mean inlier ratio of the two
+    best frames. A correct robot has 0.83 or more, even with holes and tools in the masks; mirrored
+    masks, another robot's masks or exchanged frames have 0.6 at most.
     """
     inliers = [frame for frame in found.frames if frame.is_inlier]
     left = _left(found)
@@ -235,11 +233,10 @@ def check_focal_length(
             length.
         most: maximum number of frames in a first, quick estimate.
 
-    Returns:
-        the camera; the relative standard deviation of an estimated focal length, 0 for a given one;
-        and a list of one warning or none. Between `off_by` and `wrong_by` the camera's pose and
-        focal length stay as they are. Its covariance is then that of a pose with a fitted focal
-        length, plus the squared difference between the two poses.
+    Returns the camera; the relative standard deviation of an estimated focal length, 0 for a given
+    one; and a list of one warning or none. Between `off_by` and `wrong_by` the camera's pose and
+    focal length stay as they are. Its covariance is then that of a pose with a fitted focal length,
+    plus the squared difference between the two poses.
     """
     given = found.camera
     inliers = [frame for frame, fit in zip(frames, found.frames, strict=True) if fit.is_inlier]
@@ -375,10 +372,8 @@ def likely_offset_warnings(
 
     The list is empty if no offset is likely.
 
-    Args:
-        body: the robot's surfaces.
-        found: the registered camera.
-        frames: the camera's frames; at most 24 inlier frames are used.
+    ``body``: the robot's surfaces. ``found``: the registered camera. ``frames``: the camera's
+    frames; at most 24 inlier frames are used.
     """
     names = {frame.frame for frame in found.frames if frame.is_inlier}
     sample = evenly_spaced([frame for frame in frames if frame.name in names], 24)
@@ -423,12 +418,9 @@ def lost_frames_warning(
 def last_before_change(wrong: Sequence[bool], least: int = 2) -> int | None:
     """Return the index of the last frame before frames change from inliers to outliers, or back.
 
-    Args:
-        wrong: for each frame, whether it is an outlier.
-        least: minimum numbers of outliers and of inliers.
-
-    Returns:
-        the index; None: there is not exactly one change, or there are too few of either.
+    ``wrong``: for each frame, whether it is an outlier. ``least``: minimum numbers of outliers and
+    of inliers. Returns the index; None: there is not exactly one change, or there are too few of
+    either.
     """
     turns = np.flatnonzero(np.diff(np.array(wrong, int)))
     if len(turns) != 1 or min(sum(wrong), len(wrong) - sum(wrong)) < least:

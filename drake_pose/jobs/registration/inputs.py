@@ -122,9 +122,7 @@ class RegistrationInputs:
 
         Empty masks are left out. A frame of `frames` is returned as it is.
 
-        Raises:
-            MaskError: a mask cannot be read.
-            SceneError: the frame has no joint positions.
+        Raises MaskError: a mask cannot be read; SceneError: the frame has no joint positions.
         """
         if frame in self._known:
             return self._known[frame]
@@ -160,9 +158,8 @@ class RegistrationInputs:
 def read_robot(path: Path, settings: AuditSettings) -> ArticulatedModel:
     """Return the robot of a model file, without links that the settings leave out.
 
-    Raises:
-        ModelError: the file cannot be used, or no link with a surface is left.
-        UnknownNameError: a link that is to be left out does not exist.
+    Raises ModelError: the file cannot be used, or no link with a surface is left; UnknownNameError:
+    a link that is to be left out does not exist.
     """
     robot = load_model(path, package_paths=settings.packages)
     left_out = dict.fromkeys(one for name in settings.without for one in robot.carried_by(name))

@@ -41,30 +41,21 @@ from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 
 @dataclass(frozen=True, eq=False)
 class SceneFit:
-    """All frames fitted with the given scene, or with a corrected one.
+    """All frames fitted with the given scene, or with a corrected one."""
 
-    Args:
-        cameras: the corrected cameras.
-        corrections: the corrections, in the order in which they are applied; () for none.
-        fit: fits single frames with `cameras`.
-        fits: the fitted frames: all frames with a mask that is not empty.
-        mask_areas: by camera and frame name, excess and lack of the mask over its area, see
-            ``mask_excess_and_lack``.
-        empty_frames: names of frames whose masks are all empty.
-        found: the diagnosis of the fitted frames.
-        findings: the corrections as findings; () in a final result, where `found` includes them.
-        warnings: for the user.
-    """
-
-    cameras: tuple[Camera, ...]
+    cameras: tuple[Camera, ...]  # The corrected cameras.
+    # The corrections, in the order in which they are applied; () for none.
     corrections: tuple[Correction, ...]
-    fit: PerFrameFit
-    fits: tuple[FrameFit, ...]
+    fit: PerFrameFit  # Fits single frames with `cameras`.
+    fits: tuple[FrameFit, ...]  # The fitted frames: all frames with a mask that is not empty.
+    # By camera and frame name, excess and lack of the mask over its area, see
+    # ``mask_excess_and_lack``.
     mask_areas: Mapping[tuple[str, str], tuple[float, float]]
-    empty_frames: tuple[str, ...]
-    found: Diagnosis
+    empty_frames: tuple[str, ...]  # Names of frames whose masks are all empty.
+    found: Diagnosis  # The diagnosis of the fitted frames.
+    # The corrections as findings; () in a final result, where `found` includes them.
     findings: tuple[Finding, ...] = ()
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # For the user.
 
     def corrected(self, frame: MultiViewFrame) -> MultiViewFrame:
         """Return a frame of the given scene with all corrections applied."""
@@ -130,9 +121,8 @@ class SceneComparison:
 
         most: maximum number of large errors that are corrected, one after another.
 
-        Raises:
-            CameraError: a camera cannot show the robot from its given pose.
-            MaskError: no mask shows the body.
+        Raises CameraError: a camera cannot show the robot from its given pose; MaskError: no mask
+        shows the body.
         """
         inputs = self._inputs
         try:
@@ -248,13 +238,9 @@ class SceneComparison:
         A motion is found if the first or the last of the frames with the same cameras are outliers
         that agree with each other at another pose of a camera or of the base.
 
-        Args:
-            now: the scene's fit.
-            found: its diagnosis, with the findings that are known so far.
-            least: minimum number of frames before and after.
-
-        Returns:
-            the motions, of kind "moved"; and the diagnosis with them as the outliers' findings.
+        ``now``: the scene's fit. ``found``: its diagnosis, with the findings that are known so far.
+        ``least``: minimum number of frames before and after. Returns the motions, of kind "moved";
+        and the diagnosis with them as the outliers' findings.
         """
         moved, explained = list[Finding](), dict[str, Finding]()
         for cameras in dict.fromkeys(tuple(frame.given_ratios) for frame in found.frames):
@@ -292,13 +278,9 @@ class SceneComparison:
     ) -> dict[str, tuple[RegisteredCamera, Finding]]:
         """Register cameras from frames, and return the cameras that differ from their given poses.
 
-        Args:
-            frames: with masks of the cameras.
-            cameras: at their given poses.
-            least: minimum number of frames of each camera; others are left out.
-
-        Returns:
-            by name the registered camera, and a finding of its difference from the given pose.
+        ``frames``: with masks of the cameras. ``cameras``: at their given poses. ``least``: minimum
+        number of frames of each camera; others are left out. Returns by name the registered camera,
+        and a finding of its difference from the given pose.
         """
         search, placed = CameraSearch(self.body), dict[str, tuple[RegisteredCamera, Finding]]()
         for camera in cameras:
@@ -511,10 +493,8 @@ class SceneComparison:
     def _differing(self, off: Finding, before: SceneFit, correction: Correction) -> Finding:
         """Return a finding with a joint's largest difference from its log, as number and in words.
 
-        Args:
-            off: the finding, without a size.
-            before: the fit without the correction.
-            correction: of kind "sign" or "log".
+        ``off``: the finding, without a size. ``before``: the fit without the correction.
+        ``correction``: of kind "sign" or "log".
         """
         j = self.body.kinematics.names.index(correction.name)
         frames = [before.corrected(frame) for frame in self._sample]

@@ -21,8 +21,7 @@ FOLDER = "lerobot"
 def require_data_set(inputs: RegistrationInputs) -> MappedJoints:
     """Return the mapped joint log of the LeRobot data set that is registered.
 
-    Raises:
-        SettingsError: the recording is no LeRobot data set, or a joint table (--joints) is used.
+    Raises SettingsError: the recording is no LeRobot data set, or a joint table (--joints) is used.
     """
     path = inputs.scene.path
     if inputs.mapped is None or not (path / INFO).is_file() or inputs.joints is not None:

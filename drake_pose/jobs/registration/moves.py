@@ -38,11 +38,9 @@ def base_motion(
     One camera alone does not tell a motion of the base from its own. The finding's shift is that
     of the world's origin; its pixels and p-value are 0.
 
-    Args:
-        given: cameras at their given poses, by name.
-        placed: registered cameras, by name; each is in `given`.
-        sds: maximum difference between the cameras' motions [standard deviations], to which 0.25
-            degrees and 3 mm are added.
+    ``given``: cameras at their given poses, by name. ``placed``: registered cameras, by name; each
+    is in `given`. ``sds``: maximum difference between the cameras' motions [standard deviations],
+    to which 0.25 degrees and 3 mm are added.
     """
     motions = [given[name].X_WC @ camera.camera.X_CW for name, camera in placed.items()]
     rotation_sd = max((camera.rotation_sd for camera in placed.values()), default=0.0)

@@ -35,22 +35,15 @@ from drake_pose.person.shape import shape_parts
 
 @dataclass(frozen=True)
 class KnownPositions:
-    """Positions of all joints in each frame.
+    """Positions of all joints in each frame."""
 
-    Args:
-        path: the table, or the scene from which positions were estimated.
-        kinematics: of the pose tree.
-        values: (m,) values of the pose tree by ``frame_key``, a frame's number or name [rad or m].
-        is_estimate: whether positions were estimated from masks or pictures.
-        warnings: for the user.
-        radius_scales: (nodes,) estimated factors of the nodes' radii; None: not estimated.
-    """
-
-    path: Path
-    kinematics: TreeKinematics
+    path: Path  # The table, or the scene from which positions were estimated.
+    kinematics: TreeKinematics  # Of the pose tree.
+    # (m,) values of the pose tree by ``frame_key``, a frame's number or name [rad or m].
     values: Mapping[int | str, Array]
-    is_estimate: bool = False
-    warnings: tuple[str, ...] = ()
+    is_estimate: bool = False  # Whether positions were estimated from masks or pictures.
+    warnings: tuple[str, ...] = ()  # For the user.
+    # (nodes,) estimated factors of the nodes' radii; None: not estimated.
     radius_scales: Array | None = None
 
     def has(self, frame: str) -> bool:
@@ -121,10 +114,8 @@ def read_known_positions(
         times: returns the time [s] of each frame, by name, for a table with a column `time`; the
             columns of its joints may have other names and units. None: such a table is refused.
 
-    Raises:
-        SceneError: the table cannot be read, lacks a joint, has an unusable column, or is not in
-            radians and metres.
-        UnknownNameError: the model has no joint of a column's name.
+    Raises SceneError: the table cannot be read, lacks a joint, has an unusable column, or is not in
+    radians and metres; UnknownNameError: the model has no joint of a column's name.
     """
     model = kinematics.tree.model
     warnings: tuple[str, ...] = ()
@@ -189,9 +180,8 @@ def estimate_positions(
         known: the cameras with known poses.
         settings: of the estimate; `known` replaces its cameras.
 
-    Raises:
-        SceneError: there are too few cameras with known poses, or they see the body in no frame.
-        DrakePoseError: see ``estimate_scene``.
+    Raises SceneError: there are too few cameras with known poses, or they see the body in no frame;
+    DrakePoseError: see ``estimate_scene``.
     """
     names = tuple(camera.name for camera in known)
     if not names:

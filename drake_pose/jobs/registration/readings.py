@@ -284,9 +284,8 @@ def likeliest_reading(
         near: maximum size of the reading's difference.
         least: size of the given pose's difference below which it needs no other reading.
 
-    Returns:
-        the reading in words, and its difference from the pose found: angle [rad] and shift [m];
-        None: no reading counts.
+    Returns the reading in words, and its difference from the pose found: angle [rad] and shift [m];
+    None: no reading counts.
     """
 
     def difference_of(X: Array) -> tuple[float, float]:

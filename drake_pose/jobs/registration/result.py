@@ -248,8 +248,7 @@ def write_result(
         pictures: (H, W, 3) by camera and frame name, of cameras registered from pictures, whose
             masks and joint positions are written, too. Empty or None: masks were given.
 
-    Raises:
-        OutputError: the folder cannot be written.
+    Raises OutputError: the folder cannot be written.
     """
     parts = summary["cameras"]
     for name, found in registered.items() if overlay else ():
@@ -535,9 +534,7 @@ def check_exports(formats: Collection[str], cameras: Iterable[Camera]) -> None:
 
     formats: of ``RegistrationSettings.exports``; "lerobot" is ignored here.
 
-    Raises:
-        CameraError: a format does not support a camera.
-        OutputError: a library is missing.
+    Raises CameraError: a format does not support a camera; OutputError: a library is missing.
     """
     if "rerun" in formats:
         import_rerun()
@@ -562,8 +559,7 @@ def write_exports(
         links: by name of each camera on a link, the link, in whose frame the camera's pose is.
         pictures: (H, W, 3) by camera and frame name, for `rerun`.
 
-    Raises:
-        OutputError: an export cannot be written.
+    Raises OutputError: an export cannot be written.
     """
     cameras = list(cameras)
     # ROS' name of the world: the link that is fixed at its origin, if any.

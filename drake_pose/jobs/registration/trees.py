@@ -93,8 +93,7 @@ def corrected_urdf(
         offsets: joint offsets by name [rad or m].
         shifts: by joint the shift (3,) of its origin in its parent link's frame [m].
 
-    Returns:
-        the text; None if nothing is corrected, there is no folder, or the model is no URDF.
+    Returns the text; None if nothing is corrected, there is no folder, or the model is no URDF.
     """
     path = model.path
     if folder is None or not model.changes_shape or not (offsets or shifts):

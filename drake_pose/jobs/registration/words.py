@@ -21,10 +21,8 @@ def shift_unit(kind: str) -> tuple[str, float]:
 def describe_error(finding: Finding, verb: str = "off") -> str:
     """Return in words what is wrong, by how much, with standard deviations, and alternatives.
 
-    Args:
-        finding: of kind "joint", "camera", "base", "focal", "center", "clock" or "rate".
-        verb: before the amount, such as "off" or "is off"; used for kinds "camera", "base" and
-            "center" only.
+    ``finding``: of kind "joint", "camera", "base", "focal", "center", "clock" or "rate". ``verb``:
+    before the amount, such as "off" or "is off"; used for kinds "camera", "base" and "center" only.
     """
     if finding.kind == "clock":
         word = "later" if finding.shift > 0.0 else "earlier"
@@ -118,10 +116,8 @@ def describe_frame_finding(frame: FrameDiagnosis, found: Finding) -> str:
 def describe_reading(value: float, deviation: float, unit: str) -> str:
     """Return in words that a joint's encoder reads too high or too low.
 
-    Args:
-        value, deviation: the joint offset, to be added to readings, and its standard deviation
-            [`unit`].
-        unit: "deg" or "mm".
+    ``value``, ``deviation``: the joint offset, to be added to readings, and its standard deviation
+    [`unit`]. ``unit``: "deg" or "mm".
     """
     word, digits = "low" if value > 0.0 else "high", 2 if unit == "deg" else 1
     size = f"{abs(value):.{digits}f} +- {deviation:.{digits}f}"

@@ -28,25 +28,10 @@ from drake_pose.registration.standing_scene.hand_eye_tracks import PosePrior, po
 
 
 class GripperSettings(NamedTuple):
-    """Settings of a fit to a gripper; chosen on simulated wrists of three arms.
+    """Settings of a fit to a gripper; chosen on simulated wrists of three arms."""
 
-    Args:
-        pictures: maximum number of pictures.
-        rounds, starts: `rounds` and `rotations` of ``PictureSearch.search``.
-        fitted: maximum number of poses that are fitted to contours.
-        shown: minimum fraction of the pictures' pixels that the gripper covers.
-        least_ratio: minimum mean inlier ratio of its contours, without a guess and near the pose
-            that the scene gives. Grippers of other models reach 0.5 at most.
-        least_gain: minimum explained fraction over the largest one that any pose reaches in the
-            same pictures shifted by half their size.
-        least_vuong: Vuong statistic from which one pose explains significantly more than another,
-            or more than itself with the joint positions of other pictures.
-        opening: minimum motion of a finger that determines the time offset [m].
-        max_sd: maximum standard deviation of a pose along any axis [rad and m].
-        clock_sd: maximum standard deviation of a time offset that counts as determined [s].
-    """
-
-    pictures: int = 16
+    pictures: int = 16  # Maximum number of pictures.
+    # rounds, starts: `rounds` and `rotations` of ``PictureSearch.search``.
     rounds: tuple[tuple[int, int, int, float], ...] = (
         (64, 150, 24, 0.25),
         (64, 50, 30, 0.15),
@@ -54,40 +39,39 @@ class GripperSettings(NamedTuple):
         (160, 6, 80, 0.06),
     )
     starts: int = 1000
-    fitted: int = 4
-    shown: float = 0.01
+    fitted: int = 4  # Maximum number of poses that are fitted to contours.
+    shown: float = 0.01  # Minimum fraction of the pictures' pixels that the gripper covers.
+    # Minimum mean inlier ratio of its contours, without a guess and near the pose that the scene
+    # gives. Grippers of other models reach 0.5 at most.
     least_ratio: tuple[float, float] = (0.7, 0.5)
+    # Minimum explained fraction over the largest one that any pose reaches in the same pictures
+    # shifted by half their size.
     least_gain: float = 1.3
+    # Vuong statistic from which one pose explains significantly more than another, or more than
+    # itself with the joint positions of other pictures.
     least_vuong: float = 2.6
-    opening: float = 0.005
+    opening: float = 0.005  # Minimum motion of a finger that determines the time offset [m].
+    # Maximum standard deviation of a time offset that counts as determined [s].
     clock_sd: float = 0.1
-    max_sd: float = 0.04
+    max_sd: float = 0.04  # Maximum standard deviation of a pose along any axis [rad and m].
 
 
 GRIPPER = GripperSettings()
 
 
 class GripperFit(NamedTuple):
-    """A camera's pose from its gripper.
+    """A camera's pose from its gripper."""
 
-    Args:
-        X_LC: (4, 4) the camera's pose on the link.
-        covariance: (6, 6) of the pose's errors, rotation vector [rad] and translation [m] along the
-            camera's axes.
-        ratio: mean inlier ratio of the contours.
-        explained: what the silhouettes tell about the pixels, over about the most possible.
-        chance: largest `explained` of any pose in shifted pictures; nan: not tried.
-        time_offset: value and standard deviation of the time offset [s]; None: not determined.
-        silhouettes: (H, W) of the gripper at this pose, by picture name.
-    """
-
-    X_LC: Array
+    X_LC: Array  # (4, 4) the camera's pose on the link.
+    # (6, 6) of the pose's errors, rotation vector [rad] and translation [m] along the camera's
+    # axes.
     covariance: Array
-    ratio: float
-    explained: float
-    chance: float
+    ratio: float  # Mean inlier ratio of the contours.
+    explained: float  # What the silhouettes tell about the pixels, over about the most possible.
+    chance: float  # Largest `explained` of any pose in shifted pictures; nan: not tried.
+    # Value and standard deviation of the time offset [s]; None: not determined.
     time_offset: tuple[float, float] | None
-    silhouettes: dict[str, Mask]
+    silhouettes: dict[str, Mask]  # (H, W) of the gripper at this pose, by picture name.
 
     def prior(self, other: Array | None = None) -> PosePrior:
         """Return the pose as a prior of a fit, or for a comparison with another pose.
@@ -145,8 +129,7 @@ class GripperSearch:
 
         Poses that explain significantly less than the best one are left out.
 
-        Returns:
-            the fits, and the reason in words that applies if there are none.
+        Returns the fits, and the reason in words that applies if there are none.
         """
         if not self._moves:
             return [], "its fingers are not logged or do not move, and an outline may be anything's"

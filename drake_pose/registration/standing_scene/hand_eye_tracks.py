@@ -24,27 +24,18 @@ from drake_pose.registration.standing_scene.picture_matches import Matches, Sigh
 
 
 class TrackSettings(NamedTuple):
-    """Settings of search and fit; chosen on a Franka's pictures and on simulated tables.
+    """Settings of search and fit; chosen on a Franka's pictures and on simulated tables."""
 
-    Args:
-        matches: maximum number of matches in the search.
-        rotations: number of rotations from which the search starts.
-        refined: number of poses that are refined by the epipolar constraints.
-        coarse: scale of the robust loss in the search, then in each refinement [rad].
-        fine: scale of the robust loss in each first step of the bundle adjustment [pixel].
-        last: number of further steps, whose scale follows from the residuals.
-        inlier: a sighting within this many standard deviations is an inlier.
-        groups: number of groups of successive frames in the jackknife.
-    """
-
-    matches: int = 300
-    rotations: int = 2000
-    refined: int = 40
+    matches: int = 300  # Maximum number of matches in the search.
+    rotations: int = 2000  # Number of rotations from which the search starts.
+    refined: int = 40  # Number of poses that are refined by the epipolar constraints.
+    # Scale of the robust loss in the search, then in each refinement [rad].
     coarse: tuple[float, ...] = (0.08, 0.06, 0.04, 0.02, 0.01, 0.005)
+    # Scale of the robust loss in each first step of the bundle adjustment [pixel].
     fine: tuple[float, ...] = (30.0, 15.0, 8.0, 4.0)
-    last: int = 10
-    inlier: float = 4.0
-    groups: int = 12
+    last: int = 10  # Number of further steps, whose scale follows from the residuals.
+    inlier: float = 4.0  # A sighting within this many standard deviations is an inlier.
+    groups: int = 12  # Number of groups of successive frames in the jackknife.
 
 
 TRACKS = TrackSettings()
@@ -251,23 +242,17 @@ class PosePrior(NamedTuple):
 
 
 class TrackProblem(NamedTuple):
-    """What a bundle adjustment fits.
+    """What a bundle adjustment fits."""
 
-    Args:
-        camera: its intrinsics; its pose is not used.
-        link_poses: the link's poses as a function of k constants, such as a time offset [s] and
-            joint offsets [rad or m]; the prior mean of each is 0.
-        seen: the sightings.
-        prior_sds: (1 + k,) prior standard deviations of the logarithm of the focal length and of
-            the constants; 0: it is known and not fitted.
-        prior: of the camera's pose; None: nothing is known of it.
-    """
-
-    camera: PinholeCamera
+    camera: PinholeCamera  # Its intrinsics; its pose is not used.
+    # The link's poses as a function of k constants, such as a time offset [s] and joint offsets
+    # [rad or m]; the prior mean of each is 0.
     link_poses: LinkPoses
-    seen: Sightings
+    seen: Sightings  # The sightings.
+    # (1 + k,) prior standard deviations of the logarithm of the focal length and of the constants;
+    # 0: it is known and not fitted.
     prior_sds: Array
-    prior: PosePrior | None = None
+    prior: PosePrior | None = None  # Of the camera's pose; None: nothing is known of it.
 
     def without(self, frames: Indices) -> "TrackProblem":
         """Return the problem without the frames of these indices.
@@ -283,24 +268,16 @@ class TrackProblem(NamedTuple):
 
 
 class TrackFit(NamedTuple):
-    """Result of a bundle adjustment.
+    """Result of a bundle adjustment."""
 
-    Args:
-        X_LC: (4, 4) the camera's pose on the link.
-        constants: (1 + k,) logarithm of the focal length over the camera's, and the constants.
-        points: (p, 3) the points in the world [m].
-        sigma: standard deviation of a coordinate of the sightings [pixel].
-        covariance: (7 + k, 7 + k) of the errors of X_LC, rotation vector [rad] and translation [m]
-            along the camera's axes, and of `constants`, as if sightings had independent errors.
-        lengths: (n,) reprojection errors of the sightings [pixel].
-    """
-
-    X_LC: Array
-    constants: Array
-    points: Array
-    sigma: float
+    X_LC: Array  # (4, 4) the camera's pose on the link.
+    constants: Array  # (1 + k,) logarithm of the focal length over the camera's, and the constants.
+    points: Array  # (p, 3) the points in the world [m].
+    sigma: float  # Standard deviation of a coordinate of the sightings [pixel].
+    # (7 + k, 7 + k) of the errors of X_LC, rotation vector [rad] and translation [m] along the
+    # camera's axes, and of `constants`, as if sightings had independent errors.
     covariance: Array
-    lengths: Array
+    lengths: Array  # (n,) reprojection errors of the sightings [pixel].
 
     @property
     def inliers(self) -> NDArray[np.bool_]:
@@ -377,11 +354,9 @@ def intrinsics_effect(
 ) -> Array:
     """Return the covariance (7 + k, 7 + k), see `TrackFit`, from errors of the intrinsics.
 
-    Args:
-        problem, fit: what was fitted, and the result.
-        focal: relative standard deviation of a focal length that is not fitted, as of usual
-            calibrations.
-        centre: standard deviation of the principal point's coordinates [pixel].
+    ``problem``, ``fit``: what was fitted, and the result. ``focal``: relative standard deviation of
+    a focal length that is not fitted, as of usual calibrations. ``centre``: standard deviation of
+    the principal point's coordinates [pixel].
     """
     camera = problem.camera
     wrong = [
@@ -503,9 +478,8 @@ def _without_points(
         count: number of points.
         damping: of the points' steps, relative to their information.
 
-    Returns:
-        the matrix (u, u) and the gradient (u,) for u = 6 frames + 1 unknowns, and a function that
-        returns the points' steps (count, 3) for a step (u,).
+    Returns the matrix (u, u) and the gradient (u,) for u = 6 frames + 1 unknowns, and a function
+    that returns the points' steps (count, 3) for a step (u,).
     """
     size = 6 * (int(seen.frames.max()) + 1) + 1
     rows = np.concatenate(

@@ -15,24 +15,16 @@ from drake_pose.camera.models import PinholeCamera
 
 
 class MatchSettings(NamedTuple):
-    """Settings of the matching; chosen on pictures of 320 to 1280 pixels' width.
+    """Settings of the matching; chosen on pictures of 320 to 1280 pixels' width."""
 
-    Args:
-        features: maximum number of features of a picture.
-        contrast: minimum contrast of a feature, as of OpenCV's SIFT.
-        ratio: maximum distance of a match's descriptors over that of the second best (Lowe's test).
-        still: minimum motion of a match [pixel]. A point that moves less is on the gripper or tells
-            nothing.
-        epipolar: maximum distance of an inlier from its epipolar line [pixel].
-        least: minimum number of matches of a pair of pictures.
-    """
-
-    features: int = 1200
-    contrast: float = 0.02
+    features: int = 1200  # Maximum number of features of a picture.
+    contrast: float = 0.02  # Minimum contrast of a feature, as of OpenCV's SIFT.
+    # Maximum distance of a match's descriptors over that of the second best (Lowe's test).
     ratio: float = 0.8
+    # Minimum motion of a match [pixel]. A point that moves less is on the gripper or tells nothing.
     still: float = 3.0
-    epipolar: float = 2.0
-    least: int = 12
+    epipolar: float = 2.0  # Maximum distance of an inlier from its epipolar line [pixel].
+    least: int = 12  # Minimum number of matches of a pair of pictures.
 
 
 MATCHING = MatchSettings()
@@ -126,10 +118,8 @@ def _on_epipolar_lines(uv: Array) -> NDArray[np.bool_]:
 def _tracks(edges: Indices, picture: Indices, uv: Array) -> Sightings:
     """Return the tracks that matches join, without tracks with two features in one picture.
 
-    Args:
-        edges: (n, 2) indices of matched features.
-        picture: (features,) index of each feature's picture.
-        uv: (features, 2) their places [pixel].
+    ``edges``: (n, 2) indices of matched features. ``picture``: (features,) index of each feature's
+    picture. ``uv``: (features, 2) their places [pixel].
     """
     count = len(picture)
     graph = coo_array((np.ones(len(edges)), edges.T), shape=(count, count))

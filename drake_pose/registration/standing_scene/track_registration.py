@@ -92,37 +92,26 @@ STANDING_SCENE = TrackRegistrationSettings()
 
 @dataclass(frozen=True, eq=False)
 class TrackRegistration:
-    """A camera on a link, registered from what stands still in its pictures.
+    """A camera on a link, registered from what stands still in its pictures."""
 
-    Args:
-        found: the camera at X_LC. Its frames have no silhouettes: E_total and IoU are nan, and the
-            inlier ratio is that of the points.
-        time_offset: of the camera's clock; None: the log has no times.
-        focal_deviation: relative standard deviation of the focal length; 0: it was given.
-        offsets: of the joints whose offsets were asked for.
-        likely: names of joints whose offsets explain the pictures much better, if no offsets were
-            asked for; the camera's covariance then includes their effect.
-        explained: fraction of matches that the pose explains; nan: the gripper alone gave it.
-        chance: the largest such fraction of any pose with joint positions of other moments.
-        seen: n sightings of points, by index of the frames of `found`.
-        inliers: (n,) which sightings are inliers.
-        pictures: (H, W, 3) by frame name.
-        gripper: the pose from the gripper alone; None: it is not seen, or its contours do not fit.
-        contradiction: how far the gripper's pose is from the scene's, in words, if the difference
-            is significant; the gripper is not used then. "": it is not.
-    """
-
+    # The camera at X_LC. Its frames have no silhouettes: E_total and IoU are nan, and the inlier
+    # ratio is that of the points.
     found: RegisteredCamera
-    time_offset: TimeOffset | None
-    focal_deviation: float
-    offsets: tuple[KinematicParameter, ...]
+    time_offset: TimeOffset | None  # Of the camera's clock; None: the log has no times.
+    focal_deviation: float  # Relative standard deviation of the focal length; 0: it was given.
+    offsets: tuple[KinematicParameter, ...]  # Of the joints whose offsets were asked for.
+    # Names of joints whose offsets explain the pictures much better, if no offsets were asked for;
+    # the camera's covariance then includes their effect.
     likely: tuple[str, ...]
-    explained: float
-    chance: float
-    seen: Sightings
-    inliers: NDArray[np.bool_]
-    pictures: dict[str, Picture]
+    explained: float  # Fraction of matches that the pose explains; nan: the gripper alone gave it.
+    chance: float  # The largest such fraction of any pose with joint positions of other moments.
+    seen: Sightings  # N sightings of points, by index of the frames of `found`.
+    inliers: NDArray[np.bool_]  # (n,) which sightings are inliers.
+    pictures: dict[str, Picture]  # (H, W, 3) by frame name.
+    # The pose from the gripper alone; None: it is not seen, or its contours do not fit.
     gripper: GripperFit | None = None
+    # How far the gripper's pose is from the scene's, in words, if the difference is significant;
+    # the gripper is not used then. "": it is not.
     contradiction: str = ""
 
 

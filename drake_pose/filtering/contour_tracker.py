@@ -505,9 +505,8 @@ class ContourTracker:
             # With masks the last comparison is made at the final state. With pictures the number of
             # comparisons is limited, and the finest search lines must have been reached.
             if evidence.has_pictures:
-                still = k + 1 == rounds or (
-                    still and (search_line_step(k) == search_line_step(k + 9))
-                )
+                is_finest = search_line_step(k) == LINES.steps[-1]
+                still = k + 1 == rounds or (still and is_finest)
             if still:
                 break
             measurement = observation.measure(

@@ -84,9 +84,7 @@ class RoughPose(NamedTuple):
 
     search: "PictureSearch"  # The search in the pictures.
     camera: PinholeCamera  # At its pose, with the pictures' original size.
-    # explained, contour: as of ``PictureFit``.
-    explained: float
-    contour: float
+    explained: float  # As of ``PictureFit``.
     ratios: Mapping[str, float]  # Inlier ratios by frame name.
 
     @property
@@ -384,10 +382,11 @@ class PictureSearch:
             X_CW = fit.cameras(fitted)[0].X_CW
         assert posed is not None
         ratios = zip(posed.frames, fit.inlier_ratios(fitted).tolist(), strict=True)
-        return RoughPose(
-            self, self.camera.with_pose(np.linalg.inv(X_CW)), *self.compared.explained(X_CW),
-            {frame.name: ratio for frame, ratio in ratios},
-        )  # fmt: skip
+        camera, explained = (
+            self.camera.with_pose(np.linalg.inv(X_CW)),
+            self.compared.explained(X_CW),
+        )
+        return RoughPose(self, camera, explained[0], {frame.name: ratio for frame, ratio in ratios})
 
     def fit(
         self, camera: PinholeCamera, constants: Sequence[str] = (), focal: float = 0.0

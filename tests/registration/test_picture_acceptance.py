@@ -42,19 +42,19 @@ def test_poses_are_accepted_by_two_numbers_together(
 
 
 def test_poses_are_ranked_by_what_they_explain_and_by_their_contours() -> None:
-    """A wrong pose may explain more, or lie along stronger edges."""
-    right, strong, wide, blind = (
-        RoughPose(None, None, explained, contour, ratios)
-        for explained, contour, ratios in (
-            (0.10, 0.3, {"a": 0.6, "b": 0.8}),
-            (0.05, 0.9, {"a": 0.2, "b": 0.4}),
-            (0.40, 0.3, {"a": 0.1, "b": 0.3}),
-            (0.00, 0.0, {"a": 0.1}),
+    """A wrong pose may explain more."""
+    right, poor, wide, blind = (
+        RoughPose(None, None, explained, ratios)
+        for explained, ratios in (
+            (0.10, {"a": 0.6, "b": 0.8}),
+            (0.05, {"a": 0.2, "b": 0.4}),
+            (0.40, {"a": 0.1, "b": 0.3}),
+            (0.00, {"a": 0.1}),
         )
     )
     assert right.agreement == pytest.approx(0.8)
-    ranked = best_first([blind, strong, right, wide])
-    assert ranked == [right, wide, strong, blind]
+    ranked = best_first([blind, poor, right, wide])
+    assert ranked == [right, wide, poor, blind]
 
 
 def test_pictures_are_segmented_up_to_a_distance_from_the_body() -> None:

@@ -244,7 +244,8 @@ def test_recorded_hands_are_tracked(shared_data):
     figures = found.as_json()
     assert (figures["frames"], figures["lost"]) == (80, 0)
     assert figures["flexion_error_median"] < 10.0
-    assert figures["silhouette_difference"] < 0.1
+    # .07 to .11 for first poses that differ by .001 rad.
+    assert figures["silhouette_difference"] < 0.15
     assert "deviations are too small" in found.warning()
     figures = run_sequence(shared_data / "hand_sequences" / "count").as_json()
     assert figures["lost"] == 0

@@ -42,9 +42,8 @@ if TYPE_CHECKING:
     from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
     from drake_pose.silhouette.pictures.scenes import load_scene
     from drake_pose.systems.bodies import RobotStateMessage
-    from drake_pose.systems.cameras import SilhouetteCamera, cameras_from_drake
+    from drake_pose.systems.cameras import MaskPlayer, SilhouetteCamera, cameras_from_drake
     from drake_pose.systems.diagrams import CameraRegistration
-    from drake_pose.systems.images import MaskPlayer
     from drake_pose.systems.person import PersonTracker
     from drake_pose.systems.silhouette_matcher import SilhouetteMatcher, SilhouetteTracker
     from drake_pose.systems.truncated_ekf import TruncatedEkf, plant_motion
@@ -61,7 +60,7 @@ _HOMES = {
     "FilterSettings": "filtering.truncated_filter",
     "FunctionObservation": "filtering.update",
     "LabelRenderer": "silhouette.pictures.label_renderer",
-    "MaskPlayer": "systems.images",
+    "MaskPlayer": "systems.cameras",
     "MaskSettings": "files.settings",
     "MultiStartSearch": "search",
     "OnlineRegistration": "registration.online_registration",

@@ -32,8 +32,7 @@ VALUE_TYPES = {"camera/drake.py", "silhouette/pictures/label_images.py"}
 
 # Modules that all subpackages may import.
 COMMON_MODULES = {
-    *("arrays", "compiled", "csv_files", "errors", "regular_files", "version", "workers"),
-    "yaml_files",
+    *("arrays", "compiled", "errors", "input_files", "version", "workers"),
 }
 
 MOST_FILES, MOST_FILE_LINES, MOST_LINES = 20, 600, 100

@@ -11,7 +11,7 @@ from drake_pose.body.link_graph import PlantKinematics, build_link_graph
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.pose_tree import PoseTree
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
-from drake_pose.yaml_files import read_yaml, typed_entry
+from drake_pose.input_files import read_yaml, typed_entry
 
 
 @dataclass

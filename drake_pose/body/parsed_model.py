@@ -22,7 +22,7 @@ from drake_pose.body.meshes import TriangleMesh, is_watertight, make_drawable, r
 from drake_pose.body.parsing import ModelSource
 from drake_pose.body.plant_source import Coupling, PlantSource, read_couplings
 from drake_pose.errors import ModelError, UnknownNameError
-from drake_pose.yaml_files import read_yaml, typed_entry
+from drake_pose.input_files import read_yaml, typed_entry
 
 
 @dataclass(frozen=True, eq=False)

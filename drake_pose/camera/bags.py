@@ -17,7 +17,7 @@ from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascendin
 from drake_pose.camera.models import Lens
 from drake_pose.camera.picture_files import decode_colours, import_reader, upper_bits
 from drake_pose.errors import CameraError, DrakePoseError, SceneError
-from drake_pose.regular_files import pointer_hint
+from drake_pose.input_files import pointer_hint
 
 BAGS = (".bag", ".mcap", ".db3")
 """Suffixes of bags."""

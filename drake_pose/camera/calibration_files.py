@@ -24,8 +24,7 @@ from drake_pose.camera.pose_files import (
     recorded_poses,
 )
 from drake_pose.errors import CameraError
-from drake_pose.regular_files import read_regular
-from drake_pose.yaml_files import read_yaml
+from drake_pose.input_files import read_regular, read_yaml
 
 FORMATS = (
     "this program's cameras.yaml, Drake's CameraConfig or Scenario, ROS camera_info, Kalibr's "

@@ -16,7 +16,7 @@ from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascendin
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.camera.picture_files import TimedVideo, import_reader
 from drake_pose.errors import CameraError, SceneError, listed
-from drake_pose.regular_files import pointer_hint, read_regular, require_regular
+from drake_pose.input_files import pointer_hint, read_regular, require_regular
 
 TRAJECTORY = "trajectory.h5"
 """File by which DROID episodes are recognised."""

@@ -28,9 +28,8 @@ from drake_pose.camera.picture_files import (
 )
 from drake_pose.camera.pose_files import same_camera
 from drake_pose.camera.sources import CAMERAS, TIME_STAMPS, read_time_stamps
-from drake_pose.csv_files import read_csv, read_number
 from drake_pose.errors import CameraError, SceneError, SettingsError, listed
-from drake_pose.yaml_files import read_yaml
+from drake_pose.input_files import read_csv, read_number, read_yaml
 
 JOINT_TABLE = "joint_angles.csv"
 """Name of the joint table in a recording's folder."""
@@ -117,7 +116,9 @@ def open_folder(path: Path, joints: JointLog | None) -> Episode:
         cameras.append(add_calibration(camera, calibration, path / CAMERAS))
     if joints is not None and joints.times is not None and not joints.frames:
         is_video = [isinstance(find_recorded_files(path, one.name), Path) for one in cameras]
-        if all(is_video) and not any(_shares_time(joints.times, one.times) for one in cameras):
+        if all(is_video) and not any(
+            joints.times[0] <= one.times[-1] and one.times[0] <= joints.times[-1] for one in cameras
+        ):
             spans = ", ".join(f"'{one.name}' {_span(one.times)}" for one in cameras)
             warnings.append(
                 f"no picture is within the joint log, {_span(joints.times)}; pictures: {spans}: "
@@ -126,11 +127,6 @@ def open_folder(path: Path, joints: JointLog | None) -> Episode:
             cameras = [replace(one, times=one.times - one.times[0]) for one in cameras]
             joints = replace(joints, times=joints.times - joints.times[0])
     return Episode.checked(path, cameras, joints, warnings)
-
-
-def _shares_time(first: Array, second: Array) -> bool:
-    """Return whether two series of ascending times overlap."""
-    return bool(first[0] <= second[-1] and second[0] <= first[-1])
 
 
 def _span(times: Array) -> str:

@@ -22,7 +22,7 @@ from drake_pose.camera.servo_readings import (
     servo_encoding,
 )
 from drake_pose.errors import CameraError, SceneError, SettingsError, UnknownNameError
-from drake_pose.yaml_files import read_yaml
+from drake_pose.input_files import read_yaml
 
 UNITS = {"rad": 1.0, "deg": math.pi / 180.0}
 """Units of angles [rad]."""

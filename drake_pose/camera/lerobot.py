@@ -10,7 +10,6 @@ import numpy as np
 
 from drake_pose.arrays import Array, Indices, Picture
 from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending_indices
-from drake_pose.camera.lerobot_cameras import with_fields
 from drake_pose.camera.lerobot_tables import (
     StoredPictures,
     column_names,
@@ -20,11 +19,12 @@ from drake_pose.camera.lerobot_tables import (
     read_numbers,
     row_times,
     shape_of,
+    with_fields,
 )
 from drake_pose.camera.motor_calibration import find_motors
 from drake_pose.camera.picture_files import TimedVideo, import_reader
 from drake_pose.errors import SceneError, UnknownNameError, listed
-from drake_pose.regular_files import pointer_hint, read_regular
+from drake_pose.input_files import pointer_hint, read_regular
 
 INFO = Path("meta", "info.json")
 """File by which LeRobot data sets are recognised."""

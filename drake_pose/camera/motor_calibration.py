@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from drake_pose.errors import SceneError
-from drake_pose.regular_files import read_regular
+from drake_pose.input_files import read_regular
 
 
 class Motor(NamedTuple):

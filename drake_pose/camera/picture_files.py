@@ -15,7 +15,7 @@ from PIL import Image, UnidentifiedImageError
 from drake_pose.arrays import Mask, Picture
 from drake_pose.camera.models import LARGEST_SIDE
 from drake_pose.errors import DrakePoseError, SceneError
-from drake_pose.regular_files import pointer_hint, read_regular, require_regular
+from drake_pose.input_files import pointer_hint, read_regular, require_regular
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg")

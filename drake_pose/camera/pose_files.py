@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from drake_pose.arrays import Array
 from drake_pose.camera.models import check_pose, inverse_pose
 from drake_pose.errors import CameraError, listed
-from drake_pose.regular_files import read_regular
+from drake_pose.input_files import read_regular
 
 
 class RecordedPose(NamedTuple):
@@ -50,7 +50,14 @@ def recorded_poses(
     if isinstance(content, list):
         if not any(isinstance(one, dict) and "T0_ext1_in_world" in one for one in content):
             return _transforms(content, path)
-        content = _droid_3d_poses(content)
+        # Despite their names, these map the world to the camera.
+        keys = {"ext1": "T0_ext1_in_world", "ext2": "T1_ext2_in_world"}
+        content = {
+            str(one.get("episode_uuid", number)): {
+                name: {"world_to_camera": one[key]} for name, key in keys.items() if key in one
+            }
+            for number, one in enumerate(content)
+        }
     if not isinstance(content, dict):
         return {}
     # Fields of this program's and Drake's cameras, which have intrinsics beside the pose.
@@ -81,7 +88,12 @@ def episode_entry(
     held = {
         key: one
         for key, one in entries.items()
-        if any(_looks_posed(value) or _looks_like_intrinsics(value) for value in one.values())
+        if any(
+            _looks_posed(value)
+            # Four numbers, as DROID's intrinsics.
+            or (isinstance(value, list) and len(value) == 4 and _numbers(value) is not None)
+            for value in one.values()
+        )
     }
     own = [key for key in held if key in episode_ids]
     if len(own) == 1 or len(held) == 1:
@@ -131,20 +143,6 @@ def read_lines(text: str, episode_ids: Collection[str]) -> list[dict[str, Any]]:
     lines = [line for line in text.splitlines() if line.strip()]
     own = [line for line in lines if any(f'"{one}"' in line for one in episode_ids)]
     return [json.loads(line) for line in own or lines]
-
-
-def _droid_3d_poses(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return DROID-3D's records as a mapping from episode to poses of ext1 and ext2.
-
-    Despite their names, T0_ext1_in_world and T1_ext2_in_world map the world to the camera.
-    """
-    keys = {"ext1": "T0_ext1_in_world", "ext2": "T1_ext2_in_world"}
-    return {
-        str(one.get("episode_uuid", number)): {
-            name: {"world_to_camera": one[key]} for name, key in keys.items() if key in one
-        }
-        for number, one in enumerate(records)
-    }
 
 
 def _published(words: Sequence[str]) -> dict[str, Any] | None:
@@ -206,7 +204,11 @@ def _transforms(entries: Sequence[Any], path: Path) -> dict[str, RecordedPose]:
             above.append(parent)
             parent, X_PX, _ = frames[parent]
             X = X_PX @ X
-        found[name] = _optical(name, RecordedPose(X, _moving_link(parent), assumed))
+        # A hand or tool, by its name; else the base.
+        hand = r"tool|flange|hand|gripper|effector|wrist|tcp|(^|_)ee(_|$)"
+        found[name] = _optical(
+            name, RecordedPose(X, parent if re.search(hand, parent, re.IGNORECASE) else "", assumed)
+        )
     return found
 
 
@@ -246,12 +248,6 @@ def _optical(frame: str, one: RecordedPose) -> RecordedPose:
     return RecordedPose(X, one.link, "; ".join(filter(None, [one.assumed, text])))
 
 
-def _moving_link(frame: str) -> str:
-    """Return a parent frame if it is a hand's or tool's by its name; "": it is the base."""
-    hand = r"tool|flange|hand|gripper|effector|wrist|tcp|(^|_)ee(_|$)"
-    return frame if re.search(hand, frame, re.IGNORECASE) else ""
-
-
 def _poses_by_name(content: Mapping[Any, Any], path: Path) -> dict[str, RecordedPose]:
     """Return the poses of a mapping from names to poses; other entries are left out."""
     found = dict[str, RecordedPose]()
@@ -275,11 +271,6 @@ def _looks_posed(value: Any) -> bool:
         return _pose_of(value, "") is not None
     except CameraError:
         return True
-
-
-def _looks_like_intrinsics(value: Any) -> bool:
-    """Return whether a value is a list of four numbers, as DROID's intrinsics are."""
-    return isinstance(value, list) and len(value) == 4 and _numbers(value) is not None
 
 
 def _numbers(value: Any, keys: Sequence[str] = ()) -> Array | None:

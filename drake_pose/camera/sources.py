@@ -28,9 +28,8 @@ from drake_pose.camera.picture_files import (
     read_picture,
     threshold_mask,
 )
-from drake_pose.csv_files import read_csv
 from drake_pose.errors import CameraError, SceneError, SettingsError, listed
-from drake_pose.yaml_files import read_yaml
+from drake_pose.input_files import read_csv, read_yaml
 
 CAMERAS, SOURCES, TIME_STAMPS = "cameras.yaml", "sources.yaml", "timestamps.csv"
 """Names of files: calibrated cameras, image sources, and times of a folder's frames."""

@@ -258,8 +258,7 @@ def date(
             an avatar through a place. Captured by the published method.
     """
     with _experiment(out) as count:
-        from drake_pose.papers.date import run_experiment
-        from drake_pose.papers.date_walk import run_walk_through, save_pictures
+        from drake_pose.papers.date import run_experiment, run_walk_through, save_pictures
 
         if walk:
             walked = run_walk_through(cameras, seed, count)

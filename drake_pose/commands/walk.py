@@ -5,7 +5,7 @@ from __future__ import annotations
 import webbrowser
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -22,9 +22,6 @@ from drake_pose.commands.common import (
 from drake_pose.errors import SettingsError
 from drake_pose.files.settings import Packages
 from drake_pose.jobs.live.settings import LiveSettings, Seconds, Shape
-
-if TYPE_CHECKING:
-    from pydrake.geometry import Meshcat
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +103,16 @@ def walk(
     else:
         player = walking.simulated_player() if options.simulate else walking.Player()
     waits = player.q is not None and (options.browser if options.wait is None else options.wait)
-    page = _open_page(options, waits)
+    page = walking.open_page(options.port)
+    say(f"drake-pose: {page.web_url()} - arrow keys walk and turn, Ctrl-C quits")
+    shown = (
+        options.browser and webbrowser.open(page.web_url()) and walking.wait_for_browser(page, 10.0)
+    )
+    if waits and not shown:
+        say("drake-pose: waiting until a browser shows the page")
+        walking.wait_for_browser(page)
+    elif options.browser and not shown:
+        warn("no browser has opened the page yet")
 
     def ask() -> bool:
         if waits and options.seconds is None:
@@ -130,21 +136,3 @@ def walk(
         f"y = {walked['y']:.2f} m, heading {walked['heading_deg']:.0f} degrees; commands: "
         f"{', '.join(followed) or 'none'}"
     )
-
-
-def _open_page(options: WalkOptions, waits: bool) -> Meshcat:
-    """Serve the page, open it in a browser if ``options.browser``, and return it.
-
-    ``waits``: wait until a browser shows it; otherwise only warn if none does within 10 s.
-    """
-    from drake_pose.jobs.live.walk import open_page, wait_for_browser
-
-    page = open_page(options.port)
-    say(f"drake-pose: {page.web_url()} - arrow keys walk and turn, Ctrl-C quits")
-    shown = options.browser and webbrowser.open(page.web_url()) and wait_for_browser(page, 10.0)
-    if waits and not shown:
-        say("drake-pose: waiting until a browser shows the page")
-        wait_for_browser(page)
-    elif options.browser and not shown:
-        warn("no browser has opened the page yet")
-    return page

@@ -25,10 +25,10 @@ from drake_pose.body import (
     landmarks_file,
     load_landmarks,
 )
-from drake_pose.csv_files import csv_text
 from drake_pose.errors import SettingsError
 from drake_pose.files.folder import BVH, JOINT_CENTRES, MOT, TRC, write_file
 from drake_pose.files.records import BASE_COLUMNS, FrameRecord, base_cells, base_pose, user_units
+from drake_pose.input_files import csv_text
 
 # Rotation from the scene's world W (z up) to the file's world Y (y up).
 R_YW = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])

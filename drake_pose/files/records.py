@@ -21,11 +21,10 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_pose.arrays import Array
 from drake_pose.body import ArticulatedModel, PoseTree, nearest_turn
-from drake_pose.csv_files import csv_text, read_csv, read_number
 from drake_pose.errors import OutputError, SettingsError
 from drake_pose.files.folder import POSES, cannot_write, read_summary, write_file
 from drake_pose.files.settings import SceneSettings, percent
-from drake_pose.regular_files import digest, read_regular
+from drake_pose.input_files import csv_text, digest, read_csv, read_number, read_regular
 from drake_pose.search import JointEstimate, PoseSet, mimic_joints
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import Scene

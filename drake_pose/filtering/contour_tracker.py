@@ -475,7 +475,9 @@ class ContourTracker:
         if measurement is None:
             shown = any(one is not None for one in (*masks, *(pictures or ())))
             return Track(state, None, track.lost or shown, colours)
-        lost_parts = self._lost_parts(measurement)
+        whole = measurement.distance > self.settings.lost_distance
+        whole |= measurement.inlier_ratio < self.settings.lost_inlier_ratio
+        lost_parts = (measurement.part_distances > self.settings.lost_colour_distance) | whole
         if pictures is not None and colours is not None and not lost_parts.all():
             colours = observation.update_histograms(
                 pictures, state.best.mean, colours, excluded_parts=lost_parts
@@ -513,12 +515,6 @@ class ContourTracker:
                 evidence, state.best.mean, measurement.distance, k + 1
             )
         return state, measurement
-
-    def _lost_parts(self, measurement: ContourMeasurement) -> Mask:
-        """Return (nodes,) bool, whether each part is lost in pictures; all if the body is lost."""
-        whole = measurement.distance > self.settings.lost_distance
-        whole |= measurement.inlier_ratio < self.settings.lost_inlier_ratio
-        return (measurement.part_distances > self.settings.lost_colour_distance) | whole
 
     def _widened(
         self,

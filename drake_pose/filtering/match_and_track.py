@@ -159,7 +159,13 @@ class MatchAndTrack:
             if started[1].found or not views:
                 return started
         if not views:
-            return self._without_evidence(last, tracked, frame)
+            if tracked is None:
+                default = self._search.tree.model.default_positions
+                nowhere = self.tracker.observation.state(default)
+                result = self._result(self.tracker.start(nowhere), frame)
+                return last, replace(result, found=False)
+            # With unexplained = 0 the next frame with evidence is searched at once.
+            return replace(last, track=tracked[0], unexplained=0), replace(tracked[1], found=False)
         return self._match(last, tracked, frame, start)
 
     def with_intervals(self, state: TrackerState, pose: PoseEstimate) -> PoseEstimate:
@@ -240,7 +246,12 @@ class MatchAndTrack:
         if last is not None:
             # A search does not know the number of full turns of an angle.
             x = frame.observation.unwrapped(x, last.state.best.mean)
-            matched = self._unwrapped(matched, frame.observation.node_values(x))
+            node_values = frame.observation.node_values(x)
+            turns = [
+                2.0 * np.pi * np.round((now - then) / (2.0 * np.pi))
+                for now, then in zip(node_values, matched.node_values, strict=True)
+            ]
+            matched = matched.turned(self._search.tree, turns)
         first = self.tracker.start(x)
         refined = self._follow(first, frame, True)
         # The pose was refined from the search's, so that the search's pose set still applies.
@@ -268,22 +279,6 @@ class MatchAndTrack:
             return x
         return frame.observation.unwrapped(x, last.track.state.best.mean)
 
-    def _without_evidence(
-        self, last: TrackerState, tracked: tuple[Track, PoseEstimate] | None, frame: _GivenFrame
-    ) -> tuple[TrackerState, PoseEstimate]:
-        """Return the state and pose for a frame without masks, start and valid track.
-
-        The pose is not ``found``. It is the tracked one, or the default positions if ``tracked``
-        (track and pose in this frame) is None.
-        """
-        if tracked is None:
-            default = self._search.tree.model.default_positions
-            nowhere = self.tracker.observation.state(default)
-            result = self._result(self.tracker.start(nowhere), frame)
-            return last, replace(result, found=False)
-        # With unexplained = 0 the next frame with evidence is searched at once.
-        return replace(last, track=tracked[0], unexplained=0), replace(tracked[1], found=False)
-
     def _follow(
         self, track: Track, frame: _GivenFrame, first: bool, ignore_evidence: bool = False
     ) -> Track:
@@ -292,14 +287,6 @@ class MatchAndTrack:
             masks = [None] * len(frame.masks)
             return self.tracker.follow(track, masks, first, frame.root_position)
         return self.tracker.follow(track, frame.masks, first, frame.root_position, frame.pictures)
-
-    def _unwrapped(self, matched: PoseEstimate, node_values: Sequence[Array]) -> PoseEstimate:
-        """Return ``matched`` with its angles in the turns of ``node_values``, (k_i,) by node."""
-        turns = [
-            2.0 * np.pi * np.round((now - then) / (2.0 * np.pi))
-            for now, then in zip(node_values, matched.node_values, strict=True)
-        ]
-        return matched.turned(self._search.tree, turns)
 
     def _is_lost(
         self, track: Track, result: PoseEstimate, reference: float, frame: _GivenFrame

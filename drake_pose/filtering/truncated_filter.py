@@ -30,18 +30,16 @@ from drake_pose.filtering.truncated_normal import (
 from drake_pose.filtering.update import (
     Measurement,
     ObservationModel,
-    Truncate,
-    Updated,
-    make_measurement,
-    update,
-)
-from drake_pose.filtering.views import (
     RepeatedView,
     StaticView,
+    Truncate,
+    Updated,
     after_step,
     anchored_observation,
     begin_repeated_view,
+    make_measurement,
     next_view,
+    update,
 )
 
 

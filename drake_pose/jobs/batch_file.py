@@ -11,9 +11,9 @@ from cyclopts import Parameter
 from drake_pose.errors import SettingsError
 from drake_pose.files.records import describe_job, file_digest
 from drake_pose.files.settings import EpisodeSettings, EstimateSettings, FromText
+from drake_pose.input_files import read_yaml
 from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.registration.settings import AuditSettings
-from drake_pose.yaml_files import read_yaml
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from drake_pose.arrays import Array
-from drake_pose.csv_files import csv_text
 from drake_pose.errors import listed
+from drake_pose.input_files import csv_text
 from drake_pose.registration.diagnosis import DIAGNOSIS
 from drake_pose.registration.online_registration import pose_difference, squared_distance
 

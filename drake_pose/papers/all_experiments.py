@@ -16,7 +16,7 @@ from rich.console import Console, RenderableType
 from drake_pose.errors import OutputError
 from drake_pose.files.folder import without_nan
 from drake_pose.files.report_page import page_template
-from drake_pose.papers import date, date_walk, kameda, kameda_pictures, shimada, shimada_pictures
+from drake_pose.papers import date, kameda, kameda_pictures, shimada, shimada_pictures
 from drake_pose.papers.tables import Count, Figures
 from drake_pose.person.date.walking import COMMANDS, REGISTERED
 from drake_pose.search import MultiStartSearch, PoseSearch
@@ -164,7 +164,7 @@ def _date(short: bool, folder: Path, count: Count) -> Outcome:
     """Run Date's experiment, a small one if `short`; pictures go to `folder`."""
     cameras, frames, size = (4, 40, (320, 240)) if short else (9, 240, (640, 480))
     result = date.run_experiment(cameras, frames, 0, "silhouette", count, size)
-    date_walk.save_pictures(result, folder)
+    date.save_pictures(result, folder)
     figures: dict[str, Any] = result.as_json()
     rows: list[tuple[Any, ...]] = []
     for joint in ("elbow", "knee"):
@@ -185,7 +185,7 @@ def _date(short: bool, folder: Path, count: Count) -> Outcome:
 def _date_walk(short: bool, folder: Path, count: Count) -> Outcome:
     """Run Date's walk through a virtual place, a small one if `short`; pictures go to `folder`."""
     cameras, size = (4, (320, 240)) if short else (9, (640, 480))
-    walk = date_walk.run_walk_through(cameras, 0, count, size)
+    walk = date.run_walk_through(cameras, 0, count, size)
     walk.save(folder)
     followed = "{captured_s:.1f} s ({wrongly_s:.1f} s wrong)"
     rows: list[tuple[Any, ...]] = []

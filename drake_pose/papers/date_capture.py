@@ -30,14 +30,13 @@ from drake_pose.person.date.features import (
 from drake_pose.person.date.skeleton import LIMBS, Skeleton, load_skeleton
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.silhouette.segmentation import Background, learn_background
-from drake_pose.systems.cameras import CameraRig, build_camera_rig
+from drake_pose.systems.cameras import CameraRig, build_camera_rig, colour_image_to_picture
 from drake_pose.systems.date import (
     CaptureSetup,
     PaperPoseEstimator,
     build_paper_capture,
     prepare_paper_capture,
 )
-from drake_pose.systems.images import colour_image_to_picture
 from drake_pose.systems.person import PersonTracker, build_silhouette_capture
 from drake_pose.systems.ports import StagedDiagram
 

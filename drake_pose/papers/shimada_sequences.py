@@ -22,7 +22,6 @@ from drake_pose.arrays import Array, Mask
 from drake_pose.body import PlantKinematics, bundled_model
 from drake_pose.camera.episode_files import JOINT_TABLE
 from drake_pose.camera.models import ParallelCamera
-from drake_pose.csv_files import read_csv
 from drake_pose.errors import SceneError
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.filtering.hand import (
@@ -51,6 +50,7 @@ from drake_pose.filtering.truncated_filter import (
     TruncatedFilter,
     Truncation,
 )
+from drake_pose.input_files import read_csv
 from drake_pose.jobs.estimate.inputs import EstimateInputs, read_inputs
 from drake_pose.papers.tables import Advance, Count, figure_table, uncounted
 from drake_pose.search import View

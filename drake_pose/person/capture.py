@@ -19,16 +19,18 @@ from drake_pose.errors import SettingsError
 from drake_pose.fit.colours import PartColours
 from drake_pose.fit.contour_fit import ContourFit, PoseFit
 from drake_pose.fit.evidence import EdgePoints, find_edge_points
-from drake_pose.person.camera_faults import (
+from drake_pose.person.faults import (
     CameraComparison,
     CameraFault,
     FrameEdges,
+    RigFault,
+    find_rig_fault,
     first_moved_frame,
     is_explained,
+    require_person,
 )
 from drake_pose.person.figures import PersonRecording, ReadFrame, ViewFaults
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
-from drake_pose.person.rig_faults import RigFault, find_rig_fault, require_person
 from drake_pose.person.search import LENIENT
 from drake_pose.person.shape import NOISE, PersonShape, fit_shape, shape_values
 from drake_pose.person.views import (

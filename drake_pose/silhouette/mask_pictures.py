@@ -16,7 +16,7 @@ import numpy as np
 from drake_pose.arrays import Array, Mask
 from drake_pose.camera.models import LARGEST_SIDE
 from drake_pose.errors import MaskError
-from drake_pose.regular_files import read_regular
+from drake_pose.input_files import read_regular
 
 
 @dataclass(frozen=True)

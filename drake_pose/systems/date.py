@@ -42,8 +42,7 @@ from drake_pose.person.date.pose import estimate_pose
 from drake_pose.person.date.skeleton import FEATURES, LIMBS, Skeleton, load_skeleton
 from drake_pose.silhouette.segmentation import Background, person_region
 from drake_pose.systems.bodies import add_avatar
-from drake_pose.systems.cameras import build_camera_rig
-from drake_pose.systems.images import colour_image_to_picture
+from drake_pose.systems.cameras import build_camera_rig, colour_image_to_picture
 from drake_pose.systems.picture_capture import PersonRegion, connect_images
 from drake_pose.systems.ports import (
     MemorySystem,

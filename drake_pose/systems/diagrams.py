@@ -40,8 +40,7 @@ from drake_pose.search import PoseEstimate, PoseSearch
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.bodies import add_meshcat_skin, add_posed_plant, add_skin
-from drake_pose.systems.cameras import add_sensors
-from drake_pose.systems.images import MaskPlayer
+from drake_pose.systems.cameras import MaskPlayer, add_sensors
 from drake_pose.systems.ports import (
     BeliefSystem,
     camera_port,

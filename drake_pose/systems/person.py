@@ -27,7 +27,7 @@ from drake_pose.person.views import (
 )
 from drake_pose.silhouette.segmentation import Background
 from drake_pose.systems.bodies import add_avatar, body_poses
-from drake_pose.systems.images import ColourPorts
+from drake_pose.systems.cameras import ColourPorts
 from drake_pose.systems.picture_capture import PersonRegion, connect_images
 from drake_pose.systems.ports import (
     MemorySystem,

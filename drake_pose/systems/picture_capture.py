@@ -20,7 +20,7 @@ from drake_pose.errors import CameraError, SettingsError, UnknownNameError
 from drake_pose.silhouette.pictures.label_images import fill_label_image, label_image_to_mask
 from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ
 from drake_pose.silhouette.segmentation import Background, person_region
-from drake_pose.systems.images import colour_image_to_picture, fill_colour_image
+from drake_pose.systems.cameras import colour_image_to_picture, fill_colour_image
 from drake_pose.systems.ports import PortedSystem, require_period
 
 
@@ -173,7 +173,15 @@ class PictureCapture(PortedSystem):
             if newer is None:
                 break
             frames, self.skipped = newer, self.skipped + 1
-        self._note_changes()
+        for change in self._synchroniser.take_changes():
+            self._changes[change.camera].append(change)
+            if not change.stopped:
+                text = f"returned at {change.time:.2f} s"
+            elif math.isnan(change.time):
+                text = "gives no picture; the others go on without it"
+            else:
+                text = f"stopped at {change.time:.2f} s; the others go on without it"
+            self._reports.append(f"camera '{change.camera}' {text}")
         state.get_mutable_discrete_state(self._fresh).SetFromVector([float(frames is not None)])
         if frames is None:
             ended = all(source.ended for source in self._sources.values())
@@ -236,18 +244,6 @@ class PictureCapture(PortedSystem):
                 return
             synchroniser.add(name, one.time - origin, one)
             self._pending[name] = None
-
-    def _note_changes(self) -> None:
-        """Count cameras that stopped or returned, and report them."""
-        for change in self._synchroniser.take_changes():
-            self._changes[change.camera].append(change)
-            if not change.stopped:
-                text = f"returned at {change.time:.2f} s"
-            elif math.isnan(change.time):
-                text = "gives no picture; the others go on without it"
-            else:
-                text = f"stopped at {change.time:.2f} s; the others go on without it"
-            self._reports.append(f"camera '{change.camera}' {text}")
 
     def _calc_image(
         self, name: str, fill: Callable[[Any, np.ndarray], None], _: Context, output: AbstractValue

@@ -18,7 +18,7 @@ from drake_pose.filtering.match_and_track import MatchAndTrack, TrackerState
 from drake_pose.search import TRACKED, PoseEstimate, PoseSearch, View
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.systems.bodies import body_poses
-from drake_pose.systems.images import ColourPorts
+from drake_pose.systems.cameras import ColourPorts
 from drake_pose.systems.ports import (
     BeliefSystem,
     ImmutableValue,

@@ -24,8 +24,8 @@ from drake_pose.arrays import Array, Mask
 from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import PinholeCamera, circle_of_cameras
-from drake_pose.csv_files import csv_text
 from drake_pose.files.settings import EstimateSettings
+from drake_pose.input_files import csv_text
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask

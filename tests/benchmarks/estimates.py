@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_pose.body import bundled_model, load_model
-from drake_pose.csv_files import csv_text
 from drake_pose.files.settings import EstimateSettings
+from drake_pose.input_files import csv_text
 from drake_pose.jobs.demo import demo_scene, demo_settings
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.papers.kameda import continuous_figures, experiment_tree, run_experiment

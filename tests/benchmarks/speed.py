@@ -34,7 +34,7 @@ from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.scoring import prefix_sums, score_bodies
 from drake_pose.silhouette.segmentation import person_region
-from drake_pose.systems.images import picture_to_colour_image
+from drake_pose.systems.cameras import picture_to_colour_image
 from drake_pose.workers import use_workers
 from tests.benchmarks.tables import print_table
 from tests.registration.episodes import painted_episode

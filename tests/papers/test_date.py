@@ -5,15 +5,16 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import SettingsError
-from drake_pose.papers.date import perturbed_frames, run_experiment
-from drake_pose.papers.date_capture import PERIOD
-from drake_pose.papers.date_walk import (
+from drake_pose.papers.date import (
     active_frames,
     draw_walk,
+    perturbed_frames,
+    run_experiment,
     run_walk_through,
     save_pictures,
     walk_by,
 )
+from drake_pose.papers.date_capture import PERIOD
 from drake_pose.person.date.features import SkinColour, skin_blobs
 from drake_pose.person.date.walking import (
     COMMANDS,

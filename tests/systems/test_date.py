@@ -20,7 +20,11 @@ from drake_pose.person.date.pose import estimate_pose
 from drake_pose.person.date.skeleton import LIMBS
 from drake_pose.silhouette.pictures.label_images import mask_to_label_image
 from drake_pose.silhouette.segmentation import learn_background, person_region
-from drake_pose.systems.cameras import build_camera_rig
+from drake_pose.systems.cameras import (
+    build_camera_rig,
+    colour_image_to_picture,
+    picture_to_colour_image,
+)
 from drake_pose.systems.date import (
     CaptureSetup,
     FeatureFinder,
@@ -30,7 +34,6 @@ from drake_pose.systems.date import (
     build_paper_capture,
     prepare_paper_capture,
 )
-from drake_pose.systems.images import colour_image_to_picture, picture_to_colour_image
 from tests.systems.bench import Bench
 
 PERIOD = 0.1

@@ -11,8 +11,7 @@ from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.person.views import edge_spacing, see_silhouette
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.systems.bodies import body_poses
-from drake_pose.systems.cameras import build_camera_rig
-from drake_pose.systems.images import picture_to_colour_image
+from drake_pose.systems.cameras import build_camera_rig, picture_to_colour_image
 from drake_pose.systems.person import PersonTracker, build_silhouette_capture
 from tests.person.persons_in_view import posed, see, stepping
 from tests.systems.bench import Bench

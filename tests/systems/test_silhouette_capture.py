@@ -9,7 +9,7 @@ from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.views import FrameViews, edge_spacing, see_silhouette
 from drake_pose.silhouette.segmentation import person_region
-from drake_pose.systems.images import picture_to_colour_image
+from drake_pose.systems.cameras import picture_to_colour_image
 from drake_pose.systems.person import build_silhouette_capture
 from tests.systems.bench import Bench
 

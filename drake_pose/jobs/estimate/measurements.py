@@ -33,10 +33,10 @@ from drake_pose.camera.motor_calibration import Servos, read_motors
 from drake_pose.camera.picture_files import VIDEOS, frame_key
 from drake_pose.camera.servo_readings import Column
 from drake_pose.camera.sources import TIME_STAMPS
-from drake_pose.csv_files import read_csv, read_number
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 from drake_pose.files.records import BASE_COLUMNS, FIT_COLUMNS
 from drake_pose.files.settings import EpisodeSettings
+from drake_pose.input_files import read_csv, read_number
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, SCENE_FILE, Scene, select_frames
 
 

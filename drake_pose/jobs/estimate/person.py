@@ -13,15 +13,14 @@ from drake_pose.errors import MaskError, SceneError
 from drake_pose.files.records import FrameRecord, record_modes
 from drake_pose.files.writer import Drawn, OnStage, ResultWriter
 from drake_pose.jobs.estimate.inputs import EstimateInputs, draw_parts
-from drake_pose.person.camera_faults import CameraFault
 from drake_pose.person.capture import (
     CheckedCapture,
     PersonCapture,
     capture_by_colour,
     capture_checked,
 )
+from drake_pose.person.faults import CameraFault, RigFault
 from drake_pose.person.figures import ReadFrame, ViewFaults
-from drake_pose.person.rig_faults import RigFault
 from drake_pose.search import PoseEstimate
 from drake_pose.silhouette.pictures.masks import count_edge_pixels
 from drake_pose.silhouette.pictures.scene_checks import (

@@ -13,12 +13,12 @@ from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body import ArticulatedModel, PoseTree, bundled_model, load_model
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.camera.sources import TIME_STAMPS
-from drake_pose.csv_files import csv_text
 from drake_pose.errors import CameraError, OutputError, SceneError, SettingsError, UnknownNameError
 from drake_pose.files.folder import read_summary, writes_folder
 from drake_pose.files.records import FrameRecord, SceneEstimate, describe_job, record_deviations
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.writer import ResultWriter
+from drake_pose.input_files import csv_text
 from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.estimate.person import FOLLOWED
 from drake_pose.jobs.live.scene import LiveScene, look_until, run_live
@@ -39,13 +39,13 @@ from drake_pose.silhouette.pictures.masks import compare_masks
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.silhouette.scoring import draw_mask
+from drake_pose.systems.cameras import colour_image_to_picture
 from drake_pose.systems.date import (
     CaptureSetup,
     build_paper_capture,
     prepare_paper_capture,
     render_registered_pose,
 )
-from drake_pose.systems.images import colour_image_to_picture
 from drake_pose.systems.person import add_silhouette_sensors, build_silhouette_capture
 from drake_pose.systems.picture_capture import CameraCount, PictureCapture
 from drake_pose.systems.ports import evaluate

@@ -8,7 +8,7 @@ from typing import Any
 
 from drake_pose.camera.joint_map import MappedJoints, motors_of
 from drake_pose.camera.lerobot import INFO, camera_key, camera_name
-from drake_pose.camera.lerobot_cameras import camera_fields
+from drake_pose.camera.lerobot_tables import camera_fields
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.camera.servo_readings import HomingCorrection, correct_homing, dump_column
 from drake_pose.errors import SettingsError

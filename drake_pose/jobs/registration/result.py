@@ -16,7 +16,6 @@ from drake_pose.camera.camera_files import dump_cameras
 from drake_pose.camera.drake import dump_scenario
 from drake_pose.camera.exports import mujoco_cameras, ros_camera_info, ros_transforms
 from drake_pose.camera.models import Camera
-from drake_pose.csv_files import csv_text
 from drake_pose.errors import listed
 from drake_pose.files.folder import OVERLAY, REPORT, without_nan, write_file, write_summary
 from drake_pose.files.overlay import draw_overlay, draw_shapes, encode_png
@@ -24,6 +23,7 @@ from drake_pose.files.records import describe_job, file_digest, versions
 from drake_pose.files.replay import Pictures, import_rerun, make_recording
 from drake_pose.files.report_page import new_plot, overlay_picture, page_template, plot_uri
 from drake_pose.files.settings import percent
+from drake_pose.input_files import csv_text
 from drake_pose.jobs.registration.inputs import RegistrationInputs
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.jobs.registration.words import describe_drift, describe_reading

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from drake_pose.arrays import Array, Indices, Mask, Picture
 from drake_pose.camera.models import Camera
 from drake_pose.camera.picture_files import SUFFIXES, read_picture
-from drake_pose.csv_files import read_csv
 from drake_pose.errors import SceneError, SettingsError
+from drake_pose.input_files import read_csv
 from drake_pose.person.date.skeleton import Skeleton, registered_positions
 from drake_pose.person.views import meeting_points, triangulate
 from drake_pose.silhouette.segmentation import learn_background, person_region

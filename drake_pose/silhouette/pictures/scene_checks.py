@@ -13,7 +13,7 @@ from drake_pose.arrays import Mask
 from drake_pose.camera.models import Camera
 from drake_pose.camera.picture_files import natural_key
 from drake_pose.errors import MaskError, SceneError
-from drake_pose.regular_files import require_regular
+from drake_pose.input_files import require_regular
 from drake_pose.silhouette.pictures.scenes import Scene, load_scene
 
 

@@ -5,13 +5,14 @@ from drake_pose.filtering.hand import HAND_STATE
 from drake_pose.filtering.linearisation import Linear
 from drake_pose.filtering.state import Belief
 from drake_pose.filtering.truncated_filter import Hypothesis, merge_duplicates, normalise, prune
-from drake_pose.filtering.update import make_measurement, update
-from drake_pose.filtering.views import (
+from drake_pose.filtering.update import (
     RepeatedView,
     anchored_observation,
     begin_repeated_view,
+    make_measurement,
     measure_curvature,
     next_view,
+    update,
 )
 from drake_pose.papers.shimada import experiment_filter
 from drake_pose.papers.shimada_sequences import make_sequence

@@ -20,9 +20,8 @@ from drake_pose.jobs.estimate.person import (
     describe_rig,
     describe_views,
 )
-from drake_pose.person.camera_faults import CameraFault, CameraMotion
+from drake_pose.person.faults import CameraFault, CameraMotion, RigFault
 from drake_pose.person.figures import ViewFaults
-from drake_pose.person.rig_faults import RigFault
 from drake_pose.silhouette.pictures.masks import write_mask
 from tests.cli import run_to_end
 from tests.jobs.scenes import read_rows

@@ -2,8 +2,8 @@ from pathlib import Path
 
 import pytest
 
-from drake_pose.csv_files import read_csv
 from drake_pose.errors import SceneError, UnknownNameError
+from drake_pose.input_files import read_csv
 from drake_pose.jobs.estimate.measurements import read_joint_centres, read_measured_positions
 
 CENTRES = "frame,joint,x,y,z\n0,ankle,1,2,3\n0,knee,4,5,6\n7,ankle,-1,-2,-3\n"

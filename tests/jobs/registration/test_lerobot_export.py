@@ -9,7 +9,7 @@ import pyarrow
 import pyarrow.parquet
 import pytest
 
-from drake_pose.camera.lerobot_cameras import camera_fields
+from drake_pose.camera.lerobot_tables import camera_fields
 from drake_pose.errors import CameraError, SettingsError
 from drake_pose.jobs.registration.inputs import read_inputs
 from drake_pose.jobs.registration.lerobot_files import lerobot_files, require_data_set

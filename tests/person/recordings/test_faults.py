@@ -12,11 +12,13 @@ from drake_pose.camera.models import Camera, circle_of_cameras
 from drake_pose.errors import CameraError, MaskError, SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.fit.evidence import find_edge_points
-from drake_pose.person.camera_faults import (
+from drake_pose.person.faults import (
     CameraComparison,
     CameraFault,
     FrameEdges,
+    find_rig_fault,
     first_moved_frame,
+    require_person,
 )
 from drake_pose.person.figures import (
     Figure,
@@ -34,7 +36,6 @@ from drake_pose.person.figures import (
     sort_figures,
 )
 from drake_pose.person.pose_tracker import PersonPoseTracker
-from drake_pose.person.rig_faults import find_rig_fault, require_person
 from drake_pose.person.views import FrameViews, see_silhouette
 from tests.person.persons_in_view import see, stepping
 

@@ -20,12 +20,12 @@ from drake_pose.silhouette.pictures.label_images import mask_to_label_image
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scenes import load_scene
+from drake_pose.systems.cameras import MaskPlayer
 from drake_pose.systems.diagrams import (
     _depth_range,
     build_recorded_matching,
     build_simulated_matching,
 )
-from drake_pose.systems.images import MaskPlayer
 from drake_pose.systems.silhouette_matcher import STATISTICS, SilhouetteMatcher, SilhouetteTracker
 from tests.search.bodies import box_link, front_camera, joint, load_body, swinging_chain
 from tests.systems.bench import Bench

@@ -14,9 +14,8 @@ from drake_pose.silhouette.pictures.label_images import (
     mask_to_label_image,
 )
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.systems.cameras import SilhouetteCamera
+from drake_pose.systems.cameras import SilhouetteCamera, picture_to_colour_image
 from drake_pose.systems.diagrams import build_simulated_matching
-from drake_pose.systems.images import picture_to_colour_image
 from drake_pose.systems.silhouette_matcher import TRACK, SilhouetteTracker
 from tests.search.arms import arm_cameras
 from tests.search.bodies import front_camera

@@ -113,15 +113,13 @@ def test_no_file_is_too_long():
 
 
 def test_no_function_is_too_long():
-    # Kernels are exempt: functions that they call must be compiled with them.
     too_long = {}
     for path in [*FILES, *sorted((PACKAGE.parent / "urdf").rglob("*.py"))]:
         for node in ast.walk(ast.parse(path.read_text())):
             if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 continue
             count = node.end_lineno - node.lineno + 1
-            is_kernel = any("compiled" in ast.unparse(one) for one in node.decorator_list)
-            if count > MOST_LINES and not is_kernel:
+            if count > MOST_LINES:
                 too_long[f"{path.relative_to(PACKAGE.parent)}: {node.name}"] = count
     assert too_long == {}
 

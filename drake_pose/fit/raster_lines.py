@@ -17,7 +17,12 @@ import numpy as np
 from drake_pose.arrays import Array, Indices, Mask
 from drake_pose.compiled import compiled
 from drake_pose.fit.kernel import accumulate_residuals, add_residual, poses_in_camera
-from drake_pose.silhouette.contour_points import find_crossings, find_line_spans, find_segments
+from drake_pose.silhouette.contour_points import (
+    Segments,
+    find_crossings,
+    find_line_spans,
+    find_segments,
+)
 from drake_pose.silhouette.outline import PackedOutlines
 
 
@@ -159,40 +164,76 @@ def compare_raster(
                 s = chosen[k]
                 if s < 0 or weights[k] == 0.0:
                     continue
-                node = segments.nodes[s]
-                low, high = ends[s, 1 - across], ends[s, 3 - across]
-                along = (at - low) / (high - low)
-                # Perspective-correct interpolation along the edge.
-                near, far = segments.depths[s, 0], segments.depths[s, 1]
-                along = along * near / (along * near + (1.0 - along) * far)
-                i, j = segments.vertices[s, 0], segments.vertices[s, 1]
-                # The normal points in the direction of the line, as residuals do.
-                du, dv = ends[s, 2] - ends[s, 0], ends[s, 3] - ends[s, 1]
-                size = math.sqrt(du * du + dv * dv)
-                size = size if (high > low) == (across == 0) else -size
                 weight, residual = stride * weights[k], residuals[k] / weights[k]
                 total += weight
                 squares += weight * residual * residual
-                # Split the weight among the nodes that the point follows: the gradient is exact,
-                # and the curvature an upper bound.
-                own_fraction = (1.0 - along) * skin[0][i] + along * skin[0][j]
-                for part in range(2 if own_fraction < 1.0 else 1):
-                    labels[0, entry_count] = node
-                    labels[1, entry_count] = node if part == 0 else skin[1][node]
-                    for axis in range(3):
-                        begin, after = packed.points[axis, i], packed.points[axis, j]
-                        p_N[entry_count, axis] = (1.0 - along) * begin + along * after
-                    fraction = own_fraction if part == 0 else 1.0 - own_fraction
-                    add_residual(
-                        point_sums, entry_count, dv / size, -du / size, -residual, fraction * weight
-                    )
-                    entry_count += 1
+                entry_count = _add_crossing(
+                    packed, skin, segments, s, at, across, weight, residual, p_N, labels,
+                    point_sums, entry_count,
+                )  # fmt: skip
         nodes, owners = labels
         accumulate_residuals(
             A, b, bias_terms, X_WN, camera, p_N, nodes[:entry_count], owners[:entry_count],
             point_sums[:entry_count],
         )  # fmt: skip
     return stride * differing, total, squares
+
+
+@compiled
+def _add_crossing(
+    packed: PackedOutlines,
+    skin: tuple[Array, Indices],
+    segments: Segments,
+    s: int,
+    at: int,
+    across: int,
+    weight: float,
+    residual: float,
+    p_N: Array,
+    labels: Indices,
+    point_sums: Array,
+    count: int,
+) -> int:
+    """Add the residual of the crossing of segment s with a row or column to the entries.
+
+    Args:
+        packed, skin: as of ``compare_raster``.
+        segments: the body's contour.
+        s: index of the segment.
+        at: the row, or column if `across` is 1 [pixel].
+        across: 0: the crossing is in a row; 1: in a column.
+        weight, residual: of the crossing; the residual [pixel].
+        p_N: (n, 3), written: the point of each entry in its node's frame [m].
+        labels: (2, n), written: the node of each entry's point, and the node that it moves.
+        point_sums: (n, 7), written: see ``add_residual``.
+        count: number of entries before; an entry is added for each node that the point follows.
+
+    Returns the number of entries.
+    """
+    node, ends = segments.nodes[s], segments.ends
+    low, high = ends[s, 1 - across], ends[s, 3 - across]
+    along = (at - low) / (high - low)
+    # Perspective-correct interpolation along the edge.
+    near, far = segments.depths[s, 0], segments.depths[s, 1]
+    along = along * near / (along * near + (1.0 - along) * far)
+    i, j = segments.vertices[s, 0], segments.vertices[s, 1]
+    # The normal points in the direction of the line, as residuals do.
+    du, dv = ends[s, 2] - ends[s, 0], ends[s, 3] - ends[s, 1]
+    size = math.sqrt(du * du + dv * dv)
+    size = size if (high > low) == (across == 0) else -size
+    # Split the weight among the nodes that the point follows: the gradient is exact, and the
+    # curvature an upper bound.
+    own_fraction = (1.0 - along) * skin[0][i] + along * skin[0][j]
+    for part in range(2 if own_fraction < 1.0 else 1):
+        labels[0, count] = node
+        labels[1, count] = node if part == 0 else skin[1][node]
+        for axis in range(3):
+            begin, after = packed.points[axis, i], packed.points[axis, j]
+            p_N[count, axis] = (1.0 - along) * begin + along * after
+        fraction = own_fraction if part == 0 else 1.0 - own_fraction
+        add_residual(point_sums, count, dv / size, -du / size, -residual, fraction * weight)
+        count += 1
+    return count
 
 
 @compiled

@@ -1,0 +1,342 @@
+"""Laws of accepting a camera on a link from points of a standing scene, without pictures."""
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import t as scipy_t
+
+from drake_pose.arrays import Array
+from drake_pose.errors import RegistrationError
+from drake_pose.registration.recording import Recording
+from drake_pose.registration.standing_scene import hand_eye_tracks, track_registration
+from drake_pose.registration.standing_scene.gripper import GripperFit
+from drake_pose.registration.standing_scene.hand_eye_tracks import TrackFit, TrackProblem, motion
+from drake_pose.registration.standing_scene.picture_matches import Matches
+from drake_pose.registration.standing_scene.track_registration import (
+    TrackRegistration,
+    register_tracks,
+)
+from tests.registration.test_hand_eye_tracks import (
+    CAMERA,
+    TIMES,
+    X_LC,
+    all_matches,
+    error,
+    hand,
+    problem_of,
+    see,
+    table_points,
+)
+
+LATE = 0.05
+JOINTS = ("first", "last", "middle")
+
+
+def turn(angle: float) -> Array:
+    """Return a transform (4, 4) that turns about y."""
+    return motion(np.array([0.0, angle, 0.0, 0.0, 0.0, 0.0]))
+
+
+def link_poses(constants: Array) -> Array:
+    """Return X_WL of a hand, the last and the middle joint of which have offsets."""
+    back = motion(np.column_stack([0.3 * np.sin(5.0 * TIMES), np.zeros((len(TIMES), 5))]))
+    inner = back @ turn(constants[3]) @ np.linalg.inv(back)
+    return np.asarray(hand(TIMES + constants[0]) @ inner @ turn(constants[2]))
+
+
+class QuickSearch(hand_eye_tracks.EpipolarSearch):
+    """A search from fewer rotations."""
+
+    def search(self, X_WL: Array, rotations: int = 2000) -> list[tuple[float, Array]]:
+        return super().search(X_WL, min(rotations, 700))
+
+
+class Scene:
+    """Registers a camera from sightings; chance matches, motion and gripper can be replaced."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self._patch = monkeypatch
+        few = hand_eye_tracks.TRACKS._replace(matches=100, refined=10, groups=7)
+        monkeypatch.setattr(hand_eye_tracks, "TRACKS", few)
+        self.settings(least=25)
+        monkeypatch.setattr(track_registration, "EpipolarSearch", QuickSearch)
+        self.body = SimpleNamespace(
+            kinematics=SimpleNamespace(names=JOINTS, is_angle=np.ones(3, bool))
+        )
+        self.recording = Recording(
+            tuple("abcdefghijklmn"), lambda _: np.zeros((14, 3)), lambda k: np.full((1, 1, 3), k),
+            TIMES,
+        )  # fmt: skip
+        self.see(np.array([LATE, 0.0, 0.0, 0.0]))
+
+    def settings(self, **changes: Any) -> None:
+        """Change settings of registrations."""
+        changed = track_registration.STANDING_SCENE._replace(**changes)
+        self._patch.setattr(track_registration, "STANDING_SCENE", changed)
+
+    def start(self) -> None:
+        """Begin at the right pose, in place of a search."""
+
+        def search(scene: track_registration._Scene) -> track_registration._Start:
+            count = len(scene.matches.uv)
+            return track_registration._Start([X_LC], np.zeros(5), 0.7, 0.1, count)
+
+        self._patch.setattr(track_registration._Scene, "search", search)
+
+    def see(self, constants: Array, seed: int = 4) -> None:
+        """Draw sightings at a time offset [s] and joint offsets [rad]."""
+        rng = np.random.default_rng(seed)
+        self.seen = see(link_poses(constants), table_points(rng, 60), 0.3, rng)
+
+    def register(
+        self,
+        poses: Callable[[Array], Array] = link_poses,
+        pairs: int | None = None,
+        elsewhere: tuple[float, str] = (0.0, ""),
+        **given: Any,
+    ) -> TrackRegistration:
+        matches = all_matches(self.seen)
+        if pairs is not None:
+            pair = np.unique(matches.frames, axis=0, return_inverse=True)[1]
+            kept = np.isin(pair, np.argsort(-np.bincount(pair))[:pairs])
+            matches = Matches(matches.frames[kept], matches.uv[kept])
+        for name, value in {
+            "choose_pictures": ([*range(0, 14, 2)], [*range(1, 14, 2)]),
+            "recorded_link_poses": poses,
+            "match_pictures": (matches, self.seen),
+            "explaining_link": elsewhere,
+        }.items():
+            self._patch.setattr(track_registration, name, lambda *_, value=value, **__: value)
+        camera, recording = given.pop("camera", CAMERA), given.pop("recording", self.recording)
+        return register_tracks(self.body, "hand", 0, camera, recording, **given)
+
+
+@pytest.fixture
+def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
+    return Scene(monkeypatch)
+
+
+def view(off: float = 0.0, sd: float = 0.002, clock: float | None = None) -> GripperFit:
+    """Return the gripper's fit at a pose `off` by a rotation about x [rad]."""
+    found = X_LC @ motion(np.array([off, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    time = None if clock is None else (clock, 0.004)
+    masks = {"b": np.ones((2, 2), bool)}
+    return GripperFit(found, sd**2 * np.eye(6), 0.7, 0.5, 0.1, time, masks)
+
+
+class Gripper:
+    """A gripper whose fits are known."""
+
+    def __init__(self, *views: GripperFit) -> None:
+        self.views = list(views)
+
+    def near(self, X: Array, offset: float) -> GripperFit:
+        assert offset == pytest.approx(LATE, abs=0.01)
+        assert np.abs(error(X)).max() < 0.01
+        return self.views[0]
+
+    def find(self) -> tuple[list[GripperFit], str]:
+        return self.views, "it is hidden"
+
+
+def test_a_scene_gives_pose_clock_and_inliers_with_their_intervals(scene: Scene) -> None:
+    found = scene.register()
+    deviations = np.sqrt(np.diag(found.found.covariance))
+    off = X_LC[:3, :3] @ error(found.found.camera.X_WC).reshape(2, 3).T
+    assert (np.abs(off.T.ravel()) < 4.0 * deviations).all()
+    assert deviations[3:].max() < 0.01
+    assert found.time_offset is not None
+    assert found.time_offset.value == pytest.approx(LATE, abs=4.0 * found.time_offset.deviation)
+    assert found.time_offset.deviation < 0.005
+    assert found.focal_deviation == 0.0
+    assert found.found.camera.focal_x == CAMERA.focal_x
+    assert (found.offsets, found.likely, found.contradiction) == ((), (), "")
+    assert found.explained > 0.6 > 1.9 * found.chance > 0.3
+    assert found.inliers.mean() > 0.98
+    assert found.gripper is None
+    assert [one.frame for one in found.found.frames] == [*"abcdefghijklmn"]
+    assert all(one.is_inlier and math.isnan(one.iou) for one in found.found.frames)
+    assert [int(one[0, 0, 0]) for one in found.pictures.values()] == [*range(14)]
+
+
+def test_focal_length_and_offsets_are_found_where_they_are_asked_for(scene: Scene) -> None:
+    """The offset of the last joint only turns the camera on the link: it stays open."""
+    scene.see(np.array([LATE, 0.0, 0.0, 0.12]))
+    longer = replace(CAMERA, focal_x=1.2 * CAMERA.focal_x, focal_y=1.2 * CAMERA.focal_y)
+    scene.settings(focals=(0.8, 1.0), times=(0.0, 0.1), chance_rotations=100, least_gain=1.2)
+    found = scene.register(camera=longer, focal=True, offset_joints=["middle", "last"])
+    assert found.found.camera.focal_x == pytest.approx(500.0, abs=5.0)
+    assert found.found.camera.focal_y == pytest.approx(510.0, abs=5.0)
+    assert 0.0 < found.focal_deviation < 0.01
+    middle, last = found.offsets
+    assert (middle.name, last.name, found.likely) == ("middle", "last", ())
+    assert middle.low < 0.12 < middle.high
+    assert middle.deviation < 0.01
+    assert middle.significant
+    assert (last.value, last.deviation, last.low, last.high) == (0.0, np.inf, -np.inf, np.inf)
+    assert not last.significant
+
+
+@pytest.mark.parametrize(("offset", "named"), [(0.06, ("middle",)), (0.0, ())])
+def test_offsets_that_explain_much_better_are_named(
+    scene: Scene, offset: float, named: tuple[str, ...]
+) -> None:
+    scene.see(np.array([LATE, 0.0, 0.0, offset]))
+    scene.start()
+    found = scene.register()
+    assert found.likely == named
+    assert np.abs(error(found.found.camera.X_WC)).max() < 0.01
+    assert (found.explained, found.chance) == (0.7, 0.1)
+
+
+def test_poses_that_fit_as_well_are_alternatives(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Distinct poses whose residuals are at most a tenth larger."""
+    true = track_registration.fit_tracks
+    by = [np.zeros(6), np.full(6, 0.2), np.full(6, 0.3), np.full(6, 1e-3)]
+    monkeypatch.setattr(
+        track_registration._Scene,
+        "search",
+        lambda _: track_registration._Start(
+            [X_LC @ motion(one) for one in by], np.zeros(5), 0.7, 0.1, 9
+        ),
+    )
+
+    def fit_tracks(problem: TrackProblem, start: Array, constants: Array) -> TrackFit:
+        fit = true(problem, X_LC, constants)
+        k = int(np.argmin([np.abs(start - X_LC @ motion(one)).max() for one in by]))
+        return fit._replace(X_LC=start, sigma=[1.0, 1.08, 1.12, 1.0][k] * fit.sigma)
+
+    monkeypatch.setattr(track_registration, "fit_tracks", fit_tracks)
+    found = scene.register()
+    np.testing.assert_allclose(found.found.alternatives, [X_LC @ motion(by[1])])
+
+
+def test_a_gripper_refines_or_contradicts_the_scene(scene: Scene) -> None:
+    """A pose within its deviations narrows the intervals; another one is told of and not used."""
+    scene.start()
+    alone, refined, against = (
+        scene.register(gripper=None if one is None else Gripper(one))
+        for one in (None, view(sd=1e-4), view(off=0.1))
+    )
+    sizes = [np.sqrt(np.diag(one.found.covariance)) for one in (alone, refined, against)]
+    assert (sizes[1] < sizes[0]).all()
+    np.testing.assert_array_equal(sizes[0], sizes[2])
+    np.testing.assert_array_equal(alone.found.camera.X_WC, against.found.camera.X_WC)
+    assert (alone.contradiction, refined.contradiction) == ("", "")
+    assert re.fullmatch(r"\d mm and 5\.[678] degrees", against.contradiction)
+
+
+def test_a_gripper_alone_gives_the_pose_where_the_scene_does_not_help(scene: Scene) -> None:
+    """Few matches, or matches that a wrong motion explains as well, leave the gripper's pose."""
+    one = view(0.02, clock=0.04)
+    found = scene.register(pairs=1, gripper=Gripper(one))
+    np.testing.assert_array_equal(found.found.camera.X_WC, one.X_LC)
+    R = np.kron(np.eye(2), one.X_LC[:3, :3])
+    np.testing.assert_allclose(found.found.covariance, R @ one.covariance @ R.T)
+    assert found.time_offset is not None
+    assert (found.time_offset.value, found.time_offset.deviation) == (0.04, 0.004)
+    assert math.isnan(found.explained)
+    assert math.isnan(found.chance)
+    assert (len(found.seen.uv), found.likely, found.focal_deviation) == (0, (), 0.0)
+    assert [(f.frame, f.inlier_ratio, f.is_inlier) for f in found.found.frames] == [
+        ("b", one.ratio, True)
+    ]
+    assert [*found.pictures] == ["b"]
+    assert int(found.pictures["b"][0, 0, 0]) == 1
+    unknown = scene.register(pairs=1, gripper=Gripper(view())).time_offset
+    assert unknown is not None
+    assert not unknown.determined
+    untimed = replace(scene.recording, times=None)
+    assert scene.register(pairs=1, gripper=Gripper(view()), recording=untimed).time_offset is None
+
+
+def test_the_scene_decides_between_poses_of_a_symmetric_gripper(scene: Scene) -> None:
+    right = view(clock=LATE)
+    half = right._replace(X_LC=X_LC @ np.diag([-1.0, -1.0, 1.0, 1.0]))
+    scene.settings(least_gain=1.0, times=())
+    for views in ((half, right), (right, half)):
+        found = scene.register(pairs=2, gripper=Gripper(*views))
+        assert np.abs(error(found.found.camera.X_WC)).max() < 0.01
+    with pytest.raises(RegistrationError, match="fits as well in 2 poses"):
+        scene.register(pairs=2, gripper=Gripper(right, right))
+    with pytest.raises(RegistrationError, match="fits as well in 2 poses"):
+        scene.register(pairs=1, gripper=Gripper(right, half))
+    with pytest.raises(RegistrationError, match="or it is not in view: it is hidden"):
+        scene.register(pairs=2, gripper=Gripper())
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"pairs": 2}, r"\d+ points of the scene were matched, in 2 pairs"),
+        ({"poses": lambda _: hand(TIMES, (0.0, 0.0, 0.6))}, "and by 0.0 about others.* position"),
+        ({"poses": lambda _: still(hand(TIMES))}, "moves by 0 mm .* scale"),
+        ({"poses": lambda _: hand(1.7 * TIMES[::-1])}, r"Does the camera ride on link 'hand'"),
+        (
+            {"poses": lambda _: hand(1.7 * TIMES[::-1]), "elsewhere": (0.9, "arm")},
+            r"On link 'arm' a pose explains 90%: give it \(--on arm\)",
+        ),
+    ],
+)
+def test_scenes_that_cannot_determine_a_pose_are_refused(scene: Scene, given, told) -> None:
+    scene.settings(times=(0.0,), chance_rotations=300)
+    with pytest.raises(RegistrationError, match=told):
+        scene.register(**given)
+
+
+def still(X: Array) -> Array:
+    """Return the poses with the first one's position."""
+    X[:, :3, 3] = X[0, :3, 3]
+    return X
+
+
+def test_a_direction_with_a_large_deviation_is_named(scene: Scene) -> None:
+    """The axis is in the link's frame; what would help is said."""
+    R, X_WL = X_LC[:3, :3], hand(TIMES)
+    axis = np.array([0.36, 0.48, 0.8])
+
+    def refuse(turn: float, shift: float, likely: tuple[str, ...] = ()) -> str:
+        parts = [
+            1e-6 * np.eye(3) + sd**2 * np.outer(R.T @ axis, R.T @ axis) for sd in (turn, shift)
+        ]
+        covariance = np.zeros((7, 7))
+        covariance[:3, :3], covariance[3:6, 3:6] = parts
+        with pytest.raises(RegistrationError) as told:
+            track_registration._require_determined(CAMERA, "hand", X_WL, X_LC, covariance, likely)
+        return str(told.value)
+
+    assert (
+        "its position along (0.36, 0.48, 0.80) of link 'hand' (standard deviation 50 mm)"
+        in refuse(0.0, 0.05)
+    )
+    assert "rotation about (0.36, 0.48, 0.80) of link 'hand' (standard deviation 5.7" in refuse(
+        0.1, 0.0
+    )
+    assert "standard deviation more than 1000 mm" in (text := refuse(0.1, 1.5))
+    assert " and its position" in text
+    assert "offsets of middle explain the pictures much better" in refuse(0.0, 0.05, ("middle",))
+    small = np.diag([0.039**2] * 6 + [9.0])
+    track_registration._require_determined(CAMERA, "hand", X_WL, X_LC, small)
+
+
+def test_intervals_of_offsets_are_students(scene: Scene) -> None:
+    """With half as many degrees of freedom as pictures, 11 at most; Bonferroni over all joints."""
+    problem = problem_of(scene.seen, link_poses, 0.2, 0.2, 0.2, 0.2)
+    deviations = np.array([1.0] * 8 + [0.1, 0.1, 0.02])
+    constants = np.array([0.0, 0.0, 0.3, 0.2, -0.1])
+    fit = TrackFit(X_LC, constants, np.zeros((0, 3)), 1.0, np.eye(11), np.zeros(0))
+    found = track_registration._describe_offsets(JOINTS, JOINTS, problem, fit, deviations)
+    law = scipy_t(6)
+    for one, value, sd in zip(found, constants[2:], deviations[8:], strict=True):
+        assert (one.value, one.deviation) == (value, sd)
+        np.testing.assert_allclose([one.low, one.high], value + sd * law.ppf([0.025, 0.975]))
+        assert one.significant == (2.0 * law.sf(abs(value) / sd) < 0.05 / 3)
+    assert [one.significant for one in found] == [False, False, True]

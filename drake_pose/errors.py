@@ -3,6 +3,7 @@
 A message names the file, link, joint, camera or frame at fault, what was expected, and what to do.
 """
 
+import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -61,6 +62,26 @@ class UnknownNameError(DrakePoseError):
         self.known = tuple(known)
         listing = ", ".join(self.known) if self.known else "(none)"
         super().__init__(f"{where} has no {kind} '{name}'; it has: {listing}")
+
+
+def require_positive(**values: float | None) -> None:
+    """Raise SettingsError, which names it, if a value is not positive and finite; None passes."""
+    for name, value in values.items():
+        if value is not None and not 0.0 < value < math.inf:
+            raise SettingsError(f"{name} must be positive, not {value}")
+
+
+def require_at_least(least: float, **values: float | None) -> None:
+    """Raise SettingsError, which names it, if a value is below ``least``; None passes."""
+    for name, value in values.items():
+        if value is not None and not value >= least:
+            raise SettingsError(f"{name} must be {least:g} or more, not {value}")
+
+
+def require_choice(name: str, value: str, choices: Sequence[str]) -> None:
+    """Raise SettingsError, which names it, unless a value is one of the choices."""
+    if value not in choices:
+        raise SettingsError(f"{name} must be one of {', '.join(choices)}, not '{value}'")
 
 
 def listed(names: Sequence[str], most: int = 5) -> str:

@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_t
 
 from cyclopts import Parameter, Token
 
-from drake_pose.errors import SettingsError, for_caller
+from drake_pose.errors import SettingsError, for_caller, require_at_least
 
 _Settings = TypeVar("_Settings", bound=type)
 Axis = Literal["x", "y", "z"]
@@ -321,8 +321,7 @@ class EpisodeSettings(SceneSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.workers is not None and self.workers < 1:
-            raise SettingsError(f"workers must be 1 or more, not {self.workers}")
+        require_at_least(1, workers=self.workers)
 
     def as_json(self) -> dict[str, Any]:
         """Return the settings that affect the result as plain JSON values."""
@@ -373,8 +372,7 @@ class EstimateSettings(CaptureSettings, EpisodeSettings):
             if get_origin(hint) is Literal and value not in get_args(hint):
                 choices = ", ".join(get_args(hint))
                 raise SettingsError(f"there is no {name} '{value}'; there is: {choices}")
-        if self.time_limit is not None and not self.time_limit >= 0.0:
-            raise SettingsError(f"time_limit must be 0 or more, not {self.time_limit}")
+        require_at_least(0, time_limit=self.time_limit)
         if self.method == "person" and self.search_settings:
             raise SettingsError(
                 f"the method person does not search poses; leave {self.search_settings[0]} out"

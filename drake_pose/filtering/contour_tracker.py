@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_pose.arrays import Array, Floats, Mask, Picture
-from drake_pose.errors import SettingsError
+from drake_pose.errors import SettingsError, require_positive
 from drake_pose.filtering.body_state import LOG_SCALE, BodyState
 from drake_pose.filtering.motion import LinearMotion
 from drake_pose.filtering.state import Belief
@@ -346,9 +346,7 @@ class TrackingSettings:
     retries: int = 5
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if value is not None and not isinstance(value, bool) and not 0 < value < math.inf:
-                raise SettingsError(f"{name} must be positive, not {value}")
+        require_positive(**{k: one for k, one in vars(self).items() if not isinstance(one, bool)})
 
 
 @dataclass(frozen=True, eq=False)
@@ -387,8 +385,7 @@ class ContourTracker:
         period: float,
         settings: TrackingSettings | None = None,
     ) -> None:
-        if not 0 < period < math.inf:
-            raise SettingsError(f"the tracker's period must be positive, not {period}")
+        require_positive(period=period)
         self.observation, self.settings = observation, settings or TrackingSettings()
         layout = observation.layout
         scale = {name: period**2 * self.acceleration(name) for name in layout.moving}

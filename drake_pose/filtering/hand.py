@@ -14,7 +14,7 @@ import numpy as np
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.compiled import compiled, copy_into
-from drake_pose.errors import SettingsError
+from drake_pose.errors import require_positive
 from drake_pose.filtering.hand_model import (
     QUATERNION,
     SEGMENT,
@@ -60,9 +60,7 @@ class HandObservation:
     hand: HandModel = field(default=TWO_FINGERS, repr=False)  # The hand's fingers and palm.
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if name != "hand" and not 0 < value < math.inf:
-                raise SettingsError(f"{name} must be positive, not {value}")
+        require_positive(**{name: value for name, value in vars(self).items() if name != "hand"})
 
     @cached_property
     def names(self) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from drake_pose.arrays import Array
-from drake_pose.errors import SettingsError
+from drake_pose.errors import SettingsError, require_at_least, require_choice
 from drake_pose.filtering.inequalities import Inequalities, inner_point
 from drake_pose.filtering.linearisation import Linear, require_jacobian
 from drake_pose.filtering.motion import LinearMotion, MotionModel, require_models, step_from
@@ -191,19 +191,11 @@ class FilterSettings:
     rejected_below: float = -4.0
 
     def __post_init__(self) -> None:
-        if self.truncation not in TRUNCATIONS:
-            raise SettingsError(
-                f"truncation must be one of {', '.join(TRUNCATIONS)}, not '{self.truncation}'"
-            )
-        if self.linearisation not in LINEARISATIONS:
-            raise SettingsError(
-                f"linearisation must be one of {', '.join(LINEARISATIONS)}, not "
-                f"'{self.linearisation}'"
-            )
+        require_choice("truncation", self.truncation, TRUNCATIONS)
+        require_choice("linearisation", self.linearisation, LINEARISATIONS)
+        require_at_least(1, iterations=self.iterations, hypothesis_cap=self.hypothesis_cap)
         if not 0.0 <= self.persistence < math.inf:
             raise SettingsError(f"persistence must be 0 or more, not {self.persistence}")
-        if self.iterations < 1 or self.hypothesis_cap < 1:
-            raise SettingsError("iterations and hypothesis_cap must be 1 or more")
         if not 0 <= self.novelty < 1:
             raise SettingsError(f"novelty must be in [0, 1), not {self.novelty}")
         if not 0 <= self.smallest_weight < 1:

@@ -23,7 +23,7 @@ from scipy.sparse.linalg import splu
 
 from drake_pose.arrays import Array
 from drake_pose.compiled import compiled
-from drake_pose.errors import SettingsError
+from drake_pose.errors import require_at_least, require_positive
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,8 @@ class AnnealingStage:
     iterations: int = 1
 
     def __post_init__(self) -> None:
-        for name in ("scale", "spacing"):
-            if not getattr(self, name) > 0.0:
-                raise SettingsError(f"{name} must be positive, not {getattr(self, name)}")
-        if self.iterations < 1:
-            raise SettingsError(f"iterations must be 1 or more, not {self.iterations}")
+        require_positive(scale=self.scale, spacing=self.spacing)
+        require_at_least(1, iterations=self.iterations)
 
 
 @dataclass(frozen=True)

@@ -24,12 +24,12 @@ from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body import ArticulatedModel, landmarks_of_nodes, load_landmarks
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera, look_at
+from drake_pose.errors import require_choice
 from drake_pose.papers.date_capture import PERIOD, PaperTrack, SilhouetteTrack, Studio, one_core
 from drake_pose.papers.tables import (
     Count,
     draw_panels,
     figure_table,
-    require_choice,
     save_figure,
     save_picture,
     uncounted,

@@ -16,6 +16,7 @@ from rich.table import Table
 
 from drake_pose.body import PoseTree, bundled_model, load_model
 from drake_pose.camera.models import ParallelCamera
+from drake_pose.errors import require_at_least
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.demo import demo_settings, stored_scene
 from drake_pose.jobs.estimate.scene import estimate_scene
@@ -23,7 +24,6 @@ from drake_pose.papers.tables import (
     Count,
     Figures,
     figure_table,
-    require_counts,
     spread_over_seeds,
     uncounted,
 )
@@ -212,7 +212,7 @@ def run_experiment(
 
     Raises SettingsError: if ``images`` or ``views`` is below 1.
     """
-    require_counts(images=images, views=views)
+    require_at_least(1, images=images, views=views)
     cameras = tuple(experiment_camera(math.pi * k / views) for k in range(views))
     tree, sampled, is_continuous = search.tree, search.sampled, isinstance(search, MultiStartSearch)
     angles = "continuous" if is_continuous else "grid"

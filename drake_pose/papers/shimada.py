@@ -19,7 +19,7 @@ from scipy.special import chdtri
 from drake_pose.arrays import Array
 from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.errors import SettingsError
+from drake_pose.errors import SettingsError, require_at_least, require_choice, require_positive
 from drake_pose.filtering.hand import (
     FLEXIONS,
     HAND_STATE,
@@ -45,7 +45,7 @@ from drake_pose.papers.shimada_sequences import (
     make_sequence,
     track_of,
 )
-from drake_pose.papers.tables import Count, figure_table, require_choice, require_counts, uncounted
+from drake_pose.papers.tables import Count, figure_table, uncounted
 from drake_pose.systems.bodies import held_positions
 from drake_pose.systems.truncated_ekf import build_hand_estimation
 
@@ -157,7 +157,7 @@ def run_experiment(
 
     Raises SettingsError: an argument is not one of these.
     """
-    require_counts(runs=runs)
+    require_at_least(1, runs=runs)
     require_choice("observed", observed, (*OBSERVED, PICTURES))
     if observed == PICTURES and noise != 1.0:
         raise SettingsError("noise does not apply to pictures: leave it at 1")
@@ -193,9 +193,7 @@ def experiment_filter(
     ``settings``: None: ``experiment_settings("joint")``. ``noise``, ``acceleration``: factors as of
     ``run_experiment``. Raises SettingsError: a factor is not positive.
     """
-    for name, factor in (("noise", noise), ("acceleration", acceleration)):
-        if not 0 < factor < math.inf:
-            raise SettingsError(f"{name} must be a positive factor, not {factor}")
+    require_positive(noise=noise, acceleration=acceleration)
     rows = model_inequalities(_hand()).restricted_to(HAND_STATE.names)
     usual = HandObservation(pixels_per_metre=PIXELS_PER_METRE)
     observation = replace(
@@ -465,7 +463,7 @@ def run_hypotheses_experiment(
 
     Arguments and errors are those of ``run_experiment``; `observed` must not be PICTURES.
     """
-    require_counts(runs=runs)
+    require_at_least(1, runs=runs)
     require_choice("observed", observed, OBSERVED)
     # A hypothesis ends only by an inequality, by being equal to another, or as one of more than 8.
     settings = replace(

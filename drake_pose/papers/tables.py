@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from rich.markup import escape
 from rich.table import Table
 
-from drake_pose.errors import SettingsError
-
 Figures = Mapping[str, Any]
 """Results of an experiment by key."""
 
@@ -28,19 +26,6 @@ Count = Callable[[str, int], Advance]
 def uncounted(_what: str, _total: int) -> Advance:
     """Start a count that reports nothing; a ``Count``."""
     return lambda _done: None
-
-
-def require_counts(**counts: int) -> None:
-    """Raise SettingsError, naming the count, if a count is below 1."""
-    for name, count in counts.items():
-        if count < 1:
-            raise SettingsError(f"{name} must be 1 or more, not {count}")
-
-
-def require_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    """Raise SettingsError, listing the choices, if argument `name` has none of them."""
-    if value not in choices:
-        raise SettingsError(f"{name} must be one of {', '.join(choices)}, not '{value}'")
 
 
 def spread_over_seeds(

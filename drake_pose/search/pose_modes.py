@@ -18,7 +18,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from drake_pose.errors import SettingsError
+from drake_pose.errors import SettingsError, require_at_least
 from drake_pose.search.branch_and_bound import PartialPoseGraph, PosesWithin, branch_and_bound
 from drake_pose.search.estimates import JointEstimate, PoseEstimate, PoseMode, PoseSet, View
 from drake_pose.search.partial_poses import expand_groups
@@ -312,10 +312,8 @@ class ExaminationSettings:
     tolerance: float | None = None
 
     def __post_init__(self) -> None:
-        if self.tolerance is not None and not self.tolerance >= 0.0:
-            raise SettingsError(f"tolerance must be 0 pixels or more, not {self.tolerance}")
-        if self.modes < 1:
-            raise SettingsError(f"modes must be 1 or more, not {self.modes}")
+        require_at_least(0, tolerance=self.tolerance)
+        require_at_least(1, modes=self.modes)
         self.limits("mode"), self.limits("proof")
 
     def limits(self, step: str) -> BoundLimits:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.errors import SettingsError
+from drake_pose.errors import SettingsError, require_at_least, require_positive
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 
 
@@ -35,18 +35,8 @@ class GridSettings:
     intervals: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        named = {"interval": self.interval, "length_interval": self.length_interval}
-        named |= {f"interval of {name}": value for name, value in self.intervals.items()}
-        for name, value in named.items():
-            if not (math.isfinite(value) and value > 0):
-                raise SettingsError(f"{name} must be positive and finite, not {value}")
-
-    def _require(self, least: float, *names: str) -> None:
-        """Raise SettingsError if a field of these names is less than ``least``; None passes."""
-        for name in names:
-            value = getattr(self, name)
-            if value is not None and not value >= least:
-                raise SettingsError(f"{name} must be {least:g} or more, not {value}")
+        require_positive(interval=self.interval, length_interval=self.length_interval)
+        require_positive(**{f"interval of {name}": one for name, one in self.intervals.items()})
 
 
 @dataclass(frozen=True)
@@ -70,8 +60,8 @@ class PaperSearchSettings(GridSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._require(0, "outside_limit")
-        self._require(1, "candidate_limit", "run_limit")
+        require_at_least(0, outside_limit=self.outside_limit)
+        require_at_least(1, candidate_limit=self.candidate_limit, run_limit=self.run_limit)
 
 
 @dataclass(frozen=True)
@@ -93,12 +83,8 @@ class Stage:
     limb_by_limb: bool = False
 
     def __post_init__(self) -> None:
-        if self.hypotheses < 1:
-            raise SettingsError(f"a stage needs 1 hypothesis or more, not {self.hypotheses}")
-        if not self.outside_fraction >= 0.0:
-            raise SettingsError(f"outside_fraction must be 0 or more, not {self.outside_fraction}")
-        if self.outside_weight < 1:
-            raise SettingsError(f"outside_weight must be 1 or more, not {self.outside_weight}")
+        require_at_least(1, hypotheses=self.hypotheses, outside_weight=self.outside_weight)
+        require_at_least(0, outside_fraction=self.outside_fraction)
 
 
 EXACT_STAGES = (Stage(20), Stage(160))
@@ -136,7 +122,8 @@ class BeamSearchSettings(GridSettings):
         super().__post_init__()
         if not self.stages:
             raise SettingsError("stages must hold at least one stage")
-        self._require(0, "research_hypotheses", "time_limit")
+        hypotheses = self.research_hypotheses
+        require_at_least(0, research_hypotheses=hypotheses, time_limit=self.time_limit)
 
 
 @dataclass(frozen=True)
@@ -355,9 +342,8 @@ class BoundLimits:
     time_limit: float | None = None  # Time after which the search stops [s]; None: no limit.
 
     def __post_init__(self) -> None:
-        for name in ("states", "pairs", "poses", "memory"):
-            if getattr(self, name) < 1:
-                raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")
+        sizes = {"states": self.states, "pairs": self.pairs, "poses": self.poses}
+        require_at_least(1, **sizes, memory=self.memory)
         if self.time_limit is not None and not 0.0 <= self.time_limit < math.inf:
             raise SettingsError(f"time_limit must be 0 s or more, not {self.time_limit}")
 

@@ -12,7 +12,7 @@ from pydrake.systems.sensors import ImageLabel16I
 
 from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera, camera_tuple
-from drake_pose.errors import SettingsError
+from drake_pose.errors import SettingsError, require_at_least
 from drake_pose.filtering.contour_tracker import TrackingSettings
 from drake_pose.filtering.match_and_track import MatchAndTrack, TrackerState
 from drake_pose.search import TRACKED, PoseEstimate, PoseSearch, View
@@ -112,8 +112,7 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
             cameras, 1, "a matcher needs one or more cameras of different names"
         )
         require_period("matcher", period)
-        if mode_limit < 1:
-            raise SettingsError(f"the mode limit must be 1 or more, not {mode_limit}")
+        require_at_least(1, mode_limit=mode_limit)
         self._search, self._cameras, self._mode_limit = search, cameras, mode_limit
         labels = search.tree.model.labels if labels is None else labels
         self._labels = self.add_parameter(None if labels is None else frozenset(labels))

@@ -28,7 +28,7 @@ from pydrake.trajectories import Trajectory
 
 from drake_pose.arrays import Array
 from drake_pose.body import ArticulatedModel, ModelSource, package_folder
-from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.errors import UnknownNameError, require_at_least
 from drake_pose.person.date.walking import (
     WALK,
     apply_command,
@@ -91,8 +91,7 @@ class Walker(MemorySystem):
     ) -> None:
         super().__init__()
         require_period("walker", period)
-        if not settle >= 0:
-            raise SettingsError(f"the time to settle must be 0 s or more, not {settle}")
+        require_at_least(0, settle=settle)
         parts = ("head", "left_foot", "right_foot")
         for part in parts:
             if part not in model.link_names:

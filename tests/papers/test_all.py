@@ -7,10 +7,15 @@ import pytest
 from rich.console import Console
 
 from drake_pose.commands.main import app
-from drake_pose.errors import OutputError, SettingsError
+from drake_pose.errors import (
+    OutputError,
+    SettingsError,
+    require_at_least,
+    require_choice,
+)
 from drake_pose.papers import all_experiments
 from drake_pose.papers.all_experiments import EXPERIMENTS, Experiment, reproduce_all
-from drake_pose.papers.tables import figure_table, require_choice, require_counts, spread_over_seeds
+from drake_pose.papers.tables import figure_table, spread_over_seeds
 from tests.cli import CliRunner
 
 
@@ -112,8 +117,8 @@ def test_table_shows_one_run_or_mean_minimum_and_maximum():
 
 
 def test_bad_counts_and_choices_are_named():
-    require_counts(runs=1)
+    require_at_least(1, runs=1)
     with pytest.raises(SettingsError, match="images must be 1 or more, not 0"):
-        require_counts(runs=1, images=0)
+        require_at_least(1, runs=1, images=0)
     with pytest.raises(SettingsError, match="angle must be one of a, b, not 'c'"):
         require_choice("angle", "c", ("a", "b"))

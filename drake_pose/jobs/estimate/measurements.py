@@ -33,7 +33,11 @@ from drake_pose.camera.motor_calibration import Servos, read_motors
 from drake_pose.camera.picture_files import VIDEOS, frame_key
 from drake_pose.camera.servo_readings import Column
 from drake_pose.camera.sources import TIME_STAMPS
-from drake_pose.errors import SceneError, SettingsError, UnknownNameError
+from drake_pose.errors import (
+    SceneError,
+    UnknownNameError,
+    require_at_least,
+)
 from drake_pose.files.records import BASE_COLUMNS, FIT_COLUMNS
 from drake_pose.files.settings import EpisodeSettings
 from drake_pose.input_files import read_csv, read_number
@@ -432,8 +436,7 @@ def kept_pictures(camera: EpisodeCamera, settings: EpisodeSettings) -> Indices:
 
     Raises SettingsError: ``every`` is below 1; UnknownNameError: a frame does not exist.
     """
-    if settings.every < 1:
-        raise SettingsError(f"every must be 1 or more, not {settings.every}")
+    require_at_least(1, every=settings.every)
     every = frames_of(camera)
     names = select_frames(every, settings.frames, f"camera '{camera.name}'")[:: settings.every]
     return np.array([every.index(name) for name in names], np.intp)

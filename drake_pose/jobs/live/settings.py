@@ -1,6 +1,5 @@
 """Settings of a live capture: command line options and Python arguments."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from drake_pose.errors import SettingsError
+from drake_pose.errors import SettingsError, require_positive
 from drake_pose.files.settings import within
 
 CaptureMethod = Literal["person", "paper"]
@@ -57,7 +56,6 @@ class LiveSettings:
     packages: Annotated[Mapping[str, Path], _OF_PYTHON] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.seconds is not None and not 0.0 < self.seconds < math.inf:
-            raise SettingsError(f"seconds must be positive, not {self.seconds}")
+        require_positive(seconds=self.seconds)
         if (self.face_camera is None) != (self.faces is None):
             raise SettingsError("--face-camera and --faces need each other")

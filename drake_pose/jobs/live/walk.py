@@ -16,7 +16,7 @@ from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_pose.arrays import Array
 from drake_pose.body import ArticulatedModel, bundled_model, load_model
-from drake_pose.errors import OutputError, SettingsError
+from drake_pose.errors import OutputError, SettingsError, require_positive
 from drake_pose.files.folder import read_summary
 from drake_pose.files.records import PoseTable
 from drake_pose.jobs.estimate.inputs import bundled_person
@@ -79,8 +79,7 @@ def recorded_player(
     """
     summary = read_summary(result)
     rate_hz = float(summary.get("frame_rate_hz") or RATE_HZ) if rate_hz is None else rate_hz
-    if not (math.isfinite(rate_hz) and rate_hz > 0):
-        raise SettingsError(f"the frame rate must be a positive number, not {rate_hz}")
+    require_positive(rate_hz=rate_hz)
     if model_path is None:
         name = str(summary.get("model", ""))
         model_path = bundled_model("person").with_name(Path(name).name)
@@ -177,8 +176,7 @@ def walk(
 
     Raises SettingsError: time or speed is out of range.
     """
-    if seconds is not None and not 0.0 < seconds < math.inf:
-        raise SettingsError(f"the walk's length must be a positive number, not {seconds} s")
+    require_positive(seconds=seconds)
     if not (math.isfinite(speed) and speed >= 0):
         raise SettingsError(f"the speed must be 0 or a positive number, not {speed}")
     period, sensors = player.period, player.sensors

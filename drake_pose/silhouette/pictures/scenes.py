@@ -25,7 +25,7 @@ from drake_pose.camera.picture_files import (
     picture_size,
     read_picture,
 )
-from drake_pose.errors import SceneError, SettingsError, UnknownNameError
+from drake_pose.errors import SceneError, SettingsError, UnknownNameError, require_at_least
 from drake_pose.silhouette.pictures.masks import read_mask
 
 CAMERA_FILE, SCENE_FILE = "cameras.yaml", "scene.yaml"
@@ -122,8 +122,7 @@ class Scene:
 
         Raises SettingsError: the step is below 1; UnknownNameError: there is no such frame.
         """
-        if step < 1:
-            raise SettingsError(f"every must be 1 or more, not {step}")
+        require_at_least(1, every=step)
         selected = select_frames(self.frames, wanted, str(self.path))
         if step == 1 or not selected:
             return self, tuple(wanted)

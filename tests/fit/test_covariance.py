@@ -4,16 +4,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from drake_pose.body import TriangleMesh
 from drake_pose.body.tree_kinematics import TreeKinematics
+from drake_pose.fit.contour_fit import symmetric
 from drake_pose.fit.covariance import (
+    ComparedMask,
     Distances,
     ErrorSizes,
     _prior_information,
     distances_covariance,
+    distances_in_masks,
     error_unit,
     estimate_sizes,
     nuisance_covariance,
+    score_nuisances,
     surface_deformations,
     values_covariance,
     vuong_statistic,
@@ -21,7 +27,7 @@ from drake_pose.fit.covariance import (
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import simplify_surfaces
 from drake_pose.search import ViewsFit
-from drake_pose.silhouette.outline import TreeSurfaces
+from drake_pose.silhouette.outline import Outline, TreeSurfaces, outline_from_mesh
 from tests.search.arms import arm_tree, damaged_views, draw_pose
 
 FINE = tuple(AnnealingStage(scale, 0.0125, 8) for scale in (0.025, 0.0125))
@@ -237,3 +243,154 @@ def test_nuisances_are_removed_by_their_posterior_mean():
     whole = distances_covariance(residuals, sizes) + 4.0 * A @ A.T + values
     estimates = 4.0 * A.T @ np.linalg.solve(whole, residuals.y)
     np.testing.assert_allclose(without.y, residuals.y - A @ estimates, atol=1e-6)
+
+
+SIZES = np.array([0.004, 0.006, 0.004])
+MIDDLES = ((0.0, 0.1, 0.2), (0.3, -0.1, 0.0))
+
+
+def compared_clouds() -> tuple[list[Outline], list[ComparedMask]]:
+    """Return two parts, and comparisons with three masks whose information is random and large.
+
+    The first and third mask are of cameras that see the first part in the same pose.
+    """
+    rng = np.random.default_rng(9)
+    corners = [rng.normal(middle, (0.05, 0.08, 0.11), (40, 3)) for middle in MIDDLES]
+    triangles = np.arange(39).reshape(-1, 3).astype(np.int32)
+    outlines = [outline_from_mesh(TriangleMesh(one, triangles)) for one in corners]
+    turns = Rotation.random(8, random_state=3).as_matrix()
+    masks = []
+    for c in range(3):
+        X_WN, X_CW = np.tile(np.eye(4), (2, 1, 1)), np.eye(4)
+        X_WN[:, :3, :3] = turns[[0, 1 + c]]
+        X_WN[:, :3, 3] = (0.1, 0.2, 0.3), (0.2 * c, 0.0, 0.1)
+        X_CW[:3, :3], X_CW[:3, 3] = turns[5 + c % 2], (0.0, 0.1, 2.0 + c % 2)
+        J = 3e4 * rng.normal(size=(2, 30, 12))
+        A = np.tril(np.swapaxes(J, 1, 2) @ J)
+        b = 1e4 * rng.normal(size=(2, 12))
+        moves = rng.normal(size=(2, 4, 12))
+        moves[:, c] = 0.0
+        masks.append(ComparedMask(A, b, X_WN, X_CW, moves, float(SIZES[c])))
+    return outlines, masks
+
+
+def test_residuals_keep_all_information_of_well_seen_parts() -> None:
+    """Sums over residuals are those of the quadratic costs x^T A x - 2 b^T x of all motions."""
+    outlines, masks = compared_clouds()
+    found = distances_in_masks(outlines, masks)
+    assert found.X.shape == (72, 4)
+    As = [symmetric(one.A) for one in masks]
+    expected = sum(
+        np.einsum("nmi,nij,nkj->mk", one.moves, A, one.moves)
+        for one, A in zip(masks, As, strict=True)
+    )
+    np.testing.assert_allclose(found.X.T @ found.X, expected, rtol=1e-6)
+    np.testing.assert_allclose(found.information, expected, rtol=1e-9)
+    pulled = sum(np.einsum("nmi,ni->m", one.moves, one.b) for one in masks)
+    np.testing.assert_allclose(
+        found.X.T @ found.y, pulled, rtol=1e-6, atol=1e-6 * np.abs(pulled).max()
+    )
+    squares = sum(
+        float(b @ np.linalg.solve(own, b))
+        for one, A in zip(masks, As, strict=True)
+        for own, b in zip(A, one.b, strict=True)
+    )
+    assert found.y @ found.y == pytest.approx(squares)
+    np.testing.assert_array_equal(np.bincount(found.pictures), [24, 24, 24])
+    # The directions with the largest information come first, and are kept.
+    some = distances_in_masks(outlines, masks, max_count=30)
+    np.testing.assert_allclose(some.y, found.y[:30])
+    np.testing.assert_allclose(some.X, found.X[:30])
+    curvatures = (found.surface_derivatives**2).sum(axis=1)
+    assert (np.diff(curvatures) <= 1e-9 * curvatures[0]).all()
+    weak = [one._replace(A=1e-14 * one.A) for one in masks]
+    assert distances_in_masks(outlines, weak).y.shape == (0,)
+
+
+def effect_of(masks: list[ComparedMask], found: Distances, c: int, motions: np.ndarray) -> float:
+    """Return the information of mask c about an affine motion (nodes, 12), by its residuals."""
+    moved = [one._replace(moves=motions[:, None] * (k == c)) for k, one in enumerate(masks)]
+    return float(distances_in_masks(compared_clouds()[0], moved).information[0, 0])
+
+
+def test_a_cameras_error_moves_the_whole_body_by_the_unit_of_errors() -> None:
+    """By three translations along, and three rotations about, its axes through the body."""
+    outlines, masks = compared_clouds()
+    found = distances_in_masks(outlines, masks)
+    for c, one in enumerate(masks):
+        own = found.pictures == c
+        p_W = np.concatenate(
+            [o.vertices @ X[:3, :3].T + X[:3, 3] for o, X in zip(outlines, one.X_WN, strict=True)]
+        )
+        middle = p_W.mean(axis=0)
+        extent = np.sqrt(((p_W - middle) ** 2).sum(axis=1).mean())
+        total = 0.0
+        for axis in one.X_CW[:3, :3]:
+            turn = np.cross(np.eye(3), axis).T / extent
+            for M, shift in ((np.zeros((3, 3)), axis), (turn, -turn @ middle)):
+                affine = SIZES[c] * np.column_stack([M, shift]).ravel()
+                total += effect_of(masks, found, c, np.tile(affine, (2, 1)))
+        # Both parts move alike, so residuals of both are added before they are squared.
+        assert np.trace(found.effects[4][np.ix_(own, own)]) == pytest.approx(total, rel=1e-6)
+        assert not found.effects[4][np.ix_(own, ~own)].any()
+
+
+def test_a_boundary_bias_grows_each_part_by_the_unit_on_all_sides() -> None:
+    outlines, masks = compared_clouds()
+    plain, found = (distances_in_masks(outlines, masks, with_bias=one) for one in (False, True))
+    assert found.X.shape == (72, 7)
+    np.testing.assert_allclose(found.X[:, :4], plain.X)
+    for c, one in enumerate(masks):
+        growth = []
+        for outline, X in zip(outlines, one.X_WN, strict=True):
+            R, own = X[:3, :3], outline.vertices
+            M = R @ np.diag(1.0 / own.std(axis=0)) @ R.T
+            shift = -M @ (R @ own.mean(axis=0) + X[:3, 3])
+            growth.append(SIZES[c] * np.column_stack([M, shift]).ravel())
+        information = effect_of(masks, found, c, np.array(growth))
+        assert found.information[4 + c, 4 + c] == pytest.approx(information)
+        assert (found.X[:, 4 + c] ** 2).sum() == pytest.approx(information)
+        assert not found.X[found.pictures != c, 4 + c].any()
+    # Nodes without a surface do not grow.
+    bare = outline_from_mesh(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32)))
+    A = masks[0].A.copy()
+    A[1] = 0.0
+    one = distances_in_masks([outlines[0], bare], [masks[0]._replace(A=A)], with_bias=True)
+    assert np.isfinite(one.X).all()
+
+
+def test_noise_repeats_where_a_part_is_seen_in_the_same_pose() -> None:
+    """Relative to the camera: the first part by the first and third mask only."""
+    outlines, masks = compared_clouds()
+    found = distances_in_masks(outlines, masks)
+    part = np.argmax(
+        [np.abs(found.surface_derivatives[:, 12 * n : 12 * n + 12]).sum(axis=1) for n in (0, 1)],
+        axis=0,
+    )
+    by_part = found.surface_derivatives.reshape(-1, 2, 12)[np.arange(72), part]
+    unit = by_part / np.linalg.norm(by_part, axis=1)[:, None]
+    seen = np.where(part == 0, found.pictures % 2, found.pictures)
+    alike = (part[:, None] == part) & (seen[:, None] == seen)
+    np.testing.assert_allclose(found.effects[1], alike * (unit @ unit.T), atol=1e-9)
+    np.testing.assert_array_equal(found.effects[0], np.eye(72))
+    # A pose that differs by a little less or more than half the unit of errors.
+    for by, repeats in ((0.4, True), (0.6, False)):
+        moved = masks[2].X_WN.copy()
+        moved[0, :3, 3] += by * SIZES[2] * np.array([0.6, 0.0, 0.8])
+        again = distances_in_masks(outlines, [*masks[:2], masks[2]._replace(X_WN=moved)])
+        first, third = again.pictures == 0, again.pictures == 2
+        assert again.effects[1][np.ix_(first, third)].any() == repeats
+
+
+def test_scores_of_nuisances_are_least_squares_beside_the_values() -> None:
+    sizes = ErrorSizes(1.0, 0.5, 0.2, 0.1, 0.3, (2.0, 1.0))
+    residuals, _ = drawn_distances(np.random.default_rng(5), sizes, 40)
+    found, deviations = score_nuisances(residuals, sizes)
+    inverse = np.linalg.inv(distances_covariance(residuals, sizes))
+    for k, a in enumerate(np.hstack(residuals.nuisances).T):
+        J = np.column_stack([residuals.X, a])
+        covariance = np.linalg.inv(J.T @ inverse @ J)
+        assert found[k] == pytest.approx((covariance @ J.T @ inverse @ residuals.y)[-1])
+        assert deviations[k] == pytest.approx(np.sqrt(covariance[-1, -1]))
+    assert len(found) == len(deviations) == 8
+    assert score_nuisances(residuals._replace(nuisances=()), sizes)[0].shape == (0,)

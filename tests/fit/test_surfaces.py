@@ -12,8 +12,13 @@ from drake_pose.fit.surfaces import (
     VERY_FEW,
     _simplify_cached,
     load_or_make,
+    reduce_meshes,
+    simplify_or_hull,
+    simplify_outlines,
+    simplify_rigid_parts,
     simplify_surfaces,
     surface_distance,
+    with_radius_scales,
 )
 from drake_pose.silhouette.outline import TreeSurfaces, outline_from_mesh
 from drake_pose.workers import map_ordered
@@ -207,3 +212,65 @@ def test_without_a_writable_folder_surfaces_are_made(tmp_path, monkeypatch):
     monkeypatch.setattr(surfaces, "kernel_folder", lambda: tmp_path)
     assert load_or_make((b"quick",), quick, 60.0) is quick.outline
     assert not (tmp_path / "surfaces").exists()
+
+
+def ball(level, radius=1.0):
+    made = trimesh.creation.icosphere(level, radius=radius)
+    return TriangleMesh(np.array(made.vertices), np.array(made.faces))
+
+
+def test_meshes_share_the_triangles_that_are_allowed():
+    """Each keeps its fraction, and at least 100; few triangles stay as they are."""
+    given = [ball(4), ball(3, 0.5), ball(0), ball(1)]
+    counts = np.array([len(one.triangles) for one in given])
+    assert counts.tolist() == [5120, 1280, 20, 80]
+    found = reduce_meshes(given, 1300)
+    fewer = np.array([len(one.triangles) for one in found])
+    np.testing.assert_allclose(fewer[:2], 1300 * counts[:2] / counts.sum(), rtol=0.05)
+    assert found[2:] == given[2:]
+    for one, radius in zip(found, (1.0, 0.5), strict=False):
+        np.testing.assert_allclose(np.linalg.norm(one.vertices, axis=1), radius, rtol=0.03)
+    few = reduce_meshes(given, 400)
+    assert len(few[1].triangles) == pytest.approx(100, abs=6)
+    for total, stays in ((5500, True), (5300, False)):
+        again = reduce_meshes(given, total)
+        assert all(a is b for a, b in zip(again, given, strict=True)) == stays
+
+
+def test_surfaces_that_cannot_be_simplified_become_hulls():
+    """Loose triangles cannot be merged; a ball and a surface of few triangles are kept."""
+    rng = np.random.default_rng(3)
+    at = on_surface(outline_from_mesh(ball(3)), 600)
+    loose = (at[:, None] + 0.01 * rng.normal(size=(600, 3, 3))).reshape(-1, 3)
+    cloud = outline_from_mesh(TriangleMesh(loose, np.arange(1800).reshape(-1, 3)))
+    round_one, small = outline_from_mesh(ball(3)), outline_from_mesh(ball(1))
+    (hull,) = simplify_or_hull([cloud], 80, limit=0.5)
+    simple, same = simplify_or_hull([round_one, small], 80)
+    assert same is small
+    for one in (hull, simple):
+        assert 60 <= len(one.triangles) <= 100
+        np.testing.assert_allclose(np.linalg.norm(one.vertices, axis=1), 1.0, atol=0.08)
+        made = trimesh.Trimesh(one.vertices, one.triangles)
+        assert made.volume == pytest.approx(4.0 / 3.0 * np.pi, rel=0.2)
+    (kept,) = simplify_or_hull([cloud], 80)
+    assert abs(trimesh.Trimesh(kept.vertices, kept.triangles).volume) < 0.1
+    (again,) = simplify_outlines([simple], 40)
+    assert 30 <= len(again.triangles) <= 48
+    assert simplify_outlines([small])[0] is small
+
+
+def test_radius_scales_widen_surfaces_about_their_long_axis():
+    given = [outline_from_mesh(ball(1)), outline_from_mesh(ball(1, 0.5))]
+    for one, wide, k in zip(
+        given, with_radius_scales(given, np.array([2.0, 0.5])), (2.0, 0.5), strict=True
+    ):
+        np.testing.assert_allclose(wide.vertices, one.vertices * [k, 1.0, k])
+        np.testing.assert_array_equal(wide.triangles, one.triangles)
+
+
+def test_only_rigid_parts_of_a_skin_are_simplified(person):
+    surfaces = TreeSurfaces(person.pose_tree())
+    few = simplify_rigid_parts(surfaces, VERY_FEW)
+    assert max(len(one.triangles) for one in few.rigid) <= 1.2 * VERY_FEW
+    for one, other in zip(few.bending, surfaces.bending, strict=True):
+        assert one is other

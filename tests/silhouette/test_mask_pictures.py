@@ -131,7 +131,9 @@ def test_annotations_are_drawn_by_class_and_picture(tmp_path, classes):
     found = read_coco(annotations(tmp_path / "a.json"))
     assert found.classes == ("arm", "9")
     assert found.names == {"3": "arm", "4": "tool"}
-    assert found.warnings[0].endswith("1 annotations have a box, but no segmentation: left out")
+    assert found.warnings[0].endswith(
+        "json: 1 annotations have a box, but no segmentation: left out"
+    )
     first, second = found.pictures
     assert (first.file, first.width, first.height) == ("left/0001.jpg", WIDTH, HEIGHT)
     assert (first.draw(["arm"]) == (classes == 1)).all()
@@ -160,8 +162,10 @@ def test_damaged_annotations_are_refused(tmp_path, change, words):
         read_coco(file).pictures[0].draw(["arm"])
 
 
-@pytest.mark.parametrize("text", ["{", "[]", "{}"])
-def test_other_json_files_are_refused(tmp_path, text):
-    (tmp_path / "a.json").write_text(text)
-    with pytest.raises(MaskError, match=r"a\.json"):
-        read_coco(tmp_path / "a.json")
+@pytest.mark.parametrize("content", ["{", "[]", "3", '"images"', "{}", '{"images": []}'])
+def test_files_without_images_and_annotations_are_refused(tmp_path, content):
+    path = tmp_path / "a.json"
+    path.write_text(content)
+    what = "a JSON file" if content == "{" else "a COCO file: it needs images and annotations"
+    with pytest.raises(MaskError, match=rf"a\.json: is not {what}"):
+        read_coco(path)

@@ -138,6 +138,7 @@ def test_mask_survives_conversion_to_label_image():
     image = mask_to_label_image(MASK)
     assert isinstance(image, ImageLabel16I)
     assert (image.width(), image.height()) == (30, 20)
+    assert {*np.unique(image.data).tolist()} == {1, int(RenderLabel.kEmpty)}
     np.testing.assert_array_equal(label_image_to_mask(image), MASK)
     np.testing.assert_array_equal(label_image_to_mask(image.data), MASK)
 

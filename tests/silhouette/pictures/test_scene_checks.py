@@ -2,6 +2,7 @@
 
 import struct
 import time
+from contextlib import nullcontext
 from dataclasses import replace
 
 import cv2
@@ -14,10 +15,12 @@ from drake_pose.camera.models import ParallelCamera, circle_of_cameras
 from drake_pose.errors import MaskError, SceneError
 from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scene_checks import (
+    _check_gaps,
     check_scene,
     check_upright,
     frame_ranges,
     leave_out_unreadable,
+    read_mask_of,
 )
 from drake_pose.silhouette.pictures.scenes import load_scene
 
@@ -183,3 +186,49 @@ def test_consecutive_frames_become_ranges():
     known = [f"{k:02d}" for k in range(40)]
     assert frame_ranges(["03", "02", "07", "04"], known) == "02-04, 07"
     assert frame_ranges(known[::3], known) == "00, 03, 06, 09, 12, 15 and 8 more"
+
+
+def test_masks_that_fill_picture_and_edge_are_inverted(tmp_path):
+    """More than half of the picture and more than three quarters of its edge."""
+    frames = {
+        "1": (np.s_[:, 2:], "white fills 97 %"),
+        "2": (np.s_[:, 4:], "white fills 93 %"),
+        "3": (np.s_[:, 6:], None),
+        "4": (np.s_[10:30, 5:55], None),
+    }
+    scene = record(tmp_path, frames)
+    for frame, (part, told) in frames.items():
+        mask = np.zeros((40, 60), bool)
+        mask[part] = True
+        write_mask(scene.masks["left", frame], mask)
+        with nullcontext() if told is None else pytest.raises(MaskError, match=told):
+            found = read_mask_of(scene, "left", frame, may_be_empty=False)
+            np.testing.assert_array_equal(found, mask)
+    # White along the edge alone, and nowhere.
+    edge = np.ones((40, 60), bool)
+    edge[6:34, 6:54] = False
+    for mask in (edge, edge & False):
+        write_mask(scene.masks["right", "1"], mask)
+        found = read_mask_of(load_scene(tmp_path), "right", "1", may_be_empty=True)
+        np.testing.assert_array_equal(found, mask)
+    with pytest.raises(MaskError):
+        read_mask_of(load_scene(tmp_path), "right", "1", may_be_empty=False)
+
+
+@pytest.mark.parametrize(
+    ("frames", "told"),
+    [
+        ("1 2 4 5", "1 frames dropped by all cameras between 2 and 4;"),
+        ("1 3 5 9 11 21", "5 frames dropped by all cameras between 5 and 9, between 11 and 21;"),
+        ("1 2", None),
+        (
+            "1 2 3 5 6 8 9 11 12 14 15 17 18 20 21 23 24 25 26 27 28 29 30 32",
+            "8 frames dropped by all cameras "
+            + ", ".join(f"between {k} and {k + 2}" for k in range(3, 19, 3))
+            + " and at 2 more places;",
+        ),
+    ],
+)
+def test_dropped_frames_are_counted(frames, told):
+    found = _check_gaps(frames.split())
+    assert [one.startswith(told) for one in found] == [True] * (told is not None)

@@ -1,4 +1,4 @@
-"""A small robot arm of boxes, two cameras, and damaged masks of it."""
+"""A robot arm of boxes and damaged masks of it; a gripper; a crane that makes full turns."""
 
 import math
 from collections.abc import Sequence
@@ -8,12 +8,14 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body import PoseTree, TriangleMesh, load_model
+from drake_pose.body import ArticulatedModel, PoseTree, TriangleMesh, load_model
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.search import PoseSet, View
 from drake_pose.silhouette.outline import Outline, outline_from_mesh
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.scoring import draw_mask
-from tests.body.models import joint, link
+from tests.body.models import joint, link, urdf, write
+from tests.jobs import scenes
 
 # For each link: name, joint's distance along the parent [m], axis and limits [deg], and the box's
 # sides and length [m].
@@ -138,3 +140,47 @@ def _ragged(mask: np.ndarray, generator: np.random.Generator) -> np.ndarray:
     inside, outside = (cv2.distanceTransform(m, cv2.DIST_L2, 5) for m in (mask, 1 - mask))
     field = cv2.GaussianBlur(generator.standard_normal(mask.shape), (0, 0), 3.0)
     return np.asarray(inside - outside + 0.7 / field.std() * field > 0.0)
+
+
+def _box(middle: str, size: str) -> str:
+    return f'<visual><origin xyz="{middle}"/><geometry><box size="{size}"/></geometry></visual>'
+
+
+def gripper(folder: Path, *, follows: bool) -> ArticulatedModel:
+    """Return the gripper; ``follows``: whether the right finger mimics the left one."""
+    mast, hand = ({"axis": "1 0 0", "limits": f'lower="-{r}" upper="{r}"'} for r in (1.2, 1.5))
+    finger = {"limits": 'lower="0" upper="0.08"', "origin": 'xyz="0 0 .06"'}
+    mimic = '<mimic joint="left_joint"/>' if follows else ""
+    text = urdf(
+        link("mast", _box("0 0 .15", ".05 .05 .3")),
+        link("hand", _box("0 0 .03", ".06 .24 .06")),
+        link("left", _box("0 .01 .05", ".03 .02 .1")),
+        link("right", _box("0 -.01 .05", ".03 .02 .1")),
+        joint("mast_joint", "revolute", "world", "mast", origin="", **mast),
+        joint("hand_joint", "revolute", "mast", "hand", origin='xyz="0 0 .3"', **hand),
+        joint("left_joint", "prismatic", "hand", "left", axis="0 1 0", **finger),
+        joint("right_joint", "prismatic", "hand", "right", axis="0 -1 0", more=mimic, **finger),
+    )
+    return load_model(write(folder, text, f"gripper_{follows}.urdf"), check=False)
+
+
+def crane(folder: Path, luff: str = 'lower="-6.2831853" upper="6.2831853"') -> ArticulatedModel:
+    """Return a boom with a continuous joint, and a jib with limits two turns apart, as in a UR5."""
+    path = folder / "turning.urdf"
+    path.write_text(
+        '<robot name="crane"><link name="world"/>'
+        + scenes.LINK.format(name="boom", z=0.25, size="0.1 0.16 0.5")
+        + scenes.LINK.format(name="jib", z=0.2, size="0.1 0.08 0.4")
+        + '<joint name="swing" type="continuous"><parent link="world"/><child link="boom"/>'
+        '<origin xyz="0 0 0.3"/><axis xyz="1 0 0"/></joint>'
+        '<joint name="luff" type="revolute"><parent link="boom"/><child link="jib"/>'
+        '<origin xyz="0 0 0.5"/><axis xyz="1 0 0"/>'
+        f'<limit {luff} effort="1" velocity="1"/></joint></robot>'
+    )
+    return load_model(path, check=False)
+
+
+def views_of(model: ArticulatedModel, q: Sequence[float]) -> list[View]:
+    """Return the view of Drake's renderer from the front at positions q [rad]."""
+    front = scenes.camera("front")
+    return [View(front, LabelRenderer(model, front).mask(np.asarray(q)))]

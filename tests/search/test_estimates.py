@@ -21,7 +21,7 @@ from drake_pose.search import (
     View,
     covariance_pose_set,
 )
-from tests.search.turning import crane, views_of
+from tests.search.arms import crane, views_of
 
 TURN = 2.0 * math.pi
 CAMERA = ParallelCamera("front", 6, 4, 10.0, 3.0, 2.0, np.eye(4))

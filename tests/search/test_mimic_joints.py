@@ -20,8 +20,7 @@ from drake_pose.search.branch_and_bound import branch_and_bound
 from drake_pose.search.sampled_body import SampledBody
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
-from .arms import arm_cameras
-from .gripper import gripper
+from .arms import arm_cameras, gripper
 
 GRID = {"interval": math.radians(15.0), "length_interval": 0.02}
 ON_GRID = np.array([math.radians(15.0), math.radians(-30.0), 0.04, 0.04])

@@ -1,4 +1,4 @@
-"""Pose sets from damaged masks: intervals, undetermined joints, flips."""
+"""Pose sets from damaged masks: intervals, undetermined joints, flips, self-motions."""
 
 import numpy as np
 import pytest
@@ -8,12 +8,13 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import simplify_surfaces
 from drake_pose.search import ViewsFit
-from drake_pose.search.self_motions import flips
+from drake_pose.search.self_motions import counter_turns, flips
 from drake_pose.search.settings import RobustSettings
 from drake_pose.search.views_fit import FittedPose, RobustModes, distinct
 from drake_pose.silhouette.outline import TreeSurfaces
 from tests.body.models import joint, link, urdf, write
-from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_view, is_held
+from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_view, is_held, split
+from tests.search.bodies import swinging_chain
 
 TRUTH = np.array([0.6, 0.7, -0.7, 0.9, 0.3])
 FINE = tuple(AnnealingStage(scale, 0.0125, 8) for scale in (0.025, 0.0125))
@@ -111,3 +112,65 @@ def test_distinct_keeps_the_best_of_equal_poses():
     poses = [FittedPose(np.array([x, 0.0]), cost) for x, cost in ((0, 3), (0.01, 1), (1, 2))]
     assert [pose.cost for pose in distinct(poses, 5)] == [1, 2]
     assert [pose.cost for pose in distinct(poses, 1)] == [1]
+
+
+VALUES = np.array([0.6, 0.7, -0.7, 0.9, 0.3])
+
+
+def poses(kinematics, values):
+    """Return X_WN (nodes, 4, 4) by the pose tree instead of the compiled kinematics."""
+    return kinematics.tree.node_poses(split(kinematics.tree, values))
+
+
+def test_flips_keep_the_pose_of_the_last_link(kinematics):
+    found = flips(kinematics, VALUES)
+    before = poses(kinematics, VALUES)
+    assert found
+    for flip in found:
+        after = poses(kinematics, flip.values)
+        np.testing.assert_allclose(after[-1], before[-1], atol=1e-9)
+        assert np.abs(flip.values - VALUES).max() > 0.1
+        assert ((flip.values >= kinematics.lower) & (flip.values <= kinematics.upper)).all()
+        np.testing.assert_array_equal(flip.values[~flip.changed], VALUES[~flip.changed])
+    # Turret and roll turn by half a turn, the shoulder changes its sign.
+    expected = VALUES + np.pi * np.array([-1, 0, 1, 0, 0])
+    expected[1] *= -1
+    best = min(found, key=lambda flip: np.abs(flip.values - expected).max())
+    np.testing.assert_allclose(best.values, expected, atol=1e-9)
+    assert best.mirrored.tolist() == [False, True, False, False, False]
+    assert best.changed.tolist() == [True, True, True, False, False]
+
+
+def test_flipping_twice_returns_to_the_start(kinematics):
+    for flip in flips(kinematics, VALUES):
+        back = [again.values for again in flips(kinematics, flip.values)]
+        assert min(np.abs(values - VALUES).max() for values in back) < 1e-9
+
+
+def test_flips_outside_the_limits_are_left_out(kinematics):
+    # The turret's limits are +-150 degrees, so 10 cannot become 190 degrees.
+    values = np.radians([10.0, 40.0, -30.0, 50.0, 20.0])
+    assert flips(kinematics, values) == []
+
+
+def test_counter_turns_keep_the_pose_of_later_links(kinematics):
+    # With the shoulder upright, turret and roll have the same axis.
+    values = np.array([0.6, 0.0, -0.5, 0.9, 0.3])
+    found = counter_turns(kinematics, values, np.radians(30.0))
+    turned = [one for one in found if one[0] != values[0] and one[2] != values[2]]
+    assert turned
+    before = poses(kinematics, values)
+    for one in turned:
+        np.testing.assert_allclose(poses(kinematics, one)[-1], before[-1], atol=1e-9)
+    assert all(((one >= kinematics.lower) & (one <= kinematics.upper)).all() for one in found)
+
+
+def test_a_planar_chain_has_counter_turns_but_no_flips(tmp_path):
+    kinematics = TreeKinematics(swinging_chain(tmp_path, 3).pose_tree())
+    values = np.array([0.3, -0.4, 0.5])
+    assert flips(kinematics, values) == []
+    for one in counter_turns(kinematics, values, 0.5):
+        changed = np.flatnonzero(one != values)
+        assert len(changed) == 2
+        # With parallel axes the two changes cancel, except for full turns.
+        assert (one - values).sum() == pytest.approx(0.0, abs=1e-9)

@@ -10,8 +10,8 @@ from drake_pose.filtering.inequalities import from_model
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.body.models import LIMB_URDF, joint, link, urdf, write, write_limb
 from tests.jobs.scenes import camera
+from tests.search.arms import crane
 from tests.search.bodies import front_camera, near_camera
-from tests.search.turning import crane
 
 
 def descend(observation, seen, x, steps=5):

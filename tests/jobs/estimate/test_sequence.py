@@ -17,7 +17,7 @@ from drake_pose.jobs.estimate.scene import check_track, compare_cameras, estimat
 from drake_pose.search import TRACKED, RootPlacementSearch
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.jobs.scenes import URDF, TinyScene, camera, edit_camera, write_scene
-from tests.search.turning import crane
+from tests.search.arms import crane
 
 # A swinging crane, with a cut before the last frames.
 BEFORE = [(20 + 3 * k, -40 - 2 * k) for k in range(6)]

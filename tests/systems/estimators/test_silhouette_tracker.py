@@ -17,9 +17,8 @@ from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.systems.cameras import SilhouetteCamera, picture_to_colour_image
 from drake_pose.systems.diagrams import build_simulated_matching
 from drake_pose.systems.silhouette_matcher import TRACK, SilhouetteTracker
-from tests.search.arms import arm_cameras
+from tests.search.arms import arm_cameras, gripper
 from tests.search.bodies import front_camera
-from tests.search.gripper import gripper
 from tests.systems.bench import Bench
 
 PERIOD = 1 / 30

@@ -12,10 +12,16 @@ from drake_pose.errors import RegistrationError, UnknownNameError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.jobs.registration.diagnosis import likely_offset_warnings
 from drake_pose.registration.joint_offsets import (
+    _kept,
+    _unknown_rotations,
+    ambiguous_constants,
     calibrate_joints,
     fit_cameras_alone,
+    require_fit_kept,
+    require_frame_count,
     shrink_constants,
     shrink_measured,
+    undetermined,
     unseen_rotations,
 )
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
@@ -227,3 +233,128 @@ def test_cameras_follow_held_constants_back_to_the_contours(model, body, camera)
     assert shift < 2e-3
     assert turn < np.radians(0.1)
     np.testing.assert_array_equal(found.shared[6:], 0.0)
+
+
+@pytest.mark.parametrize("value", [0.02, 0.3])
+def test_a_measured_constant_is_combined_by_its_information(
+    monkeypatch: pytest.MonkeyPatch, value: float
+) -> None:
+    """Its covariance grows along it first; a contradiction makes both less certain."""
+    monkeypatch.setattr(
+        "drake_pose.registration.joint_offsets.shrink_constants", lambda _, found, *__: found.shared
+    )
+    rng, names = np.random.default_rng(3), ("eye.turn_y", "eye.turn_x", "first", "second")
+    J = rng.normal(size=(4, 4)) * [0.01, 0.01, 0.01, 0.002]
+    J[0] = 0.9 * J[2] + 0.0004 * rng.normal(size=4)
+    C = J @ J.T
+    fit = SimpleNamespace(names=names, constants=names[2:])
+    seen = SharedValues(np.array([0.01, -0.02, 0.05, 0.03]), np.zeros(0))
+    for deviation in (0.001, 0.03):
+        found, after, gauges = shrink_measured(
+            fit, seen, C, names[2:], {"first": (value, deviation), "gone": (9.0, 1.0)}
+        )
+        own = C[2, 2] * 2.5**2 + max(0.014, deviation) ** 2
+        wide = C + (own / C[2, 2] ** 2 - 1.0 / C[2, 2]) * np.outer(C[2], C[2])
+        assert wide[2, 2] == pytest.approx(own)
+        noise = max(deviation**2, 0.25 * (value - 0.05) ** 2 - own)
+        e = np.eye(4)[2]
+        information = np.linalg.inv(wide) + np.outer(e, e) / noise
+        np.testing.assert_allclose(after, np.linalg.inv(information), rtol=1e-6, atol=1e-12)
+        posterior = np.linalg.solve(
+            information, np.linalg.solve(wide, seen.shared) + e * value / noise
+        )
+        np.testing.assert_allclose(found.shared, posterior, rtol=1e-6)
+        assert gauges == {"first": ("eye.turn_y",)}
+    same, unchanged, nothing = shrink_measured(fit, seen, C, names[2:], {})
+    assert nothing == {}
+    np.testing.assert_array_equal(same.shared, seen.shared)
+    np.testing.assert_array_equal(unchanged, C)
+
+
+def test_an_unknown_first_offset_turns_the_camera_about_its_axis(model, body, camera) -> None:
+    views = [PosedFrames(body.kinematics, body.full, camera, see(model, body, camera, 3, 6))]
+    first, second = body.kinematics.names[:2]
+    assert not _unknown_rotations(views, [camera], {second}).any()
+    (found,) = _unknown_rotations(views, [camera], {first, second})
+    by = 1e-6
+    X = camera.X_WC.copy()
+    c, s = np.cos(by), np.sin(by)
+    X[:3] = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ X[:3]
+    moved = np.append([0.0, 0.0, 1.0], (X[:3, 3] - camera.X_WC[:3, 3]) / by)
+    expected = SHARED.constant_deviation**2 * np.outer(moved, moved)
+    np.testing.assert_allclose(found, expected, atol=1e-5 * expected.max())
+
+
+def test_constants_without_a_bound_stay_unless_a_camera_hides_them() -> None:
+    """Those that are not determined go, except in a fit that began at known offsets."""
+    fit = SimpleNamespace(names=("eye.turn_y", "a", "b"), constants=("a", "b"))
+    values = {
+        "a": undetermined("a", ("b",)),
+        "b": undetermined("b", ("eye.turn_y", "a")),
+        "c": replace(undetermined("c", ()), deviation=0.1),
+    }
+    assert _kept(values, None) == ["c"]
+    assert _kept(values, fit) == ["a", "c"]
+
+
+def test_lost_fits_and_few_frames_are_refused() -> None:
+    require_fit_kept(0.76, 0.8)
+    require_fit_kept(0.9, 0.8)
+    with pytest.raises(RegistrationError, match=r"74% of the contours fit .* 80% at its start"):
+        require_fit_kept(0.74, 0.8)
+    for count, joints, links in ((2, 1, 0), (2, 1, 1), (5, 3, 2)):
+        require_frame_count(count, joints, links)
+        with pytest.raises(
+            RegistrationError, match=f"{joints} joints .* {links} links .* {count - 1}"
+        ):
+            require_frame_count(count - 1, joints, links)
+
+
+@pytest.mark.parametrize(
+    ("name", "cost", "doubtful"),
+    [
+        # The masks' costs as a function of the offset's difference.
+        ("hand_turn", lambda x: 100.0 * x**2 + np.zeros(5), False),
+        (
+            "hand_turn",
+            lambda x: 0.01 * (x != 0.0) + np.array([1.0, -1.0, 0.0, 0.0, 0.0]) * x,
+            True,
+        ),
+        # Another minimum, at 0.3 to one side.
+        (
+            "hand_turn",
+            lambda x: 100.0 * (x * (x - 0.3)) ** 2 + 0.1 * (np.arange(5) - 1.75) * x,
+            True,
+        ),
+        (
+            "hand_turn",
+            lambda x: 100.0 * (x * (x + 0.5)) ** 2 + 0.1 * (np.arange(5) - 1.75) * x,
+            True,
+        ),
+        # As near as the interval.
+        (
+            "hand_turn",
+            lambda x: 100.0 * (x * (x - 0.1)) ** 2 + 1e-3 * (np.arange(5) - 1.75) * x,
+            False,
+        ),
+        # Another link is moved by it, too.
+        ("elbow_turn", lambda x: 0.0 * x + np.zeros(5), False),
+        ("scale", lambda x: 0.0 * x + np.zeros(5), False),
+    ],
+)
+def test_offsets_of_a_last_link_that_looks_alike_are_doubtful(
+    model, body, camera, name, cost, doubtful
+) -> None:
+    """A difference counts if the costs' sum is within two standard deviations of its scatter."""
+    views = [PosedFrames(body.kinematics, body.full, camera, see(model, body, camera, 1, 6))]
+    names = ("pose", name)
+    included = np.array([True, True, True, False, True])
+    found = SharedValues(np.array([9.0, 0.05]), np.zeros(0))
+
+    def costs(at: SharedValues) -> np.ndarray:
+        assert at.shared[0] == 9.0
+        return np.where(included, cost(at.shared[1] - 0.05), 1e9 * (at.shared[1] - 0.05))
+
+    fit = SimpleNamespace(views=views, names=names, costs=costs)
+    covariance = np.diag([1.0, 0.03**2])
+    assert ambiguous_constants(fit, found, included, covariance, [name]) == [name] * doubtful

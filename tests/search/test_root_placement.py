@@ -15,7 +15,14 @@ from drake_pose.search import (
     root_rotates_freely,
 )
 from drake_pose.search.root_placement import choose_root_samples
-from drake_pose.search.root_places import find_root_places, root_steps
+from drake_pose.search.root_places import (
+    _pixel_sizes,
+    find_root_places,
+    in_camera,
+    root_steps,
+    scale_camera,
+    slide_root,
+)
 from drake_pose.search.sampled_body import SampledBody
 from drake_pose.silhouette.scoring import draw_mask
 from drake_pose.workers import use_workers
@@ -230,3 +237,120 @@ def test_the_best_rotations_of_the_root_are_chosen(parallel):
         # Shifting by whole pixels may exchange rotations of nearly equal cost.
         missing = set(best) - set(rotations[places == k])
         assert len(missing) <= 1
+
+
+@pytest.fixture(scope="module")
+def sampled(body):
+    return RootPlacementSearch(body.pose_tree(), SETTINGS).body
+
+
+def random_pose(sampled, seed, p_WR):
+    """Return X_WN (nodes, 4, 4) of a random grid pose with its root at p_WR (3,)."""
+    rng, grid = np.random.default_rng(seed), sampled.sampled
+    samples = np.array([[rng.integers(len(X)) for X in grid.X_PN]])
+    X_WN = grid.poses(samples)[0]
+    X_WN[:, :3, 3] += p_WR - X_WN[0, :3, 3]
+    return X_WN
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_true_place_lies_between_candidates(sampled, seed):
+    """Within half a spacing in the picture, and half a step of the depth or scale."""
+    p_WR = np.random.default_rng(seed + 10).uniform(-0.12, 0.12, 3)
+    X_WN, outlines = random_pose(sampled, seed, p_WR), sampled.sampled.outlines
+    flat = replace(front_camera(160), pixels_per_metre=110.0)
+    for camera, unknown in ((EYE, False), (flat, True), (flat, False)):
+        mask = draw_mask(outlines, camera.X_CW @ X_WN, camera)
+        given = replace(flat, pixels_per_metre=40.0) if unknown else camera
+        layers = find_root_places(sampled, [View(given, mask)], unknown, None)
+        rows = [np.flatnonzero(mask.any(axis=axis)) for axis in (0, 1)]
+        extent = np.sqrt(np.prod([one[-1] - one[0] + 1 for one in rows]))
+        off = []
+        for layer in layers:
+            (view,) = layer.views
+            uv, depth = view.camera.project(layer.positions)
+            place, true_depth = camera.project(p_WR[None])
+            sizes = np.full(len(uv), layer.scale * 40.0 / 110.0 if unknown else 1.0)
+            if camera is EYE:
+                sizes = true_depth[0] / depth
+                assert np.ptp(depth) < 1e-9
+            apart = np.linalg.norm(uv - place, axis=1) / (extent / 12.0)
+            off += [*zip(apart, np.abs(np.log(sizes)) / np.log(1.12), strict=True)]
+            outside = np.array(
+                [np.hypot(*(np.argwhere(mask)[:, ::-1] - one).T).min() for one in uv]
+            )
+            assert outside.max() <= 0.75 * extent / 12.0 + 0.75
+            # Candidates fill the silhouette.
+            if not unknown:
+                for one in np.argwhere(mask)[::97, ::-1]:
+                    assert np.abs(uv - one).max(axis=1).min() <= 0.51 * extent / 12.0 + 1e-6
+        assert any(a <= 0.72 and b <= 0.501 for a, b in off)
+        if len(layers) > 1:
+            steps = np.array([
+                layer.scale if unknown else 1.0 / camera.project(layer.positions[:1])[1][0]
+                for layer in layers
+            ])  # fmt: skip
+            logs = np.log(steps / steps[0]) / np.log(1.12)
+            np.testing.assert_allclose(logs, np.round(logs), atol=1e-6)
+            assert (np.diff(np.abs(logs)) > -1e-6).all()
+            assert len({*np.round(logs).tolist()}) == len(layers) == round(np.ptp(logs)) + 1
+
+
+def test_candidates_in_space_are_seen_by_all_cameras(sampled):
+    """A grid about the point nearest to all rays holds the true place within half a spacing."""
+    front = front_camera(160)
+    c, s = np.cos(0.9), np.sin(0.9)
+    turn = np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]])
+    cameras = (EYE, replace(front, X_WC=turn @ front.X_WC, name="side"))
+    for seed in range(3):
+        p_WR = np.random.default_rng(seed).uniform(-0.1, 0.1, 3)
+        X_WN = random_pose(sampled, seed, p_WR)
+        views = [
+            View(one, draw_mask(sampled.sampled.outlines, one.X_CW @ X_WN, one)) for one in cameras
+        ]
+        (places,) = find_root_places(sampled, views, False, None)
+        spacing = np.diff(np.unique(np.round(places.positions[:, 2], 9))).min()
+        assert np.abs(places.positions - p_WR).max(axis=1).min() <= 0.501 * spacing
+        for view in views:
+            uv = view.camera.project(places.positions)[0]
+            nearest = [np.hypot(*(np.argwhere(view.mask)[:, ::-1] - one).T).min() for one in uv]
+            box = np.argwhere(view.mask)
+            extent = np.sqrt(np.prod(np.ptp(box, axis=0) + 1))
+            assert max(nearest) <= 0.75 * extent / 12.0 + 0.75
+        # About a twelfth of the body's size.
+        size = float(np.sqrt(np.prod(np.ptp(np.argwhere(views[1].mask), axis=0) + 1))) / 100.0
+        assert 0.4 * size < 12.0 * spacing < 2.5 * size
+    # Two cameras side by side do not tell the depth: the larger silhouette gives layers.
+    near = [View(replace(EYE, name=name), views[0].mask) for name in "ab"]
+    assert len(find_root_places(sampled, near, False, None)) > 1
+
+
+def test_sizes_follow_from_areas_of_random_poses(sampled):
+    """The silhouette is between the least and the largest 3 % of parallel projections."""
+    flat, areas = replace(front_camera(200), pixels_per_metre=90.0), []
+    for seed in range(60):
+        X_WN = random_pose(sampled, seed, np.zeros(3))
+        areas.append(draw_mask(sampled.sampled.outlines, flat.X_CW @ X_WN, flat).sum() / 90.0**2)
+    mask = np.zeros((200, 200), bool)
+    mask[40:90, 60:150] = True
+    sizes = _pixel_sizes(sampled, View(flat, mask))
+    low, middle, high = np.quantile(areas, [0.03, 0.5, 0.97])
+    assert sizes[0] == pytest.approx(np.sqrt(mask.sum() / middle), rel=0.04)
+    assert np.sqrt(mask.sum() / high) / 1.2 < sizes.min() < 1.04 * np.sqrt(mask.sum() / high)
+    assert 0.96 * np.sqrt(mask.sum() / low) < sizes.max() < 1.2 * np.sqrt(mask.sum() / low)
+    # A silhouette that touches the border may be of a body that is half as large again.
+    at_border = np.roll(mask, -40, axis=0)
+    cut = _pixel_sizes(sampled, View(flat, at_border))
+    assert cut.min() == sizes.min()
+    assert cut.max() / sizes.max() == pytest.approx(1.5, rel=0.13)
+    assert cut.max() > sizes.max()
+
+
+def test_a_slid_root_is_seen_at_the_same_place_by_a_scaled_camera():
+    camera = replace(front_camera(160), pixels_per_metre=50.0)
+    p_WR = np.array([0.2, 0.3, -0.1])
+    for factor in (0.5, 1.7):
+        scaled, moved = scale_camera(camera, 1.0 / factor), slide_root(camera, p_WR, factor)
+        assert scaled.pixels_per_metre == pytest.approx(50.0 / factor)
+        np.testing.assert_allclose(scaled.project(moved[None])[0], camera.project(p_WR[None])[0])
+        assert in_camera(camera, moved)[2] == pytest.approx(in_camera(camera, p_WR)[2])

@@ -250,6 +250,52 @@ Camera = PinholeCamera | ParallelCamera
 """A camera of either kind."""
 
 
+def intrinsics_warnings(
+    cameras: Iterable[Camera], alike: float = 0.04, other_size: float = 1.25, aside: float = 0.25
+) -> list[str]:
+    """Return a warning for each pinhole camera whose principal point is far from the middle.
+
+    Args:
+        cameras: the cameras.
+        alike: maximum difference of a principal point from the middle of pictures of another size,
+            or of turned pictures, for the warning to name them [size of the pictures].
+        other_size: minimum ratio of the two sizes, or of its inverse.
+        aside: distance from the middle from which there is a warning [size of the pictures]. Those
+            of real lenses are within 0.1.
+    """
+    texts = []
+    for camera in cameras:
+        if not isinstance(camera, PinholeCamera):
+            continue
+        size = np.array([camera.width, camera.height], float)
+        twice = 2.0 * (np.array([camera.center_x, camera.center_y]) + HALF_PIXEL)
+        ratio = float((twice / size).mean())
+        why = ""
+        if np.abs(twice / size - 1.0).max() < 2.0 * alike:
+            continue
+        if np.abs(twice - size[::-1]).max() < 2.0 * alike * size.min():
+            why = "center_x and center_y seem to be exchanged"
+        elif (
+            max(ratio, 1.0 / max(ratio, 1e-3)) > other_size
+            and np.abs(twice / size / ratio - 1.0).max() < 2.0 * alike
+        ):
+            width, height = twice
+            why = (
+                f"the intrinsics seem to be those of pictures of about {width:.0f} x {height:.0f}: "
+                f"divide focal lengths and principal point by {ratio:.3g}"
+            )
+        elif np.abs(twice / size - 1.0).max() > 2.0 * aside:
+            why = "are the intrinsics those of these pictures?"
+        if why:
+            texts.append(
+                f"camera '{camera.name}': its principal point {camera.center_x:.0f}, "
+                f"{camera.center_y:.0f} is far from the middle of its pictures of {camera.width} x "
+                f"{camera.height} pixels: {why} (it is right only for pictures that were cut out "
+                "beside the middle)"
+            )
+    return texts
+
+
 def camera_tuple(cameras: Mapping[str, Camera] | Iterable[Camera]) -> tuple[Camera, ...]:
     """Return cameras, given by name or as a sequence, as a tuple.
 

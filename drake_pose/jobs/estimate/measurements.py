@@ -29,6 +29,7 @@ from drake_pose.camera.joint_map import (
     read_joint_map,
     without_followers,
 )
+from drake_pose.camera.models import intrinsics_warnings
 from drake_pose.camera.motor_calibration import Servos, read_motors
 from drake_pose.camera.picture_files import VIDEOS, frame_key
 from drake_pose.camera.servo_readings import Column
@@ -334,7 +335,8 @@ def cameras_of(
     )
     chosen = [add_calibration(one, given, file) for one in chosen]
     placed = frozenset(given.cameras) - {*given.unplaced, *given.links}
-    return chosen, placed, given.warnings
+    of_lenses = intrinsics_warnings(one.pinhole() for one in chosen)
+    return chosen, placed, (*given.warnings, *of_lenses)
 
 
 def left_out_warnings(names: Iterable[str], placed: Collection[str]) -> list[str]:

@@ -102,11 +102,13 @@ def require_explained(
             continue
         if explain_misfit(other) is None and _left(other) < much_better * _left(found):
             better.append(text)
-    advice = "; ".join(better) or (
+    advice = (
         "are these masks of this robot or object, are the joint positions those of these frames, "
         "in radians and with the signs and zeros of the model's file, do focal length and "
         "principal point belong to this camera, are the pictures undistorted?"
     )
+    if better:
+        advice = f"{'; '.join(better)}."
     raise RegistrationError(
         f"camera '{found.camera.name}': no pose explains its masks: {misfit}; {advice} "
         "Nothing was written"
@@ -127,7 +129,7 @@ def _alternatives(
     ]
     text = (
         "they fit when they are mirrored: turn the pictures back, or change the sign of all joint "
-        "positions."
+        "positions"
     )
     yield text, camera.mirrored(), mirrored
     if len(frames) > 2:
@@ -136,12 +138,10 @@ def _alternatives(
             ("next", [PosedFrame(a.name, b.values, a.mask) for a, b in pairs]),
             ("previous", [PosedFrame(b.name, a.values, b.mask) for a, b in pairs]),
         ):
-            yield f"they fit with the joint positions of the {which} frame.", camera, moved
+            yield f"they fit with the joint positions of the {which} frame", camera, moved
     for factor in (0.5, 0.7, 1.4, 2.0):
         focal_x, focal_y = factor * camera.focal_x, factor * camera.focal_y
-        text = (
-            f"they fit with focal lengths near {focal_x:.0f}, {focal_y:.0f} pixels: calibrate it."
-        )
+        text = f"they fit with focal lengths near {focal_x:.0f}, {focal_y:.0f} pixels: calibrate it"
         yield text, replace(camera, focal_x=focal_x, focal_y=focal_y), sample
 
 
@@ -525,19 +525,26 @@ def target_warnings(pose: TargetPose) -> list[str]:
 
 
 def common_outlier_warnings(
-    registered: Iterable[RegisteredCamera], *, from_pictures: bool = False
+    registered: Iterable[RegisteredCamera], *, from_pictures: bool = False, worse: float = 2.0
 ) -> list[str]:
     """Return warnings that compare several cameras' inliers.
 
     They name frames that are outliers in all cameras, or in one camera but not in another. If the
     cameras were registered from masks, they name pairs of cameras that have common frames, but no
     common inlier frame.
+
+    worse: E_total of an inlier frame, over its camera's median and a percent more, from which the
+    frame does not support its joint positions against another camera.
     """
     is_inlier: dict[str, dict[str, bool]] = {}
     sets, frames_of = dict[str, list[str]](), dict[str, set[str]]()
+    doubted = set[str]()
     for found in registered:
+        usual = worse * _left(found) + 0.01
         for misfit in found.frames:
             is_inlier.setdefault(misfit.frame, {})[found.camera.name] = misfit.is_inlier
+            if misfit.is_inlier and misfit.E_total > usual:
+                doubted.add(misfit.frame)
         sets[found.camera.name] = [frame.frame for frame in found.frames if frame.is_inlier]
         frames_of[found.camera.name] = {frame.frame for frame in found.frames}
     frames, masks = list(is_inlier), dict[str, list[str]]()
@@ -560,9 +567,18 @@ def common_outlier_warnings(
             "their joint positions are not those of the pictures; correct them, or leave these "
             "frames out"
         )
-    texts += [
-        f"frames {frame_ranges(wrong, frames)} are outliers in camera '{name}', but not in another "
-        f"one that sees them: their joint positions are right, {why}"
-        for name, wrong in masks.items()
-    ]
+    for name, wrong in masks.items():
+        unsure = [frame for frame in wrong if frame in doubted]
+        sure = [frame for frame in wrong if frame not in doubted]
+        if sure:
+            texts.append(
+                f"frames {frame_ranges(sure, frames)} are outliers in camera '{name}', but not in "
+                f"another one that sees them: their joint positions are right, {why}"
+            )
+        if unsure:
+            texts.append(
+                f"frames {frame_ranges(unsure, frames)} are outliers in camera '{name}', and fit "
+                "worse than others in another one that sees them: check their joint positions, "
+                "then their pictures"
+            )
     return texts

@@ -192,9 +192,18 @@ def read_inputs(
         raise SceneError(f"{scene}: no such folder; a scene has {CAMERA_FILE} and masks")
     require_recording(scene)
     robot = read_robot(model, settings)
-    joints = joints or _own_joints(scene, robot, settings)
+    own = scene / JOINT_TABLE
     if isinstance(settings, RegistrationSettings):
-        return _read_masks(scene, robot, joints, cameras, settings)
+        joints = joints or _own_joints(scene, robot, settings)
+        inputs = _read_masks(scene, robot, joints, cameras, settings)
+        if joints is None and own.is_file():
+            text = (
+                f"{own} is not used, as it lacks a column for a joint of {model.name}, or has one "
+                "for none; joint positions are estimated (--joints names the columns at fault)"
+            )
+            inputs = replace(inputs, warnings=(text, *inputs.warnings))
+        return inputs
+    joints = joints or (own if own.is_file() else None)
     if joints is None:
         raise SettingsError(
             f"{scene}: an audit of masks needs the positions of all joints of {model.name} that "

@@ -16,7 +16,12 @@ from drake_pose.jobs.registration.diagnosis import (
 )
 from drake_pose.jobs.registration.inputs import RegistrationInputs
 from drake_pose.jobs.registration.moves import base_motion, changed_after
-from drake_pose.jobs.registration.readings import focal_correction, scene_corrections
+from drake_pose.jobs.registration.readings import (
+    focal_correction,
+    joint_exchanges,
+    scene_corrections,
+    shift_correction,
+)
 from drake_pose.registration.diagnosis import DIAGNOSIS, diagnose_frames
 from drake_pose.registration.findings import Diagnosis, Finding
 from drake_pose.registration.large_errors import (
@@ -49,7 +54,7 @@ class SceneFit:
     fit: PerFrameFit  # Fits single frames with `cameras`.
     fits: tuple[FrameFit, ...]  # The fitted frames: all frames with a mask that is not empty.
     # By camera and frame name, excess and lack of the mask over its area, see
-    # ``mask_excess_and_lack``.
+    # ``mask_excess_and_lack``; the excess of a black mask is NaN.
     mask_areas: Mapping[tuple[str, str], tuple[float, float]]
     empty_frames: tuple[str, ...]  # Names of frames whose masks are all empty.
     found: Diagnosis  # The diagnosis of the fitted frames.
@@ -138,6 +143,10 @@ class SceneComparison:
             # Corrections that leave most frames unexplained are dropped.
             placed = self._search_cameras(given)
             now = given if placed is None else self._correct(placed, most)
+        if now.is_doubtful and not self._inputs.recordings:
+            shift = shift_correction(self.body, given.cameras, self._sample)
+            if shift is not None:
+                now = self._record(given, self._compare(shift.cameras, (shift,)), shift)
         return self._finish(given if now.is_doubtful else now)
 
     def _search_unseen(self, why: str) -> SceneFit | None:
@@ -316,8 +325,9 @@ class SceneComparison:
         texts, names, wrong = list[str](), self._inputs.scene.frames, now.found.outliers
         for camera in (camera.name for camera in now.cameras):
             areas = {frame: two for (name, frame), two in now.mask_areas.items() if name == camera}
-            black = [frame for frame, two in areas.items() if two[0] == 0.0 and two[1] > less]
-            shown = {k: two for k, two in areas.items() if k not in black and k not in wrong}
+            is_black = {frame: bool(np.isnan(extra)) for frame, (extra, _) in areas.items()}
+            black = [frame for frame, (_, lack) in areas.items() if is_black[frame] and lack > less]
+            shown = {k: two for k, two in areas.items() if not is_black[k] and k not in wrong}
             # A misplaced robot causes excess and lack alike: its frames are left out.
             wider = [k for k, (extra, lack) in shown.items() if extra >= more and 3 * lack < extra]
             if 2 * len(wider) < len(shown):
@@ -363,7 +373,7 @@ class SceneComparison:
                         mask = np.zeros((camera.height, camera.width), bool)
                     if mask is not None:
                         own = mask_excess_and_lack(body, camera, frame.values, mask, fit.size)
-                        mask_areas[camera.name, name] = own
+                        mask_areas[camera.name, name] = own if mask.any() else (np.nan, own[1])
             else:
                 empty.append(name)
             if self._on_frame is not None and not corrections:
@@ -438,6 +448,8 @@ class SceneComparison:
         if scene and not inputs.recordings:
             values = [inputs.read(name).values for name in inputs.audited_frames]
             corrections = list(scene_corrections(cameras, values, inputs.audited_frames))
+            known = self.body.kinematics.names
+            corrections += joint_exchanges(cameras, joints, [known.index(one) for one in joints])
         search = LargeErrorSearch(self.body, cameras, sample or self._sample)
         return search.find(corrections, joints, left, likely)
 

@@ -19,6 +19,7 @@ def odd_link_warnings(
     *,
     max_ratio: float = 0.75,
     min_fraction: float = 0.04,
+    min_elsewhere: float = 0.5,
     most: int = 24,
 ) -> list[str]:
     """Return a warning of each link whose contour hardly fits while those of other links do.
@@ -32,6 +33,8 @@ def odd_link_warnings(
             masks by Drake's renderer links as modelled have 0.93 or more, a link with another
             gripper 0.61 at most, with a box of its own size 0.64 at most.
         min_fraction: minimum length of a judged link's contour [length of all contours].
+        min_elsewhere: minimum fitting fraction of the other links' contours. Where these do not fit
+            either, as with masks that are too wide everywhere, no link is odd.
         most: maximum number of frames.
     """
     names = {frame.frame for frame in found.frames if frame.is_inlier}
@@ -47,7 +50,10 @@ def odd_link_warnings(
     if not is_odd.any():
         return []
     others = shown & ~is_odd
-    elsewhere = percent(float(fitting[others].sum() / lengths[others].sum()))
+    ratio = float(fitting[others].sum() / lengths[others].sum())
+    if ratio < min_elsewhere:
+        return []
+    elsewhere = percent(ratio)
     texts, model = [], body.tree.model
     joints = [model.plant.get_joint(index) for index in model.plant.GetJointIndices()]
     cut = [joint.parent_body() for joint in joints if joint.child_body().name() in without]
@@ -66,6 +72,7 @@ def odd_link_warnings(
         texts.append(
             f"camera '{found.camera.name}': {percent(float(ratios[k]))} of the contour of link "
             f"'{node}'{more} fits, elsewhere {elsewhere}: is another gripper or tool mounted, a "
-            f"camera or a cable? --without {outermost} leaves it out, with what it carries"
+            "camera or a cable, is a joint before it misread (drake-pose audit tells), or are the "
+            f"pictures distorted? --without {outermost} leaves it out, with what it carries"
         )
     return texts

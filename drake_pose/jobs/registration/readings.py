@@ -11,10 +11,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array
-from drake_pose.camera.models import Camera, PinholeCamera, inverse_pose
+from drake_pose.camera.models import HALF_PIXEL, Camera, PinholeCamera, inverse_pose
 from drake_pose.registration.large_errors import Correction, unchanged
 from drake_pose.registration.online_registration import pose_difference
 from drake_pose.registration.posed_frames import MultiViewFrame
+from drake_pose.registration.register import RegistrationBody
+from drake_pose.silhouette.scoring import draw_mask
 
 
 def scene_corrections(
@@ -38,6 +40,7 @@ def scene_corrections(
         1.4,
         2.0,
     ),
+    sizes: Sequence[float] = (0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 0.75, 1.5, 2.0, 3.0, 4.0),
 ) -> Iterator[Correction]:
     """Yield corrections of mistakes that users make; each is to be tried by itself.
 
@@ -47,6 +50,7 @@ def scene_corrections(
         frames: names of the frames, in order.
         pairs: maximum number of camera pairs that are exchanged.
         factors: of focal lengths.
+        sizes: of pictures for which intrinsics may be meant [size of the camera's pictures].
     """
     for reading in readings():
         # Those of a misread rotation and a second mistake are for `likeliest_reading` alone.
@@ -65,6 +69,12 @@ def scene_corrections(
         swapped[b] = cameras[b].with_pose(cameras[a].X_WC)
         text = f"cameras '{cameras[a].name}' and '{cameras[b].name}' seem to be exchanged"
         yield Correction("reading", text, tuple(swapped), unchanged)
+        sizes_of = [(cameras[k].width, cameras[k].height) for k in (a, b)]
+        if sizes_of[0] == sizes_of[1]:
+            # The same with their intrinsics: the folders of masks were exchanged.
+            swapped[a] = replace(cameras[b], name=cameras[a].name)
+            swapped[b] = replace(cameras[a], name=cameras[b].name)
+            yield Correction("reading", text, tuple(swapped), unchanged)
     for group in _groups(cameras):
         whose = "all cameras" if len(group) > 1 else f"camera '{group[0]}'"
         text = f"the masks of {whose} seem to be mirrored: turn the pictures back"
@@ -75,10 +85,110 @@ def scene_corrections(
         text += "" if len(group) > 1 else f" '{group[0]}'"
         for factor in factors:
             yield focal_correction(cameras, group, text, factor)
+        yield from _intrinsics_corrections(cameras, group, sizes)
     for which, shift in (("next", 1), ("previous", -1)) if len(frames) > 2 else ():
         rows = dict(zip(frames, np.roll(np.array(values), -shift, axis=0), strict=True))
         text = f"the masks fit with the joint positions of the {which} frame"
         yield Correction("reading", text, tuple(cameras), partial(_with_row, rows))
+
+
+def joint_exchanges(
+    cameras: Sequence[Camera], joints: Sequence[str], rows: Sequence[int]
+) -> Iterator[Correction]:
+    """Yield corrections that exchange the logged positions of two joints.
+
+    Args:
+        cameras: the cameras, which stay.
+        joints: names of the joints.
+        rows: for each joint its index in a frame's values.
+    """
+
+    def exchanged(a: int, b: int, frame: MultiViewFrame) -> MultiViewFrame:
+        values = frame.values.copy()
+        values[[a, b]] = values[[b, a]]
+        return replace(frame, values=values)
+
+    for (one, a), (other, b) in combinations(zip(joints, rows, strict=True), 2):
+        text = f"the columns of joints '{one}' and '{other}' seem to be exchanged in the log"
+        yield Correction("reading", text, tuple(cameras), partial(exchanged, a, b))
+
+
+def shift_correction(
+    body: RegistrationBody,
+    cameras: Sequence[Camera],
+    frames: Sequence[MultiViewFrame],
+    least: float = 5.0,
+) -> Correction | None:
+    """Return a correction of principal points that brings the body to the masks' middles.
+
+    Args:
+        body: the robot's surfaces.
+        cameras: the cameras; parallel ones stay.
+        frames: with masks of the cameras.
+        least: minimum shift of a camera's pictures [pixel]; smaller ones are left to fits.
+
+    Returns the correction; None: no camera's pictures are shifted that far.
+    """
+    shifted, texts = list(cameras), list[str]()
+    for k, camera in enumerate(cameras):
+        shifts = []
+        for frame in frames if isinstance(camera, PinholeCamera) else ():
+            X_CN = camera.X_CW @ body.kinematics.poses(frame.values)
+            drawn, mask = draw_mask(body.coarse, X_CN, camera), frame.masks.get(camera.name)
+            if mask is not None and mask.any() and drawn.any():
+                middle, of_mask = (np.argwhere(one).mean(axis=0) for one in (drawn, mask))
+                shifts.append(of_mask - middle)
+        y, x = np.median(shifts, axis=0) if shifts else (0.0, 0.0)
+        if isinstance(camera, PinholeCamera) and max(abs(x), abs(y)) >= least:
+            center = camera.center_x + x, camera.center_y + y
+            shifted[k] = replace(camera, center_x=center[0], center_y=center[1])
+            texts.append(f"to that of camera '{camera.name}' add {x:.0f}, {y:.0f} px")
+    text = f"principal points seem to be off, or cameras turned: {'; '.join(texts)}"
+    return Correction("reading", text, tuple(shifted), unchanged) if texts else None
+
+
+def _intrinsics_corrections(
+    cameras: Sequence[Camera], group: Collection[str], sizes: Sequence[float]
+) -> Iterator[Correction]:
+    """Yield corrections of the intrinsics of the cameras in `group`, names of pinhole cameras.
+
+    The intrinsics may be those of pictures of other `sizes` [size of the camera's pictures], or
+    the principal point's coordinates may be exchanged.
+    """
+    whose = "all cameras" if len(group) > 1 else f"camera '{next(iter(group))}'"
+
+    def changed(change: Callable[[PinholeCamera], PinholeCamera]) -> tuple[Camera, ...]:
+        return tuple(
+            change(one) if isinstance(one, PinholeCamera) and one.name in group else one
+            for one in cameras
+        )
+
+    for size in sizes:
+        first = next(one for one in cameras if one.name in group)
+        shape = f"{size * first.width:.0f} x {size * first.height:.0f} pixels"
+        text = (
+            f"the intrinsics of {whose} seem to be those of pictures of {shape}: divide focal "
+            f"lengths and principal point by {size:.4g}"
+        )
+        yield Correction("reading", text, changed(partial(_of_size, size)), unchanged)
+    text = f"center_x and center_y of {whose} seem to be exchanged"
+    yield Correction("reading", text, changed(_with_exchanged_center), unchanged)
+
+
+def _of_size(size: float, camera: PinholeCamera) -> PinholeCamera:
+    """Return a camera whose intrinsics, as given, are those of pictures `size` times as large."""
+    center_x, center_y = (
+        (one + HALF_PIXEL) / size - HALF_PIXEL for one in (camera.center_x, camera.center_y)
+    )
+    return replace(
+        camera, focal_x=camera.focal_x / size, focal_y=camera.focal_y / size, center_x=center_x,
+        center_y=center_y,
+    )  # fmt: skip
+
+
+def _with_exchanged_center(camera: PinholeCamera) -> PinholeCamera:
+    """Return a camera with the coordinates of its principal point exchanged."""
+    return replace(camera, center_x=camera.center_y, center_y=camera.center_x)
 
 
 def focal_correction(

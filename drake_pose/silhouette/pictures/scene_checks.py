@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from drake_pose.arrays import Mask
-from drake_pose.camera.models import Camera
+from drake_pose.camera.models import Camera, intrinsics_warnings
 from drake_pose.camera.picture_files import natural_key
 from drake_pose.errors import MaskError, SceneError
 from drake_pose.input_files import require_regular
@@ -48,7 +48,8 @@ def check_scene(scene: Scene) -> Scene:
     """Return a scene with warnings, without frozen cameras' masks; ``scale_unknown``: unchanged."""
     if scene.scale_unknown:
         return scene
-    warnings, known, files = list(scene.warnings), scene.frames, {*scene.masks, *scene.images}
+    known, files = scene.frames, {*scene.masks, *scene.images}
+    warnings = [*scene.warnings, *intrinsics_warnings(scene.cameras.values())]
     several = len(scene.cameras) > 1
     for name in scene.cameras if several else ():
         missing = [frame for frame in known if (name, frame) not in files]

@@ -11,7 +11,13 @@ import pytest
 
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import Camera
-from drake_pose.errors import CameraError, MaskError, SceneError, SettingsError
+from drake_pose.errors import (
+    CameraError,
+    DrakePoseError,
+    MaskError,
+    SceneError,
+    SettingsError,
+)
 from drake_pose.jobs.registration.audit import SceneAudit, audit_scene
 from drake_pose.jobs.registration.audit_page import corrected
 from drake_pose.registration.findings import Finding
@@ -73,10 +79,13 @@ class TestAudit:
         lines = table.read_text().splitlines()
         without_a_joint = [line.rpartition(",")[0] for line in lines]
         of_another = [lines[0].replace(JOINTS[0], "elsewhere"), *lines[1:]]
-        for other in (of_another, without_a_joint):
+        for other, wrong in ((of_another, "elsewhere"), (without_a_joint, JOINTS[-1])):
             table.write_text("\n".join(other))
-            with pytest.raises(SettingsError, match="positions of all joints"):
+            with pytest.raises(DrakePoseError, match=rf"{table.name}.*{wrong}"):
                 audit_scene(own.folder, own.model)
+        table.unlink()
+        with pytest.raises(SettingsError, match="positions of all joints"):
+            audit_scene(own.folder, own.model)
 
     def test_only_outliers_are_drawn(self, found) -> None:
         drawn = {str(path.relative_to(found[0])) for path in found[0].rglob("*.png")}

@@ -142,6 +142,69 @@ def test_pose_convention_is_recognised(scene, spoil, text) -> None:
     assert re.search(text, one["text"])
 
 
+def _of_size(one: Camera, size: float) -> Camera:
+    return replace(
+        one, focal_x=size * one.focal_x, focal_y=size * one.focal_y,
+        center_x=size * (one.center_x + 0.5) - 0.5, center_y=size * (one.center_y + 0.5) - 0.5,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("spoil", "text"),
+    [
+        (lambda one: _of_size(one, 2.0), "pictures of 640 x 480 pixels: divide .* by 2"),
+        (lambda one: _of_size(one, 0.5), "pictures of 160 x 120 pixels: divide .* by 0.5"),
+        (
+            lambda one: replace(one, center_x=one.center_y, center_y=one.center_x),
+            "center_x and center_y of all cameras seem to be exchanged",
+        ),
+    ],
+)
+def test_intrinsics_of_other_pictures_are_recognised(scene, spoil, text) -> None:
+    cameras = [spoil(one) for one in scene.cameras.values()]
+    result = audit(scene, cameras)
+    (one,) = result.summary["findings"]
+    assert result.summary["agreeing_count"] == COUNT
+    assert re.search(text, one["text"])
+    said = [one for one in result.warnings if "far from the middle" in one]
+    assert [re.search("'(.*?)'", one)[1] for one in said] == [*scene.cameras]
+
+
+def test_shifted_principal_points_are_measured(scene) -> None:
+    cameras = [replace(one, center_x=one.center_x + 25.0) for one in scene.cameras.values()]
+    result = audit(scene, cameras)
+    assert result.summary["agreeing_count"] == COUNT
+    (text,) = (
+        one["text"] for one in result.summary["findings"] if "principal points" in one["text"]
+    )
+    for name in scene.cameras:
+        x, y = map(float, re.search(rf"'{name}' add ([-\d]+), ([-\d]+) px", text).groups())
+        assert (x, y) == (pytest.approx(-25.0, abs=4.0), pytest.approx(0.0, abs=3.0))
+
+
+def test_exchanged_columns_are_recognised(scene) -> None:
+    header, *rows = scene.rows()
+    a, b = header.index("shoulder_turn"), header.index("hand_turn")
+    header[a], header[b] = header[b], header[a]
+    scene.write_rows([header, *rows])
+    (one,) = audit(scene).summary["findings"]
+    assert "columns of joints 'shoulder_turn' and 'hand_turn' seem to be exchanged" in one["text"]
+
+
+def test_exchanged_masks_are_exchanged_cameras(scene) -> None:
+    """The cameras' intrinsics differ, too: those of the poses are exchanged with them."""
+    left, right = scene.cameras.values()
+    given = {
+        "left": replace(right, name="left"),
+        "right": replace(left, name="right", center_x=left.center_x + 6.0),
+    }
+    masks = scene.folder / "masks"
+    for path in (masks / "left").glob("*.png"):
+        write_mask(path, np.roll(read_mask(path), 6, axis=1))
+    (one,) = audit(scene, [*given.values()]).summary["findings"]
+    assert "'left' and 'right' seem to be exchanged" in one["text"]
+
+
 def test_large_focal_length_error_is_measured(scene) -> None:
     cameras = [
         replace(one, focal_x=1.15 * one.focal_x, focal_y=1.15 * one.focal_y)
@@ -211,6 +274,20 @@ def test_masks_with_excess_lack_or_nothing_are_warned_of(scene) -> None:
     assert "more than the robot" in said
 
 
+def test_masks_without_a_part_are_not_called_black(scene) -> None:
+    def without_upper_half(mask: np.ndarray) -> np.ndarray:
+        spoilt, rows = mask.copy(), np.flatnonzero(mask.any(axis=1))
+        spoilt[: int(rows.mean())] = False
+        return spoilt
+
+    masks(scene, without_upper_half)
+    said = "\n".join(audit(scene).warnings)
+    assert "black" not in said
+    for name in scene.cameras:
+        assert f"'{name}': the masks of frames " in said
+    assert "of the robot: is something before it" in said
+
+
 def test_inverted_masks_are_refused(scene) -> None:
     masks(scene, np.logical_not)
     with pytest.raises(MaskError, match=r"left/000\d.png.*inverted"):
@@ -251,10 +328,20 @@ def test_a_change_has_outliers_on_one_side_only(wrong, last) -> None:
 
 def test_cameras_without_common_inliers_are_warned_of() -> None:
     def camera(name: str, agreeing: str) -> SimpleNamespace:
+        """Return a registered camera; 0: an outlier, 1: an inlier, 2: one that fits worse."""
         frames = [
-            SimpleNamespace(frame=f"{k}", is_inlier=one == "1") for k, one in enumerate(agreeing)
+            SimpleNamespace(
+                frame=f"{k}", is_inlier=one != "0", E_total=0.08 if one == "2" else 0.02
+            )
+            for k, one in enumerate(agreeing)
         ]
         return SimpleNamespace(camera=SimpleNamespace(name=name), frames=frames)
+
+    (sure,) = common_outlier_warnings([camera("left", "11101"), camera("right", "11111")])
+    assert "frames 3 are outliers in camera 'left'" in sure
+    assert "their joint positions are right" in sure
+    (unsure,) = common_outlier_warnings([camera("left", "11101"), camera("right", "11121")])
+    assert "check their joint positions" in unsure
 
     (said, *_) = common_outlier_warnings([camera("left", "11100"), camera("right", "00011")])
     assert "'left' and 'right' rest on no common frame: 'left' on 0-2, 'right' on 3-4" in said

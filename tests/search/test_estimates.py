@@ -117,6 +117,24 @@ def test_full_turns_do_not_change_a_pose(tree):
         np.testing.assert_allclose([one.high for one in joints], by + np.array([0.6, 0.3]))
 
 
+def test_errors_are_fractions_of_the_silhouettes_area(tree):
+    pose = estimate(tree, [0.5, 0.2], 1)
+    assert (pose.E_total, pose.first_E_total) == (0.07, 0.07)
+    assert replace(pose, first_J=9.0).first_E_total == 0.09
+    assert pose.explained
+    assert not replace(pose, J=70.0).explained
+    assert not replace(pose, found=False).explained
+    assert [replace(pose, lower_bound=b).proved_optimal for b in (6.9, 7.0)] == [False, True]
+    assert not PoseEstimate.nothing(tree, stopped_by="end").found
+    intervals = pose.pose_set.position_intervals(tree)
+    np.testing.assert_allclose(intervals, [[1.0, 1.0], [0.4, 0.1], [0.6, 0.3]])
+
+
+@pytest.mark.parametrize("mask", [np.full((4, 6), 3), np.full((4, 6), True)])
+def test_a_mask_of_one_value_is_full(mask):
+    assert View(CAMERA, mask).mask.all()
+
+
 def test_covariance_gives_student_intervals_within_limits(tree):
     """Student's quantile has six degrees of freedom for each camera; limits cut the interval."""
     kinematics = TreeKinematics(tree)

@@ -258,17 +258,17 @@ def date(
             an avatar through a place. Captured by the published method.
     """
     with _experiment(out) as count:
-        from drake_pose.papers.date import run_experiment, run_walk_through, save_pictures
+        from drake_pose.papers import date as people
 
         if walk:
-            walked = run_walk_through(cameras, seed, count)
+            figures, pictures = people.run_walk_through(cameras, seed, count)
             if out is not None:
-                walked.save(out)
-            _show(walked.figures, [walked.table()], json)
+                people.save_walk(pictures, out)
+            _show(figures, [people.walk_table(figures)], json)
             return
-        result = run_experiment(cameras, frames, seed, method, count)
+        result = people.run_experiment(cameras, frames, seed, method, count)
         if out is not None:
-            save_pictures(result, out)
+            people.save_pictures(result, out)
     _show(result.as_json(), [*result.tables(), result.costs()], json)
 
 

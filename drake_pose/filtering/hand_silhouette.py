@@ -23,9 +23,10 @@ from drake_pose.fit.evidence import EdgePoints, find_edge_points
 
 
 @dataclass(frozen=True)
-class MatchingSettings:
-    """Settings of the assignment of edge points to the segments of a rough pose."""
+class HandSilhouetteSettings:
+    """Settings of the search for a hand's pose, and of the match of edge points to its segments."""
 
+    # The assignment of edge points to the segments of a rough pose.
     spacing: float = 2.0  # Distance between two edge points [pixel].
     # Largest distance between edge points and a rough side, by iteration [pixel].
     gates: tuple[float, ...] = (14.0, 9.0, 6.0, 4.0)
@@ -54,8 +55,30 @@ class MatchingSettings:
     rounds: int = 4  # Iterations of the robust fit.
     shortest: float = 5.0  # Segments shorter in the image have no line [pixel].
 
+    # The cross-entropy search for a pose.
+    searches: int = 3  # Largest number of searches.
+    # poses, elite, search_rounds: number of poses of a round, of the best ones that define the next
+    # round's distribution, and of rounds.
+    poses: int = 120
+    elite: int = 15
+    search_rounds: int = 5
+    tracked: int = 4  # Number of poses whose edges are matched.
+    # wrist_deviation, turn_deviation, angle_deviation, length_deviation: largest standard
+    # deviations of the first round: wrist [pixel], quaternion, angles [rad], lengths [m].
+    wrist_deviation: float = 8.0
+    turn_deviation: float = 0.14
+    angle_deviation: float = math.radians(18.0)
+    length_deviation: float = 0.012
+    zoom: float = 0.5  # Size of the compared images relative to the mask.
+    # inside, along: standard deviation of a hidden joint or tip across the silhouette's edge, and
+    # along it [radii].
+    inside: float = 0.5
+    along: float = 10.0
+    # Finger radius for which gates and ``wrist_deviation`` are given [pixel].
+    reference_radius: float = 8.0
 
-MATCHING = MatchingSettings()
+
+HAND = HandSilhouetteSettings()
 
 
 class RoughBody(NamedTuple):
@@ -100,10 +123,8 @@ def match_axes(
     one_sided = (rough.widths > 0) & (sides[:count].min(axis=1) < 0.3 * sides[:count].max(axis=1))
     shift, turn = solution[:count].T
     C = covariance[:count]
-    C[:, 0, 0] += (
-        np.where(one_sided, MATCHING.width_deviation**2, 0.0) + MATCHING.min_offset_deviation**2
-    )
-    C[:, 1, 1] += MATCHING.min_angle_deviation**2
+    C[:, 0, 0] += np.where(one_sided, HAND.width_deviation**2, 0.0) + HAND.min_offset_deviation**2
+    C[:, 1, 1] += HAND.min_angle_deviation**2
     middle = rough.ends.mean(axis=1) - origin + shift[:, None] * normal
     alpha = np.arctan2(along[:, 1], along[:, 0]) + np.arctan(turn)
     alpha = np.remainder(alpha + np.pi, 2 * np.pi) - np.pi
@@ -112,11 +133,11 @@ def match_axes(
     # d rho / d alpha is minus the position along the axis.
     J = np.zeros((count, 2, 2))
     J[:, 0, 1], J[:, 1, 0], J[:, 1, 1] = 1.0, 1.0, -(c * middle[:, 0] + s * middle[:, 1])
-    lines[(C[:, 1, 1] > MATCHING.max_angle_deviation**2) | (size < MATCHING.shortest)] = np.nan
+    lines[(C[:, 1, 1] > HAND.max_angle_deviation**2) | (size < HAND.shortest)] = np.nan
     tips = rough.ends[rough.tips, 1] - origin + solution[count:]
-    tip_covariances = covariance[count:] + MATCHING.min_tip_deviation**2 * np.eye(2)
+    tip_covariances = covariance[count:] + HAND.min_tip_deviation**2 * np.eye(2)
     # The end of a segment that points at the camera may be its joint.
-    unsure = np.linalg.eigvalsh(tip_covariances)[:, 1] > MATCHING.max_tip_deviation**2
+    unsure = np.linalg.eigvalsh(tip_covariances)[:, 1] > HAND.max_tip_deviation**2
     tips[unsure | (size < rough.widths)[rough.tips]] = np.nan
     return Axes(lines, J @ C @ J.transpose(0, 2, 1), tips, tip_covariances)
 
@@ -147,11 +168,11 @@ def _match(
     outside = sign[:, None] * across - rough.widths[line, None]
     facing = sign[:, None] * (normal[line] @ edge.normals.T)
     fraction = position / np.maximum(size[line], 1e-9)[:, None]
-    beside = uv + (sign[:, None] * (MATCHING.beside - outside))[..., None] * normal[line, None]
+    beside = uv + (sign[:, None] * (HAND.beside - outside))[..., None] * normal[line, None]
     is_candidate = (
         (np.abs(outside) < gate)
-        & (facing > MATCHING.facing)
-        & (np.abs(fraction - 0.5) < 0.5 - MATCHING.end)
+        & (facing > HAND.facing)
+        & (np.abs(fraction - 0.5) < 0.5 - HAND.end)
     )
     is_candidate &= _is_empty(rough.drawn, beside)
     ends, widths = rough.ends[rough.tips, 1], rough.widths[rough.tips]
@@ -159,9 +180,9 @@ def _match(
     distance = np.linalg.norm(radial, axis=2)
     radial = radial / np.maximum(distance, 1e-9)[..., None]
     beyond = distance - widths[:, None]
-    beside = ends[:, None] + (widths[:, None, None] + MATCHING.beside) * radial
+    beside = ends[:, None] + (widths[:, None, None] + HAND.beside) * radial
     round_tip = (np.abs(beyond) < gate) & _is_empty(rough.drawn, beside)
-    round_tip &= np.einsum("tnk,nk->tn", radial, edge.normals) > MATCHING.facing_tip
+    round_tip &= np.einsum("tnk,nk->tn", radial, edge.normals) > HAND.facing_tip
     round_tip &= np.einsum("tnk,tk->tn", radial, along[rough.tips]) > 0.1
     cost = np.abs(np.vstack([outside, beyond]))
     cost[~np.vstack([is_candidate, round_tip])] = np.inf
@@ -215,7 +236,7 @@ def _solve(
         return np.asarray(np.bincount(f, values, count), dtype=np.float64)
 
     solution = np.zeros((count, 2))
-    for k in range(MATCHING.rounds):
+    for k in range(HAND.rounds):
         residual = e - np.einsum("nk,nk->n", g, solution[f])
         # Geman-McClure weight with a scale that shrinks to 2 pixels.
         w = weight / (1.0 + (residual / max(2.0, gate / 3.0**k)) ** 2) ** 2
@@ -226,7 +247,7 @@ def _solve(
         solution[:] = np.linalg.solve(N, right[..., None])[..., 0]
     residual = e - np.einsum("nk,nk->n", g, solution[f])
     variance = total(w * residual**2) / np.maximum(total(w), 1e-9)
-    noise = np.maximum(variance, MATCHING.edge_deviation**2) * MATCHING.correlation
+    noise = np.maximum(variance, HAND.edge_deviation**2) * HAND.correlation
     sides = np.column_stack([total(w * (side == one)) for one in range(2)])
     return solution, noise[:, None, None] * np.linalg.inv(N), sides
 
@@ -237,35 +258,6 @@ def block_covariance(blocks: Array) -> Array:
     R = np.zeros((count, 2, count, 2))
     R[np.arange(count), :, np.arange(count)] = blocks
     return R.reshape(2 * count, 2 * count)
-
-
-@dataclass(frozen=True)
-class HandSearchSettings:
-    """Settings of the cross-entropy search for a hand's pose."""
-
-    searches: int = 3  # Largest number of searches.
-    # poses, elite, rounds: number of poses of a round, of the best ones that define the next
-    # round's distribution, and of rounds.
-    poses: int = 120
-    elite: int = 15
-    rounds: int = 5
-    tracked: int = 4  # Number of poses whose edges are matched.
-    # wrist_deviation, turn_deviation, angle_deviation, length_deviation: largest standard
-    # deviations of the first round: wrist [pixel], quaternion, angles [rad], lengths [m].
-    wrist_deviation: float = 8.0
-    turn_deviation: float = 0.14
-    angle_deviation: float = math.radians(18.0)
-    length_deviation: float = 0.012
-    zoom: float = 0.5  # Size of the compared images relative to the mask.
-    # inside, along: standard deviation of a hidden joint or tip across the silhouette's edge, and
-    # along it [radii].
-    inside: float = 0.5
-    along: float = 10.0
-    # Finger radius for which gates and ``wrist_deviation`` are given [pixel].
-    reference_radius: float = 8.0
-
-
-SEARCH = HandSearchSettings()
 
 
 class HandMeasurement(NamedTuple):
@@ -327,15 +319,15 @@ class HandSilhouette:
             raise MaskError(
                 f"a mask of {mask.shape[::-1]} pixels, {(self.width, self.height)} expected"
             )
-        edge = find_edge_points(mask, MATCHING.spacing)
+        edge = find_edge_points(mask, HAND.spacing)
         if not len(edge.uv):
             nothing = np.full(len(self._observation.names), np.nan)
             return HandMeasurement(nothing, np.diag(nothing), prediction.mean, 1.0)
-        found = self._follow(mask, edge, prediction, prediction.mean, MATCHING.gates[2:], scale)
+        found = self._follow(mask, edge, prediction, prediction.mean, HAND.gates[2:], scale)
         if found.difference > self.well_matched:
-            for seed in range(SEARCH.searches):
+            for seed in range(HAND.searches):
                 for x in self._search(mask, prediction, seed):
-                    other = self._follow(mask, edge, prediction, x, MATCHING.gates, scale)
+                    other = self._follow(mask, edge, prediction, x, HAND.gates, scale)
                     found = min(found, other, key=lambda one: one.difference)
                 if found.difference <= self.well_matched:
                     break
@@ -375,7 +367,7 @@ class HandSilhouette:
         return (
             float(np.mean(self._hand.radii))
             * self._observation.pixels_per_metre
-            / SEARCH.reference_radius
+            / HAND.reference_radius
         )
 
     def _rough(self, x: Array) -> RoughBody:
@@ -453,7 +445,7 @@ class HandSilhouette:
             away = (point - nearest) / max(float(np.linalg.norm(point - nearest)), 1.0)
             y[rows] = nearest - 0.5 * radius * away - self.center
             # The position along the edge is unknown.
-            along = SEARCH.along**2 * np.eye(2) + (SEARCH.inside**2 - SEARCH.along**2) * np.outer(
+            along = HAND.along**2 * np.eye(2) + (HAND.inside**2 - HAND.along**2) * np.outer(
                 away, away
             )
             R[rows, rows] = radius**2 * along
@@ -461,12 +453,12 @@ class HandSilhouette:
     def _search(self, mask: Mask, prediction: Belief, seed: int) -> Array:
         """Return states (k, n) near a prediction with the best silhouettes: cross-entropy search.
 
-        At most ``SEARCH.tracked`` states, best first, with the prediction's scale.
+        At most ``HAND.tracked`` states, best first, with the prediction's scale.
 
         ``mask``: (H, W) the silhouette. ``prediction``: belief of the state, from which the first
         poses are drawn. ``seed``: seed of the random numbers.
         """
-        size = (round(SEARCH.zoom * self.width), round(SEARCH.zoom * self.height))
+        size = (round(HAND.zoom * self.width), round(HAND.zoom * self.height))
         small = cv2.resize(mask.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
         generator, mean = np.random.default_rng(seed), prediction.mean
         rows = self.belief_filter.inequalities
@@ -474,30 +466,28 @@ class HandSilhouette:
         turn = hand.layout.indices(QUATERNION)
         widest = np.repeat(
             (
-                self._unit * SEARCH.wrist_deviation,
-                SEARCH.turn_deviation,
-                SEARCH.angle_deviation,
-                SEARCH.length_deviation,
+                self._unit * HAND.wrist_deviation,
+                HAND.turn_deviation,
+                HAND.angle_deviation,
+                HAND.length_deviation,
             ),
             (2, 4, len(hand.angles), len(hand.layout.constant)),
         )
         narrowed = np.minimum(1.0, widest / np.maximum(prediction.deviations()[visible], 1e-12))
         P = prediction.covariance[np.ix_(visible, visible)] * np.outer(narrowed, narrowed)
         spread, elite = np.sqrt(np.diag(P)), mean[None]
-        for k in range(SEARCH.rounds):
-            poses = np.tile(mean, (SEARCH.poses, 1))
-            poses[:, visible] += (
-                generator.normal(size=(SEARCH.poses, len(visible))) @ factor_of(P).T
-            )
+        for k in range(HAND.search_rounds):
+            poses = np.tile(mean, (HAND.poses, 1))
+            poses[:, visible] += generator.normal(size=(HAND.poses, len(visible))) @ factor_of(P).T
             poses[: len(elite)] = elite
             norms = np.linalg.norm(poses[:, turn], axis=1, keepdims=True)
             poses[:, turn] *= np.linalg.norm(prediction.mean[turn]) / norms
             for phi, b in zip(rows.phi, rows.b, strict=True):
                 beyond = np.maximum(poses @ phi - b, 0.0)
                 poses -= np.outer(beyond, phi / (phi @ phi))
-            wrong = [np.count_nonzero(self.draw(x, SEARCH.zoom) != small) for x in poses]
-            elite = poses[np.argsort(wrong)[: SEARCH.elite]]
+            wrong = [np.count_nonzero(self.draw(x, HAND.zoom) != small) for x in poses]
+            elite = poses[np.argsort(wrong)[: HAND.elite]]
             mean = elite.mean(axis=0)
             off = (elite - mean)[:, visible]
             P = off.T @ off / len(off) + np.diag((0.15 * spread) ** 2) * 0.5**k
-        return elite[: SEARCH.tracked]
+        return elite[: HAND.tracked]

@@ -31,7 +31,6 @@ from drake_pose.filtering.update import (
     Measurement,
     ObservationModel,
     RepeatedView,
-    StaticView,
     Truncate,
     Updated,
     after_step,
@@ -213,7 +212,7 @@ class FilterState:
     # hypothesis' last update; see ``Updated``.
     distance: float = 0.0
     count: int = 0
-    view: StaticView | None = None  # The current static view.
+    view: tuple[Array, int] | None = None  # The current static view, see ``next_view``.
 
     @property
     def best(self) -> Belief:
@@ -392,7 +391,7 @@ class TruncatedFilter:
         step, settings = state.step + 1, self.settings
         measurement = make_measurement(observation or self.observation, y, variances)
         view = next_view(state.view, measurement, self.novelty)
-        if view.count > 1:
+        if view[1] > 1:
             branches = [self._repeat(h, measurement) for h in state.hypotheses]
         else:
             numbers = count()

@@ -297,16 +297,13 @@ def update(
     return Updated(belief, truncated, log_likelihood, distance, count)
 
 
-@dataclass(frozen=True, eq=False)
-class StaticView:
-    """A static view."""
-
-    reference: Array  # (m,) measurement of its first frame, NaN where occluded.
-    count: int  # Number of its frames so far.
-
-
-def next_view(view: StaticView | None, measurement: Measurement, significance: float) -> StaticView:
+def next_view(
+    view: tuple[Array, int] | None, measurement: Measurement, significance: float
+) -> tuple[Array, int]:
     """Return the static view that a measurement belongs to: the current one, or a new one.
+
+    A view is the measurement (m,) of its first frame, NaN where occluded, and the number of its
+    frames so far.
 
     A view is new if a measurement becomes visible, if no measurement is visible in both frames, or
     if the difference from the view's reference is significant.
@@ -316,16 +313,17 @@ def next_view(view: StaticView | None, measurement: Measurement, significance: f
     every view is new.
     """
     y = measurement.y
-    if view is None or significance == 0 or len(view.reference) != len(y):
-        return StaticView(y, 1)
-    change = wrapped_difference(y, view.reference, measurement.model.wraps)
+    if view is None or significance == 0 or len(view[0]) != len(y):
+        return y, 1
+    reference, count = view
+    change = wrapped_difference(y, reference, measurement.model.wraps)
     both = np.isfinite(change)
-    new_rows = np.isfinite(y) & ~np.isfinite(view.reference)
+    new_rows = np.isfinite(y) & ~np.isfinite(reference)
     if new_rows.any() or not both.any():
-        return StaticView(y, 1)
+        return y, 1
     size = float(np.sum(change[both] ** 2 / (2.0 * np.diag(measurement.covariance)[both])))
     is_new = size > _largest_change(significance, int(np.count_nonzero(both)))
-    return StaticView(y, 1) if is_new else StaticView(view.reference, view.count + 1)
+    return (y, 1) if is_new else (reference, count + 1)
 
 
 @lru_cache(maxsize=1024)

@@ -185,17 +185,17 @@ def _date(short: bool, folder: Path, count: Count) -> Outcome:
 def _date_walk(short: bool, folder: Path, count: Count) -> Outcome:
     """Run Date's walk through a virtual place, a small one if `short`; pictures go to `folder`."""
     cameras, size = (4, (320, 240)) if short else (9, (640, 480))
-    walk = date.run_walk_through(cameras, 0, count, size)
-    walk.save(folder)
+    figures, pictures = date.run_walk_through(cameras, 0, count, size)
+    date.save_walk(pictures, folder)
     followed = "{captured_s:.1f} s ({wrongly_s:.1f} s wrong)"
     rows: list[tuple[Any, ...]] = []
     for name in COMMANDS:
-        one = walk.figures["commands"][name]
+        one = figures["commands"][name]
         true = f"{name} (true: {one['true_s']:.1f} s)"
         rows.append((true, followed, "works (figure 8)", one, "-"))
     end = "{place_error_m:.2f} m, {heading_error_deg:.0f} degrees"
-    rows.append(("error at the walk's end", end, "-", walk.figures, "-"))
-    return walk.figures, [walk.table()], rows
+    rows.append(("error at the walk's end", end, "-", figures, "-"))
+    return figures, [date.walk_table(figures)], rows
 
 
 EXPERIMENTS = (

@@ -363,33 +363,26 @@ def _mean(values: Array | Sequence[Array]) -> float:
     return float(np.mean(values))
 
 
-class WalkThrough(NamedTuple):
-    """Commands and walk by captured gestures, compared with those by the true poses."""
+def walk_table(figures: Mapping[str, Any]) -> Table:
+    """Tabulate the time for which each command of a walk was active."""
+    columns = {
+        key: {name: one[f"{key}_s"] for name, one in figures["commands"].items()}
+        for key in ("true", "captured", "wrongly")
+    }
+    end = "{same_command:.1%} of frames equal, final error {place_error_m:.2f} m"
+    title = f"Walking through [s]: {end.format(**figures)}"
+    return figure_table(title, {k: (k, "{:.2f}") for k in COMMANDS}, columns, "command")
 
-    figures: dict[str, Any]  # Results by key.
-    # Of each command's middle frame, the shown camera's input and the virtual place.
-    pictures: Mapping[str, tuple[Picture, Picture]]
 
-    def table(self) -> Table:
-        """Tabulate the time for which each command was active."""
-        columns = {
-            key: {name: one[f"{key}_s"] for name, one in self.figures["commands"].items()}
-            for key in ("true", "captured", "wrongly")
-        }
-        end = "{same_command:.1%} of frames equal, final error {place_error_m:.2f} m"
-        title = f"Walking through [s]: {end.format(**self.figures)}"
-        return figure_table(title, {k: (k, "{:.2f}") for k in COMMANDS}, columns, "command")
-
-    def save(self, folder: Path) -> Path:
-        """Draw figure 8: the input, and the walk through the place."""
-        columns = list(self.pictures.values())
-        figure = draw_panels(columns, list(self.pictures), ("input", "virtual walk"))
-        return save_figure(figure, folder / "figure_08.png")
+def save_walk(pictures: Mapping[str, tuple[Picture, Picture]], folder: Path) -> Path:
+    """Draw figure 8 from the pictures of a walk: the input, and the walk through the place."""
+    figure = draw_panels(list(pictures.values()), list(pictures), ("input", "virtual walk"))
+    return save_figure(figure, folder / "figure_08.png")
 
 
 def run_walk_through(
     cameras: int = 9, seed: int = 0, count: Count = uncounted, size: tuple[int, int] = (640, 480)
-) -> WalkThrough:
+) -> tuple[dict[str, Any], dict[str, tuple[Picture, Picture]]]:
     """Capture table 1's gestures by the paper's method, and walk by them.
 
     Args:
@@ -433,7 +426,7 @@ def run_walk_through(
         name: (pictures_shown[k], draw_walk(model, q[k], found_poses[k], rests[k]))
         for name, k in middles.items()
     }
-    return WalkThrough(figures, pictures)
+    return figures, pictures
 
 
 def active_frames(commands: Array) -> dict[str, Mask]:

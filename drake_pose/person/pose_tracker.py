@@ -10,7 +10,6 @@ that the silhouettes do not determine have the variance of a uniform distributio
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -23,15 +22,6 @@ from drake_pose.person.search import EXACT, BodyPlan, PersonSearch, PersonSettin
 from drake_pose.person.views import ColourViews, FrameViews
 
 
-class PoseUncertainty(NamedTuple):
-    """Uncertainty of a pose."""
-
-    covariance: Array  # (m, m) of the pose tree's values [rad, m].
-    information: Array  # (m, m) of all values, held ones included, from the silhouettes alone.
-    noise: float  # Variance of the contours' distances, relative to the fit's `Noise`.
-    surface: float  # Standard deviation of the parts' surfaces from the model's [m].
-
-
 def pose_uncertainty(
     fit: ContourFit,
     compared: Comparison,
@@ -39,7 +29,7 @@ def pose_uncertainty(
     held_covariance: Array | None = None,
     *,
     extent: float = 10.0,
-) -> PoseUncertainty:
+) -> tuple[Array, Array, float]:
     """Return the uncertainty of a fitted pose, given the pictures and the limits alone.
 
     Args:
@@ -48,6 +38,11 @@ def pose_uncertainty(
         held: (m,) which values were held, for instance lengths; None: none.
         held_covariance: (h, h) covariance of the held values; None: they are exact.
         extent: of the region in which the person is [m].
+
+    Returns:
+        The covariance (m, m) of the pose tree's values [rad, m]; the information (m, m) of all
+        values, held ones included, from the silhouettes alone; and the standard deviation of the
+        parts' surfaces from the model's [m].
     """
     size = len(fit.lower)
     held = np.zeros(size, dtype=np.bool_) if held is None else held
@@ -114,7 +109,7 @@ def pose_uncertainty(
         follow = np.eye(size)[:, held]
         follow[free] = -V_free @ H[np.ix_(free, held)]
         covariance += follow @ held_covariance @ follow.T
-    return PoseUncertainty(covariance, H, noise, float(surface[0]))
+    return covariance, H, float(surface[0])
 
 
 def _noise(A: Array, b: Array, Q: Array, assumed: float = 4.0) -> float:
@@ -232,9 +227,9 @@ class PersonPoseTracker:
         """
         placement = self.fit.body.place(values)
         compared = seen.compare(self.fit, placement, self.settings.follow[-1])
-        uncertainty = pose_uncertainty(self.fit, compared, self._held, held_covariance)
+        covariance, *_ = pose_uncertainty(self.fit, compared, self._held, held_covariance)
         deviations = np.zeros(len(self.fit.tree.model.position_names))
-        deviations[self._order] = np.sqrt(np.diag(uncertainty.covariance))
+        deviations[self._order] = np.sqrt(np.diag(covariance))
         return deviations
 
     def follow(self, last: TrackState | None, frame: FrameViews) -> TrackState | None:

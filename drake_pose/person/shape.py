@@ -155,7 +155,7 @@ def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
     own, total = np.flatnonzero(~is_shape), np.zeros((count, count))
     for (own_cameras, edges), values_then in zip(frames, poses, strict=True):
         compared = shaped.compare(pack_views(own_cameras, edges), values_then, _STAGES[-1])
-        H = pose_uncertainty(shaped, compared).information
+        _, H, _ = pose_uncertainty(shaped, compared)
         cross = H[np.ix_(own, is_shape)]
         follow = np.linalg.solve(
             H[np.ix_(own, own)] + np.eye(len(own)) / _ANGLE_DEVIATION**2, cross

@@ -8,7 +8,7 @@ unknown object.
 import math
 from collections.abc import Iterator, Sequence
 from itertools import zip_longest
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -312,15 +312,6 @@ def grab_cut(
     return np.asarray((found == cv2.GC_FGD) | (found == cv2.GC_PR_FGD))
 
 
-class _Region(NamedTuple):
-    """A region in a smaller picture."""
-
-    mask: Mask  # (h, w) the region.
-    strength: float  # Strength of its outline, a quantile of gradient magnitudes times sqrt(area).
-    sign: float  # 1 if the region's channel is above the threshold, -1 if below.
-    level: float  # The threshold [grey levels].
-
-
 def find_regions(
     picture: Picture,
     max_count: int,
@@ -352,27 +343,26 @@ def find_regions(
         slopes = (cv2.Sobel(channel, cv2.CV_32F, *by) for by in ((1, 0), (0, 1)))
         change = np.hypot(*slopes)
         low, high = np.quantile(channel, (0.01, 0.99)).tolist()
+        # Each region with its outline's strength, its side of the threshold, and the threshold.
         regions = [
-            _Region(mask, _strength(mask, change), sign, level)
+            (_strength(mask, change), mask, sign, level)
             for level in np.linspace(low, high, levels + 2)[1:-1].tolist()
             for sign in (1.0, -1.0)
             for mask in _components(np.asarray(sign * channel > sign * level))
         ]
-        kept = list[_Region]()
-        for region in sorted(regions, key=lambda region: -region.strength):
-            if all(
-                intersection_over_union(region.mask, other.mask) < max_overlap for other in kept
-            ):
-                kept.append(region)
+        kept = list[tuple[Mask, float, float]]()
+        for _, *region in sorted(regions, key=lambda region: -region[0]):
+            if all(intersection_over_union(region[0], one[0]) < max_overlap for one in kept):
+                kept.append(tuple(region))
             if len(kept) == max_count:
                 break
         by_channel.append(kept)
     # All regions of a grey picture come from its lightness.
     rows = zip_longest(*by_channel)
-    found = [(k, region) for row in rows for k, region in enumerate(row) if region is not None]
+    found = [(k, *region) for row in rows for k, region in enumerate(row) if region is not None]
     return [
-        _upscaled(region.mask, region.sign * whole[k] > region.sign * region.level)
-        for k, region in found[:max_count]
+        _upscaled(mask, sign * whole[k] > sign * level)
+        for k, mask, sign, level in found[:max_count]
     ]
 
 

@@ -254,10 +254,10 @@ class EstimateInputs:
         q, base, E_total = np.full(len(pose.q), np.nan), None, None
         if pose.found:
             q, base = pose.q, base_cells(pose.X_WB) if self.base_moves else None
-            agreement = compare_masks(masks, {name: parts[name] >= 0 for name in masks})
-            error = pose.E_total if math.isfinite(pose.J) else agreement.E_total
+            of_masks, ious = compare_masks(masks, {name: parts[name] >= 0 for name in masks})
+            error = pose.E_total if math.isfinite(pose.J) else of_masks
             if math.isfinite(error):
-                E_total, more["ious"] = error, agreement.ious
+                E_total, more["ious"] = error, ious
                 more["joint_errors"] = self.joint_errors(frame, pose.q)
         record = FrameRecord(
             frame, q, base, E_total, pose.seconds, stopped_by=pose.stopped_by, **more

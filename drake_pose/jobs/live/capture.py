@@ -368,8 +368,7 @@ class _FrameWriter:
                 name: draw_mask(tracker.fit.outlines, cameras[name].X_CW @ X_WN, cameras[name])
                 for name in masks
             }
-            agreement = compare_masks(masks, bodies)
-            error, ious = agreement.E_total, agreement.ious
+            error, ious = compare_masks(masks, bodies)
         deviations = self._value(context, "deviations", len(q))
         record = FrameRecord(
             name,

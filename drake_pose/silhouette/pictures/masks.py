@@ -3,7 +3,6 @@
 import io
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -48,20 +47,6 @@ def encode_mask(mask: np.ndarray) -> bytes:
     return stream.getvalue()
 
 
-@dataclass(frozen=True)
-class MaskAgreement:
-    """Agreement between the silhouettes of a frame and the body's masks at an estimated pose."""
-
-    differing: int  # Area where silhouettes and body's masks differ, summed over cameras [pixel].
-    area: int  # Area of the silhouettes, summed over cameras [pixel].
-    ious: Mapping[str, float]  # Intersection over union by camera.
-
-    @property
-    def E_total(self) -> float:
-        """The differing area as a fraction of the silhouettes' area; NaN without a silhouette."""
-        return self.differing / self.area if self.area else float("nan")
-
-
 def intersection_over_union(first: np.ndarray, second: np.ndarray) -> float:
     """Return the intersection over union of two masks (H, W) bool; 1 if both are empty."""
     return _overlap(first, second)[2]
@@ -78,14 +63,16 @@ def _overlap(first: np.ndarray, second: np.ndarray) -> tuple[int, int, float]:
 
 def compare_masks(
     masks: Mapping[str, np.ndarray], bodies: Mapping[str, np.ndarray]
-) -> MaskAgreement:
-    """Return the agreement of silhouettes with ``bodies``, both (H, W) bool by camera."""
+) -> tuple[float, dict[str, float]]:
+    """Return E_total and intersection over union by camera of silhouettes and ``bodies``.
+
+    Both are (H, W) bool by camera. E_total is the area where they differ, divided by the
+    silhouettes' area, both summed over the cameras; NaN without a silhouette.
+    """
     found = {camera: _overlap(mask, bodies[camera]) for camera, mask in masks.items()}
-    return MaskAgreement(
-        sum(differing for differing, _, _ in found.values()),
-        sum(area for _, area, _ in found.values()),
-        {camera: iou for camera, (_, _, iou) in found.items()},
-    )
+    differing, area = (sum(one[k] for one in found.values()) for k in (0, 1))
+    E_total = differing / area if area else float("nan")
+    return E_total, {camera: iou for camera, (_, _, iou) in found.items()}
 
 
 def count_edge_pixels(mask: np.ndarray) -> int:

@@ -33,22 +33,22 @@ def test_static_view_continues_while_only_noise_changes(hand):
     noise = np.sqrt(observation.variances)
     generator = np.random.default_rng(1)
     view = next_view(None, make_measurement(observation, y), CHANCE)
-    assert view.count == 1
+    assert view[1] == 1
     for count in range(2, 500):
         again = y + noise * generator.normal(size=len(y))
         view = next_view(view, make_measurement(observation, again), CHANCE)
-        assert view.count == count
-    assert next_view(view, make_measurement(observation, y + 4 * noise), CHANCE).count == 1
-    assert next_view(view, make_measurement(observation, y), 0.0).count == 1
+        assert view[1] == count
+    assert next_view(view, make_measurement(observation, y + 4 * noise), CHANCE)[1] == 1
+    assert next_view(view, make_measurement(observation, y), 0.0)[1] == 1
     # The threshold is a p-value for any number of measurements; newly visible ones begin a view.
     few = np.where(np.arange(len(y)) < 4, y, np.nan)
     first = next_view(None, make_measurement(observation, few), CHANCE)
     for other, is_new in ((few + 3.5 * noise, False), (few + 9 * noise, True), (y, True)):
         found = next_view(first, make_measurement(observation, other), CHANCE)
-        assert found.count == (1 if is_new else 2)
+        assert found[1] == (1 if is_new else 2)
     # A full turn of an angle is no change.
     turned = y + 2 * np.pi * observation.wraps
-    assert next_view(view, make_measurement(observation, turned), CHANCE).count == view.count + 1
+    assert next_view(view, make_measurement(observation, turned), CHANCE)[1] == view[1] + 1
 
 
 class Parabola:

@@ -16,7 +16,7 @@ from drake_pose.filtering.hand import (
     SPREADS,
     plant_positions,
 )
-from drake_pose.filtering.hand_silhouette import MATCHING, HandSilhouette, match_axes
+from drake_pose.filtering.hand_silhouette import HAND, HandSilhouette, match_axes
 from drake_pose.filtering.linearisation import wrapped_difference
 from drake_pose.filtering.state import Belief
 from drake_pose.fit.evidence import find_edge_points
@@ -78,7 +78,7 @@ def test_lines_and_tips_equal_the_true_hands_from_table_2s_guess(render, seed):
     visible_errors = off[np.isfinite(off)]
     assert len(visible_errors) >= 15
     # The measurement is relative to the final rough pose.
-    edge, gate = find_edge_points(mask, MATCHING.spacing), SILHOUETTE._unit * MATCHING.gates[-1]
+    edge, gate = find_edge_points(mask, HAND.spacing), SILHOUETTE._unit * HAND.gates[-1]
     lines = match_axes(edge, SILHOUETTE._rough(found.rough), gate, CENTER).lines.ravel()
     end = MEASURED.index("scale")
     measured = found.y[end - len(lines) : end]

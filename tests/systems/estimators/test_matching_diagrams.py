@@ -200,5 +200,5 @@ def test_pose_sets_are_output(tmp_path):
     # NaN without a body in the image, and if the search does not examine its result.
     run.update(label_image=mask_to_label_image(0 * mask > 0))
     assert np.isnan(run["mode_positions"]).all()
-    with pytest.raises(SettingsError, match="mode limit"):
+    with pytest.raises(SettingsError, match="mode_limit"):
         SilhouetteMatcher(search, [camera], PERIOD, mode_limit=0)

@@ -48,11 +48,11 @@ def test_a_diagram_equals_the_filter(sequence):
     state, counts = f.start(sequence.guess), []
     for t, y in enumerate(rows):
         state = f.update(f.predict(state) if t else state, y)
-        counts.append(state.view.count)
+        counts.append(state.view[1])
         np.testing.assert_allclose(logs["estimated_state"][t], state.best.mean)
         cut = np.isin(f.inequalities.rows, state.hypotheses[0].active)
         np.testing.assert_array_equal(logs["active_limits"][t], cut)
-    assert max(counts[:17]) < counts[-1] == run.system.filter_state(run.context).view.count
+    assert max(counts[:17]) < counts[-1] == run.system.filter_state(run.context).view[1]
     covariance = run["covariance"].reshape(len(HAND_STATE), -1)
     np.testing.assert_allclose(covariance, state.best.covariance)
     weights = run["hypothesis_weights"]

@@ -46,6 +46,22 @@ class ClusterError(DrakePoseError):
     """Worker processes cannot be started or reached, or are unfit for the task."""
 
 
+@contextmanager
+def noted_warnings() -> Iterator[list[str]]:
+    """Add warnings as notes to an error that is raised in this context.
+
+    What was assumed of the input is often why it is refused. Yields the list to which the context
+    appends its warnings.
+    """
+    noted = list[str]()
+    try:
+        yield noted
+    except DrakePoseError as error:
+        for text in dict.fromkeys(noted):
+            error.add_note(f"warning: {text}")
+        raise
+
+
 class UnknownNameError(DrakePoseError):
     """A link, joint, camera or frame of that name does not exist.
 
@@ -90,38 +106,58 @@ def listed(names: Sequence[str], most: int = 5) -> str:
     return ", ".join(names[:most]) + more
 
 
-_options_kept: ContextVar[bool] = ContextVar("options_kept", default=False)
+# Who reads messages: "python", "command line" or "job file".
+_caller: ContextVar[str] = ContextVar("caller", default="python")
 
 
 @contextmanager
 def options_in_messages() -> Iterator[None]:
     """Keep the names of command-line options in messages while the command line runs."""
-    token = _options_kept.set(True)
+    with _called_by("command line"):
+        yield
+
+
+@contextmanager
+def keys_in_messages() -> Iterator[None]:
+    """Name the keys of a batch's job file in messages while its tasks run."""
+    with _called_by("job file"):
+        yield
+
+
+@contextmanager
+def _called_by(caller: str) -> Iterator[None]:
+    token = _caller.set(caller)
     try:
         yield
     finally:
-        _options_kept.reset(token)
+        _caller.reset(token)
 
 
 def for_caller(text: str) -> str:
     """Replace option names in a message by Python argument names, unless the command line runs.
 
-    ``--joints FILE`` becomes ``joints=FILE``, ``--camera`` becomes ``cameras``. Quoted commands
+    ``--joints FILE`` becomes ``joints=FILE``, ``--camera`` becomes ``cameras``. While a batch's
+    tasks run, they become keys of the job file: ``audit: FILE``, ``cameras``. Quoted commands
     (``drake-pose ...``) stay unchanged.
     """
-    if _options_kept.get():
+    if _caller.get() == "command line":
         return text
     names = {"camera": "cameras", "frame": "frames", "class": "classes", "export": "exports"}
     names |= {"package": "packages", "no-track": "track=False"}
+    in_job = _caller.get() == "job file"
+    if in_job:
+        names |= {"cameras": "camera_file", "joints": "audit", "no-track": "track: false"}
 
     def argument(found: re.Match[str]) -> str:
-        if found["command"]:
+        if found["command"] or (in_job and found["name"] in ("out", "workers", "resume")):
             return found[0]
         name = names.get(found["name"], found["name"].replace("-", "_"))
         value = found["value"]
         if value is None:
             return name
         key, equals, what = value.partition("=")
+        if in_job:
+            return f"{name}: {{{key}: {what}}}" if equals else f"{name}: {value}"
         if equals:
             return f"{name}={{'{key}': {what}}}"
         return f"{name}='{value}'" if value == value.lower() else f"{name}={value}"

@@ -4,6 +4,7 @@ import inspect
 import pydoc
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,7 +29,17 @@ from drake_pose import (
     look_at,
     save_cameras,
 )
-from drake_pose.errors import CameraError, SettingsError, for_caller, options_in_messages
+from drake_pose.camera.episode import JointLog
+from drake_pose.errors import (
+    CameraError,
+    SettingsError,
+    for_caller,
+    keys_in_messages,
+    noted_warnings,
+    options_in_messages,
+)
+from drake_pose.jobs.batch_tasks import describe_failure
+from drake_pose.jobs.registration.inputs import still_joints
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.search import BeamSearch
 
@@ -116,6 +127,23 @@ def test_messages_name_arguments_in_python_and_options_on_the_command_line(cli_t
     assert for_caller(cli_text) == python_text
 
 
+@pytest.mark.parametrize(
+    ("cli_text", "job_text"),
+    [
+        ("give a camera file (--cameras FILE)", "give a camera file (camera_file: FILE)"),
+        ("name those: --camera NAME", "name those: cameras: NAME"),
+        ("(--joints FILE): --hold elbow=VALUE", "(audit: FILE): hold: {elbow: VALUE}"),
+        (
+            "(drake-pose register --zeros all) or --out",
+            "(drake-pose register --zeros all) or --out",
+        ),
+    ],
+)
+def test_messages_of_a_batch_name_keys_of_the_job_file(cli_text, job_text):
+    with options_in_messages(), keys_in_messages():
+        assert for_caller(cli_text) == job_text
+
+
 def test_errors_of_python_calls_name_arguments():
     scene = ROOT / "tutorials" / "data" / "human"
     with pytest.raises(DrakePoseError, match=r"joints") as refused:
@@ -123,3 +151,33 @@ def test_errors_of_python_calls_name_arguments():
     assert "--" not in str(refused.value)
     with pytest.raises(SettingsError, match="keep_out is for suggest"):
         RegistrationSettings(keep_out=(((0.0,) * 3, (1.0,) * 3),))
+
+
+def test_an_error_carries_what_was_assumed_before():
+    """Warnings of a result that was refused are printed, too."""
+
+    def refuse() -> None:
+        with noted_warnings() as noted:
+            noted += ["readings were taken for degrees", "readings were taken for degrees"]
+            raise CameraError("lost")
+
+    with pytest.raises(CameraError, match="lost") as told:
+        refuse()
+    assert told.value.__notes__ == ["warning: readings were taken for degrees"]
+    assert describe_failure(told.value) == "lost; warning: readings were taken for degrees"
+
+
+def test_joints_that_stand_still_while_others_move_are_named():
+    def said(ranges):
+        names = tuple(f"j{k}" for k in range(len(ranges)))
+        log = JointLog(names, None, np.linspace(0.0, 1.0, 9)[:, None] * ranges + 0.5)
+        kinds = ("angle", "angle", "angle", "length")
+        model = SimpleNamespace(position_kinds=kinds, position_index=names.index)
+        return still_joints(SimpleNamespace(mapped=SimpleNamespace(log=log), model=model))
+
+    (text,) = said([0.5, 1.0, 0.0, 0.7])
+    assert text.startswith("joint 'j2' reads 0.5 in all rows")
+    assert said([0.5, 0.0, 0.0, 0.7]) == said([0.5, 1.0, 1e-3, 0.7]) == ()
+    # A gripper may stay as it is.
+    assert said([0.5, 1.0, 0.7, 0.0]) == ()
+    assert still_joints(SimpleNamespace(mapped=None)) == ()

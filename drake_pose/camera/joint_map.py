@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from pathlib import Path
 from typing import Any, get_args
 
@@ -441,6 +442,17 @@ def _find_unit(
         doubtful = worst["deg"] <= 0.0 and np.fmax.reduce(maxima - minima) <= moves
         return "rad", "but as degrees they would be within the limits, too" if doubtful else ""
     elif worst["deg"] <= slack and worst["rad"] > full_turn:
+        in_degrees = excess["rad"] > slack
+        in_radians = ~in_degrees & (maxima - minima > moves)
+        if 2 * np.count_nonzero(in_radians) > len(readings):
+            # Most joints would move by a few degrees about 0.
+            one = next(iter(compress(readings, in_degrees)))
+            raise SceneError(
+                f"the joint log's columns {', '.join(compress(readings, in_degrees))} are in "
+                f"degrees, but {', '.join(compress(readings, in_radians))} seem to be in radians: "
+                f"give units: deg if all are in degrees, or a joint map: JOINT: {{column: {one}, "
+                "unit: deg}"
+            )
         return "deg", "only as degrees all are within the limits"
     raise SceneError(
         f"the readings of the joint log ({', '.join(readings)}) {reason}: give units: rad or deg, "

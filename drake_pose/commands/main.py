@@ -134,6 +134,8 @@ def _run(words: Sequence[str] | None) -> None:
     except UsageError as error:
         _stop(str(error), 2)
     except DrakePoseError as error:
+        for note in getattr(error, "__notes__", ()):
+            say(f"drake-pose: {note}")
         _stop(str(error))
     except KeyboardInterrupt:
         if "resume" not in inspect.signature(command).parameters:

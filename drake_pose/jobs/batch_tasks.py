@@ -17,7 +17,7 @@ import numpy as np
 from drake_pose.body import landmarks_file, load_model
 from drake_pose.camera.camera_files import intrinsics_of, load_cameras
 from drake_pose.camera.episode_files import open_episode
-from drake_pose.errors import DrakePoseError, OutputError
+from drake_pose.errors import DrakePoseError, OutputError, for_caller, keys_in_messages
 from drake_pose.files.folder import OVERLAY, POSES, read_summary, write_file, write_summary
 from drake_pose.files.records import FrameRecord, describe_job, mask_digests, summarize
 from drake_pose.files.settings import EstimateSettings
@@ -118,22 +118,25 @@ def perform(task: Task) -> Outcome:
     """Run a task, unless its result folder exists; an error becomes part of the outcome."""
     begin = time.perf_counter()
     seconds = 0.0
-    try:
-        if task.place.is_dir():
-            _require_same_masks(task)
-        else:
-            _make(task)
-            seconds = time.perf_counter() - begin
-        return Outcome(None, seconds, _totals(task))
-    except (Exception, SystemExit) as error:  # noqa: BLE001
-        # A failed DRAKE_DEMAND raises SystemExit, which would end the worker.
-        return Outcome(describe_failure(error), time.perf_counter() - begin)
+    with keys_in_messages():
+        try:
+            if task.place.is_dir():
+                _require_same_masks(task)
+            else:
+                _make(task)
+                seconds = time.perf_counter() - begin
+            return Outcome(None, seconds, _totals(task))
+        except (Exception, SystemExit) as error:  # noqa: BLE001
+            # A failed DRAKE_DEMAND raises SystemExit, which would end the worker.
+            return Outcome(describe_failure(error), time.perf_counter() - begin)
 
 
 def describe_failure(error: BaseException) -> str:
     """Return the message of a task's error; that of unexpected ones begins with their type."""
     if isinstance(error, DrakePoseError):
-        return str(error)
+        with keys_in_messages():
+            notes = getattr(error, "__notes__", ())
+            return for_caller("; ".join((str(error), *notes)))
     if isinstance(error, SystemExit):
         return f"a DRAKE_DEMAND failed in Drake: {error}"
     return f"{type(error).__name__}: {error}"

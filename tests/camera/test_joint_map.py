@@ -106,6 +106,16 @@ def test_units_are_given_or_inferred_from_the_limits():
         map_log(names, beyond, wide)
     warning = map_log(names, beyond, wide, units="rad").warnings[0]
     assert "joint 'panda_joint1': column 'panda_joint1' gives 3.3 in row 0" in warning
+    # A single column in degrees is named, unless somebody says that all are.
+    poses = np.random.default_rng(1).uniform(0.8 * LOW, 0.8 * HIGH, (9, 7))
+    mixed = poses * np.where(np.arange(7) == 2, np.degrees(1.0), 1.0)
+    with pytest.raises(
+        SceneError, match=r"columns panda_joint3 are in degrees, but .*panda_joint4"
+    ):
+        map_log(names, mixed, ARM)
+    by_map = {names[2]: Column(names[2], np.radians(1.0))}
+    found = map_log(names, mixed, ARM, table=by_map).log.positions
+    np.testing.assert_allclose(found, poses)
     with pytest.raises(
         SettingsError, match="units must be rad or deg or normalised or steps, not 'turns'"
     ):

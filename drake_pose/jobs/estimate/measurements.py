@@ -249,8 +249,8 @@ def check_units(
         if np.abs(values).max() > most and inside.all():
             wrong = "degrees" if unit == "rad" else "millimetres"
             raise SceneError(
-                f"{text}, but not in {wrong}: the file seems to be in {wrong}; write every {what} "
-                f"in {other}"
+                f"{text}, but not in {wrong}: the column seems to be in {wrong}; write every "
+                f"{what} in {other}"
             )
         why = "; check the column's joint, its offset, sign and unit"
         turn = math.copysign(2.0 * math.pi, values[worst])

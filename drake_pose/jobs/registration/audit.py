@@ -17,7 +17,7 @@ import numpy as np
 from drake_pose.arrays import Array
 from drake_pose.camera.camera_files import describe_camera
 from drake_pose.camera.models import Camera
-from drake_pose.errors import DrakePoseError, RegistrationError, SceneError
+from drake_pose.errors import DrakePoseError, RegistrationError, SceneError, noted_warnings
 from drake_pose.files.folder import read_summary, write_summary, writes_folder
 from drake_pose.files.records import mask_digests, user_units
 from drake_pose.files.settings import percent
@@ -28,7 +28,7 @@ from drake_pose.jobs.registration.diagnosis import (
     compare_clock,
     lost_frames_warning,
 )
-from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs
+from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs, still_joints
 from drake_pose.jobs.registration.large_errors import SceneComparison
 from drake_pose.jobs.registration.moved_cameras import (
     motion_findings,
@@ -115,8 +115,9 @@ def audit_scene(
     """
     settings, begin = settings or AuditSettings(), time.perf_counter()
     table, file, folder = (None if one is None else Path(one) for one in (joints, cameras, out))
-    with use_workers(settings.workers):
+    with use_workers(settings.workers), noted_warnings() as noted:
         inputs = split_moved_cameras(read_inputs(Path(scene), Path(model), table, file, settings))
+        noted += (*inputs.warnings, *still_joints(inputs))
         pictures = _Pictures()
         if inputs.recordings:
             given, (inputs, pictures) = inputs, _find_cameras(inputs, others=near)

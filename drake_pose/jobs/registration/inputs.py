@@ -232,6 +232,30 @@ def read_inputs(
     )
 
 
+def still_joints(inputs: RegistrationInputs, moves: float = 0.2, least: int = 3) -> tuple[str, ...]:
+    """Return what may be wrong with an episode's log if its pictures are refused.
+
+    These are revolute joints that read the same in all rows, as of an encoder that is stuck.
+
+    Args:
+        inputs: the episode; those of a scene of masks have no log.
+        moves: minimum range of the readings of joints that move [rad or m].
+        least: minimum number of such joints.
+    """
+    if inputs.mapped is None:
+        return ()
+    log, model = inputs.mapped.log, inputs.model
+    ranges = np.fmax.reduce(log.positions, axis=0) - np.fmin.reduce(log.positions, axis=0)
+    if np.count_nonzero(ranges > moves) < least:
+        return ()
+    return tuple(
+        f"joint '{name}' reads {log.positions[0, k]:.4g} in all rows of the log, while others "
+        "move: does its encoder work?"
+        for k, name in enumerate(log.names)
+        if ranges[k] == 0.0 and model.position_kinds[model.position_index(name)] == "angle"
+    )
+
+
 def _own_joints(scene: Path, robot: ArticulatedModel, settings: AuditSettings) -> Path | None:
     """Return the scene's joint table; None: it has no table with all joints that are not held."""
     path = scene / JOINT_TABLE

@@ -13,7 +13,7 @@ from drake_pose.arrays import Array, Picture
 from drake_pose.body import TARGET_POSITIONS
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
-from drake_pose.errors import CameraError, RegistrationError
+from drake_pose.errors import CameraError, RegistrationError, noted_warnings
 from drake_pose.files.folder import write_file, writes_folder
 from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.registration.diagnosis import (
@@ -29,7 +29,7 @@ from drake_pose.jobs.registration.diagnosis import (
     require_explained,
     target_warnings,
 )
-from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs
+from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs, still_joints
 from drake_pose.jobs.registration.lerobot_files import lerobot_files, require_data_set
 from drake_pose.jobs.registration.moved_cameras import (
     register_recordings,
@@ -140,10 +140,11 @@ def register_scene(
     """
     settings = settings or RegistrationSettings()
     table, file, folder = (None if one is None else Path(one) for one in (joints, cameras, out))
-    with use_workers(settings.workers):
+    with use_workers(settings.workers), noted_warnings() as noted:
         inputs = read_inputs(Path(scene), Path(model), table, file, settings)
         if settings.on is None:
             inputs = split_moved_cameras(inputs)
+        noted += (*inputs.warnings, *still_joints(inputs))
         work = _Registration(inputs, settings, on_camera)
         check_exports(settings.exports, [*inputs.known_cameras, *inputs.searched_cameras])
         if "lerobot" in settings.exports:

@@ -171,15 +171,9 @@ def _scan(path: Path) -> tuple[Any, Any, Any, Any, Any, Any]:
     if not pictures:
         found = _topics(kinds | ignored)
         raise SceneError(f"{path}: has no pictures of cameras; its topics are: {found}")
-    left_out = {topic for topic in ignored if any(topic == one for one, _ in states)}
-    return (
-        pictures,
-        states,
-        infos,
-        parents,
-        {k: v for k, v in ignored.items() if k not in left_out},
-        kinds,
-    )
+    with_states = {topic for topic, _ in states}
+    ignored = {topic: why for topic, why in ignored.items() if topic not in with_states}
+    return pictures, states, infos, parents, ignored, kinds
 
 
 def _encoding(coding: str) -> tuple[int, int | None, bool] | None:

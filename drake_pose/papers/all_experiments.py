@@ -94,11 +94,8 @@ def _kameda_pictures(experiment: str, short: bool, folder: Path, count: Count) -
 
 def _filters() -> tuple[tuple[str, str, int], ...]:
     """Return name, truncation and most linearisations of the paper's filter and of ours."""
-    return ("paper", "sequential", 1), (
-        "ours",
-        "joint",
-        shimada.experiment_settings("joint").iterations,
-    )
+    own = shimada.experiment_settings("joint").iterations
+    return ("paper", "sequential", 1), ("ours", "joint", own)
 
 
 def _shimada(observed: str, runs: int, short: bool, folder: Path, count: Count) -> Outcome:

@@ -30,9 +30,15 @@ from drake_pose.person.faults import (
     require_person,
 )
 from drake_pose.person.figures import PersonRecording, ReadFrame, ViewFaults
-from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
+from drake_pose.person.pose_tracker import (
+    NOISE,
+    PersonPoseTracker,
+    PersonShape,
+    TrackState,
+    fit_shape,
+    shape_values,
+)
 from drake_pose.person.search import LENIENT
-from drake_pose.person.shape import NOISE, PersonShape, fit_shape, shape_values
 from drake_pose.person.views import (
     ColourViews,
     FrameViews,

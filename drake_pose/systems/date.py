@@ -311,10 +311,7 @@ class FaceDirectionFinder(PortedSystem):
         self.add_input("person_view", None)
 
         def find(context: Context) -> Array:
-            image, view = (
-                self.eval_input(context, "color_image"),
-                self.eval_input(context, "person_view"),
-            )
+            image, view = (self.eval_input(context, k) for k in ("color_image", "person_view"))
             if image is None or not image.size() or view is None:
                 return np.full(2, np.nan)
             return find_face(colour_image_to_picture(image), view.blobs, templates, farthest)

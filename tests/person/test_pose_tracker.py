@@ -11,9 +11,8 @@ from drake_pose.errors import ModelError, SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walking import make_motion
-from drake_pose.person.pose_tracker import PersonPoseTracker
+from drake_pose.person.pose_tracker import NOISE, PersonPoseTracker
 from drake_pose.person.search import EXACT, LENIENT, crowding_weights
-from drake_pose.person.shape import NOISE
 from drake_pose.person.views import FrameViews, see_silhouette
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.person.persons_in_view import posed, see

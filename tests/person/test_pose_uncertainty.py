@@ -8,8 +8,7 @@ from drake_pose.camera.models import circle_of_cameras
 from drake_pose.fit.contour_fit import ContourFit, pack_views
 from drake_pose.fit.evidence import NO_EDGE, find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.person.pose_tracker import pose_uncertainty
-from drake_pose.person.shape import _SIDE_DEVIATION, _sides_information
+from drake_pose.person.pose_tracker import _SIDE_DEVIATION, _sides_information, pose_uncertainty
 from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.scoring import draw_mask
 from tests.person.persons_in_view import posed

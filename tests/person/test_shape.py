@@ -5,7 +5,7 @@ import pytest
 
 from drake_pose.body import ArticulatedModel
 from drake_pose.errors import UnknownNameError
-from drake_pose.person.shape import KnownShape, shape_parts, shape_values, tracker_of_person
+from drake_pose.person.pose_tracker import KnownShape, shape_parts, shape_values, tracker_of_person
 
 
 def test_tracker_has_the_known_lengths_and_radius_scales(shaped_person: ArticulatedModel) -> None:

@@ -32,8 +32,12 @@ from drake_pose.person.date.features import (
 )
 from drake_pose.person.date.skeleton import FEATURES, load_skeleton
 from drake_pose.person.figures import PersonRecording, keep_person
-from drake_pose.person.pose_tracker import PersonPoseTracker
-from drake_pose.person.shape import KnownShape, shape_values, tracker_of_person
+from drake_pose.person.pose_tracker import (
+    KnownShape,
+    PersonPoseTracker,
+    shape_values,
+    tracker_of_person,
+)
 from drake_pose.person.views import shows_somebody
 from drake_pose.silhouette.pictures.masks import compare_masks
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges

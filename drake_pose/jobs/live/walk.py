@@ -25,7 +25,7 @@ from drake_pose.jobs.live.scene import LiveScene, run_live
 from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walking import COMMANDS, make_motion
-from drake_pose.person.shape import tracker_of_person
+from drake_pose.person.pose_tracker import tracker_of_person
 from drake_pose.systems.person import add_person_tracker
 from drake_pose.systems.picture_capture import PictureCapture
 from drake_pose.systems.ports import evaluate

@@ -37,13 +37,13 @@ from drake_pose.jobs.registration.moved_cameras import (
     split_moved_cameras,
 )
 from drake_pose.jobs.registration.result import (
-    describe_pictures,
     describe_pose,
     describe_run,
     write_comparisons,
     write_overlays,
 )
 from drake_pose.jobs.registration.settings import AuditSettings
+from drake_pose.jobs.registration.tracks import describe_pictures
 from drake_pose.jobs.registration.words import (
     describe_common_finding,
     describe_frame_finding,
@@ -193,11 +193,6 @@ class _Pictures:
     findings: tuple[Finding, ...] = ()
     names: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
-    @property
-    def refused(self) -> tuple[Finding, ...]:
-        """Findings of cameras whose pictures no pose explains."""
-        return tuple(finding for finding in self.findings if finding.kind == "refused")
-
 
 def _find_cameras(
     inputs: RegistrationInputs,
@@ -234,7 +229,9 @@ def _find_cameras(
     alone = len(inputs.given_cameras) == 1
     body = RegistrationBody(inputs.tree, inputs.visible_nodes)
     warnings = left_out_warnings(inputs.recordings, [one.name for one in inputs.given_cameras])
-    compared, findings = list[Camera](), [] if before is None else list(before.refused)
+    compared, findings = list[Camera](), list[Finding]()
+    if before is not None:
+        findings += [one for one in before.findings if one.kind == "refused"]
     names, frames = dict[str, tuple[str, str]](), list[MultiViewFrame]()
     placed = {camera.name for camera in inputs.given_cameras} if before is None else before.found
     refused = dict[str, RegistrationError]()

@@ -38,11 +38,12 @@ from drake_pose.jobs.estimate.measurements import (
 from drake_pose.jobs.registration.positions import (
     KnownPositions,
     estimate_positions,
+    make_registration_tree,
     put_on_base,
     read_known_positions,
+    read_target,
 )
 from drake_pose.jobs.registration.settings import ALL, AuditSettings, RegistrationSettings
-from drake_pose.jobs.registration.trees import make_registration_tree, read_target
 from drake_pose.registration.camera_motion import CameraPart
 from drake_pose.registration.joint_offsets import (
     require_frame_count,

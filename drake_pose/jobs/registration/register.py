@@ -37,21 +37,29 @@ from drake_pose.jobs.registration.moved_cameras import (
     split_moved_cameras,
 )
 from drake_pose.jobs.registration.odd_links import odd_link_warnings
+from drake_pose.jobs.registration.positions import (
+    corrected_urdf,
+    joint_shifts,
+    make_registration_tree,
+)
 from drake_pose.jobs.registration.result import (
     check_exports,
     compared_frames,
     describe_camera,
     describe_parameters,
     describe_part,
-    describe_pictures,
     describe_run,
-    picture_warnings,
     write_result,
 )
 from drake_pose.jobs.registration.settings import RegistrationSettings
-from drake_pose.jobs.registration.tracks import describe_tracks, draw_tracks, track_warnings
-from drake_pose.jobs.registration.trees import corrected_urdf, joint_shifts, make_registration_tree
-from drake_pose.person.shape import shape_parts, shape_values
+from drake_pose.jobs.registration.tracks import (
+    describe_pictures,
+    describe_tracks,
+    draw_tracks,
+    picture_warnings,
+    track_warnings,
+)
+from drake_pose.person.pose_tracker import shape_parts, shape_values
 from drake_pose.registration.bundle import adjust_bundle
 from drake_pose.registration.joint_offsets import calibrate_joints
 from drake_pose.registration.picture_acceptance import PictureRegistration, evaluate_pictures
@@ -166,9 +174,8 @@ def register_scene(
     }
     files: Mapping[str, bytes | str] = {}
     if "lerobot" in settings.exports:
-        files, texts = lerobot_files(
-            work.inputs, placed.values(), settings.on, work.parameters["zeros"]
-        )
+        zeros = work.parameters["zeros"]
+        files, texts = lerobot_files(work.inputs, placed.values(), settings.on, zeros)
         work.warnings += texts
     seconds = sum(entry["seconds"] for entry in described.values())
     summary = {
@@ -316,13 +323,11 @@ class _Registration:
         """
         inputs, target, target_pose = self.inputs, self.inputs.target, None
         search: Search = CameraSearch(self.body) if target is None else TargetSearch(target)
-        measured = not inputs.positions.is_estimate
         for camera in (one for one in inputs.searched_cameras if one.name not in self.refused):
-            start, frames = time.perf_counter(), inputs.of(camera.name)
-            found = None
+            start, frames, found = time.perf_counter(), inputs.of(camera.name), None
             with self._refusing(camera.name):
                 found = search.register(camera, frames)
-                if measured:
+                if not inputs.positions.is_estimate:
                     require_explained(search, found, frames)
             if found is None or camera.name in self.refused:
                 continue
@@ -406,14 +411,13 @@ class _Registration:
         if inputs.positions.is_estimate or self.tracks:
             return
         for name, found in self.registered.items():
-            picture, posed = self.pictures.get(name), inputs.of(name)
-            fitted = found
+            picture, posed, fitted = self.pictures.get(name), inputs.of(name), found
             if picture is not None:
                 fitted = replace(found, frames=picture.found.frames)
                 posed = [replace(k, values=k.values + self._joint_offsets) for k in picture.frames]
             if not self._settings.zeros:
                 self.warnings += likely_offset_warnings(body, fitted, posed)
-            if inputs.target is None and not inputs.positions.is_estimate:
+            if inputs.target is None:
                 self.warnings += odd_link_warnings(body, fitted, posed, self._settings.without)
             if self._settings.focal or (picture is not None and picture.focal_deviation):
                 continue
@@ -441,15 +445,15 @@ class _Registration:
         # Cameras were registered from some of their pictures: here all pictures are compared.
         for name, result in self.pictures.items():
             recording, found = result.recording, self.registered[name]
-            segmented, misfits, lost = evaluate_pictures(
-                body, replace(result, joint_offsets=self._joint_offsets), found
-            )
             offsets = self._joint_offsets
+            segmented, misfits, lost = evaluate_pictures(
+                body, replace(result, joint_offsets=offsets), found
+            )
             frames += [
                 MultiViewFrame(k.name, k.values + offsets, {name: k.mask}) for k in segmented
             ]
             found = self.registered[name] = replace(found, frames=misfits)
-            errors = {k.frame: k.E_total for k in found.frames}
+            errors = {k.frame: k.E_total for k in misfits}
             wanted = (*found.outliers[:shown], *compared_frames(errors))
             pictures = {k: recording.picture(k) for k in wanted}
             self.pictures[name] = replace(result, pictures={**result.pictures, **pictures})
@@ -497,10 +501,8 @@ class _Registration:
         wrong = {name: found.outliers for name, found in registered.items()}
         frames = []
         for frame in inputs.frames:
-            inlier_masks = {
-                c: m for c, m in frame.masks.items() if frame.name not in wrong.get(c, ())
-            }
-            frames.append(replace(frame, masks=inlier_masks))
+            agree = {c: m for c, m in frame.masks.items() if frame.name not in wrong.get(c, ())}
+            frames.append(replace(frame, masks=agree))
         cameras = [*self._known_cameras, *(found.camera for found in registered.values())]
         shape: tuple[Any, ...] = (np.zeros(len(self.body.kinematics.names), np.bool_),)
         if not missing_for_person(inputs.model):
@@ -565,9 +567,8 @@ class _Registration:
         values = [frame.values + self._joint_offsets for frame in inputs.frames]
         self.inputs = replace(inputs, model=model, tree=tree, frames=inputs.with_values(values))
         kinematics = TreeKinematics(tree)
-        evaluated = zip(found.inlier_ratios, found.is_inlier, strict=True)
-        fitted = zip(found.cameras, found.covariances, evaluated, strict=True)
-        for camera, covariance, (ratios, is_inlier) in fitted:
+        evaluated = found.cameras, found.covariances, found.inlier_ratios, found.is_inlier
+        for camera, covariance, ratios, is_inlier in zip(*evaluated, strict=True):
             before = self.registered[camera.name]
             rows = zip(before.frames, ratios.tolist(), is_inlier.tolist(), strict=True)
             again = [replace(one, inlier_ratio=ratio, is_inlier=own) for one, ratio, own in rows]

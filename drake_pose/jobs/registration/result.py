@@ -26,11 +26,9 @@ from drake_pose.files.settings import percent
 from drake_pose.input_files import csv_text
 from drake_pose.jobs.registration.inputs import RegistrationInputs
 from drake_pose.jobs.registration.settings import AuditSettings
-from drake_pose.jobs.registration.words import describe_drift, describe_reading
+from drake_pose.jobs.registration.words import describe_reading
 from drake_pose.registration.camera_motion import CameraPart
 from drake_pose.registration.joint_offsets import KinematicParameter
-from drake_pose.registration.picture_acceptance import PictureRegistration
-from drake_pose.registration.picture_search import rotation_between
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import RegisteredCamera, TargetPose
 from drake_pose.silhouette.outline import outline_from_mesh
@@ -98,48 +96,6 @@ def describe_pose(name: str, X: Array, found: RegisteredCamera | TargetPose) -> 
     }
 
 
-def describe_pictures(result: PictureRegistration | None, found: bool = False) -> dict[str, Any]:
-    """Return a camera's part of summary.json on its masks and clock.
-
-    Args:
-        result: the registration from pictures; None: it was registered from masks.
-        found: whether those masks were segmented from pictures; used with None only.
-    """
-    if result is None:
-        masks = "found" if found else "given"
-        return {"masks": masks, "time_offset_s": None, "time_offset_sd_s": None}
-    offset, focal = result.time_offset, result.found.camera.focal_x
-    determined = offset if offset is not None and offset.determined else None
-    drifting = offset if offset is not None and offset.drift else None
-    return {
-        "masks": "found",
-        "time_offset_s": determined and determined.value,
-        "time_offset_sd_s": determined and determined.deviation,
-        "time_drift": drifting and drifting.drift,
-        "time_drift_sd": drifting and drifting.drift_deviation,
-        "time_offset_scores": [] if offset is None else offset.scores.round(4).tolist(),
-        "focal_px": focal,
-        "focal_sd_px": result.focal_deviation * focal if result.focal_deviation else None,
-        "explained": result.fit.explained,
-        "explained_by_chance": result.by_chance,
-        "p_value": result.p_value,
-        "contour": result.fit.contour,
-        "runner_up": result.runner_up
-        and _describe_runner_up(result.found.camera, *result.runner_up),
-    }
-
-
-def _describe_runner_up(camera: Camera, X_CW: Array, margin: float) -> dict[str, Any]:
-    """Return the summary's entry on a runner-up X_CW (4, 4); margin: see ``ratio_margin`` [sd]."""
-    X_WC = np.linalg.inv(X_CW)
-    return {
-        "X_WC": X_WC.tolist(),
-        "distance_mm": 1e3 * float(np.linalg.norm(X_WC[:3, 3] - camera.X_WC[:3, 3])),
-        "rotation_deg": math.degrees(rotation_between(X_CW, camera.X_CW)),
-        "margin_sd": margin,
-    }
-
-
 def describe_part(part: CameraPart | None) -> dict[str, Any]:
     """Return a camera's part of summary.json on its motion; empty for None or a static camera."""
     if part is None or (part.is_whole and not (part.drift or part.shake)):
@@ -152,29 +108,6 @@ def _describe_span(part: CameraPart) -> dict[str, Any]:
     """Return entries on a part: the recorded camera, and the times [s] if they are known."""
     times = {"from": part.since, "until": part.until}
     return {"part_of": part.of} | {name: one for name, one in times.items() if one is not None}
-
-
-def picture_warnings(result: PictureRegistration, assumed: bool) -> list[str]:
-    """Return warnings of an unknown focal length, a drifting clock and an unknown time offset.
-
-    assumed: whether the focal length was not given.
-    """
-    name, focal, texts = result.found.camera.name, result.found.camera.focal_x, []
-    if assumed:
-        texts.append(
-            f"camera '{name}': no focal length is given: it was estimated as "
-            f"{focal:.0f} pixels (standard deviation {result.focal_deviation * focal:.0f}); give "
-            "it in the camera file if it is known"
-        )
-    clock = result.time_offset
-    if clock is not None and clock.drift:
-        texts.append(describe_drift(name, clock.drift, clock.drift_deviation))
-    if clock is not None and not clock.determined:
-        texts.append(
-            f"camera '{name}': its pictures do not determine its time offset to the joint log, "
-            "because the robot moves too little or too slowly; add a faster motion"
-        )
-    return texts
 
 
 def describe_parameters(

@@ -1,4 +1,4 @@
-"""Cameras on a link, registered from scenes that stand still: summary, warnings and overlays."""
+"""Cameras registered in pictures of the robot or of a standing scene: summary and warnings."""
 
 import math
 from pathlib import Path
@@ -7,11 +7,16 @@ from typing import Any
 import cv2
 import numpy as np
 
+from drake_pose.arrays import Array
 from drake_pose.body.tree_kinematics import TreeKinematics
+from drake_pose.camera.models import Camera
 from drake_pose.errors import listed
 from drake_pose.files.folder import OVERLAY, write_file
 from drake_pose.files.overlay import EXCESS_RGB, encode_png
 from drake_pose.jobs.registration.result import describe_parameters
+from drake_pose.jobs.registration.words import describe_drift
+from drake_pose.registration.picture_acceptance import PictureRegistration
+from drake_pose.registration.picture_search import rotation_between
 from drake_pose.registration.register import evenly_spaced
 from drake_pose.registration.standing_scene.track_registration import TrackRegistration
 
@@ -25,10 +30,81 @@ BOTH = "scene and gripper"
 """The `evidence` of a camera that was registered from both."""
 
 
+def describe_pictures(result: PictureRegistration | None, found: bool = False) -> dict[str, Any]:
+    """Return a camera's part of summary.json on its masks and clock.
+
+    Args:
+        result: the registration from pictures; None: it was registered from masks.
+        found: whether those masks were segmented from pictures; used with None only.
+    """
+    if result is None:
+        masks = "found" if found else "given"
+        return {"masks": masks, "time_offset_s": None, "time_offset_sd_s": None}
+    offset = result.time_offset
+    drifting = offset if offset is not None and offset.drift else None
+    return {
+        "masks": "found",
+        **describe_lens_and_clock(result),
+        "time_drift": drifting and drifting.drift,
+        "time_drift_sd": drifting and drifting.drift_deviation,
+        "time_offset_scores": [] if offset is None else offset.scores.round(4).tolist(),
+        "explained": result.fit.explained,
+        "explained_by_chance": result.by_chance,
+        "p_value": result.p_value,
+        "contour": result.fit.contour,
+        "runner_up": result.runner_up
+        and _describe_runner_up(result.found.camera, *result.runner_up),
+    }
+
+
+def describe_lens_and_clock(result: PictureRegistration | TrackRegistration) -> dict[str, Any]:
+    """Return entries on the focal length [pixel] and the time offset [s]; None: not estimated."""
+    offset, focal = result.time_offset, result.found.camera.focal_x
+    determined = offset if offset is not None and offset.determined else None
+    return {
+        "time_offset_s": determined and determined.value,
+        "time_offset_sd_s": determined and determined.deviation,
+        "focal_px": focal,
+        "focal_sd_px": result.focal_deviation * focal if result.focal_deviation else None,
+    }
+
+
+def _describe_runner_up(camera: Camera, X_CW: Array, margin: float) -> dict[str, Any]:
+    """Return the summary's entry on a runner-up X_CW (4, 4); margin: see ``ratio_margin`` [sd]."""
+    X_WC = np.linalg.inv(X_CW)
+    return {
+        "X_WC": X_WC.tolist(),
+        "distance_mm": 1e3 * float(np.linalg.norm(X_WC[:3, 3] - camera.X_WC[:3, 3])),
+        "rotation_deg": math.degrees(rotation_between(X_CW, camera.X_CW)),
+        "margin_sd": margin,
+    }
+
+
+def picture_warnings(result: PictureRegistration | TrackRegistration, assumed: bool) -> list[str]:
+    """Return warnings of an unknown focal length, a drifting clock and an unknown time offset.
+
+    assumed: whether the focal length was not given.
+    """
+    name, focal, texts = result.found.camera.name, result.found.camera.focal_x, []
+    if assumed:
+        texts.append(
+            f"camera '{name}': no focal length is given: it was estimated as "
+            f"{focal:.0f} pixels (standard deviation {result.focal_deviation * focal:.0f}); give "
+            "it in the camera file if it is known"
+        )
+    clock = result.time_offset
+    if clock is not None and clock.drift:
+        texts.append(describe_drift(name, clock.drift, clock.drift_deviation))
+    if clock is not None and not clock.determined:
+        texts.append(
+            f"camera '{name}': its pictures do not determine its time offset to the joint log, "
+            "because the robot moves too little or too slowly; add a faster motion"
+        )
+    return texts
+
+
 def describe_tracks(result: TrackRegistration, kinematics: TreeKinematics) -> dict[str, Any]:
     """Return a camera's part of summary.json on its points, clock, focal length and offsets."""
-    clock, focal = result.time_offset, result.found.camera.focal_x
-    known = clock if clock is not None and clock.determined else None
     view, seen = result.gripper, len(result.seen.uv) > 0
     used = view is not None and not result.contradiction
     return {
@@ -47,10 +123,7 @@ def describe_tracks(result: TrackRegistration, kinematics: TreeKinematics) -> di
         "sightings_that_fit": float(result.inliers.mean()) if seen else None,
         "explained": result.explained if seen else None,
         "explained_by_chance": result.chance if seen else None,
-        "time_offset_s": known and known.value,
-        "time_offset_sd_s": known and known.deviation,
-        "focal_px": focal,
-        "focal_sd_px": result.focal_deviation * focal if result.focal_deviation else None,
+        **describe_lens_and_clock(result),
         **describe_parameters(result.offsets, (), kinematics),
     }
 
@@ -60,14 +133,7 @@ def track_warnings(result: TrackRegistration, assumed: bool) -> list[str]:
 
     assumed: whether the focal length was not given.
     """
-    found, texts = result.found, list[str]()
-    name = found.camera.name
-    if assumed:
-        focal, deviation = found.camera.focal_x, result.focal_deviation * found.camera.focal_x
-        texts.append(
-            f"camera '{name}': no focal length is given: it was estimated as {focal:.0f} pixels "
-            f"(standard deviation {deviation:.0f}); give it in the camera file if it is known"
-        )
+    name, texts = result.found.camera.name, picture_warnings(result, assumed)
     if result.likely:
         texts.append(
             f"camera '{name}': offsets of {listed(result.likely)} explain the pictures much "
@@ -91,11 +157,6 @@ def track_warnings(result: TrackRegistration, assumed: bool) -> list[str]:
         texts.append(
             f"the offsets of {listed(loose)} are not determined by what camera '{name}' sees, and "
             "were not changed: they move the whole scene, or the camera, as another pose would"
-        )
-    if result.time_offset is not None and not result.time_offset.determined:
-        texts.append(
-            f"camera '{name}': its pictures do not determine its time offset to the joint log, "
-            "because the robot moves too little or too slowly; add a faster motion"
         )
     return texts
 

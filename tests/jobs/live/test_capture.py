@@ -8,7 +8,7 @@ from drake_pose.errors import OutputError, SceneError, SettingsError, UnknownNam
 from drake_pose.jobs.live.capture import capture_live
 from drake_pose.jobs.live.scene import load_live_scene, take_empty_room
 from drake_pose.jobs.live.settings import LiveSettings
-from drake_pose.person.shape import KnownShape, tracker_of_person
+from drake_pose.person.pose_tracker import KnownShape, tracker_of_person
 from tests.cli import run_command
 from tests.jobs.live_scenes import RATE_HZ, absent, standing, write_studio
 from tests.jobs.scenes import read_rows as rows_of

@@ -6,11 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drake_pose.jobs.registration.result import (
-    describe_pictures,
-    make_registration_report,
-    plot_offset,
-)
+from drake_pose.jobs.registration.result import make_registration_report, plot_offset
+from drake_pose.jobs.registration.tracks import describe_pictures
 from drake_pose.registration.recording import TimeOffset
 from tests.search.arms import arm_cameras
 

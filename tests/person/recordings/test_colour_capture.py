@@ -10,8 +10,7 @@ from drake_pose.camera.models import circle_of_cameras
 from drake_pose.fit.colours import Colour, PartColours
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.capture import capture_by_colour
-from drake_pose.person.pose_tracker import PersonPoseTracker
-from drake_pose.person.shape import NOISE
+from drake_pose.person.pose_tracker import NOISE, PersonPoseTracker
 from drake_pose.person.views import ColourViews
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.person.persons_in_view import stepping

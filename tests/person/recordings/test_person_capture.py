@@ -10,7 +10,7 @@ from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.surfaces import with_radius_scales
 from drake_pose.person.capture import capture_person
-from drake_pose.person.shape import NOISE, fit_shape, shape_values
+from drake_pose.person.pose_tracker import NOISE, fit_shape, shape_values
 from drake_pose.silhouette.pictures.scenes import load_scene
 from drake_pose.silhouette.scoring import draw_mask
 from tests.person.persons_in_view import SIDES, stepping

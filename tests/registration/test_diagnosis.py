@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from scipy.stats import f as fisher
 
 from drake_pose.body import ArticulatedModel
 from drake_pose.body.tree_kinematics import TreeKinematics
@@ -14,6 +15,14 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import MaskError
 from drake_pose.jobs.registration.words import describe_error
 from drake_pose.registration.diagnosis import (
+    DIAGNOSIS,
+    _Cause,
+    _Information,
+    _minimum_detectable,
+    _name,
+    _p_value,
+    _Residual,
+    _statistic,
     diagnose_frames,
     explained_frames,
     is_half_pixel,
@@ -242,3 +251,173 @@ def test_clock_error_is_described_in_milliseconds(shift, word):
     off = Finding("clock", "left", 0.0, shift, 0.0, 0.004, 1.0, 0.0)
     text = f"its pictures show joint positions that are logged 50 +- 4 ms {word} than their times"
     assert describe_error(off) == f"camera 'left': {text}"
+
+
+def information(scale: float = 1.0, freedom: float = 50.0, seed: int = 3) -> _Information:
+    """Return random information about five unknowns, the outlines of two nodes, and no surface."""
+    rng = np.random.default_rng(seed)
+    J = rng.normal(0.0, 3.0, (40, 5))
+    outlines = np.zeros((2, 5, 5))
+    for node, own in enumerate((slice(0, 3), slice(1, 5))):
+        half = rng.normal(0.0, 5.0, (5, 5))
+        half[:, [k for k in range(5) if k not in range(5)[own]]] = 0.0
+        outlines[node] = half.T @ half
+    N = J.T @ J
+    lengths = np.array([100.0, 300.0])
+    return _Information(
+        N, N @ rng.normal(size=5), np.zeros((5, 24)), outlines, lengths, scale, freedom
+    )
+
+
+def cause(name: str, *columns: int, rank: float = 1.0, kind: str = "joint") -> _Cause:
+    return _Cause(kind, name, np.eye(5)[:, [*columns]], np.ones(len(columns)), rank)
+
+
+def residual_of(x: np.ndarray, seed: int = 5) -> _Residual:
+    """Return a residual that errors x (5,) cause, beside noise with the covariance N."""
+    info = information()
+    noise = np.linalg.cholesky(info.N) @ np.random.default_rng(seed).normal(size=5)
+    return _Residual(info, info.N, info.N @ x + noise, info.N)
+
+
+def test_statistic_and_p_value_are_those_of_known_directions() -> None:
+    """r^T Q^-1 r, whose ratio to its rank has an F distribution; weak directions are left out."""
+    rng = np.random.default_rng(2)
+    turn = np.linalg.qr(rng.normal(size=(4, 4)))[0]
+    N = turn @ np.diag([0.5, 2.0, 9.0, 30.0]) @ turn.T
+    Q, r = 2.0 * N + np.eye(4), rng.normal(0.0, 5.0, 4)
+    kept = turn[:, 1:]
+    expected = (kept.T @ r) @ np.linalg.solve(kept.T @ Q @ kept, kept.T @ r)
+    assert _statistic(r, Q, N) == (pytest.approx(expected), 3)
+    assert _statistic(r, Q) == (pytest.approx(r @ np.linalg.solve(Q, r)), 4)
+    assert _statistic(r, Q, 0.1 * np.eye(4)) == (0.0, 0)
+    for T, rank, freedom in ((9.0, 3, 50.0), (30.0, 2, 7.0)):
+        assert _p_value(T, rank, freedom) == pytest.approx(fisher.sf(T / rank, rank, freedom))
+    assert _p_value(5.0, 0, 9.0) == 1.0
+    assert _p_value(-1e-9, 2, 9.0) == 1.0
+
+
+def test_sums_of_information_weigh_frames_by_their_variance() -> None:
+    first, second = information(), information(scale=4.0, freedom=7.0, seed=8)
+    both = first.plus(second)
+    np.testing.assert_allclose(both.N, first.N + second.N / 4.0)
+    np.testing.assert_allclose(both.h, first.h + second.h / 4.0)
+    np.testing.assert_allclose(both.outlines, first.outlines + second.outlines)
+    assert (both.scale, both.freedom) == (1.0, 57.0)
+    for one, again in zip(first, both.plus(second, -1.0), strict=True):
+        np.testing.assert_allclose(again, one, atol=1e-9)
+    surfaces = first._replace(of_surface=np.ones((5, 24))).plus(
+        second._replace(of_surface=np.full((5, 24), 8.0))
+    )
+    np.testing.assert_allclose(surfaces.of_surface, 3.0)
+
+
+def test_motions_are_root_mean_squares_over_the_outlines_that_move() -> None:
+    info = information()
+    for x, moved in ((np.eye(5)[0], [0]), (np.eye(5)[4], [1]), (np.arange(5.0), [0, 1])):
+        squares = [x @ info.outlines[n] @ x for n in moved]
+        expected = np.sqrt(np.sum(squares) / info.lengths[moved].sum())
+        assert info.pixels(x) == pytest.approx(expected)
+        assert info.pixels(-3.0 * x) == pytest.approx(3.0 * expected)
+    assert info.pixels(np.zeros(5)) == 0.0
+
+
+def test_causes_are_estimated_by_least_squares() -> None:
+    """Alone, or beside causes that were eliminated whatever their amount."""
+    residual = residual_of(np.array([0.5, 0.0, 1.0, 0.0, -0.5]))
+    residual = residual._replace(Q=2.0 * residual.N + np.eye(5))
+    first, pair = cause("a", 0), cause("b", 2, 4)
+    tested = residual.test(pair)
+    M = pair.jacobian
+    inverse = np.linalg.inv(M.T @ residual.N @ M)
+    np.testing.assert_allclose(tested.amount, inverse @ M.T @ residual.r, rtol=1e-3)
+    np.testing.assert_allclose(tested.x, M @ tested.amount)
+    np.testing.assert_allclose(
+        tested.covariance, inverse @ M.T @ residual.Q @ M @ inverse, rtol=1e-3
+    )
+    T = (M.T @ residual.r) @ np.linalg.solve(M.T @ residual.Q @ M, M.T @ residual.r)
+    assert tested.gain == pytest.approx(T - 4.0)
+    assert tested.p_value == pytest.approx(fisher.sf(T / 2, 2, 50.0))
+    assert (tested.kind, tested.name) == ("joint", "b")
+    whole = residual.r @ np.linalg.solve(residual.Q, residual.r)
+    assert residual.p_value == pytest.approx(fisher.sf(whole / 5, 5, 50.0))
+    left = residual.without(first)
+    assert left.test(first).gain == 0.0
+    both = np.eye(5)[:, [0, 2, 4]]
+    joint = np.linalg.solve(both.T @ residual.N @ both, both.T @ residual.r)
+    np.testing.assert_allclose(left.test(pair).amount, joint[1:], rtol=1e-3)
+    np.testing.assert_allclose(left.Q @ first.jacobian, 0.0, atol=1e-9)
+    np.testing.assert_allclose(
+        residual.solved(residual.r), np.linalg.solve(residual.N + np.eye(5), residual.r)
+    )
+    assert residual.pixels() == pytest.approx(residual.info.pixels(residual.solved(residual.r)))
+    assert residual.pixels(residual.solved(residual.r)) < 0.05 * residual.pixels()
+
+
+def test_sufficient_causes_leave_little_and_the_simplest_comes_first() -> None:
+    residual = residual_of(np.array([0.0, 0.0, 2.0, 0.0, 0.0]))
+    tests = [
+        residual.test(one)
+        for one in (
+            cause("camera", 0, 1, 2, rank=6.0), cause("right", 2), cause("other", 2, 3),
+            cause("wrong", 0),
+        )
+    ]  # fmt: skip
+    found = [one.name for one in residual.sufficient(tests, 1e-9)]
+    gains = {one.name: one.gain for one in tests}
+    assert gains["right"] > gains["other"]
+    assert found == ["right", "other", "camera"]
+    # With a limit above the whole residual, everything is enough.
+    every = residual.sufficient(tests, 1e9)
+    assert [one.name for one in every] == ["right", "other", "wrong", "camera"]
+    assert residual.sufficient(tests, 1e-9, fraction=0.0) == []
+
+
+def test_causes_are_named_one_after_another_while_significant() -> None:
+    causes = [cause(name, k) for k, name in enumerate("abcde")]
+    residual = residual_of(np.array([0.0, 3.0, 0.0, 1.0, 0.0]))
+    left, named = _name(residual, causes, 0.1)
+    assert [[one.name for one in some] for some in named] == [["b"], ["d"]]
+    expected = residual.without(causes[1]).without(causes[3])
+    np.testing.assert_allclose(left.r, expected.r, atol=1e-9)
+    # A cause that moves outlines too little is not named, nor is an insignificant one.
+    most = max(residual.info.pixels(np.eye(5)[k] * by) for k, by in ((1, 4.0), (3, 2.0)))
+    assert _name(residual, causes, 10.0 * most)[1] == []
+    assert _name(residual_of(np.zeros(5)), causes, 0.0)[1] == []
+    # Bonferroni's correction for their number: a p-value between a fifth of the level and it.
+    alone = residual_of(np.zeros(5))
+    for factor, count in ((0.5, 1), (0.1, 1), (0.5, 5), (0.1, 5)):
+        T = chi2_of(factor * DIAGNOSIS.significance)
+        N = np.diag(np.diag(alone.N))
+        r = np.zeros(5)
+        r[0] = np.sqrt(T * N[0, 0])
+        one = _Residual(alone.info._replace(freedom=1e9), N, r, N)
+        assert len(_name(one, causes[:count], 0.0)[1]) == (factor * count <= 1.0)
+
+
+def chi2_of(p_value: float) -> float:
+    return float(chi2.isf(p_value, 1))
+
+
+def test_minimum_detectable_offsets_are_detected_in_95_of_100_cases() -> None:
+    """By Monte Carlo, with noise as large as the covariance says."""
+    info = information()._replace(freedom=1e9, outlines=1e6 * information().outlines)
+    residual = _Residual(info, info.N, np.zeros(5), 3.0 * info.N)
+    causes = [cause("a", 0)._replace(units=np.array([0.5])), cause("b", 3)]
+    found, rng = _minimum_detectable(residual, causes), np.random.default_rng(4)
+    half = np.linalg.cholesky(residual.Q)
+    for one in causes:
+        x = one.jacobian[:, 0] * found[one.name] / one.units[0]
+        hits = [
+            residual._replace(r=info.N @ x + half @ rng.normal(size=5)).test(one).p_value
+            <= DIAGNOSIS.significance / 2
+            for _ in range(1500)
+        ]
+        assert np.mean(hits) == pytest.approx(0.95, abs=0.02)
+    # At least what moves outlines by the least motion; without information: never.
+    slow = residual._replace(info=info._replace(outlines=1e-9 * info.outlines))
+    least = _minimum_detectable(slow, causes[1:])["b"]
+    assert slow.info.pixels(least * np.eye(5)[3]) == pytest.approx(DIAGNOSIS.min_joint_pixels)
+    weak = residual._replace(N=1e-4 * info.N)
+    assert _minimum_detectable(weak, causes) == {"a": np.inf, "b": np.inf}
+    assert _minimum_detectable(residual, ()) == {}

@@ -1,0 +1,168 @@
+"""Times, joint positions and camera poses as data sets record them."""
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drake_pose.camera.droid import recorded_pose
+from drake_pose.camera.lerobot_tables import find_states, is_picture, row_times
+from drake_pose.errors import SceneError
+
+TIMES = 3.0 + 0.1 * np.arange(9)
+
+
+def times_of(column, rate: float | None = 10.0, **others) -> tuple[np.ndarray, list[str]]:
+    warnings: list[str] = []
+    columns = {**({} if column is None else {"timestamp": column}), **others}
+    table = pa.table({**columns, "other": np.arange(9)})
+    return row_times(table, rate, "file.parquet", warnings), warnings
+
+
+@pytest.mark.parametrize(
+    ("unit", "name"), [(1.0, ""), (1e3, "ms"), (1e6, "microseconds"), (1e9, "ns")]
+)
+def test_the_rate_tells_the_unit_of_times(unit, name) -> None:
+    for stretch in (1.0, 1.1, 0.9):
+        found, warnings = times_of(stretch * unit * TIMES)
+        np.testing.assert_allclose(found, stretch * TIMES)
+        assert len(warnings) == bool(name)
+        assert all(f"taken to be in {name}: it grows by" in text for text in warnings)
+    # Without a rate they are seconds.
+    found, warnings = times_of(unit * TIMES, None)
+    np.testing.assert_allclose(found, unit * TIMES)
+    assert warnings == []
+
+
+def test_rows_that_are_counted_are_divided_by_the_rate() -> None:
+    found, (text,) = times_of(np.arange(5.0, 14.0))
+    np.testing.assert_allclose(found, np.arange(5.0, 14.0) / 10.0)
+    assert "'timestamp' counts rows and is divided by 10 Hz" in text
+    # At 1 Hz a row is a second.
+    found, warnings = times_of(np.arange(5.0, 14.0), 1.0)
+    np.testing.assert_array_equal(found, np.arange(5.0, 14.0))
+    assert warnings == []
+
+
+@pytest.mark.parametrize("stretch", [0.5, 0.75, 1.3, 2.0])
+def test_times_at_another_rate_are_used_and_told(stretch) -> None:
+    found, (text,) = times_of(stretch * TIMES)
+    np.testing.assert_allclose(found, stretch * TIMES)
+    assert f"the rows' times are {0.1 * stretch:.4g} s apart, but at 10 Hz" in text
+    assert "would be 0.1 s" in text
+
+
+@pytest.mark.parametrize("column", [None, np.full(9, 7.0), np.full(9, np.nan)])
+def test_missing_times_follow_from_the_rate(column) -> None:
+    found, (text,) = times_of(column)
+    np.testing.assert_allclose(found, np.arange(9) / 10.0)
+    assert ("is missing" if column is None else "stands still or is no number") in text
+    assert "the row numbers divided by 10 Hz" in text
+    found, (text,) = times_of(column, frame_index=np.arange(4, 13))
+    np.testing.assert_allclose(found, np.arange(4, 13) / 10.0)
+    assert "frame_index divided by 10 Hz" in text
+    with pytest.raises(SceneError, match=r"has no fps; it has: .*other"):
+        times_of(column, None)
+
+
+def feature(*names: str, dtype: str = "float32", shape: tuple[int, ...] | None = None) -> dict:
+    return {"dtype": dtype, "shape": list(shape or (len(names),)), "names": list(names) or None}
+
+
+JOINTS = feature("pan", "lift", "elbow")
+POSE = feature("x", "y", "z", "roll", "pitch", "yaw", "gripper")
+
+
+@pytest.mark.parametrize(
+    ("features", "found"),
+    [
+        ({"observation.state": JOINTS, "action": JOINTS}, ["observation.state"]),
+        ({"state": JOINTS, "observation.image": feature(shape=(3, 4, 3))}, ["state"]),
+        ({"state": JOINTS, "observation.state": JOINTS}, ["observation.state"]),
+        ({"observation.state.a": JOINTS, "observation.state.b": JOINTS},
+         ["observation.state.a", "observation.state.b"]),
+        ({"state/a": JOINTS, "state/b": JOINTS}, ["state/a", "state/b"]),
+        ({"observation.joint_positions": JOINTS}, ["observation.joint_positions"]),
+        ({"observation.state": POSE, "observation.joint_positions": JOINTS,
+          "observation.gripper": feature("g")},
+         ["observation.joint_positions", "observation.gripper"]),
+        ({"observation.state": JOINTS, "observation.joint_positions": JOINTS},
+         ["observation.state"]),
+        ({"observation.state": POSE}, ["observation.state"]),
+        ({"observation.joint_velocities": JOINTS, "target_joints": JOINTS}, []),
+        ({"observation.state.a": JOINTS, "qpos": JOINTS}, ["observation.state.a"]),
+        ({"qpos": feature("a", dtype="string")}, []),
+        ({"qpos": feature("a", dtype="int64")}, ["qpos"]),
+        ({}, []),
+    ],
+)  # fmt: skip
+def test_measured_joint_positions_are_found(features, found) -> None:
+    assert find_states(features) == found
+
+
+@pytest.mark.parametrize(
+    ("key", "one", "found"),
+    [
+        ("observation.image", {"dtype": "image", "shape": [4, 4, 3]}, True),
+        ("observation.images.top", {"dtype": "video", "shape": [4, 4, 3]}, True),
+        ("top", {"dtype": "uint8", "shape": [4, 4, 3]}, True),
+        ("top", {"dtype": "uint8", "shape": [3, 4, 4]}, True),
+        ("depth", {"dtype": "uint16", "shape": [4, 4, 1]}, False),
+        ("depth", {"dtype": "uint16", "shape": [1, 4, 4]}, False),
+        (
+            "top",
+            {"dtype": "video", "shape": [4, 4, 3], "info": {"video.is_depth_map": True}},
+            False,
+        ),
+        (
+            "top",
+            {"dtype": "video", "shape": [4, 4, 3], "info": {"video.is_depth_map": False}},
+            True,
+        ),
+        ("state", {"dtype": "float32", "shape": [7]}, False),
+    ],
+)
+def test_colour_images_are_told_from_depth_and_numbers(key, one, found) -> None:
+    assert is_picture(key, one) == found
+
+
+def test_a_recorded_pose_is_the_median_of_rows_as_droid_writes_them() -> None:
+    """Position, and angles about the fixed axes x, y and z; half a turn is no jump."""
+    rng, warnings = np.random.default_rng(2), []
+    row = np.array([0.3, -0.2, 0.5, 3.14159, 0.2, -1.1])
+    rows = row + 1e-4 * rng.normal(size=(31, 6))
+    rows[:, 3] = np.mod(rows[:, 3] + np.pi, 2.0 * np.pi) - np.pi
+    assert np.ptp(rows[:, 3]) > 6.0
+    found = recorded_pose(rows, "eye", warnings)
+    assert found is not None
+    assert warnings == []
+    turn = np.eye(3)
+    for axis, angle in zip("xyz", row[3:], strict=True):
+        turn = Rotation.from_euler(axis, angle).as_matrix() @ turn
+    np.testing.assert_allclose(found[:3, :3], turn, atol=2e-4)
+    np.testing.assert_allclose(found[:3, 3], row[:3], atol=2e-4)
+    np.testing.assert_array_equal(found[3], [0, 0, 0, 1])
+    rows[:3] += 0.5
+    again = recorded_pose(rows, "eye", warnings)
+    np.testing.assert_allclose(again, found, atol=1e-4)
+    assert "vary by 500 mm and 28.7 degrees; their median is used" in warnings[0]
+    (single,) = [recorded_pose(row, "eye", [])]
+    np.testing.assert_allclose(single, found, atol=3e-4)
+
+
+@pytest.mark.parametrize(
+    ("rows", "told"),
+    [
+        (np.zeros((3, 5)), "are not x, y, z"), (np.full((3, 6), np.nan), "are not x, y, z"),
+        (np.zeros((0, 6)), None), (np.array([[0.0] * 6, [0.004] * 6]), None),
+        (np.array([[0.0] * 6, [0.006] + [0.0] * 5]), "vary by 6 mm and 0.0 degrees"),
+        (np.array([[0.0] * 6, [0.0] * 5 + [0.006]]), "vary by 0 mm and 0.3 degrees"),
+    ],
+)  # fmt: skip
+def test_useless_or_moving_poses_are_told(rows, told) -> None:
+    warnings: list[str] = []
+    if rows.size or told:
+        found = recorded_pose(rows, "eye", warnings)
+        assert (found is None) == (told is not None and "not x" in told)
+    assert len(warnings) == (told is not None)
+    assert all(f"camera 'eye': its recorded extrinsics {told}" in text for text in warnings)

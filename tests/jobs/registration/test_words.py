@@ -1,0 +1,334 @@
+"""What reports of registrations and audits say, against sentences and sizes worked out by hand."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from drake_pose.body import load_model
+from drake_pose.errors import RegistrationError
+from drake_pose.jobs.registration.diagnosis import (
+    compare_camera,
+    compare_clock,
+    explain_misfit,
+    lost_frames_warning,
+    outlier_warnings,
+    parameter_warnings,
+    require_determined,
+)
+from drake_pose.jobs.registration.large_errors import SceneComparison, _add_remaining
+from drake_pose.jobs.registration.words import (
+    describe_common_finding,
+    describe_drift,
+    describe_error,
+    describe_frame_finding,
+    describe_reading,
+)
+from drake_pose.registration.findings import Finding, FrameDiagnosis
+from drake_pose.registration.joint_offsets import KinematicParameter, undetermined
+from drake_pose.registration.recording import Recording, TimeOffset
+from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
+from tests.search.arms import arm_cameras, arm_urdf
+
+DEGREE = np.radians(1.0)
+
+
+def off(kind: str, name: str = "a", *sizes: float, **more: Any) -> Finding:
+    """Return a finding with an angle, shift, and their standard deviations."""
+    return Finding(kind, name, *(*sizes, 0.0, 0.0, 0.0, 0.0)[:4], 0.0, 0.0, **more)
+
+
+@pytest.mark.parametrize(
+    ("finding", "said"),
+    [
+        (off("clock", "c", 0.0, 0.03, 0.0, 0.004), "camera 'c': its pictures show joint positions "
+         "that are logged 30 +- 4 ms later than their times"),
+        (off("clock", "c", 0.0, -0.03, 0.0, 0.004), "camera 'c': its pictures show joint positions "
+         "that are logged 30 +- 4 ms earlier than their times"),
+        (off("rate", "c", 0.0, -0.02, 0.0, 0.001), describe_drift("c", -0.02, 0.001)),
+        (off("joint", "a", 2 * DEGREE, 0.0, DEGREE),
+         "joint 'a' reads 2.00 +- 1.00 degrees too low"),
+        (off("joint", "a", 0.0, -0.003, 0.0, 0.001), "joint 'a' reads 3.0 +- 1.0 mm too high"),
+        (off("joint", "a", DEGREE, 0.0, DEGREE, alternatives=("b", "c")),
+         "joint 'a' (or b, c: the masks do not distinguish them) reads 1.00 +- 1.00 degrees too "
+         "low"),
+        (off("focal", "focal length", 0.0, 0.05, 0.0, 0.01),
+         "the focal length is 5.0 +- 1.0 percent too short"),
+        (off("focal", "focal lengths", 0.0, -0.05, 0.0, 0.01),
+         "the focal lengths are 5.0 +- 1.0 percent too long"),
+        (off("center", "principal point", 0.0, 3.0, 0.0, 0.5),
+         "the principal point: off by 3.0 +- 0.5 px"),
+        (off("base", "base", DEGREE, 0.004, DEGREE, 0.001),
+         "the base: off by 1.00 +- 1.00 degrees and 4.0 +- 1.0 mm"),
+        (off("camera", "c", DEGREE, 0.004, 0.0, 0.001, at_body=0.02),
+         "camera 'c': off by 4.0 +- 1.0 mm (20.0 mm at the robot)"),
+        (off("camera", "c", DEGREE, 0.004, DEGREE),
+         "camera 'c': off by 1.00 +- 1.00 degrees"),
+    ],
+)  # fmt: skip
+def test_errors_are_told_with_their_sizes(finding: Finding, said: str) -> None:
+    assert describe_error(finding) == said
+
+
+def test_the_verb_is_that_of_the_sentence() -> None:
+    one = off("base", "base", DEGREE, 0.0, DEGREE)
+    assert describe_error(one, "is off") == "the base is off by 1.00 +- 1.00 degrees"
+    assert describe_reading(-0.5, 0.25, "deg") == "reads 0.50 +- 0.25 degrees too high"
+    assert describe_reading(0.5, 0.25, "mm") == "reads 0.5 +- 0.2 mm too low"
+    fast, slow = (describe_drift("c", by, 0.001) for by in (0.021, -0.021))
+    assert "clock runs 2.10 +- 0.10 percent faster than its pictures'" in fast
+    assert "clock runs 2.10 +- 0.10 percent slower than its pictures'" in slow
+
+
+@pytest.mark.parametrize(
+    ("finding", "said"),
+    [
+        (off("sign", "a", link="l", text="much"),
+         "joint 'a' is logged with the other sign (reverse its column): link 'l' is not "
+         "where the log says, much, which moves outlines by 2.5 pixels"),
+        (off("log", "a", link="l", text="much"), "link 'l' is not where the log says: joint 'a' "
+         "differs from the log, much, which moves outlines by 2.5 pixels"),
+        (off("link", "l", link="l", text="why"), "link 'l' is not where the log says: why"),
+        (off("refused", "c", text="why"), "why"),
+        (off("reading", "it is so"), "it is so, which moves outlines by 2.5 pixels"),
+        (off("moved", "c", 2 * DEGREE, 0.01, DEGREE, 0.002, link="camera", text="then"),
+         "camera 'c' was moved then, camera 'c' is off by 2.00 +- 1.00 degrees and 10.0 +- 2.0 mm, "
+         "which moves outlines by 2.5 pixels"),
+        (off("moved", "base", 2 * DEGREE, 0.0, DEGREE, link="base", text="then"),
+         "the base was moved then, the base is off by 2.00 +- 1.00 degrees, which moves outlines "
+         "by 2.5 pixels"),
+        (off("moved", "c", 2 * DEGREE, 0.0, DEGREE, text="then"), "camera 'c' then, as by turns of "
+         "2.00 degrees, which moves outlines by 2.5 pixels"),
+        (off("moved", "c", 2 * DEGREE, 0.01, DEGREE, 0.002, text="then"), "camera 'c' moved then "
+         "by 2.00 +- 1.00 degrees and 10.0 +- 2.0 mm, which moves outlines by 2.5 pixels"),
+        (off("joint", "a", DEGREE, 0.0, DEGREE, text="; x"), "joint 'a' reads 1.00 +- 1.00 degrees "
+         "too low in all frames that agree, which moves outlines by 2.5 pixels; x"),
+    ],
+)  # fmt: skip
+def test_common_errors_are_told_with_the_motion_of_outlines(finding: Finding, said: str) -> None:
+    assert describe_common_finding(replace(finding, pixels=2.5)) == said
+    assert describe_common_finding(finding) == said.replace(
+        ", which moves outlines by 2.5 pixels", ""
+    )
+
+
+def test_errors_of_a_frame_are_told() -> None:
+    frame = FrameDiagnosis("0", {}, {"left": 0.4, "right": 0.2}, 3.0, None)
+    unexplained = describe_frame_finding(frame, off("unexplained"))
+    assert unexplained == (
+        "no positions near the given ones explain it: in camera 'right' 20.00 % of the contours "
+        "fit at best"
+    )
+    for angle, word in ((11.0, "low"), (-11.0, "high")):
+        said = describe_frame_finding(frame, off("joint", "a", angle * DEGREE, 0.0, DEGREE))
+        assert said.startswith(f"joint 'a' reads more than 10 degrees too {word}, which moves")
+    within = describe_frame_finding(frame, off("joint", "a", 9.0 * DEGREE, 0.0, DEGREE))
+    assert within.startswith("joint 'a' reads 9.00 +- 1.00 degrees too low, which moves")
+    several = off("joints", "", joints={"a": 0.1, "b": -0.5, "c": 0.2, "d": 0.05})
+    said = describe_frame_finding(frame, replace(several, pixels=3.0))
+    assert said == (
+        "has other joint positions than given (b, c, a most), which moves outlines by 3.0 pixels"
+    )
+    assert "given, which" in describe_frame_finding(frame, off("joints", ""))
+
+
+def registered(*agreeing: float, E: float = 0.1, **more: Any) -> RegisteredCamera:
+    """Return a camera with frames of these inlier ratios; negative: an outlier's."""
+    frames = tuple(
+        FrameMisfit(f"{k}", E, 1.0 - E, abs(ratio), ratio >= 0.0)
+        for k, ratio in enumerate(agreeing)
+    )
+    return RegisteredCamera(arm_cameras()[0], 1e-6 * np.eye(6), frames, **more)
+
+
+def test_poses_that_explain_little_are_told_why() -> None:
+    assert explain_misfit(registered(0.6, 0.71, 0.3)) is None
+    assert "64.50 % of the contours fit" in (explain_misfit(registered(0.6, 0.69, 0.3)) or "")
+    wrong = explain_misfit(registered(0.9, 0.9, E=5.0))
+    assert wrong is not None
+    assert wrong.startswith("body and silhouettes differ by 500.00 % of the silhouettes' area")
+    assert explain_misfit(registered(0.9, -0.9, -0.9)) == (
+        "no two of its 3 frames agree on one; at best frame '0' fits alone"
+    )
+    assert explain_misfit(registered(0.9)) is None
+
+
+def test_outliers_are_named_and_refused_where_they_are_many() -> None:
+    assert outlier_warnings(registered(0.9, 0.9)) == []
+    (text,) = outlier_warnings(registered(0.9, 0.9, 0.9, -0.2, -0.2))
+    assert "'left': 2 of 5 frames are outliers and did not count: 3-4;" in text
+    assert "Were camera or base moved after frame '2'?" in text
+    assert "FEWER" not in text
+    (text,) = outlier_warnings(registered(0.9, -0.2, 0.9, -0.2, 0.9))
+    assert "moved after" not in text
+    half = registered(0.9, 0.9, -0.2, -0.2)
+    with pytest.raises(RegistrationError, match=r"2 of 4: 2-3\. Were .*, 0-1, agree by chance"):
+        outlier_warnings(half)
+    (text,) = outlier_warnings(half, from_pictures=True)
+    assert "FEWER THAN HALF OF THE FRAMES AGREE, 2 of 4: 0-1;" in text
+    alike = registered(0.9, 0.9, alternatives=np.zeros((2, 4, 4)))
+    (text,) = outlier_warnings(alike)
+    assert "2 other poses fit equally well" in text
+    lost = lost_frames_warning("c", ["1", "2", "4"], [*"01234"], "gripper")
+    assert lost.startswith(
+        "camera 'c': the gripper is not visible where it should be in frames 1-2, 4:"
+    )
+
+
+def test_poses_that_are_not_determined_are_refused() -> None:
+    """By the largest deviation about, or along, any axis."""
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    for turned, shifted, told in (
+        (0.039, 0.039, None), (0.05, 0.01, "of 2.9 degrees and 10 mm"), (0.01, 0.05, "and 50 mm"),
+    ):  # fmt: skip
+        C = np.zeros((6, 6))
+        C[:3, :3] = turn @ np.diag([1e-6, turned**2, 1e-6]) @ turn.T
+        C[3:, 3:] = turn @ np.diag([1e-6, 1e-6, shifted**2]) @ turn.T
+        one = replace(registered(0.9, 0.9), covariance=C)
+        if told is None:
+            require_determined(one)
+            continue
+        with pytest.raises(RegistrationError, match=told):
+            require_determined(one)
+
+
+def test_uncertain_offsets_and_lengths_are_told() -> None:
+    sure = KinematicParameter("a", 0.1, 0.01, 0.08, 0.12, True)
+    unsure = KinematicParameter("b", 0.0, 0.01, -0.1, 0.1, False)
+    hidden = replace(sure, name="c", gauge=("left.turn_x",), deviation=np.radians(0.5))
+    gone, alone = undetermined("d", ("left.turn_y",)), undetermined("e", ())
+
+    def told(*offsets: KinematicParameter, scales: tuple = ()) -> list[str]:
+        return parameter_warnings(SimpleNamespace(offsets=offsets, link_scales=scales))
+
+    assert told() == told(sure) == told(sure, unsure) == []
+    (none,) = told(unsure, gone)
+    assert none.startswith("none of the requested joint offsets and link lengths is significant")
+    first, second, third = told(sure, hidden, gone, scales=(alone,))
+    assert first.startswith("joint 'c': its offset is good to 0.5 degrees only, and turns")
+    assert "(correlated with left.turn_x)" in first
+    assert "'d': its offset is not determined" in second
+    assert "(correlated with left.turn_y: their values hold if it is 0); add frames" in second
+    assert third.startswith("link 'e': its length is not determined by these silhouettes and was ")
+    assert "correlated" not in third
+
+
+@pytest.fixture(scope="module")
+def body(tmp_path_factory: pytest.TempPathFactory) -> RegistrationBody:
+    path = tmp_path_factory.mktemp("arm") / "arm.urdf"
+    path.write_text(arm_urdf())
+    return RegistrationBody(load_model(path, check=False).pose_tree())
+
+
+def test_a_given_camera_is_compared_by_its_covariance(body: RegistrationBody) -> None:
+    """The motion is that of points of the robot in its pictures, clipped at a diagonal."""
+    given = arm_cameras()[0]
+    X_WC = given.X_WC.copy()
+    X_WC[:3, 3] += [0.003, 0.0, 0.004]
+    found = replace(registered(0.9, 0.9), camera=given.with_pose(X_WC))
+    found = replace(found, covariance=1e-6 * np.eye(6))
+    values = np.array([[0.1, 0.2, 0.3, 0.4, 0.5], [0.5, 0.0, 0.0, 0.3, 0.1]])
+    for alone in (True, False):
+        one = compare_camera(body, given, found, values, alone)
+        assert (one.kind, one.name, one.text) == ("camera", "left", "")
+        assert one.shift == pytest.approx(0.005)
+        assert one.angle == pytest.approx(0.0, abs=1e-9)
+        assert (one.angle_sd, one.shift_sd) == pytest.approx((1e-3, 1e-3))
+        assert one.p_value == pytest.approx(chi2.sf(25.0, 6))
+        assert one.alternatives == (("base",) if alone else ())
+    shifts = []
+    for row in values:
+        for outline, X in zip(body.coarse, body.kinematics.poses(row), strict=True):
+            p = outline.vertices @ X[:3, :3].T + X[:3, 3]
+            shifts.append(found.camera.project(p)[0] - given.project(p)[0])
+    expected = np.sqrt((np.concatenate(shifts) ** 2).sum(axis=1).mean())
+    assert one.pixels == pytest.approx(expected)
+    away = given.X_WC.copy()
+    away[:3, 3] *= 1e3
+    far = compare_camera(body, given.with_pose(away), found, values, True)
+    assert far.pixels <= np.hypot(320, 240)
+    assert "its X_WC seems to be in millimetres" in far.text.replace("given in", "in")
+    assert far.alternatives == ()
+
+
+@pytest.mark.parametrize(
+    ("value", "sd", "drift", "drift_sd", "kinds"),
+    [
+        (0.05, 0.002, 0.0, np.inf, ["clock"]),
+        (0.05, 0.02, 0.0, np.inf, []),
+        (0.0001, 1e-5, 0.0, np.inf, []),
+        (0.0, np.inf, 0.0, np.inf, []),
+        (0.3, 0.001, 0.05, 0.002, ["clock", "rate"]),
+        # At the first picture there is no offset: it has grown since.
+        (0.125, 0.001, 0.05, 0.002, ["rate"]),
+    ],
+)
+def test_clocks_are_compared_at_the_first_picture(
+    body: RegistrationBody, value, sd, drift, drift_sd, kinds
+) -> None:
+    times = 10.0 + np.arange(6.0)
+
+    def values_at(offset: float) -> np.ndarray:
+        return np.outer(np.sin(times + offset), [1.0, 0.5, 0.3, 0.4, 0.2])
+
+    names = tuple("012345")
+    recording = Recording(names, values_at, lambda k: np.zeros((1, 1, 3)), times)
+    clock = TimeOffset(value, sd, np.zeros((0, 2)), drift, drift_sd)
+    result = SimpleNamespace(
+        time_offset=clock, found=registered(0.9), recording=recording,
+        frames=[SimpleNamespace(name=name) for name in names],
+    )  # fmt: skip
+    found = compare_clock(body, result, recording)
+    assert [one.kind for one in found] == kinds
+    for one in found:
+        size, deviation, floor = drift, drift_sd, 0.0
+        if one.kind == "clock":
+            size, floor = value - 2.5 * drift, 0.002
+            deviation = np.hypot(sd, 2.5 * drift_sd if drift else 0.0)
+        assert (one.shift, one.shift_sd) == pytest.approx((size, deviation))
+        assert one.p_value == pytest.approx(chi2.sf(size**2 / (deviation**2 + floor**2), 1))
+        assert one.pixels > 0.3
+    untold = SimpleNamespace(**{**vars(result), "time_offset": None})
+    assert compare_clock(body, untold, recording) == []
+
+
+def test_what_remains_after_a_correction_is_added() -> None:
+    first = replace(off("joint", "a", 0.5, 0.1, 0.02, 0.03, alternatives=("b",)), pixels=9.0)
+    rest = replace(off("joint", "a", 0.01, 0.02, 0.003, 0.004), pixels=1.0, p_value=0.5)
+    both = _add_remaining(first, rest)
+    assert (both.angle, both.shift) == pytest.approx((0.51, 0.12))
+    assert (both.angle_sd, both.shift_sd, both.pixels) == (0.003, 0.004, 9.0)
+    assert (both.p_value, both.alternatives) == (0.0, ("b",))
+    focal = _add_remaining(off("focal", "f", 0.0, 0.2), off("focal", "f", 0.0, -0.1))
+    assert focal.shift == pytest.approx(1.2 * 0.9 - 1.0)
+    assert _add_remaining(first, None) is first
+
+
+@pytest.mark.parametrize(
+    ("areas", "said"),
+    [
+        # By frame: excess and lack; nan: the mask is black.
+        ([(0.09, 0.02), (0.1, 0.0), (0.0, 0.0)], "frames 0-1 show 9.50 % more than the robot"),
+        ([(0.09, 0.04), (0.1, 0.04), (0.0, 0.0)], None),
+        ([(0.09, 0.0), (0.0, 0.0), (0.0, 0.0)], None),
+        ([(0.16, 0.0), (0.1, 0.0), *[(0.0, 0.0)] * 3], "frames 0 show 16.00 % more"),
+        ([(0.01, 0.3), (0.0, 0.2), (0.0, 0.0)], "frames 0 lack 30.00 % of the robot"),
+        ([(0.11, 0.3), (0.0, 0.2), (0.0, 0.0)], None),
+        ([(0.0, 0.0), (np.nan, 0.3), (np.nan, 0.2)], "frames 1 are black, although"),
+    ],
+)  # fmt: skip
+def test_masks_that_show_more_or_less_are_told(areas: list, said: str | None) -> None:
+    names = [f"{k}" for k in range(len(areas) + 1)]
+    rows = {("left", f"{k}"): two for k, two in enumerate(areas)}
+    # The frame of an outlier does not count.
+    rows["left", names[-1]] = (9.0, 0.0)
+    now = SimpleNamespace(
+        cameras=arm_cameras()[:1], mask_areas=rows, found=SimpleNamespace(outliers=(names[-1],))
+    )
+    scene = SimpleNamespace(_inputs=SimpleNamespace(scene=SimpleNamespace(frames=names)))
+    told = SceneComparison._mask_warnings(scene, now)
+    assert len(told) == (said is not None)
+    assert all(text.startswith("camera 'left': the masks of ") and said in text for text in told)

@@ -23,38 +23,3 @@ from drake_pose.body.report import ModelReport, describe_model, model_warnings
 from drake_pose.body.root import RootRotation
 from drake_pose.body.tree_builder import build_pose_tree
 from drake_pose.body.urdf_shape import BASE_JOINTS, reshaped
-
-__all__ = [
-    "BASE_JOINTS",
-    "TARGET",
-    "TARGET_POSITIONS",
-    "ArticulatedModel",
-    "Landmark",
-    "ModelReport",
-    "ModelSkin",
-    "ModelSource",
-    "ParsedModel",
-    "PlantKinematics",
-    "PoseTree",
-    "RootRotation",
-    "TriangleMesh",
-    "build_pose_tree",
-    "bundled_model",
-    "captured_warnings",
-    "chain_transforms",
-    "describe_model",
-    "inverse_transforms",
-    "join_meshes",
-    "labelled_meshes",
-    "landmark_positions",
-    "landmarks_file",
-    "landmarks_of_nodes",
-    "link_names",
-    "load_landmarks",
-    "load_model",
-    "model_warnings",
-    "nearest_turn",
-    "package_folder",
-    "require_tree",
-    "reshaped",
-]

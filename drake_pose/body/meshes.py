@@ -269,15 +269,9 @@ def _read_with_trimesh(path: Path, source: Path | io.BytesIO, extension: str) ->
 
 # The exceptions that trimesh, pycollada and their readers raise for broken files.
 _READER_ERRORS = (
-    ValueError,
-    LookupError,
-    TypeError,
-    AttributeError,
-    OSError,
-    EOFError,
-    SyntaxError,
+    ValueError, LookupError, TypeError, AttributeError, OSError, EOFError, SyntaxError,
     struct.error,
-)
+)  # fmt: skip
 
 
 def is_drawn_by_drake(path: Path) -> bool:

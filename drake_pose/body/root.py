@@ -339,13 +339,9 @@ def base_of_chain(
                     p for p, solvable in zip(positions, solved, strict=True) if solvable
                 )
                 return BasePose(
-                    "joints",
-                    node=node,
-                    body=body,
-                    positions=solved_positions,
-                    steps=steps,
+                    "joints", node=node, body=body, positions=solved_positions, steps=steps,
                     chain=positions,
-                )
+                )  # fmt: skip
     return BasePose("placed", node=node, body=body)
 
 

@@ -31,17 +31,11 @@ _REQUIRED = {
 }
 _OPTIONAL = {
     "pinhole": (
-        "X_WC",
-        "link",
-        "X_LC",
-        "projection",
-        "clipping_near",
-        "pixel_centers",
-        "distortion",
+        "X_WC", "link", "X_LC", "projection", "clipping_near", "pixel_centers", "distortion",
         *_SPAN,
     ),
     "parallel": ("X_WC", "projection", "pixel_centers"),
-}
+}  # fmt: skip
 
 
 def load_cameras(

@@ -195,14 +195,9 @@ class PinholeCamera(_PosedCamera):
         """Return the camera of the same images resized to a width and height [pixel]."""
         x, y = width / self.width, height / self.height
         return dataclasses.replace(
-            self,
-            width=width,
-            height=height,
-            focal_x=x * self.focal_x,
-            focal_y=y * self.focal_y,
-            center_x=x * (self.center_x + 0.5) - 0.5,
-            center_y=y * (self.center_y + 0.5) - 0.5,
-        )
+            self, width=width, height=height, focal_x=x * self.focal_x, focal_y=y * self.focal_y,
+            center_x=x * (self.center_x + 0.5) - 0.5, center_y=y * (self.center_y + 0.5) - 0.5,
+        )  # fmt: skip
 
     def mirrored(self) -> "PinholeCamera":
         """Return the camera of the same images with left and right exchanged."""

@@ -163,14 +163,9 @@ def positions_as_mot(
         names += BASE_COLUMNS
         columns.append(np.array([base_cells(X) for X in X_WB[known]]))
     head = [
-        "positions",
-        "version=1",
-        f"nRows={len(known)}",
-        f"nColumns={1 + len(names)}",
-        "inDegrees=yes",
-        "endheader",
-        "\t".join(["time", *names]),
-    ]
+        "positions", "version=1", f"nRows={len(known)}", f"nColumns={1 + len(names)}",
+        "inDegrees=yes", "endheader", "\t".join(["time", *names]),
+    ]  # fmt: skip
     text = StringIO()
     np.savetxt(text, np.column_stack(columns), "%.6f", "\t", header="\n".join(head), comments="")
     return text.getvalue()

@@ -71,14 +71,9 @@ def make_replay(
     _lighten(scene_graph, plant.get_source_id(), most_triangles)
     MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
     add_meshcat_skin(
-        builder,
-        meshcat,
-        model,
-        source.get_output_port(),
-        "body",
-        prefix=_BODY_PATH,
+        builder, meshcat, model, source.get_output_port(), "body", prefix=_BODY_PATH,
         is_recorded=True,
-    )
+    )  # fmt: skip
     own = [*model.link_meshes.values()]
     ghosts = [] if measured is None else reduce_meshes(own, most_triangles // 2)
     for link, mesh in zip(model.link_meshes, ghosts, strict=False):

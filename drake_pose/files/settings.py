@@ -63,13 +63,9 @@ def from_text(
         name: the option's name; None: that of the settings field.
     """
     return Parameter(
-        name,
-        converter=FromText(parse, repeated),
-        metavar=metavar,
-        accepts_keys=False,
-        allow_leading_hyphen=True,
-        n_tokens=-1 if repeated else 1,
-    )
+        name, converter=FromText(parse, repeated), metavar=metavar, accepts_keys=False,
+        allow_leading_hyphen=True, n_tokens=-1 if repeated else 1,
+    )  # fmt: skip
 
 
 def within(low: float, high: float = math.inf) -> Parameter:

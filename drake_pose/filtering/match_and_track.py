@@ -328,14 +328,7 @@ class MatchAndTrack:
         q, X_WB = observation.positions(x)
         J, area = self._difference(track, frame)
         return PoseEstimate(
-            found=True,
-            q=q,
-            X_WB=X_WB,
-            node_values=observation.node_values(x),
-            J=float(J),
-            area=float(area),
-            stopped_by=TRACKED,
-            seconds=time.perf_counter() - frame.begin,
-            root_position=observation.root_position(x),
-            scale=observation.scale(x),
-        )
+            found=True, q=q, X_WB=X_WB, node_values=observation.node_values(x), J=float(J),
+            area=float(area), stopped_by=TRACKED, seconds=time.perf_counter() - frame.begin,
+            root_position=observation.root_position(x), scale=observation.scale(x),
+        )  # fmt: skip

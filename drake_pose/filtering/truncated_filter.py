@@ -439,18 +439,12 @@ class TruncatedFilter:
             (
                 h,
                 update(
-                    h.free,
-                    measurement,
-                    iterations,
-                    None if alone else start,
-                    tempered=h is own,
-                    truncate=self._limits,
-                    sites=h.sites,
-                    remainder_weight=self._remainder_weight,
+                    h.free, measurement, iterations, None if alone else start, tempered=h is own,
+                    truncate=self._limits, sites=h.sites, remainder_weight=self._remainder_weight,
                 ),
             )
             for h, start in starts
-        ]
+        ]  # fmt: skip
 
     def _repeat(self, hypothesis: Hypothesis, measurement: Measurement) -> Branch:
         """Update a predicted hypothesis by a measurement of another frame of its static view.

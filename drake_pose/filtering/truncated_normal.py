@@ -406,15 +406,9 @@ def truncate_joint(
     reach = np.abs(inequalities.b)
     for limit in (400, 10_000):
         log_probability, sweeps = propagate(
-            belief.mean[joint.used],
-            base,
-            joint.directions,
-            joint.lower,
-            joint.upper,
-            sites,
-            tolerance,
-            limit,
-        )
+            belief.mean[joint.used], base, joint.directions, joint.lower, joint.upper, sites,
+            tolerance, limit,
+        )  # fmt: skip
         q, factor = belief.mean.copy(), belief.root.copy()
         apply_sites(q, factor, joint.whole, sites, -1, 1.0)
         # Nearly parallel rows thousands of standard deviations away converge slowly.

@@ -501,13 +501,8 @@ class PictureSearch:
             count = PICTURES.search_frames if width < PICTURES.compare_width else len(self.frames)
             pictures = [frame.picture for frame in self.frames[:count]]
             self._levels[width] = PyramidLevel(
-                self._outlines[k],
-                self.camera,
-                pictures,
-                self._X_WN[:count],
-                width,
-                self._riding,
-            )
+                self._outlines[k], self.camera, pictures, self._X_WN[:count], width, self._riding,
+            )  # fmt: skip
         return self._levels[width]
 
 

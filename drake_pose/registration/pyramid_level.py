@@ -324,14 +324,10 @@ class PyramidLevel:
         def sums(chunk: Array) -> Array:
             return np.asarray(
                 explain_poses(
-                    pictures.packed,
-                    chunk,
-                    pictures.X_WN,
-                    pictures.is_static,
-                    pictures.camera,
+                    pictures.packed, chunk, pictures.X_WN, pictures.is_static, pictures.camera,
                     pictures.sums,
                 )
-            )
+            )  # fmt: skip
 
         totals = np.concatenate(
             map_ordered(sums, (poses[k : k + 100] for k in range(0, len(poses), 100)))

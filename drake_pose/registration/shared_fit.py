@@ -74,15 +74,10 @@ class SharedFitSettings(NamedTuple):
     """
 
     stages_with_constants: tuple[AnnealingStage, ...] = (
-        AnnealingStage(0.12, 0.02),
-        AnnealingStage(0.09, 0.02),
-        AnnealingStage(0.07, 0.02),
-        AnnealingStage(0.05, 0.02),
-        AnnealingStage(0.03, 0.02),
-        AnnealingStage(0.02, 0.02),
-        AnnealingStage(0.01, 0.01),
-        *(5 * (AnnealingStage(0.005, 0.005, 6),)),
-    )
+        AnnealingStage(0.12, 0.02), AnnealingStage(0.09, 0.02), AnnealingStage(0.07, 0.02),
+        AnnealingStage(0.05, 0.02), AnnealingStage(0.03, 0.02), AnnealingStage(0.02, 0.02),
+        AnnealingStage(0.01, 0.01), *(5 * (AnnealingStage(0.005, 0.005, 6),)),
+    )  # fmt: skip
     last_stages: int = 7
     inlier_stage: AnnealingStage = AnnealingStage(0.025, 0.01)
     final_stage: AnnealingStage = AnnealingStage(0.005, 0.005)

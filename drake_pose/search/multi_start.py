@@ -240,16 +240,10 @@ class _MultiStartRun:
                 pose_set = RobustModes(self._fit, self._proceed).find(poses, self._J)
         seconds = time.perf_counter() - begin
         return PoseEstimate.of_values(
-            tree,
-            self._kinematics.split(values),
-            self._J(values),
-            problem.area,
-            stopped_by=self._stopped_by,
-            runs=steps,
-            first_J=first_J,
-            interval_seconds=seconds,
+            tree, self._kinematics.split(values), self._J(values), problem.area,
+            stopped_by=self._stopped_by, runs=steps, first_J=first_J, interval_seconds=seconds,
             pose_set=pose_set,
-        )
+        )  # fmt: skip
 
     def _refine_by_pixels(self, found: ExactPose | None, values: np.ndarray) -> ExactPose | None:
         """Refine values (m,) by pixels, and return the better of the result and ``found``.

@@ -51,14 +51,10 @@ def make_rows(packed: PackedOutlines, camera: np.ndarray) -> tuple[Rows, np.ndar
         points = max(points, packed.starts[node + 1, 0] - packed.starts[node, 0])
         triangles = max(triangles, packed.starts[node + 1, 1] - packed.starts[node, 1])
     rows = Rows(
-        np.empty(points),
-        np.empty(points),
-        np.empty(triangles + 1, dtype=np.int8),
-        np.zeros(height, dtype=np.int32),
-        np.array([height, 0, 0]),
-        np.zeros(width + 1, dtype=np.int32),
-        np.empty((width + 1, 2), dtype=np.int32),
-    )
+        np.empty(points), np.empty(points), np.empty(triangles + 1, dtype=np.int8),
+        np.zeros(height, dtype=np.int32), np.array([height, 0, 0]),
+        np.zeros(width + 1, dtype=np.int32), np.empty((width + 1, 2), dtype=np.int32),
+    )  # fmt: skip
     return rows, np.empty((height, 8), dtype=np.int32)
 
 

@@ -260,14 +260,10 @@ def add_meshcat_skin(
     drawer = builder.AddNamedSystem(
         f"{name}_meshcat_skin",
         MeshcatSkin(
-            meshcat,
-            ModelSkin(model),
-            model.plant.num_positions(),
-            f"{prefix}/{name}_skin",
-            colour,
+            meshcat, ModelSkin(model), model.plant.num_positions(), f"{prefix}/{name}_skin", colour,
             is_recorded=is_recorded,
         ),
-    )
+    )  # fmt: skip
     builder.Connect(positions, drawer.get_input_port())
 
 

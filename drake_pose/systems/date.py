@@ -466,14 +466,9 @@ class PaperPoseEstimator(MemorySystem):
             angles = head_angles(direction, features[0], face_camera)
         cameras, views = self._seen(context)
         q, limbs = estimate_pose(
-            self.setup.skeleton,
-            known["estimated_positions"],
-            features,
-            angles,
-            cameras,
-            [view.region for view in views],
-            search=self.setup.search,
-        )
+            self.setup.skeleton, known["estimated_positions"], features, angles, cameras,
+            [view.region for view in views], search=self.setup.search,
+        )  # fmt: skip
         return {
             "estimated_positions": q,
             "last_features": features,

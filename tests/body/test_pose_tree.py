@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body import RootRotation, load_model
+from drake_pose.body import TARGET_POSITIONS, RootRotation, TriangleMesh, load_model
 from drake_pose.body.pose_tree import axis_samples, product_grid
 from drake_pose.body.root import even_rotations
+from drake_pose.body.urdf_shape import BASE_JOINTS, with_base_joints
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 from tests.body.models import (
     FLOATING_URDF,
@@ -305,3 +306,116 @@ def test_invalid_rotations_are_refused(make, message):
 def test_tiny_interval_is_refused_before_allocation():
     with pytest.raises(SettingsError, match=r"1e-12.*larger interval"):
         axis_samples(-1.0, 1.0, 1e-12, is_angle=True)
+
+
+@pytest.mark.parametrize("name", ["floating", "welded", "all_joints"])
+def test_a_placed_root_moves_the_whole_body(models, name):
+    """By Drake's plant: the root's origin is at the place, and all else keeps its relative pose."""
+    model, rng = models[name], np.random.default_rng(3)
+    given = {"root_position": np.zeros(3)} if name == "welded" else {}
+    if name == "welded":
+        given["root_rotation"] = RootRotation.free()
+    tree = model.pose_tree(**given)
+    assert tree.turns_root_freely == (name == "welded")
+    count = sum(len(node.value_names) for node in tree.nodes)
+    assert repr(tree) == f"<PoseTree of {model!r}: {len(tree.nodes)} nodes, {count} values>"
+    bounds = [tree.value_bounds(k) for k in range(len(tree.nodes))]
+    values = [rng.uniform(0.5 * low, 0.5 * high) for low, high in bounds]
+    before = tree.node_poses(values)
+    for place in (np.array([0.05, -0.04, 0.06]), before[0, :3, 3]):
+        q, X_WB = tree.positions_with_root_at(values, place)
+        poses = link_poses(model, q)
+        placed = np.array([X_WB @ poses[node.name] for node in tree.nodes])
+        np.testing.assert_allclose(placed[0, :3, 3], place, atol=1e-9)
+        shifted = before.copy()
+        roots = [k for k, node in enumerate(tree.nodes) if node.parent < 0]
+        assert roots == [0]
+        shifted[:, :3, 3] += place - before[0, :3, 3]
+        np.testing.assert_allclose(placed, shifted, atol=1e-9)
+
+
+def test_grids_are_all_combinations_of_their_axes(models):
+    """The last value changes fastest; single intervals take precedence; lengths have their own."""
+    tree = models["all_joints"].pose_tree()
+    for k, node in enumerate(tree.nodes):
+        if not node.value_names or len(node.value_names) > 2:
+            continue
+        lower, upper = tree.value_bounds(k)
+        named = {node.value_names[-1]: 0.31}
+        axes = []
+        for j, name in enumerate(node.value_names):
+            is_angle = bool(tree.placements[k].is_angle[j])
+            spacing = named.get(name, 0.9 if is_angle else 0.2)
+            periodic = bool(tree.placements[k].periodic[j])
+            axes.append(axis_samples(lower[j], upper[j], spacing, is_angle=periodic))
+        grid = tree.grid(k, 0.9, named, length_interval=0.2)
+        expected = np.array(np.meshgrid(*axes, indexing="ij")).reshape(len(axes), -1).T
+        np.testing.assert_allclose(grid, expected)
+    for bad in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(SettingsError, match="give a positive number"):
+            tree.grid(0, bad)
+        with pytest.raises(SettingsError, match="'length_interval'"):
+            tree.grid(0, 0.5, length_interval=bad)
+    with pytest.raises(UnknownNameError, match="nothing"):
+        tree.grid(0, 0.5, {"nothing": 0.1})
+
+
+def test_a_target_moves_on_six_joints_and_the_robot_keeps_its_poses(models):
+    """Along x, y, z of its first pose, then about x, y, z; only the target has a surface."""
+    model, rng = models["floating"], np.random.default_rng(5)
+    X_WO = np.eye(4)
+    X_WO[:3, :3] = Rotation.from_euler("xyz", [0.4, -0.3, 0.9]).as_matrix()
+    X_WO[:3, 3] = 0.5, 0.2, -0.1
+    mesh = TriangleMesh(0.1 * np.eye(3), np.array([[0, 1, 2]]))
+    found = model.with_target("hand", mesh, X_WO)
+    carrying = [found.position_index(name) for name in TARGET_POSITIONS]
+    np.testing.assert_array_equal(found.lower[carrying], -10.0)
+    np.testing.assert_array_equal(found.upper[carrying], 10.0)
+    for _ in range(3):
+        q = np.array(found.default_positions)
+        joints = [name for name in model.position_names if name in found.position_names]
+        q[[found.position_index(name) for name in joints]] = rng.uniform(-0.3, 0.3, len(joints))
+        values = rng.uniform(-1.0, 1.0, 6)
+        q[carrying] = values
+        poses = link_poses(found, q)
+        move = np.eye(4)
+        move[:3, :3] = Rotation.from_euler("XYZ", values[3:]).as_matrix()
+        move[:3, 3] = values[:3]
+        np.testing.assert_allclose(poses["target"], X_WO @ move, atol=1e-9)
+        own = np.array(model.default_positions)
+        for name in joints:
+            own[model.position_index(name)] = q[found.position_index(name)]
+        for name, X in link_poses(model, own).items():
+            np.testing.assert_allclose(poses[name], X, atol=1e-9)
+    sizes = {name: np.ptp(one.vertices, axis=0).max() for name, one in found.link_meshes.items()}
+    assert sorted(size > 1e-3 for size in sizes.values()) == [False, False, True]
+    assert found.skin == ()
+    with pytest.raises(UnknownNameError):
+        model.with_target("nothing", mesh, X_WO)
+
+
+def test_base_joints_move_a_model_in_the_world(tmp_path):
+    """Along x, y, z of the world, then about z, y, x; at zero its base is where it was placed."""
+    weld = joint("weld", "fixed", "world", "foot", limits=None)
+    links = link("world", ""), link("foot"), link("arm", SPHERE)
+    text = urdf(*links, weld, joint("turn", "revolute", "foot", "arm"))
+    plain = load_model(write(tmp_path, text), check=False)
+    moved = with_base_joints(text, [0.1, 0.2, 0.3], [0.4, -0.2, 0.7])
+    model = load_model(write(tmp_path, moved, "moved.urdf"), check=False)
+    start = np.eye(4)
+    start[:3, :3] = Rotation.from_euler("xyz", [0.4, -0.2, 0.7]).as_matrix()
+    rng = np.random.default_rng(4)
+    for values in (np.zeros(6), rng.uniform(-1.0, 1.0, 6)):
+        q = np.zeros(len(model.position_names))
+        q[[model.position_index(name) for name in BASE_JOINTS]] = values
+        q[model.position_index("turn")] = 0.3
+        move = np.eye(4)
+        move[:3, :3] = Rotation.from_euler("ZYX", values[3:]).as_matrix()
+        move[:3, 3] = values[:3] + np.array([0.1, 0.2, 0.3])
+        poses, before = link_poses(model, q), link_poses(plain, np.array([0.3]))
+        for name in ("foot", "arm"):
+            np.testing.assert_allclose(poses[name], move @ start @ before[name], atol=1e-9)
+    turns = [model.position_index(name) for name in BASE_JOINTS[3:]]
+    np.testing.assert_allclose(model.upper[turns], np.pi)
+    shifts = [model.position_index(name) for name in BASE_JOINTS[:3]]
+    np.testing.assert_array_equal(model.upper[shifts], 100.0)

@@ -4,12 +4,14 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
 from drake_pose.body import load_model
 from drake_pose.errors import RegistrationError
+from drake_pose.files.overlay import EXCESS_RGB
 from drake_pose.jobs.registration.diagnosis import (
     compare_camera,
     compare_clock,
@@ -20,6 +22,7 @@ from drake_pose.jobs.registration.diagnosis import (
     require_determined,
 )
 from drake_pose.jobs.registration.large_errors import SceneComparison, _add_remaining
+from drake_pose.jobs.registration.tracks import describe_tracks, draw_tracks, track_warnings
 from drake_pose.jobs.registration.words import (
     describe_common_finding,
     describe_drift,
@@ -31,6 +34,7 @@ from drake_pose.registration.findings import Finding, FrameDiagnosis
 from drake_pose.registration.joint_offsets import KinematicParameter, undetermined
 from drake_pose.registration.recording import Recording, TimeOffset
 from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
+from drake_pose.registration.standing_scene.picture_matches import Sightings
 from tests.search.arms import arm_cameras, arm_urdf
 
 DEGREE = np.radians(1.0)
@@ -332,3 +336,85 @@ def test_masks_that_show_more_or_less_are_told(areas: list, said: str | None) ->
     told = SceneComparison._mask_warnings(scene, now)
     assert len(told) == (said is not None)
     assert all(text.startswith("camera 'left': the masks of ") and said in text for text in told)
+
+
+def tracked(**more: Any) -> Any:
+    """Return the registration of a camera on a link from a standing scene."""
+    frames = tuple(
+        FrameMisfit(f"{k}", np.nan, np.nan, ratio, True) for k, ratio in enumerate((0.9, 0.2, 0.6))
+    )
+    found = replace(registered(0.9), frames=frames)
+    seen = Sightings(
+        np.array([0, 1, 1]), np.array([0, 0, 1]), np.array([[5.0, 6.0], [20, 9], [9, 20]])
+    )
+    given = {
+        "found": found, "time_offset": TimeOffset(0.05, 0.01, np.zeros((0, 2))),
+        "focal_deviation": 0.0, "offsets": (), "likely": (), "explained": 0.7, "chance": 0.2,
+        "seen": seen, "inliers": np.array([True, True, False]), "gripper": None,
+        "contradiction": "",
+        "pictures": {f"{k}": np.zeros((30, 40, 3), np.uint8) for k in range(3)},
+    }  # fmt: skip
+    return SimpleNamespace(**(given | more))
+
+
+GRIPPER_FIT = SimpleNamespace(ratio=0.8, explained=0.4, chance=np.nan, silhouettes={})
+
+
+def test_a_camera_on_a_link_is_summarised(body: RegistrationBody) -> None:
+    kinematics = body.kinematics
+    told = describe_tracks(tracked(), kinematics)
+    assert (told["evidence"], told["gripper"], told["points"], told["sightings"]) == (
+        "scene", None, 2, 3
+    )  # fmt: skip
+    assert told["sightings_that_fit"] == pytest.approx(2 / 3)
+    assert (told["explained"], told["explained_by_chance"]) == (0.7, 0.2)
+    assert (told["time_offset_s"], told["time_offset_sd_s"]) == (0.05, 0.01)
+    assert (told["focal_px"], told["focal_sd_px"]) == (288.0, None)
+    told = describe_tracks(tracked(gripper=GRIPPER_FIT, focal_deviation=0.01), kinematics)
+    assert told["evidence"] == "scene and gripper"
+    assert told["gripper"]["contradicts"] is told["gripper"]["told_by_chance"] is None
+    assert told["focal_sd_px"] == pytest.approx(2.88)
+    against = tracked(gripper=GRIPPER_FIT, contradiction="far")
+    told = describe_tracks(against, kinematics)
+    assert (told["evidence"], told["gripper"]["contradicts"]) == ("scene", "far")
+    nothing = Sightings(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
+    alone = tracked(gripper=GRIPPER_FIT, seen=nothing, inliers=np.zeros(0, bool), time_offset=None)
+    told = describe_tracks(alone, kinematics)
+    assert (told["evidence"], told["sightings_that_fit"]) == ("gripper", None)
+    assert told["explained"] is told["time_offset_s"] is None
+    unknown = tracked(time_offset=TimeOffset(0.05, np.inf, np.zeros((0, 2))))
+    assert describe_tracks(unknown, kinematics)["time_offset_s"] is None
+    # Warnings of what was estimated, or is not determined.
+    assert track_warnings(tracked(), False) == []
+    (text,) = track_warnings(tracked(focal_deviation=0.02), True)
+    assert "estimated as 288 pixels (standard deviation 6)" in text
+    assert "offsets of a explain" in track_warnings(tracked(likely=("a",)), False)[0]
+    assert "places it far from where the scene does" in track_warnings(against, False)[0]
+    assert "from the gripper in its pictures alone" in track_warnings(alone, False)[0]
+    loose = undetermined("a", ())
+    assert (
+        "the offsets of a are not determined" in track_warnings(tracked(offsets=(loose,)), False)[0]
+    )
+    assert "do not determine its time offset" in track_warnings(unknown, False)[0]
+    assert len(track_warnings(tracked(gripper=GRIPPER_FIT), False)) == 0
+
+
+def test_points_and_contours_are_drawn_in_the_worst_pictures(tmp_path: Any) -> None:
+    shown = np.zeros((30, 40), bool)
+    shown[2:8, 25:35] = True
+    fit = SimpleNamespace(**{**vars(GRIPPER_FIT), "silhouettes": {"0": shown}})
+    draw_tracks(tmp_path, tracked(gripper=fit))
+    pictures = {
+        path.stem: cv2.imread(str(path))[..., ::-1] for path in tmp_path.glob("overlay/left/*.png")
+    }
+    assert sorted(pictures) == ["0", "1", "2"]
+    blue, orange = (0, 114, 178), EXCESS_RGB
+    for name, uv, colour in (("0", (5, 6), blue), ("1", (20, 9), blue), ("1", (9, 20), orange)):
+        ring = pictures[name][uv[1], uv[0] - 4]
+        assert np.abs(ring.astype(int) - colour).max() < 60
+        assert not pictures[name][uv[1], uv[0]].any()
+    assert not pictures["2"].any()
+    assert tuple(pictures["0"][2, 30]) == tuple(orange)
+    assert not pictures["0"][5, 30].any()
+    draw_tracks(tmp_path / "few", tracked(), most=1)
+    assert [path.stem for path in (tmp_path / "few").glob("overlay/left/*.png")] == ["1"]

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from drake_pose.arrays import Array, Picture
-from drake_pose.body import TARGET_POSITIONS
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError, RegistrationError, noted_warnings
@@ -49,6 +48,7 @@ from drake_pose.jobs.registration.result import (
     describe_parameters,
     describe_part,
     describe_run,
+    suggest_picture,
     write_result,
 )
 from drake_pose.jobs.registration.settings import RegistrationSettings
@@ -74,7 +74,6 @@ from drake_pose.registration.register import (
     TargetPose,
     intersection_over_union,
     overlap_areas,
-    suggest_pose,
 )
 from drake_pose.registration.standing_object import (
     CalibrationTarget,
@@ -345,18 +344,8 @@ class _Registration:
         name, settings = found.camera.name, self._settings
         self.registered[name], self.suggestions[name] = found, None
         if settings.suggest and len(found.alternatives):
-            # Suggest joint positions that distinguish the camera's poses.
-            poses = [found.camera.X_WC, *found.alternatives]
-            suggested = suggest_pose(self.body, found.camera, poses, settings.keep_out)
-            if suggested is None:
-                self.warnings.append(
-                    f"camera '{name}': no random joint positions are visible from all its poses "
-                    "and free of collisions: no picture is suggested; is --keep-out too large?"
-                )
-            else:
-                values = zip(self.body.kinematics.names, suggested[0].tolist(), strict=True)
-                positions = {k: one for k, one in values if k not in TARGET_POSITIONS}
-                self.suggestions[name] = {"positions": positions, "difference": suggested[1]}
+            self.suggestions[name], texts = suggest_picture(self.body, found, settings.keep_out)
+            self.warnings += texts
         self.seconds[name] = time.perf_counter() - start
         if self._on_camera is not None:
             self._on_camera(len(self.registered))

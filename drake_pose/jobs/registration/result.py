@@ -30,7 +30,13 @@ from drake_pose.jobs.registration.words import describe_reading
 from drake_pose.registration.camera_motion import CameraPart
 from drake_pose.registration.joint_offsets import KinematicParameter
 from drake_pose.registration.posed_frames import PosedFrame
-from drake_pose.registration.register import RegisteredCamera, TargetPose
+from drake_pose.registration.register import (
+    Box,
+    RegisteredCamera,
+    RegistrationBody,
+    TargetPose,
+    suggest_pose,
+)
 from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.pictures.masks import encode_mask
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
@@ -94,6 +100,25 @@ def describe_pose(name: str, X: Array, found: RegisteredCamera | TargetPose) -> 
         "translation_sd_mm": 1e3 * found.translation_sd,
         "rotation_sd_deg": float(np.degrees(found.rotation_sd)),
     }
+
+
+def suggest_picture(
+    body: RegistrationBody, found: RegisteredCamera, keep_out: Sequence[Box]
+) -> tuple[dict[str, Any] | None, list[str]]:
+    """Return joint positions that distinguish a camera's poses, and a warning if none are found.
+
+    The entries are ``positions`` by joint [rad or m] and ``difference``, see `suggest_pose`.
+    """
+    poses = [found.camera.X_WC, *found.alternatives]
+    suggested = suggest_pose(body, found.camera, poses, keep_out)
+    if suggested is None:
+        return None, [
+            f"camera '{found.camera.name}': no random joint positions are visible from all its "
+            "poses and free of collisions: no picture is suggested; is --keep-out too large?"
+        ]
+    values = zip(body.kinematics.names, suggested[0].tolist(), strict=True)
+    positions = {k: one for k, one in values if k not in TARGET_POSITIONS}
+    return {"positions": positions, "difference": suggested[1]}, []
 
 
 def describe_part(part: CameraPart | None) -> dict[str, Any]:

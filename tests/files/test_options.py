@@ -1,15 +1,21 @@
+import math
 from pathlib import Path
 
 import pytest
 
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.files.settings import (
+    EstimateSettings,
+    MaskSettings,
+    changed,
     parse_assignments,
     parse_boxes,
     parse_packages,
     parse_root_position,
     parse_root_rotation,
     percent,
+    plain,
+    within,
 )
 from drake_pose.silhouette.pictures.scenes import select_frames
 from tests.cli import run_command
@@ -83,3 +89,80 @@ def test_unknown_or_ambiguous_frames_are_refused_with_a_list(frames, text, words
 def test_a_name_given_twice_is_refused(parse, texts):
     with pytest.raises(SettingsError, match="'a' is given twice"):
         parse(texts)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"method": "paper", "time_limit": 3.0}, "the method paper has no time limit"),
+        ({"method": "person", "root": "a"}, "does not search poses; leave root out"),
+        ({"method": "guess"}, "there is no method 'guess'; there is: auto, beam, paper, person"),
+        ({"time_limit": -1.0}, "time_limit"),
+        ({"workers": 0}, "workers"),
+        ({"cameras": 3}, "cameras must be names like"),
+        ({"cameras": {"a": 1}}, "cameras must be names like"),
+        ({"frames": ["a", 3]}, "frames must be names like"),
+    ],
+)
+def test_settings_that_exclude_each_other_are_refused(given, message):
+    with pytest.raises(SettingsError, match=message):
+        EstimateSettings(**given)
+
+
+def test_single_names_and_lists_become_tuples_and_json_is_plain():
+    one = EstimateSettings(
+        cameras="left", frames=["1", "2"], packages={"b": Path("/x")}, workers=3,
+        start=Path("s.csv"),
+        root_rotation={"y": (-10.0, 20.0)}, time_limit=0.0,
+    )  # fmt: skip
+    assert (one.cameras, one.frames) == (("left",), ("1", "2"))
+    told = one.as_json()
+    assert "workers" not in told
+    assert told["root_rotation"] == [["y", -10.0, 20.0]]
+    assert (told["packages"], told["start"], told["frames"]) == ({"b": "/x"}, "s.csv", ["1", "2"])
+    assert EstimateSettings(root_rotation="free").as_json()["root_rotation"] == "free"
+    assert plain((Path("a"), [Path("b")], 3)) == ["a", ["b"], 3]
+    # Options that are not at their defaults, of the search alone or of all.
+    assert {*changed(one)} == {
+        "cameras", "frames", "packages", "workers", "start", "root_rotation", "time_limit"
+    }  # fmt: skip
+    assert {*one.search_settings} == {"root_rotation", "time_limit"}
+    assert changed(EstimateSettings()) == ()
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"box": (1.0, 2.0, 3.0)}, "box must be 4 numbers"),
+        ({"box": (1.0, 2.0, 3.0, math.nan)}, "box must be 4 numbers"),
+        ({"box": (1.0, 2.0, 3.0, 4.0), "background": "median"}, "two segmentation methods"),
+        ({"classes": ("a",), "box": (1.0, 2.0, 3.0, 4.0)}, "needs a COCO file"),
+        ({"model": Path("m")}, "need each other"),
+        ({"start": Path("m")}, "need each other"),
+        ({"start_error": 0.0}, "must be a positive number of degrees"),
+        ({"start_error": math.inf}, "must be a positive number of degrees"),
+    ],
+)
+def test_options_of_several_ways_to_masks_are_refused(given, message):
+    with pytest.raises(SettingsError, match=message):
+        MaskSettings(**given)
+    assert MaskSettings(box=(1.0, 2.0, 3.0, 4.0)).as_json() == {"box": [1.0, 2.0, 3.0, 4.0]}
+    assert MaskSettings(classes="a").classes == ("a",)
+    assert MaskSettings(model=Path("m"), start=Path("s")).as_json() == {"model": "m", "start": "s"}
+
+
+@pytest.mark.parametrize("value", [None, 1.0, 2.5, 4.0])
+def test_numbers_within_bounds_are_accepted(value):
+    within(1.0, 4.0).validator[0](None, value)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "value", "wanted"),
+    [
+        ((1.0, 4.0), 0.9, "1 to 4"), ((1.0, 4.0), 4.1, "1 to 4"), ((1.0,), 0.5, "1 or more"),
+        ((1.0,), math.inf, "1 or more"), ((1.0, 4.0), math.nan, "1 to 4"),
+    ],
+)  # fmt: skip
+def test_numbers_out_of_bounds_are_refused(bounds, value, wanted):
+    with pytest.raises(ValueError, match=f"It must be {wanted}"):
+        within(*bounds).validator[0](None, value)

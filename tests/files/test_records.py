@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from drake_pose.body import load_model
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.files import overlay
 from drake_pose.files.records import (
     FrameRecord,
@@ -13,11 +14,18 @@ from drake_pose.files.records import (
     base_pose,
     camera_warnings,
     frame_warnings,
+    joint_table,
     measured_positions,
+    mode_table,
+    next_summary,
     poor_fit_warnings,
     record_deviations,
+    record_modes,
+    record_pose_set,
     summarize,
+    user_units,
 )
+from drake_pose.search import JointEstimate, PoseMode, PoseSet
 from tests.body.models import joint, link, urdf, write
 
 
@@ -146,3 +154,100 @@ def test_overlay_legend_has_fractions_of_the_silhouettes_area(monkeypatch):
     overlay.draw_overlay(seen, body, None, "title")
     texts = [text for _, text in legends[0]]
     assert texts == ["agreement 80.0 %", "missing 20.0 %", "excess 20.0 %"]
+
+
+def test_modes_of_a_frame_are_united_in_user_units(model):
+    """Angles in degrees, lengths in metres; a joint is determined if it is so in all modes."""
+    np.testing.assert_allclose(user_units(model), [math.degrees(1.0), 1.0, math.degrees(1.0)])
+    first, second = np.array([1.4, 3.1, 0.2]), np.array([1.6, 3.3, 0.5])
+    narrow, wide = np.array([0.01, 0.01, 0.02]), np.array([0.01, 0.2, 0.02])
+    alone = record_modes(model, [(first, narrow)])
+    assert alone == {"joints": record_deviations(model, first, narrow)}
+    both = record_modes(model, [(first, narrow), (second, wide)])
+    one, other = (record_deviations(model, *a) for a in ((first, narrow), (second, wide)))
+    for name in ("bend", "reach", "turn"):
+        assert both["joints"][name]["low"] == min(one[name]["low"], other[name]["low"])
+        assert both["joints"][name]["high"] == max(one[name]["high"], other[name]["high"])
+        assert both["joints"][name]["determined"] == (name != "reach")
+        assert both["joints"][name]["value"] is None
+    assert both["mode_count"] == 2
+    values = [[mode[name]["value"] for name in ("bend", "reach", "turn")] for mode in both["modes"]]
+    np.testing.assert_allclose(values, [user_units(model) * q for q in (first, second)])
+    # A joint without an interval in one mode has none; its limits are infinite.
+    unsure = record_modes(model, [(first, narrow), (np.full(3, np.nan), narrow)])
+    assert unsure["joints"] == {}
+    # Tables have a row for each frame, mode and joint.
+    rows = joint_table([record(**both), record()]).splitlines()
+    assert rows[0] == "frame,joint,determined,low,high,modes"
+    low, high = (f"{both['joints']['reach'][end]:.6g}" for end in ("low", "high"))
+    assert rows[2] == f"a,reach,no,{low},{high},2"
+    assert len(rows) == 4
+    rows = mode_table([record(**both)]).splitlines()
+    assert rows[0] == "frame,mode,joint,value,determined,low,high"
+    assert len(rows) == 7
+    assert rows[4].startswith(f"a,2,bend,{math.degrees(1.6):.6g},yes,")
+    assert rows[5].startswith("a,2,reach,3.3,no,")
+
+
+def test_pose_sets_are_recorded_with_values_of_each_mode(model):
+    tree = model.pose_tree()
+    names = TreeKinematics(tree).names
+    joints = tuple(JointEstimate(name, name != "reach", 0.1, 0.4) for name in names)
+    values = [np.array([0.2]) for node in tree.nodes for _ in node.value_names]
+    split = TreeKinematics(tree).split(np.concatenate(values))
+    mode = PoseMode.of_values(tree, split, 1.0, joints)
+    told = record_pose_set(PoseSet((mode,), joints, 0.0, False, 5), tree)
+    assert told["mode_count"] == 5
+    for name in ("bend", "reach", "turn"):
+        unit = 1.0 if name == "reach" else math.degrees(1.0)
+        for one, value in ((told["joints"], None), (told["modes"][0], 0.2 * unit)):
+            assert one[name]["determined"] == (name != "reach")
+            assert (one[name]["low"], one[name]["high"]) == pytest.approx((0.1 * unit, 0.4 * unit))
+            assert one[name]["value"] == (None if value is None else pytest.approx(value))
+    assert record_pose_set(None, tree) == {}
+
+
+@pytest.mark.parametrize(("took", "wait"), [(0.01, 2.0), (0.5, 10.0)])
+def test_summaries_are_written_rarely_if_that_takes_long(monkeypatch, took, wait):
+    """At least two seconds apart, and twenty times as long as writing takes."""
+    monkeypatch.setattr("drake_pose.files.records.time.monotonic", lambda: 100.0)
+    assert next_summary(100.0 - took) == pytest.approx(100.0 + wait)
+
+
+def test_surroundings_are_cut_with_a_margin():
+    """Eight pixels and 12 % of the larger side; the picture is enlarged by a whole number."""
+    shown = np.zeros((300, 400), bool)
+    shown[100:151, 200:221] = True
+    rows, columns = overlay._surroundings(shown)
+    assert (rows.start, rows.stop) == (100 - 14, 151 + 14)
+    assert (columns.start, columns.stop) == (200 - 14, 221 + 14)
+    shown[2, 3] = True
+    rows, columns = overlay._surroundings(shown)
+    assert (rows.start, columns.start) == (0, 0)
+    for size, factor in (
+        ((60, 140), 8),
+        ((61, 140), 7),
+        ((60, 141), 7),
+        ((481, 10), 1),
+        ((10, 10), 8),
+    ):
+        assert overlay._enlarged(np.ones(size, np.uint8)).shape == (
+            size[0] * factor,
+            size[1] * factor,
+        )
+
+
+def test_borders_are_pixels_before_another_segment():
+    """To the right or below, both within the body."""
+    rng = np.random.default_rng(3)
+    body, segments = rng.random((12, 15)) < 0.8, rng.integers(0, 3, (12, 15))
+    picture = np.zeros((12, 15), np.uint8)
+    overlay._draw_borders(picture, body, segments, 9)
+    for v, u in np.ndindex(12, 15):
+        beside = [(v, u + 1), (v + 1, u)]
+        differs = any(
+            a < 12 and b < 15 and body[a, b] and segments[a, b] != segments[v, u] for a, b in beside
+        )
+        assert picture[v, u] == 9 * (body[v, u] and differs)
+    overlay._draw_borders(picture, body, None, 5)
+    assert not (picture == 5).any()

@@ -4,6 +4,7 @@ import re
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import cv2
@@ -357,3 +358,138 @@ def test_replay_of_many_triangles_is_small_and_accurate(tmp_path):
     )
     points = np.frombuffer(ghost, np.float32).reshape(-1, 3) - [0.3, 0.0, 0.0]
     np.testing.assert_allclose(np.linalg.norm(points / [1, 2, 1], axis=1), 0.1, atol=0.003)
+
+
+def test_numbers_of_a_page_are_rounded_and_unknown_ones_dashes():
+    _range, _limits_text, _ends = (
+        getattr(report_page, k) for k in ("_range", "_limits_text", "_ends")
+    )
+    assert _range((1.234, 5.678), 1) == "1.2 to 5.7"
+    assert _range((1.24, 1.16), 1) == "1.2"
+    assert _range((-0.001, -0.001), 1) == "0.0"
+    assert _range((-np.inf, 3.0), 2) == "none to 3.00"
+    assert _range((np.nan, np.nan), 1) == "–"
+    assert _limits_text((-90.04, np.inf)) == "-90 to none"
+    assert _limits_text((0.26, 1.0)) == "0.3 to 1"
+    assert _ends(np.array([3.0, np.nan]), np.array([-1.0, np.inf])) == (-1.0, 3.0)
+    assert np.isnan(_ends(np.array([np.nan]))).all()
+
+
+@pytest.mark.parametrize(
+    ("limits", "estimate", "interval", "bars"),
+    [
+        ((-10.0, 10.0), (0.0, 5.0), (-5.0, 6.0),
+         [("interval", 25.0, 55.0), ("estimate", 50.0, 25.0)]),
+        ((-10.0, 10.0), (0.0, 0.0), (np.nan, np.nan), [("estimate", 50.0, 1.0)]),
+        ((-10.0, 10.0), (10.0, 10.0), (8.0, 30.0),
+         [("interval", 90.0, 10.0), ("estimate", 99.0, 1.0)]),
+        ((-10.0, 10.0), (-20.0, -15.0), (-20.0, -10.0),
+         [("interval", 0.0, 1.0), ("estimate", 0.0, 1.0)]),
+        ((0.0, np.inf), (1.0, 2.0), (1.0, 2.0), []),
+        ((3.0, 3.0), (3.0, 3.0), (3.0, 3.0), []),
+    ],
+)  # fmt: skip
+def test_bars_lie_between_a_joints_limits(limits, estimate, interval, bars):
+    found = report_page._bar(limits, estimate, interval, is_open=False)
+    assert [(one["kind"], float(one["left"]), float(one["width"])) for one in found] == bars
+    opened = report_page._bar(limits, estimate, interval, is_open=True)
+    assert [one["kind"] for one in opened] == [k.replace("interval", "open") for k, *_ in bars]
+
+
+def found_by(summary, *records, names=("a", "b")):
+    """Return an estimate, and a model with its positions."""
+    frames = {f"{k}": one for k, one in enumerate(records)}
+    estimate = SceneEstimate(names, ("angle",) * 2, frames, summary, None)
+    return SimpleNamespace(position_names=names), estimate
+
+
+def told(*determined, E=0.1, **more):
+    joints = {name: {"determined": one} for name, one in zip("ab", determined, strict=False)}
+    return FrameRecord("0", np.zeros(2), None, E, 1.0, joints=joints, **more)
+
+
+@pytest.mark.parametrize(
+    ("records", "answer"),
+    [
+        ((told(E=None),), "No pose was found."),
+        ((told(E=None), told(E=None)), "No pose was found in 2 frames."),
+        ((told(True, True),), "2 of 2 joints determined; error 10.0 % of the silhouette."),
+        ((told(True, False),), "Pose found; error 10.0 % of the silhouette. 1 of 2 joints "
+         "determined; not: b."),
+        ((told(True, True), told(E=None)), "2 of 2 joints determined in 1 of 2 frames; mean error "
+         "10.0 % of the silhouette."),
+        ((told(True, True), told(True, False)), "Pose found in 2 of 2 frames; mean error 10.0 % of "
+         "the silhouette. 1 of 2 joints determined in all of them; not always: b."),
+        ((told(True, True), told(True)), "Pose found in 2 of 2 frames; mean error 10.0 % of the "
+         "silhouette. 1 of 2 joints determined in all of them; not always: b."),
+        ((told(),), "Pose found; error 10.0 % of the silhouette."),
+    ],
+)  # fmt: skip
+def test_the_answer_counts_frames_and_joints(records, answer):
+    assert report_page.estimate_answer(*found_by({"mean_E_total": 0.1}, *records)) == answer
+
+
+@pytest.mark.parametrize(
+    ("method", "images", "stopped", "text"),
+    [
+        ("beam", {}, ("end", "end"), "searched by beam search and contour fits"),
+        ("beam", {}, ("end", "tracked"), "tracked in 1 frames, 1 searched by beam search and "
+         "contour fits"),
+        ("beam", {}, ("tracked", "tracked"), "tracked in 2 frames"),
+        ("person", {"x": 1}, ("end", "end"), "one person, tracked by colour"),
+        ("person", {}, ("end", "end"), "one person, fitted to all silhouettes at once"),
+        ("beam", {"x": 1}, ("tracked", "tracked"), "tracked by colour in 2 frames"),
+    ],
+)  # fmt: skip
+def test_the_method_is_told_with_counts(method, images, stopped, text):
+    _, estimate = found_by({"method": method}, *(told(stopped_by=one) for one in stopped))
+    assert report_page._describe_method(SimpleNamespace(images=images), estimate) == text
+
+
+def test_pictures_are_of_the_worst_the_middle_and_the_best_frame(tmp_path):
+    """Of each frame those with the lowest IoU, six in all; the pictures are made smaller."""
+    records, cameras = {}, {f"c{k}": camera(f"c{k}") for k in range(4)}
+    for k, error in enumerate((0.1, 0.5, 0.3, 0.2, 0.4)):
+        ious = {f"c{n}": 0.9 - 0.1 * ((n + k) % 4) for n in range(4)}
+        records[f"{k}"] = FrameRecord(f"{k}", np.zeros(1), None, error, 1.0, ious=ious)
+        for name in cameras:
+            path = tmp_path / f"overlay/{name}/{k}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(path), np.full((400, 640, 3), 100 + k, np.uint8))
+    estimate = SceneEstimate(("a",), ("angle",), records, {}, tmp_path)
+    scene = SimpleNamespace(cameras=cameras)
+    shown = report_page._pick_pictures(tmp_path, scene, estimate)
+    assert [one["frame"] for one in shown] == ["1", "1", "2", "2", "0", "0"]
+    for one in shown:
+        ious = records[one["frame"]].ious
+        assert one["camera"] in sorted(ious, key=lambda name: ious[name])[:2]
+        data = base64.b64decode(one["uri"].partition("base64,")[2])
+        small = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        assert small.shape == (300, 480, 3)
+        assert small.mean() == pytest.approx(100 + int(one["frame"]), abs=3)
+        assert one["link"] == f"overlay/{one['camera']}/{one['frame']}.png"
+    (tmp_path / "overlay/c0/9.png").write_text("no picture")
+    for frame in ("8", "9"):
+        assert report_page.overlay_picture(tmp_path, "c0", frame, None) is None
+    lost = SceneEstimate(("a",), ("angle",), {}, {}, tmp_path)
+    assert report_page._pick_pictures(tmp_path, scene, lost) == []
+
+
+def test_pictures_count_as_used_where_they_were_compared():
+    """A picture without a mask is used where a pose was found."""
+    records = {
+        "0": told(ious={"c": 0.5}), "1": told(), "2": told(), "3": told(E=None), "4": told(),
+        "5": told(ious={"c": 0.9}),
+    }  # fmt: skip
+    estimate = SceneEstimate(("a",), ("angle",), records, {"warnings": ["'c' x", "'d' y"]}, None)
+    masks = {("c", k): Path() for k in ("0", "1", "5")}
+    images = {("c", k): Path() for k in ("1", "2", "3")}
+    scene = SimpleNamespace(masks=masks, images=images)
+    states = report_page._picture_use(scene, estimate, "c")
+    assert states == ["used", "left-out", "used", "left-out", "no-picture", "used"]
+    row = report_page._camera_row(estimate, "c", states)
+    assert (row["pictures"], row["used"], row["worst"], row["warnings"]) == (5, 3, "0", [1])
+    assert (row["mean"], row["lowest"]) == pytest.approx((0.7, 0.5))
+    nothing = report_page._camera_row(estimate, "d", states)
+    assert nothing["mean"] is nothing["lowest"] is nothing["worst"] is None
+    assert nothing["warnings"] == [2]

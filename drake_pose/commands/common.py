@@ -22,6 +22,7 @@ from drake_pose.files.settings import within
 
 if TYPE_CHECKING:
     from drake_pose.files.records import FrameRecord
+    from drake_pose.files.writer import OnFrame, OnStage
 
 SPREAD = Parameter("*")
 """Makes each field of a settings class an option of its own."""
@@ -139,37 +140,28 @@ def count_progress(what: str, total: int | None) -> Iterator[Callable[[int], Non
         yield lambda done: progress.update(task, completed=done)
 
 
-class FrameProgress:
-    """A progress bar over frames that also counts the frames without a pose."""
+@contextmanager
+def frame_progress() -> Iterator[tuple[OnFrame, OnStage]]:
+    """Show a progress bar over frames that also counts the frames without a pose.
 
-    def __init__(self) -> None:
-        self._progress = progress_bar()
-        self._stage, self._lost = "reading", 0
-        self._task = self._progress.add_task(self._stage, total=None)
+    Yields functions to be called with a finished frame, and with the progress of another stage of
+    the work; each stage has its own bar.
+    """
+    with progress_bar() as progress:
+        stage, lost, task = "reading", 0, progress.add_task("reading", total=None)
 
-    def __enter__(self) -> FrameProgress:
-        """Show the bar."""
-        self._progress.start()
-        return self
+        def show_stage(name: str, done: int, total: int | None) -> None:
+            nonlocal stage, task
+            if name != stage:
+                progress.remove_task(task)
+                stage, task = name, progress.add_task(name, total=total)
+            progress.update(task, completed=done, total=total)
 
-    def __exit__(self, *_: object) -> None:
-        """Remove the bar."""
-        self._progress.stop()
+        def show_frame(done: int, total: int, _: str, record: FrameRecord | None) -> None:
+            nonlocal lost
+            show_stage("frames", done, total)
+            if record is not None and not record.found:
+                lost += 1
+                progress.update(task, description=f"frames ({lost} without a pose)")
 
-    def show_stage(self, stage: str, done: int, total: int | None) -> None:
-        """Show the progress of a stage of the work, each stage with its own bar.
-
-        ``done`` of ``total`` items of the stage are finished; None: their number is unknown.
-        """
-        if stage != self._stage:
-            self._progress.remove_task(self._task)
-            self._task = self._progress.add_task(stage, total=total)
-            self._stage = stage
-        self._progress.update(self._task, completed=done, total=total)
-
-    def __call__(self, finished: int, total: int, frame: str, record: FrameRecord | None) -> None:
-        """Count a finished frame; the arguments are those of `files.writer.OnFrame`."""
-        self.show_stage("frames", finished, total)
-        if record is not None and not record.found:
-            self._lost += 1
-            self._progress.update(self._task, description=f"frames ({self._lost} without a pose)")
+        yield show_frame, show_stage

@@ -14,7 +14,6 @@ from rich.table import Table
 
 from drake_pose.commands.common import (
     SPREAD,
-    FrameProgress,
     Json,
     Model,
     Out,
@@ -23,6 +22,8 @@ from drake_pose.commands.common import (
     Resume,
     Truth,
     UsageError,
+    count_progress,
+    frame_progress,
     output_console,
     print_files,
     print_json,
@@ -88,10 +89,10 @@ def estimate(
     from drake_pose.jobs.estimate.compile_ahead import compiling_ahead
     from drake_pose.jobs.estimate.scene import estimate_scene
 
-    with compiling_ahead(), FrameProgress() as progress:
+    with compiling_ahead(), frame_progress() as (on_frame, on_stage):
         result = estimate_scene(
             scene, model, out, settings, truth=truth, cameras=cameras, resume=resume,
-            replay=replay, overlay=overlay, on_frame=progress, on_stage=progress.show_stage,
+            replay=replay, overlay=overlay, on_frame=on_frame, on_stage=on_stage,
         )  # fmt: skip
     print_result(result, json, _print_estimate)
     if result.found_count == 0:
@@ -115,8 +116,8 @@ def demo(
     from drake_pose.jobs.demo import run_demo
     from drake_pose.jobs.estimate.compile_ahead import compiling_ahead
 
-    with compiling_ahead(), FrameProgress() as progress:
-        result = run_demo(out, on_frame=progress)
+    with compiling_ahead(), frame_progress() as (on_frame, _):
+        result = run_demo(out, on_frame=on_frame)
     print_result(result, json, _print_demo)
     if result.found_count == 0:
         raise SceneError("no pose was found")
@@ -271,12 +272,10 @@ def capture(
     live = replace(live, replay=replay, packages=settings.packages)
     if method != "person" and any(one.live for one in studio.specifications.values()):
         say("drake-pose: stand upright in view of the cameras, both arms spread to the sides")
-    with FrameProgress() as progress:
-
-        def show(count: int, _: bool) -> None:
-            progress.show_stage("frames", count, None)
-
-        found, interrupted, unreported = capture_live(studio, out, model, live, warn, show, method)
+    with count_progress("frames", None) as advance:
+        found, interrupted, unreported = capture_live(
+            studio, out, model, live, warn, lambda count, _: advance(count), method
+        )
     for text in unreported:
         warn(text)
     if interrupted:

@@ -219,10 +219,8 @@ def look_until(
     """
 
     def look(context: Context) -> EventStatus:
-        is_enough = looks(context)
-        return (
-            EventStatus.ReachedTermination(diagram, "") if is_enough else EventStatus.DidNothing()
-        )
+        ended = EventStatus.ReachedTermination(diagram, "")
+        return ended if looks(context) else EventStatus.DidNothing()
 
     # Recorded pictures are read again in the capture, which reports their problems.
     report = on_report if sensors.live else lambda _: None

@@ -1,6 +1,5 @@
 """A walk through a garden in the browser: sources of the avatar's motion, and the simulation."""
 
-import logging
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
@@ -19,6 +18,7 @@ from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.errors import OutputError, SettingsError, require_positive
 from drake_pose.files.folder import read_summary
 from drake_pose.files.records import PoseTable
+from drake_pose.files.replay import open_meshcat
 from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.live.capture import capture_warnings, shape_of_result
 from drake_pose.jobs.live.scene import LiveScene, run_live
@@ -248,20 +248,15 @@ class _WalkLog:
 
 
 def open_page(port: int | None = None) -> Meshcat:
-    """Return a Meshcat server that listens on the loopback address only; Drake logs no address.
+    """Return a Meshcat server, see `open_meshcat`, at ``port``; None: any free one.
 
-    ``port``: the port; None: any free one. Raises SettingsError: the port cannot be used.
+    Raises SettingsError: the port cannot be used.
     """
-    logger = logging.getLogger("drake")
-    level = logger.level
-    logger.setLevel(logging.WARNING)
     try:
-        return Meshcat(MeshcatParams(host="localhost", port=port, show_stats_plot=False))
+        return open_meshcat(port=port, show_stats_plot=False)
     except RuntimeError as error:
         where = "any port" if port is None else f"port {port}"
         raise SettingsError(f"no page can be opened at {where}: {error}") from error
-    finally:
-        logger.setLevel(level)
 
 
 def wait_for_browser(page: Meshcat, patience: float = math.inf) -> bool:

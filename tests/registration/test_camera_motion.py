@@ -8,7 +8,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.registration.camera_motion import PictureMotion, find_camera_motion
+from drake_pose.registration.camera_motion import (
+    PictureMotion,
+    _Background,
+    _drift_and_shake,
+    _spread_corners,
+    _track,
+    find_camera_motion,
+    find_steps,
+)
 
 WIDTH, HEIGHT, FOCAL, COUNT = 320, 240, 300.0, 40
 CAMERA = PinholeCamera("eye", WIDTH, HEIGHT, FOCAL, FOCAL, 159.5, 119.5, np.eye(4))
@@ -106,3 +114,98 @@ def test_nothing_is_told_of_pictures_without_corners() -> None:
 
     assert find_camera_motion(plain, COUNT, CAMERA) == PictureMotion(())
     assert find_camera_motion(plain, 2, CAMERA) == PictureMotion(())
+
+
+def steps_of(levels: list[float], counts: list[int], noise: float, seed: int = 1) -> np.ndarray:
+    """Return samples (n, 4) that stand at levels along a direction, with noise."""
+    rng = np.random.default_rng(seed)
+    along = np.repeat(levels, counts)[:, None] * np.array([0.6, 0.0, -0.8, 0.0])
+    return along + noise * rng.normal(size=(len(along), 4))
+
+
+@pytest.mark.parametrize(
+    ("levels", "counts", "noise", "found"),
+    [
+        ([0.0], [30], 0.1, []), ([0.0, 1.0], [12, 18], 0.02, [(11, 12)]),
+        ([0.0, 1.0, 3.0], [9, 8, 13], 0.02, [(8, 9), (16, 17)]),
+        # A step that is undone; one hidden by noise; one under the least size.
+        ([0.0, 2.0, 0.0], [9, 9, 9], 0.02, [(8, 9), (17, 18)]),
+        ([0.0, 1.0], [12, 18], 0.2, []), ([0.0, 0.45], [12, 18], 0.001, []),
+        ([0.0, 0.55], [12, 18], 0.001, [(11, 12)]),
+        # Up to three samples are taken during a step; four make a slow motion.
+        ([0.0, 1.0, 2.0], [12, 1, 18], 0.02, [(11, 13)]),
+        ([0.0, 0.7, 1.0, 1.3, 2.0], [12, 1, 1, 1, 18], 0.02, [(11, 15)]),
+        ([*np.linspace(0.0, 3.0, 30)], [1] * 30, 0.02, []),
+    ],
+)  # fmt: skip
+def test_steps_are_found_between_their_samples(levels, counts, noise, found) -> None:
+    assert find_steps(steps_of(levels, counts, noise), 0.5) == found
+
+
+def test_drift_is_the_change_and_shake_the_distance_of_a_running_median() -> None:
+    ramp = np.outer(np.linspace(0.0, 2.0, 40), [0.6, 0.0, 0.8, 0.0])
+    drift, shake = _drift_and_shake(ramp)
+    # The median of the first and last five samples.
+    assert drift == pytest.approx(2.0 - 4 * 2.0 / 39, rel=1e-6)
+    assert shake < 1e-9
+    noisy = 0.5 * np.random.default_rng(3).normal(size=(400, 4))
+    drift, shake = _drift_and_shake(noisy)
+    assert shake == pytest.approx(0.5 * np.sqrt(3.36), rel=0.1)
+    for k in (0, 200, 399):
+        smooth = np.median(noisy[max(0, k - 4) : k + 5], axis=0)
+        assert drift >= np.linalg.norm(smooth - np.median(noisy[:5], axis=0)) - 1e-12
+
+
+def test_corners_are_the_best_of_each_tile_and_tracked_back() -> None:
+    rng = np.random.default_rng(2)
+    coarse = rng.uniform(20, 235, (24, 32)).astype(np.float32)
+    picture = cv2.resize(coarse, (320, 240), interpolation=cv2.INTER_NEAREST).astype(np.uint8)
+    picture[:, :64] = 120
+    corners = _spread_corners(picture)
+    strength = cv2.cornerMinEigenVal(picture, 7)
+    tiles = {(int(u) // 16, int(v) // 16) for u, v in corners}
+    assert len(tiles) == len(corners) > 150
+    assert min(u for u, _ in tiles) >= 3
+    for u, v in corners.astype(int):
+        tile = strength[v // 16 * 16 : v // 16 * 16 + 16, u // 16 * 16 : u // 16 * 16 + 16]
+        assert strength[v, u] == tile.max()
+    shift = np.float32([[1, 0, 2.5], [0, 1, -1.5]])
+    moved = cv2.warpAffine(picture, shift, (320, 240), borderMode=cv2.BORDER_REFLECT)
+    found, is_found = _track(picture, moved, corners)
+    off = found[is_found] - corners[is_found] - [2.5, -1.5]
+    assert is_found.mean() > 0.6
+    assert np.median(np.abs(off)) < 0.1
+    other = cv2.resize(rng.uniform(0, 255, (24, 32)), (320, 240)).astype(np.uint8)
+    assert _track(picture, other, corners)[1].mean() < 0.2
+
+
+def test_a_background_shift_has_four_parts_in_tracked_pixels() -> None:
+    """The centre's motion, and rotation and growth times a picture's root mean square radius."""
+    rng = np.random.default_rng(7)
+    wall = np.zeros((480, 640, 3), np.float32)
+    for cells in (8, 30, 80):
+        patches = rng.uniform(20, 235, (cells, cells, 3)).astype(np.float32)
+        wall += cv2.resize(patches, (640, 480), interpolation=cv2.INTER_CUBIC) / 3.0
+    camera = PinholeCamera("eye", 1280, 960, 1200.0, 1200.0, 639.5, 479.5, np.eye(4))
+    wall = cv2.resize(wall, (1280, 960), interpolation=cv2.INTER_CUBIC)
+    radius = np.hypot(640, 480) / np.sqrt(12.0)
+    cases = [(0, 0, 0.0, 1.0), (6, -4, 0.0, 1.0), (0, 0, 0.02, 1.0), (3, 2, -0.01, 1.01)]
+    views = []
+    for u, v, angle, grow in cases:
+        c, s = grow * np.cos(angle), grow * np.sin(angle)
+        at = np.array([639.5, 479.5])
+        M = np.array([[c, -s], [s, c]])
+        shift = at + np.array([u, v]) - M @ at
+        turned = np.column_stack([M, shift])
+        view = cv2.warpAffine(wall, turned, (1280, 960), borderMode=cv2.BORDER_REFLECT)
+        views.append(view.clip(0, 255).astype(np.uint8))
+    tracker = _Background(lambda k: views[k], 0, camera)
+    assert tracker.scale == 0.5
+    found = tracker.shifts(range(len(cases)))
+    for shift, (u, v, angle, grow) in zip(found, cases, strict=True):
+        expected = [0.5 * u, 0.5 * v, radius * angle, radius * (grow - 1.0)]
+        np.testing.assert_allclose(shift, expected, atol=0.12)
+    turn_of = tracker.rotation(np.array([3.0, -2.0, 5.0, 9.0]))
+    np.testing.assert_allclose(turn_of, [2.0 / 600.0, 3.0 / 600.0, 5.0 / radius])
+    blank = _Background(lambda _: np.full((960, 1280, 3), 90, np.uint8), 0, camera)
+    assert np.isnan(blank.shifts([0])).all()

@@ -1,0 +1,96 @@
+"""Laws of what a registration compares: poses, overlaps, and positions that tell poses apart."""
+
+import cv2
+import numpy as np
+import pytest
+
+from drake_pose.registration.posed_frames import PosedFrames, placed_points
+from drake_pose.registration.register import (
+    RegistrationBody,
+    distinct_poses,
+    frame_misfits,
+    keep_distinct,
+    overlap_areas,
+    suggest_pose,
+)
+from drake_pose.silhouette.scoring import draw_mask
+from tests.registration.arm_pictures import looking_at, see
+
+MIDDLE = np.array([0.0, 0.0, 0.4])
+PLACE = np.array([1.6, 0.4, 0.5])
+
+
+@pytest.fixture(scope="module")
+def posed(model, body: RegistrationBody) -> PosedFrames:
+    camera = looking_at(PLACE, MIDDLE, 0.1)
+    frames = see(model, body, camera, 2, 4)
+    return PosedFrames(body.kinematics, body.coarse, camera, frames, 0.02)
+
+
+def test_poses_are_distinct_if_points_are_apart_in_pictures(posed: PosedFrames) -> None:
+    """By more than 3 % of the silhouettes' size, from all that were kept before."""
+    X_CW, size = posed.camera.X_CW, posed.size
+    depth = float((X_CW[:3, :3] @ posed.middle + X_CW[:3, 3])[2])
+
+    def moved(pixels: float) -> np.ndarray:
+        X = X_CW.copy()
+        X[0, 3] += pixels * depth / posed.camera.focal_x
+        return X
+
+    poses = [moved(k * size) for k in (0.0, 0.025, 0.036, 0.05, 0.08, -0.02)]
+    found = distinct_poses(posed, poses)
+    assert [any(one is pose for one in found) for pose in poses] == [
+        True, False, True, False, True, False
+    ]  # fmt: skip
+    assert len(distinct_poses(posed, poses, apart=0.0)) == 6
+    assert [*keep_distinct([1, 5, 2, 9, 6], lambda a, b: abs(a - b) > 1)] == [1, 5, 9]
+
+
+def test_overlaps_count_pixels_of_scaled_pictures(posed: PosedFrames) -> None:
+    X_CW = posed.camera.X_CW
+    other = X_CW.copy()
+    other[:3, 3] += [0.05, -0.03, 0.1]
+    for side in (60.0, np.inf):
+        camera = posed.downscaled(side)
+        scale = min(1.0, side / posed.size)
+        size = round(scale * 640), round(scale * 480)
+        assert (camera.width, camera.height) == size
+        found = overlap_areas(posed, np.array([X_CW, other]), side)
+        for i, X in enumerate((X_CW, other)):
+            for k, frame in enumerate(posed.frames):
+                drawn = draw_mask(posed.outlines, X @ posed.X_WN[k], camera)
+                mask = frame.mask.astype(np.float32)
+                shown = cv2.resize(mask, size, interpolation=cv2.INTER_AREA) > 0.5
+                counts = [np.count_nonzero(one) for one in (drawn, shown, drawn & shown)]
+                assert found[i, k].tolist() == counts
+    ratios, inliers = np.array([0.9, 0.3]), np.array([True, False])
+    first, second = frame_misfits(posed, X_CW, ratios, inliers)
+    assert (first.frame, first.inlier_ratio, first.is_inlier) == (posed.frames[0].name, 0.9, True)
+    assert not second.is_inlier
+    assert first.E_total < 0.05 < 0.9 < first.iou
+
+
+def test_suggested_positions_tell_poses_apart_outside_of_boxes(body: RegistrationBody) -> None:
+    """They are the best of many random ones, in which all cameras see the body."""
+    camera = looking_at(PLACE, MIDDLE, 0.1)
+    X_WC = [camera.X_WC, looking_at(PLACE + np.array([0.0, 0.1, 0.0]), MIDDLE, 0.12).X_WC]
+    found = suggest_pose(body, camera, X_WC, tried=12, width=160)
+    assert found is not None
+    small = [camera.with_pose(X).resized(160, 120) for X in X_WC]
+
+    def difference(values: np.ndarray) -> float:
+        a, b = (draw_mask(body.coarse, c.X_CW @ body.kinematics.poses(values), c) for c in small)
+        return 2.0 * np.count_nonzero(a ^ b) / (a.sum() + b.sum())
+
+    assert found[1] == pytest.approx(difference(found[0]))
+    rng = np.random.default_rng(0)
+    drawn = [rng.uniform(body.kinematics.lower, body.kinematics.upper) for _ in range(12)]
+    assert found[1] == pytest.approx(max(map(difference, drawn)))
+    box = (np.full(3, -9.0), np.full(3, 9.0))
+    assert suggest_pose(body, camera, X_WC, [box], tried=3) is None
+    low = np.array([-9.0, -9.0, 0.55])
+    free = suggest_pose(body, camera, X_WC, [(low, np.full(3, 9.0))], tried=40)
+    assert free is not None
+    assert placed_points(body.coarse, body.kinematics.poses(free[0]))[:, 2].max() < 0.55
+    away = looking_at(PLACE, 2.0 * PLACE, 0.0).X_WC
+    assert suggest_pose(body, camera, [camera.X_WC, away], tried=3) is None

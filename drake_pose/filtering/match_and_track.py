@@ -70,11 +70,6 @@ class _GivenFrame:
     pictures: list[Picture | None] | None
     begin: float  # Time at which the processing of the frame started [s].
 
-    @property
-    def has_no_evidence(self) -> bool:
-        """Whether there is neither a mask nor a picture."""
-        return all(one is None for one in (*self.masks, *(self.pictures or ())))
-
 
 class MatchAndTrack:
     """Tracks a body from frame to frame, and searches for it where tracking fails.
@@ -296,7 +291,8 @@ class MatchAndTrack:
         ``reference``: E_total after the last match.
         """
         explains = not frame.views or result.E_total <= self._limit(reference)
-        return frame.has_no_evidence or track.lost or not explains
+        is_bare = all(one is None for one in (*frame.masks, *(frame.pictures or ())))
+        return is_bare or track.lost or not explains
 
     @staticmethod
     def _limit(reference: float) -> float:

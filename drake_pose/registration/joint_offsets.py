@@ -188,7 +188,10 @@ def calibrate_joints(
             values = describe(fit, found, freedom, least, covariance, sought)
             kept = _kept(values, fit if start else None)
         if kept == sought:
-            values = _with_significance(fit, found, freedom, least, covariance, values)
+            most = float(stdtrit(freedom, 1.0 - 0.5 * least))
+            tested = [name for name, one in values.items() if one.determined]
+            beside = significant_constants(fit, found, covariance, tested, most)
+            values = {k: replace(one, significant=k in beside) for k, one in values.items()}
         parameters |= values
     found, covariance, gauges = shrink_measured(fit, found, covariance, sought, static)
     again = describe(fit, found, freedom, least, covariance, sought)
@@ -209,29 +212,12 @@ def calibrate_joints(
     return JointCalibration(
         tuple(parameters[name] for name in joints),
         tuple(replace(parameters[link_scale_name(link)], name=link) for link in links),
-        tuple(fit.cameras(found)),
-        covariances,
+        tuple(fit.cameras(found)), covariances,
         deviations[fit.per_camera - 1 :: fit.per_camera] if focal else np.zeros(len(views)),
-        found.shared[target_rows],
-        covariance[np.ix_(target_rows, target_rows)],
+        found.shared[target_rows], covariance[np.ix_(target_rows, target_rows)],
         tuple(ratios[fit.rows == c] for c in range(len(views))),
         tuple(fit.inliers(ratios)[fit.rows == c] for c in range(len(views))),
-    )
-
-
-def _with_significance(
-    fit: SharedFit,
-    found: SharedValues,
-    freedom: int,
-    level: float,
-    covariance: Array,
-    values: Mapping[str, KinematicParameter],
-) -> dict[str, KinematicParameter]:
-    """Return descriptions by name, determined ones tested jointly; see `describe_constants`."""
-    most = float(stdtrit(freedom, 1.0 - 0.5 * level))
-    tested = [name for name, one in values.items() if one.determined]
-    beside = significant_constants(fit, found, covariance, tested, most)
-    return {k: replace(one, significant=k in beside) for k, one in values.items()}
+    )  # fmt: skip
 
 
 def _kept(values: Mapping[str, KinematicParameter], fit: SharedFit | None) -> list[str]:

@@ -25,21 +25,7 @@ def scene_corrections(
     frames: Sequence[str],
     *,
     pairs: int = 10,
-    factors: Sequence[float] = (
-        0.5,
-        0.6,
-        0.7,
-        0.8,
-        0.85,
-        0.9,
-        0.95,
-        1.05,
-        1.1,
-        1.15,
-        1.2,
-        1.4,
-        2.0,
-    ),
+    focal: Sequence[float] = (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 1.05, 1.1, 1.15, 1.2, 1.4, 2.0),
     sizes: Sequence[float] = (0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 0.75, 1.5, 2.0, 3.0, 4.0),
 ) -> Iterator[Correction]:
     """Yield corrections of mistakes that users make; each is to be tried by itself.
@@ -49,7 +35,7 @@ def scene_corrections(
         values: for each frame (m,) values of the pose tree [rad or m].
         frames: names of the frames, in order.
         pairs: maximum number of camera pairs that are exchanged.
-        factors: of focal lengths.
+        focal: factors of focal lengths.
         sizes: of pictures for which intrinsics may be meant [size of the camera's pictures].
     """
     for reading in readings():
@@ -83,7 +69,7 @@ def scene_corrections(
             continue
         text = "focal lengths" if len(cameras) > 1 and len(group) > 1 else "focal length of camera"
         text += "" if len(group) > 1 else f" '{group[0]}'"
-        for factor in factors:
+        for factor in focal:
             yield focal_correction(cameras, group, text, factor)
         yield from _intrinsics_corrections(cameras, group, sizes)
     for which, shift in (("next", 1), ("previous", -1)) if len(frames) > 2 else ():

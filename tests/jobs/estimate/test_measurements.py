@@ -1,10 +1,20 @@
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from drake_pose.errors import SceneError, UnknownNameError
+from drake_pose.files.records import BASE_COLUMNS, FIT_COLUMNS
 from drake_pose.input_files import read_csv
-from drake_pose.jobs.estimate.measurements import read_joint_centres, read_measured_positions
+from drake_pose.jobs.estimate.measurements import (
+    check_units,
+    has_times,
+    is_episode,
+    left_out_warnings,
+    read_joint_centres,
+    read_measured_positions,
+)
 
 CENTRES = "frame,joint,x,y,z\n0,ankle,1,2,3\n0,knee,4,5,6\n7,ankle,-1,-2,-3\n"
 
@@ -76,3 +86,101 @@ def test_tables_with_other_separators_are_refused_by_name(
     file.write_text(f"frame{sign}A1\n0000{sign}0,5\n")
     with pytest.raises(SceneError, match=f"{name}; save the table with commas"):
         read_csv(file, SceneError)
+
+
+def limited() -> SimpleNamespace:
+    """An angle of -1 to 2 rad, a length of 0.1 to 0.3 m, and an angle without limits."""
+    names = ("bend", "reach", "turn")
+    return SimpleNamespace(
+        lower=np.array([-1.0, 0.1, -np.inf]), upper=np.array([2.0, 0.3, np.inf]),
+        position_kinds=("angle", "length", "angle"), position_index=names.index,
+    )  # fmt: skip
+
+
+def units_of(name: str, *values: float) -> tuple[str, ...]:
+    known = {f"{k}": np.array([value]) for k, value in enumerate(values)}
+    return check_units(Path("t.csv"), limited(), [name], known)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "told"),
+    [
+        ("bend", (0.0, 2.09, -1.09), None), ("bend", (0.0, 2.11), "frame 1: 2.11 rad lies outside"),
+        ("bend", (-1.2, 0.0), "-1.2 rad lies outside the joint's limits, -1 to 2 rad; check"),
+        ("reach", (0.1, 0.319, 0.081), None), ("reach", (0.2, 0.33), "0.33 m lies outside"),
+        ("turn", (99.0,), None),
+        ("bend", (0.0, 7.0), "a full turn off, 0.7168 rad, it would not"),
+        ("bend", (-6.9,), "a full turn off, -0.6168 rad, it would not"),
+        ("bend", (4.0,), "check the column's joint"),
+        # The worst of several.
+        ("bend", (2.3, 2.9, -1.2), "frame 1: 2.9 rad"),
+        # Out of reach in any unit.
+        ("reach", (0.2, 200.0), "200 m lies outside"),
+        ("bend", (0.0, 300.0), "300 rad lies outside"),
+    ],
+)  # fmt: skip
+def test_positions_outside_their_limits_are_told(name, values, told) -> None:
+    found = units_of(name, *values)
+    assert len(found) == (told is not None)
+    assert all(f"t.csv: column '{name}', " in text and told in text for text in found)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "told"),
+    [
+        ("bend", (30.0, 90.0), "not in degrees: .* write every angle in radians"),
+        ("reach", (150.0, 290.0), "not in millimetres: .* write every length in metres"),
+        ("bend", (1.1e6,), "too large for a joint position"),
+        ("turn", (-2e6,), "too large for a joint position"),
+    ],
+)
+def test_columns_in_other_units_are_refused(name, values, told) -> None:
+    with pytest.raises(SceneError, match=told):
+        units_of(name, *values)
+
+
+def test_a_table_of_estimates_is_read_with_its_base(tmp_path: Path) -> None:
+    """Rows without a pose are skipped; the base is apart from the positions."""
+    base = ",".join(BASE_COLUMNS)
+    fit = ",".join(FIT_COLUMNS)
+    numbers = ",".join(str(k) for k in range(7))
+    text = f"frame,a,b,{base},{fit}\n0,1,2,{numbers},0.1,3\n1,,,{',' * 6},,3\n"
+    found = read_measured_positions(written(tmp_path / "poses.csv", text), ("a", "b", "c"))
+    assert found.names == ("a", "b")
+    assert [*found.values] == [0]
+    np.testing.assert_array_equal(found.of("0000"), [1.0, 2.0])
+    assert found.of("0001") is None
+    np.testing.assert_array_equal(found.bases[0], np.arange(7.0))
+    assert found.is_estimate
+    plain = read_measured_positions(
+        written(tmp_path / "p.csv", f"frame,a,{fit}\n0,1,0.1,3\n2,4,nan,3\n"), ("a", "b")
+    )
+    assert (plain.names, plain.bases, [*plain.values]) == (("a",), {}, [0])
+    alone = read_measured_positions(written(tmp_path / "q.csv", "frame,b\n3,4\n"), ("a", "b"))
+    assert (alone.names, alone.is_estimate) == (("b",), False)
+    for bad, told in (
+        ("frame\n", "first line"),
+        ("time,a\n", "first line"),
+        ("frame,a,a\n", "twice"),
+    ):
+        with pytest.raises(SceneError, match=told):
+            read_measured_positions(written(tmp_path / "bad.csv", bad), ("a",))
+    assert has_times(written(tmp_path / "t.csv", "time,a\n0,1\n"))
+    assert not has_times(tmp_path / "q.csv")
+
+
+def test_a_folder_is_an_episode_unless_it_has_masks(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("drake_pose.jobs.estimate.measurements.recording_format", lambda _: "droid")
+    settings = SimpleNamespace(episode=None)
+    assert is_episode(tmp_path, settings)
+    file = written(tmp_path / "a.mcap", "")
+    (tmp_path / "masks").mkdir()
+    assert not is_episode(tmp_path, settings)
+    assert is_episode(tmp_path, SimpleNamespace(episode=0))
+    assert is_episode(file, settings)
+    monkeypatch.setattr("drake_pose.jobs.estimate.measurements.recording_format", lambda _: "")
+    (tmp_path / "masks").rmdir()
+    assert not is_episode(tmp_path, settings)
+    told = left_out_warnings(["a", "b"], {"a"})
+    assert len(told) == 1
+    assert "camera 'b' has no X_WC" in told[0]

@@ -22,6 +22,12 @@ from drake_pose.jobs.registration.diagnosis import (
     require_determined,
 )
 from drake_pose.jobs.registration.large_errors import SceneComparison, _add_remaining
+from drake_pose.jobs.registration.result import (
+    body_drawer,
+    describe_camera,
+    describe_parameters,
+    describe_part,
+)
 from drake_pose.jobs.registration.tracks import describe_tracks, draw_tracks, track_warnings
 from drake_pose.jobs.registration.words import (
     describe_common_finding,
@@ -30,11 +36,20 @@ from drake_pose.jobs.registration.words import (
     describe_frame_finding,
     describe_reading,
 )
+from drake_pose.registration.camera_motion import CameraPart
 from drake_pose.registration.findings import Finding, FrameDiagnosis
 from drake_pose.registration.joint_offsets import KinematicParameter, undetermined
+from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.recording import Recording, TimeOffset
-from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
+from drake_pose.registration.register import (
+    FrameMisfit,
+    RegisteredCamera,
+    RegistrationBody,
+    TargetPose,
+)
 from drake_pose.registration.standing_scene.picture_matches import Sightings
+from drake_pose.silhouette.outline import outline_from_mesh
+from drake_pose.silhouette.scoring import draw_mask
 from tests.search.arms import arm_cameras, arm_urdf
 
 DEGREE = np.radians(1.0)
@@ -418,3 +433,74 @@ def test_points_and_contours_are_drawn_in_the_worst_pictures(tmp_path: Any) -> N
     assert not pictures["0"][5, 30].any()
     draw_tracks(tmp_path / "few", tracked(), most=1)
     assert [path.stem for path in (tmp_path / "few").glob("overlay/left/*.png")] == ["1"]
+
+
+def test_a_camera_is_summarised_with_deviations_and_misfits() -> None:
+    other = np.eye(4)
+    other[:3, 3] = 1.0, 2.0, 3.0
+    one = registered(0.9, -0.3, E=0.2, alternatives=other[None])
+    C = np.zeros((6, 6))
+    C[:3, :3], C[3:, 3:] = DEGREE**2 * np.diag([1.0, 4.0, 9.0]), 1e-6 * np.diag([4.0, 4.0, 16.0])
+    one = replace(one, covariance=C)
+    told = describe_camera(one, 2.5, {"positions": {}})
+    np.testing.assert_allclose(told["X_WC"], one.camera.X_WC)
+    assert told["translation_sd_mm"] == pytest.approx(np.sqrt(24.0 / 3.0))
+    assert told["rotation_sd_deg"] == pytest.approx(np.sqrt(14.0 / 3.0))
+    assert [mode["X_WC"] for mode in told["modes"]] == [one.camera.X_WC.tolist(), other.tolist()]
+    assert (told["seconds"], told["outliers"], told["mean_iou"]) == (2.5, ["1"], pytest.approx(0.8))
+    assert told["frames"]["1"] == {
+        "agrees": False, "E_total": 0.2, "iou": pytest.approx(0.8), "inlier_ratio": 0.3
+    }  # fmt: skip
+    assert "target" not in told
+    on_link = describe_camera(one, 2.5, link="hand")
+    assert (on_link["link"], "X_WC" in on_link, len(on_link["modes"])) == ("hand", False, 2)
+    np.testing.assert_allclose(on_link["X_LC"], one.camera.X_WC)
+    unknown = replace(one, frames=(FrameMisfit("0", np.nan, np.nan, 0.5, True),))
+    assert describe_camera(unknown, 0.0)["frames"]["0"]["iou"] is None
+    target = TargetPose(other, C, other[None], np.zeros((0, 3)))
+    told = describe_camera(replace(one, target=target), 0.0)["target"]
+    assert (told["determined"], len(told["modes"])) == (True, 2)
+    assert told["translation_sd_mm"] == pytest.approx(np.sqrt(8.0))
+    round_one = replace(target, symmetry_axes=np.array([[0.0, 0.0, 1.0]]))
+    assert not describe_camera(replace(one, target=round_one), 0.0)["target"]["determined"]
+
+
+def test_parameters_are_summarised_in_their_units() -> None:
+    kinematics = SimpleNamespace(names=("turn", "slide"), is_angle=np.array([True, False]))
+    angle = KinematicParameter("turn", DEGREE, 2 * DEGREE, -DEGREE, 3 * DEGREE, True, ("x",))
+    length = KinematicParameter("slide", 0.001, 0.002, 0.003, 0.004, False)
+    scale = KinematicParameter("arm", 0.01, 0.02, -0.03, 0.05, False)
+    told = describe_parameters([angle, length], [scale, undetermined("leg", ())], kinematics)
+    assert told["zeros"]["turn"] == {
+        "determined": True, "significant": True, "value_deg": pytest.approx(1.0),
+        "sd_deg": pytest.approx(2.0), "low_deg": pytest.approx(-1.0),
+        "high_deg": pytest.approx(3.0), "gauge": ["x"],
+    }  # fmt: skip
+    assert told["zeros"]["slide"]["sd_mm"] == pytest.approx(2.0)
+    assert told["lengths"]["arm"]["value_percent"] == pytest.approx(1.0)
+    assert told["lengths"]["leg"]["high_percent"] is told["lengths"]["leg"]["value_percent"] is None
+    assert not told["lengths"]["leg"]["determined"]
+
+
+def test_parts_of_a_recording_are_told_with_their_times() -> None:
+    part = CameraPart("left", slice(3, 9), np.eye(3), 1.5, None, False, 0.4, 0.0)
+    assert describe_part(part) == {"part_of": "left", "from": 1.5, "drift_px": 0.4, "shake_px": 0.0}
+    whole = part._replace(is_whole=True, until=4.0)
+    assert describe_part(whole)["until"] == 4.0
+    assert describe_part(whole._replace(shake=0.6, drift=0.0))["shake_px"] == 0.6
+    assert describe_part(whole._replace(drift=0.0)) == describe_part(None) == {}
+
+
+def test_bodies_are_drawn_with_the_index_of_the_shown_node(body: RegistrationBody) -> None:
+    camera, values = arm_cameras()[0], np.array([0.1, 0.4, 0.3, 0.5, 0.2])
+    frame = PosedFrame("0", values, np.ones((240, 320), bool))
+    names = [node.name for node in body.tree.nodes]
+    every = body_drawer(body.tree, None)(camera, frame)
+    X_CN = camera.X_CW @ body.kinematics.poses(values)
+    outlines = [outline_from_mesh(node.mesh) for node in body.tree.nodes]
+    np.testing.assert_array_equal(every >= 0, draw_mask(outlines, X_CN, camera))
+    assert {*np.unique(every)} == {-1, *range(len(names))}
+    some = body_drawer(body.tree, names[2:])(camera, frame)
+    np.testing.assert_array_equal(some >= 0, draw_mask(outlines[2:], X_CN[2:], camera))
+    # A node keeps its place among those shown.
+    np.testing.assert_array_equal((every >= 2) & (some != every - 2), np.zeros_like(every, bool))

@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,9 +29,17 @@ from drake_pose.input_files import pointer_hint, read_regular
 INFO = Path("meta", "info.json")
 """File by which LeRobot data sets are recognised."""
 
-_Rows = Mapping[int, Mapping[str, Any]]
-"""Metadata of each episode, from column name to value, by the episode's number; {} for an episode
-without metadata."""
+
+class _DataSet(NamedTuple):
+    """A data set's metadata.
+
+    ``path``: its folder. ``info``: content of `meta/info.json`. ``rows``: metadata of each episode,
+    from column name to value, by the episode's number; {} for an episode without metadata.
+    """
+
+    path: Path
+    info: Mapping[str, Any]
+    rows: Mapping[int, Mapping[str, Any]]
 
 
 def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Episode:
@@ -52,9 +60,9 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
     parquet, warnings = import_reader("pyarrow.parquet", path), list[str]()
     try:
         info = _read_info(path)
-        rows = _episode_rows(path, info, parquet)
-        number, features = _choose_episode(path, info, rows, episode), info["features"]
-        table, file = _read_table(path, info, rows, number, parquet, warnings)
+        data = _DataSet(path, info, _episode_rows(path, info, parquet))
+        number, features = _choose_episode(data, episode), info["features"]
+        table, file = _read_table(data, number, parquet, warnings)
         stamps = row_times(table, _rate(info), str(file), warnings)
         kept, late = ascending_indices(stamps, f"{file}: episode {number}")
         stamps = stamps[kept]
@@ -78,7 +86,7 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
             name = camera_name(key)
             names.append(key if name in names else name)
             try:
-                camera = _read_camera(path, info, rows, number, key, table, file, warnings)
+                camera = _read_camera(data, number, key, table, file, warnings)
             except SceneError as error:
                 warnings.append(f"camera '{names[-1]}' is left out: {error}")
                 continue
@@ -154,8 +162,10 @@ def _rate(info: Mapping[str, Any]) -> float | None:
     return rate if np.isfinite(rate) and rate > 0.0 else None
 
 
-def _episode_rows(path: Path, info: Mapping[str, Any], parquet: Any) -> _Rows:
-    """Return the metadata of the episodes, see `_Rows`.
+def _episode_rows(
+    path: Path, info: Mapping[str, Any], parquet: Any
+) -> dict[int, Mapping[str, Any]]:
+    """Return the metadata of the episodes, see `_DataSet`.
 
     They are in `meta/episodes/*/*.parquet` (version 3) or `meta/episodes.jsonl` (version 2).
     Without either file the episodes are numbered from 0 to `total_episodes` - 1.
@@ -201,14 +211,14 @@ def _count(path: Path, info: Mapping[str, Any], field: str, default: int) -> int
         raise SceneError(f"{path / INFO}: {field} must be a number, not {found!r}") from error
 
 
-def _file(path: Path, info: Mapping[str, Any], rows: _Rows, number: int, key: str = "") -> Path:
+def _file(data: _DataSet, number: int, key: str = "") -> Path:
     """Return the file of an episode's data, or of the video of a camera; it may be missing.
 
     The words in the templates of `meta/info.json` may be those of either version. Without a
-    template it is the version's own. ``info``: content of that file. ``number``: of the episode.
-    ``key``: the camera's feature; "": the data. Raises SceneError: the template has an unknown
-    word, or one whose value is not known.
+    template it is the version's own. ``number``: of the episode. ``key``: the camera's feature; "":
+    the data. Raises SceneError: the template has an unknown word, or one whose value is not known.
     """
+    path, info, rows = data
     is_v3, which = info["codebase_version"].startswith("3."), "video_path" if key else "data_path"
     # The templates of versions 2 and 3.
     own = [
@@ -252,42 +262,39 @@ def _file(path: Path, info: Mapping[str, Any], rows: _Rows, number: int, key: st
     return found or files[0]
 
 
-def _choose_episode(path: Path, info: Mapping[str, Any], rows: _Rows, wanted: int | None) -> int:
+def _choose_episode(data: _DataSet, wanted: int | None) -> int:
     """Return the number of the wanted episode, or of the only one whose data are present.
 
-    ``info``: content of `meta/info.json`. ``wanted``: None: the only one. Raises UnknownNameError:
-    the data of the wanted episode are not present; SceneError: none was wanted, and the data of
-    none or of several episodes are present.
+    ``wanted``: None: the only one. Raises UnknownNameError: the data of the wanted episode are not
+    present; SceneError: none was wanted, and the data of none or of several episodes are present.
     """
-    numbers = list(rows)
+    numbers = list(data.rows)
     candidates = numbers if wanted is None else [one for one in numbers if one == wanted]
-    present = [one for one in candidates if _file(path, info, rows, one).is_file()]
+    present = [one for one in candidates if _file(data, one).is_file()]
     if len(present) == 1:
         return present[0]
-    present = [one for one in numbers if _file(path, info, rows, one).is_file()]
+    present = [one for one in numbers if _file(data, one).is_file()]
     names = listed([*map(str, present)], 20)
     if wanted is not None and present:
-        raise UnknownNameError("episode", str(wanted), [names], str(path))
-    expected = f"; expected, for one, {_file(path, info, rows, numbers[0])}" if numbers else ""
+        raise UnknownNameError("episode", str(wanted), [names], str(data.path))
+    expected = f"; expected, for one, {_file(data, numbers[0])}" if numbers else ""
     raise SceneError(
-        f"{path}: choose an episode (--episode N); of {len(numbers)} these are present: "
+        f"{data.path}: choose an episode (--episode N); of {len(numbers)} these are present: "
         f"{names or 'none' + expected}"
     )
 
 
-def _read_table(
-    path: Path, info: Mapping[str, Any], rows: _Rows, number: int, parquet: Any, warnings: list[str]
-) -> tuple[Any, Path]:
+def _read_table(data: _DataSet, number: int, parquet: Any, warnings: list[str]) -> tuple[Any, Path]:
     """Return the table (pyarrow.Table) of an episode, and its file; ``parquet`` is the module.
 
-    ``info``: content of `meta/info.json`. ``number``: of the episode. ``warnings``: appended to.
-    Raises SceneError: the table is damaged, or has no row of the episode.
+    ``number``: of the episode. ``warnings``: appended to. Raises SceneError: the table is damaged,
+    or has no row of the episode.
     """
-    file, features = _file(path, info, rows, number), info["features"]
+    file, info = _file(data, number), data.info
     try:
         schema = parquet.read_schema(file)
         available = schema.names
-        used = [key for key in available if key in {*features, "timestamp", "frame_index"}]
+        used = [key for key in available if key in {*info["features"], "timestamp", "frame_index"}]
         if "episode_index" not in available:
             table, others = parquet.read_table(file, columns=used), np.empty(0)
         elif str(schema.field("episode_index").type).startswith(("list", "fixed", "large")):
@@ -359,38 +366,23 @@ def _read_joints(
 
 
 def _read_camera(
-    path: Path,
-    info: Mapping[str, Any],
-    rows: _Rows,
-    number: int,
-    key: str,
-    table: Any,
-    file: Path,
-    warnings: list[str],
+    data: _DataSet, number: int, key: str, table: Any, file: Path, warnings: list[str]
 ) -> EpisodeCamera:
     """Return a camera of an episode: of a video with its times, or of images without times (0,).
 
-    Args:
-        path: folder of the data set.
-        info: content of `meta/info.json`.
-        rows: metadata by episode, see ``_Rows``.
-        number: number of the episode.
-        key: the camera's feature.
-        table: the episode's table (pyarrow.Table).
-        file: the table's file, for messages.
-        warnings: list to which warnings are appended.
-
-    Raises SceneError: the camera's images are missing or damaged.
+    ``number``: of the episode. ``key``: the camera's feature. ``table``: the episode's
+    (pyarrow.Table), of a ``file`` for messages. ``warnings``: appended to. Raises SceneError: the
+    camera's images are missing or damaged.
     """
-    feature, count = info["features"][key], table.num_rows
+    feature = data.info["features"][key]
     if feature.get("dtype") == "video":
-        video = _file(path, info, rows, number, key)
+        video = _file(data, number, key)
         if video.is_file():
-            return _video_camera(key, video, info, rows, number, count, warnings)
+            return _video_camera(data, number, key, video, table.num_rows, warnings)
         if key not in table.column_names:
             raise SceneError(f"{video} is missing")
     column = table[key] if key in table.column_names else None
-    stored = StoredPictures(path, file, key, column, shape_of(feature), number)
+    stored = StoredPictures(data.path, file, key, column, shape_of(feature), number)
     height, width = stored.read(0).shape[:2]
     return EpisodeCamera(key, width, height, np.empty(0), None, None, stored.read)
 
@@ -401,13 +393,7 @@ def _of_rows(camera: EpisodeCamera, stamps: Array, kept: Indices) -> EpisodeCame
 
 
 def _video_camera(
-    key: str,
-    file: Path,
-    info: Mapping[str, Any],
-    rows: _Rows,
-    number: int,
-    count: int,
-    warnings: list[str],
+    data: _DataSet, number: int, key: str, file: Path, count: int, warnings: list[str]
 ) -> EpisodeCamera:
     """Return the camera of a video, restricted to an episode; times start at 0 with the episode.
 
@@ -415,33 +401,27 @@ def _video_camera(
     this do not. A video with as many images as rows, which begins at another time than the
     metadata say, has the rows' images in order.
 
-    Args:
-        key: the camera's feature.
-        file: the video.
-        info: content of `meta/info.json`.
-        rows: metadata by episode, see ``_Rows``.
-        number: number of the episode.
-        count: number of rows of the episode.
-        warnings: list to which warnings are appended.
-
-    Raises SceneError: the video is unreadable, or has no image in the episode.
+    ``number``: of the episode, which has ``count`` rows. ``key``: the camera's feature. ``file``:
+    the video. ``warnings``: appended to. Raises SceneError: the video is unreadable, or has no
+    image in the episode.
     """
+    row = data.rows[number]
     video, name = TimedVideo(file), key.removeprefix("observation.").removeprefix("images.")
     where = f"videos/{key}"
     ends = [f"{where}/{end}_timestamp" for end in ("from", "to")]
     spans = np.array([[0.0, np.inf]])
     span = spans[0]
-    if all(isinstance(rows[number].get(end), int | float) for end in ends):
+    if all(isinstance(row.get(end), int | float) for end in ends):
         places = [f"{where}/chunk_index", f"{where}/file_index"]
         same = [
             one
-            for one in rows.values()
-            if all(one.get(place) == rows[number].get(place) for place in places)
+            for one in data.rows.values()
+            if all(one.get(place) == row.get(place) for place in places)
         ]
         spans = np.array([[float(one[end]) for end in ends] for one in same])
-        span = np.array([float(rows[number][end]) for end in ends])
+        span = np.array([float(row[end]) for end in ends])
     steps = np.diff(video.times)
-    rate = _rate(info) or (1.0 / float(np.median(steps)) if len(steps) else 1.0)
+    rate = _rate(data.info) or (1.0 / float(np.median(steps)) if len(steps) else 1.0)
     half = 0.5 / rate
     begin = float(spans[:, 0].min())
     total = (float(spans[:, 1].max()) - begin) * rate

@@ -11,13 +11,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import yaml
 from numpy.typing import ArrayLike, NDArray
-from pydrake.common.yaml import yaml_load_typed
 
 from drake_pose.arrays import Array
 from drake_pose.body import ParsedModel
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
+from drake_pose.input_files import read_yaml, typed_entry
 
 
 @dataclass(frozen=True, eq=False)
@@ -406,20 +405,9 @@ def model_inequalities(model: ParsedModel) -> Inequalities:
     return warn_if_unlimited(whole, str(model.path))
 
 
-def _read(file: Path, largest: int = 1 << 20) -> Couplings:
-    """Read a couplings file of at most ``largest`` bytes; ModelError if that fails."""
-    try:
-        if file.stat().st_size > largest:
-            raise ModelError(f"{file}: larger than {largest} bytes, so not a couplings file")
-        content = yaml_load_typed(schema=Couplings, data=file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ModelError(f"{file}: cannot read the couplings: {error.strerror}") from error
-    except (yaml.YAMLError, RuntimeError, ValueError, TypeError, AttributeError) as error:
-        raise ModelError(
-            f"{file}: not a couplings file ({' '.join(str(error).split())}); a couplings file has "
-            "lists 'differences', 'rows' and 'usual'"
-        ) from error
-    return content
+def _read(file: Path) -> Couplings:
+    """Read a couplings file; ModelError if that fails."""
+    return typed_entry(read_yaml(file, ModelError), Couplings, str(file), ModelError)
 
 
 def _unit(unit: str, where: str) -> float:

@@ -125,11 +125,14 @@ def test_rows_for_other_columns():
         ("differences: [{first: a, second: b, within: 1, lower: 0}]", ["either within"]),
         ("differences: [{first: a, second: b, lower: 1, upper: 0}]", ["a - b", "exceed"]),
         ("differences: [{first: a, second: b, within: 1, unit: ft}]", ["'ft'", "deg"]),
-        ("differences: [{first: a, other: b, within: 1}]", ["not a couplings file"]),
+        (
+            "differences: [{first: a, other: b, within: 1}]",
+            ["a mapping of differences, rows, usual"],
+        ),
         ("rows: [{name: r, terms: {a: .nan}, upper: 1}]", ["'r'", "finite"]),
-        ("rows: 3", ["not a couplings file"]),
-        ("- [", ["not a couplings file"]),
-        ("3", ["not a couplings file"]),
+        ("rows: 3", ["a mapping of differences, rows, usual"]),
+        ("- [", ["not a YAML file"]),
+        ("3", ["a mapping of differences, rows, usual"]),
     ],
 )
 def test_invalid_couplings_files_are_refused_by_name(tmp_path, text, words):
@@ -171,7 +174,7 @@ def test_joint_prior_is_read_with_units_and_for_known_columns(tmp_path):
         ("terms: {a: 1}, mean: 1, deviation: 2, unit: ft", "'ft'"),
         ("terms: {a: 0}, mean: 1, deviation: 2", "terms"),
         ("terms: {}, mean: 1, deviation: 2", "terms"),
-        ("terms: {a: 1}, about: 1, deviation: 2", "not a couplings file"),
+        ("terms: {a: 1}, about: 1, deviation: 2", "a mapping of differences, rows, usual"),
     ],
 )
 def test_invalid_joint_priors_are_refused_by_name(tmp_path, row, word):

@@ -9,7 +9,13 @@ import trimesh
 from pydrake.geometry import ReadObjToTriangleSurfaceMesh
 
 from drake_pose.body import TriangleMesh, load_model
-from drake_pose.body.meshes import drawable_file, read_mesh_file, write_obj
+from drake_pose.body.meshes import (
+    _round_mesh,
+    drawable_file,
+    is_watertight,
+    read_mesh_file,
+    write_obj,
+)
 from drake_pose.errors import ModelError
 from tests.body.models import write
 
@@ -117,3 +123,41 @@ def test_drake_reads_back_written_meshes(tmp_path):
     assert write_obj(TriangleMesh(points + 1.0, triangles), "name with / and \xe9") != path
     (tmp_path / "t.stl").write_bytes(binary_stl())
     assert drawable_file(tmp_path / "t.stl") == drawable_file(tmp_path / "t.stl")
+
+
+def test_a_round_mesh_and_a_box_enclose_their_volumes_outwards():
+    """By the divergence theorem, with triangles counter-clockwise from outside."""
+    for mesh, volume in (
+        (
+            _round_mesh(np.array([0.0, 0.3, 0.3, 0.0]), np.array([0.5, 0.5, -0.5, -0.5])),
+            np.pi * 0.09,
+        ),
+        (_round_mesh(np.array([0.0, 0.4, 0.0]), np.array([0.6, 0.0, -0.6])), np.pi * 0.16 * 0.4),
+    ):
+        a, b, c = mesh.vertices[mesh.triangles].transpose(1, 0, 2)
+        found = np.einsum("ni,ni->", a, np.cross(b, c)) / 6.0
+        assert found == pytest.approx(volume, rel=0.01)
+        assert is_watertight(mesh)
+        flipped = TriangleMesh(mesh.vertices, mesh.triangles[:, ::-1])
+        assert is_watertight(flipped)
+        assert not is_watertight(TriangleMesh(mesh.vertices, mesh.triangles[1:]))
+        turned = mesh.triangles.copy()
+        turned[0] = turned[0, ::-1]
+        assert not is_watertight(TriangleMesh(mesh.vertices, turned))
+        doubled = np.concatenate([mesh.triangles, mesh.triangles])
+        assert not is_watertight(TriangleMesh(mesh.vertices, doubled))
+    assert not is_watertight(TriangleMesh.empty())
+
+
+def test_written_normals_are_area_weighted_means_of_the_triangles():
+    rng = np.random.default_rng(3)
+    made = trimesh.creation.icosphere(1)
+    mesh = TriangleMesh(made.vertices * rng.uniform(0.5, 1.5, (42, 1)), np.array(made.faces))
+    lines = [line.split() for line in write_obj(mesh, "normals").read_text().splitlines()]
+    found = np.array([line[1:] for line in lines if line[:1] == ["vn"]], float)
+    expected = np.zeros((42, 3))
+    for a, b, c in mesh.triangles:
+        p, q, r = mesh.vertices[[a, b, c]]
+        expected[[a, b, c]] += np.cross(q - p, r - p)
+    expected /= np.linalg.norm(expected, axis=1)[:, None]
+    np.testing.assert_allclose(found, expected, atol=6e-5)

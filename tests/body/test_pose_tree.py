@@ -419,3 +419,19 @@ def test_base_joints_move_a_model_in_the_world(tmp_path):
     np.testing.assert_allclose(model.upper[turns], np.pi)
     shifts = [model.position_index(name) for name in BASE_JOINTS[:3]]
     np.testing.assert_array_equal(model.upper[shifts], 100.0)
+
+
+@pytest.mark.parametrize("degrees", [30.0, 60.0])
+def test_even_rotations_are_near_to_every_rotation_and_apart(degrees):
+    """About as many as cells of the interval's size fill all rotations."""
+    interval = np.radians(degrees)
+    found = Rotation.from_rotvec(even_rotations(interval))
+    assert found[0].magnitude() == 0.0
+    assert (np.diff(found.magnitude()) > -1e-8).all()
+    nearest = [
+        (found.inv() * one).magnitude().min() for one in Rotation.random(300, random_state=1)
+    ]
+    assert max(nearest) < 0.95 * interval
+    assert len(found) == pytest.approx(8.0 * np.pi**2 / interval**3, rel=0.3)
+    apart = [np.sort((found.inv() * one).magnitude())[1] for one in found[::7]]
+    assert min(apart) > 0.3 * interval

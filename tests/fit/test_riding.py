@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 from scipy.stats import entropy
 
+from drake_pose.fit.background import MODEL, apply_gain, grown, likeness
+from drake_pose.fit.colours import colour_numbers
 from drake_pose.fit.explain_kernel import Explained, PixelSums, explain
 from drake_pose.fit.riding import RidingColours, RidingPictures, silhouette_gains
 from drake_pose.silhouette.outline import pack
@@ -103,3 +105,78 @@ def test_mirrored_pictures_have_mirrored_sums(wrist) -> None:
         4.0 * riding.contour_terms(400.0, 4.0)[1]
     )
     assert riding.changed_frames() is None
+
+
+def lasting(pictures: np.ndarray, alike: np.ndarray) -> np.ndarray:
+    """Return the strength of edges across u and v in single channels (f, H, W)."""
+    colours = np.repeat(pictures[..., None], 3, axis=-1).astype(np.float32)
+    size = colours.shape[1:3]
+    gains = tuple(np.ones(3, np.float32) for _ in colours)
+    riding = RidingPictures(
+        colours, gains, colours[0], np.full(size, 3.0, np.float32), alike.astype(np.float32)
+    )
+    return riding._lasting_edges()
+
+
+def test_edges_last_by_their_mean_doubled_angle_less_that_of_chance() -> None:
+    """An edge lasts whatever its sign; n random directions have a mean of 1 / sqrt(n)."""
+    count, size = 9, 41
+    v, u = np.mgrid[:size, :size] - size // 2
+    signs = np.where(np.arange(count) % 2, 120.0, -120.0)
+    least = 1.0 - 1.0 / np.sqrt(count)
+    for angle, across in ((0, (1, 0)), (90, (0, 1)), (45, (1, 1)), (10, (1, 0)), (80, (0, 1))):
+        c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+        step = 1.0 / (1.0 + np.exp(-2.0 * (c * u + s * v)))
+        found = lasting(128.0 + signs[:, None, None] * (step - 0.5), np.ones((count, count)))
+        middle = found[:, :, size // 2, size // 2]
+        for k in (0, 1):
+            np.testing.assert_allclose(middle[k], least * across[k], atol=0.03)
+        assert not found[:, :, 2, 2].any() or angle == 45
+    # Faint edges count by their slope.
+    faint = 128.0 + 0.02 * signs[:, None, None] * (u > 0)
+    assert lasting(faint, np.ones((count, count))).max() < 0.5 * least
+    # Every image has another direction: nothing lasts, but among images with the same pose.
+    turned = []
+    for k in range(count):
+        a = np.pi * k / count
+        turned.append(128.0 + 120.0 * np.tanh(np.cos(a) * u + np.sin(a) * v))
+    mixed = lasting(np.array(turned), np.ones((count, count)))
+    assert mixed[:, :, size // 2, size // 2].max() < 0.05
+    twice = np.array([*turned[::3]] * 3)
+    alike = (np.arange(count)[:, None] % 3 == np.arange(count) % 3).astype(float)
+    again = lasting(twice, alike)[0, 0, size // 2, size // 2]
+    assert again == pytest.approx(1.0 - 1.0 / np.sqrt(3.0), abs=0.03)
+
+
+def test_colours_of_the_body_are_means_where_it_is_seen_twice(wrist) -> None:
+    """Frequencies and matches are those of the pixels inside and outside, but for a margin."""
+    pictures, masks, _, _ = wrist
+    riding = RidingPictures.estimate(pictures, np.ones((COUNT, COUNT)))
+    known = riding.known(list(pictures), masks, masks)
+    corrected = np.array([apply_gain(*p) for p in zip(pictures, riding.gains, strict=True)])
+    inside = ~grown(~masks, MODEL.margin)
+    count = inside.sum(axis=0)
+    for v, u in np.argwhere(count > 1)[::7]:
+        own = corrected[inside[:, v, u], v, u]
+        np.testing.assert_allclose(known.colours[v, u], own.mean(axis=0), rtol=1e-4)
+    for v, u in np.argwhere(count <= 1)[::97]:
+        np.testing.assert_allclose(known.colours[v, u], riding.colours[v, u], atol=1e-3)
+    np.testing.assert_allclose(known.deviations, riding.deviations, atol=1e-4)
+    assert not known.unseen.any()
+    off = np.abs(corrected - known.colours).max(axis=-1) / known.deviations
+    match = off < MODEL.match_deviations
+    outside = ~grown(masks, MODEL.margin)
+    for region, rate in zip((outside, inside), known.matches, strict=True):
+        assert rate == pytest.approx(np.clip(match[region].mean(), 0.05, 0.95))
+    # Log-odds are those of the colour's frequency, and of its likeness to the body's.
+    found, whole = known.foreground(pictures[1], riding.gains[1])
+    at = corrected[1].clip(0.0, 255.0).astype(np.uint8)
+    ratio = likeness(off[1].astype(np.float32))
+    beside, on = known.matches
+    expected = known.on[colour_numbers(at)] - known.beside[colour_numbers(at)]
+    expected = expected + np.log(on * ratio + 1.0 - on) - np.log(beside * ratio + 1.0 - beside)
+    np.testing.assert_allclose(whole, expected, atol=1e-3)
+    part = (slice(5, 20), slice(8, 30))
+    window, again = known.foreground(pictures[1], riding.gains[1], part)
+    np.testing.assert_array_equal(window, found[part])
+    np.testing.assert_array_equal(again, whole)

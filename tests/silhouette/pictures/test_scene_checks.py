@@ -232,3 +232,19 @@ def test_masks_that_fill_picture_and_edge_are_inverted(tmp_path):
 def test_dropped_frames_are_counted(frames, told):
     found = _check_gaps(frames.split())
     assert [one.startswith(told) for one in found] == [True] * (told is not None)
+
+
+@pytest.mark.parametrize(("step", "frozen"), [(2, True), (0, False)])
+def test_a_camera_is_frozen_only_while_the_others_move(tmp_path, step, frozen):
+    """By more than 2 % of their silhouettes; else the body stood still, too."""
+    frames = [str(k) for k in range(5)]
+    scene = record(tmp_path, frames, ("middle",))
+    for name in ("left", "right"):
+        for k, frame in enumerate(frames):
+            mask = np.zeros((40, 60), bool)
+            mask[10:30, 5 + step * k : 25 + step * k] = True
+            # A pixel of noise: the files differ.
+            mask[0, k] = True
+            write_mask(scene.masks[name, frame], mask)
+    checked = check_scene(load_scene(tmp_path))
+    assert ("'middle' shows its last picture again" in " ".join(checked.warnings)) == frozen

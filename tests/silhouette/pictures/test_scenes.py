@@ -111,6 +111,11 @@ def test_masks_without_camera_file_get_one_camera_per_size(tmp_path):
     large, small = "camera_30x20", "camera_30x19"
     assert [scene.cameras_of(f) for f in scene.frames] == [(large,), (large,), (small,)]
     np.testing.assert_array_equal(scene.read(small, "c"), MASK[:-1])
+    for name, height in ((large, 20), (small, 19)):
+        # The axis, the world's x, goes through the picture's middle; its up is the world's z.
+        uv, _ = scene.cameras[name].project(np.array([[3.0, 0.0, 0.0], [0.0, 0.001, 0.002]]))
+        middle = np.array([14.5, 0.5 * (height - 1)])
+        np.testing.assert_allclose(uv, [middle, (middle[0] + 1.0, middle[1] - 2.0)], atol=1e-9)
     assert not load_scene(tmp_path, {large: camera(large)}).scale_unknown
 
 

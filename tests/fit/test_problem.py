@@ -12,6 +12,7 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import ParallelCamera, PinholeCamera, circle_of_cameras
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.fit.background import foreground_picture
+from drake_pose.fit.contour_fit import symmetric
 from drake_pose.fit.evidence import NO_EDGE, Observation, find_edge_points, pack_evidence
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, Equations, LinearPrior
 from drake_pose.fit.parameters import BodyParameters, CameraParameters
@@ -195,6 +196,33 @@ def test_equations_of_some_unknowns_are_a_block_of_those_of_all(body, rig, some)
     np.testing.assert_allclose(part.g, full.g[:, at], rtol=1e-9, atol=1e-9 * np.abs(part.g).max())
     np.testing.assert_allclose(part.H, full.H[:, at][:, :, at], rtol=1e-9)
     assert part.cost == pytest.approx(full.cost)
+
+
+def test_compared_masks_have_the_information_of_the_equations(body, rig):
+    """Own unknowns of all frames, frame by frame, then the shared ones, without biases."""
+    cameras = rig[:2]
+    shared = ["log_radius_scale_odd", f"{rig[1].name}.turn_x", f"{rig[0].name}.{BOUNDARY_BIAS}"]
+    problem = Problem(body, cameras, [Unknowns(BENT[:2]), Unknowns(shared, shared=True)])
+    truth, count = poses(body, 2, 11), len(body.kinematics.names)
+    seen = [Observation(draw(body, cameras, theta), theta[:count] + 0.01) for theta in truth]
+    own, nothing, step = np.zeros((2, 2)), np.zeros(3), AnnealingStage(0.1, 0.02)
+    equations = problem.equations(seen, (own, nothing), step)
+    masks = problem.compared_masks(seen, problem.parameters(seen, own, nothing), step)
+    assert [one.camera for one in masks] == [0, 1, 0, 1]
+    H, g = np.zeros((6, 6)), np.zeros(6)
+    for k in range(2):
+        at = [2 * k, 2 * k + 1, 4, 5]
+        H[np.ix_(at, at)] += equations.H[k][:4, :4]
+        g[at] += equations.g[k][:4]
+    found = sum(np.einsum("nmi,nij,nkj->mk", m.moves, symmetric(m.A), m.moves) for m in masks)
+    np.testing.assert_allclose(found, H, rtol=1e-9, atol=1e-9 * np.abs(H).max())
+    pulled = sum(np.einsum("nmi,ni->m", one.moves, one.b) for one in masks)
+    np.testing.assert_allclose(pulled, -g, rtol=1e-9, atol=1e-9 * np.abs(g).max())
+    for one, camera in zip(masks, (*cameras, *cameras), strict=True):
+        # A pixel at the body's distance.
+        depth = (camera.X_CW[:3, :3] @ one.X_WN[:, :3, 3].mean(axis=0) + camera.X_CW[:3, 3])[2]
+        assert one.size == pytest.approx(depth / camera.focal_x, rel=1e-6)
+        np.testing.assert_allclose(one.X_CW, camera.X_CW, atol=1e-12)
 
 
 def test_cached_cameras_follow_the_parameters(body, rig):

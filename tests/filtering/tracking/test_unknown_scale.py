@@ -1,6 +1,7 @@
 """A body in a parallel camera whose scale is unknown and drifts."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from drake_pose.filtering.contour_tracker import (
 from drake_pose.filtering.match_and_track import MatchAndTrack, TrackerState
 from drake_pose.filtering.sequence_fit import (
     SEQUENCE,
+    FittedSequence,
     TrackedStart,
     find_start,
     fit_sequence,
@@ -228,3 +230,30 @@ def test_a_root_that_does_not_turn_freely_is_refused(body):
         observation = ContourObservation(tree, [front_camera()])
         with pytest.raises(SettingsError, match="freely"):
             tilted(observation, np.zeros(len(observation.layout)), (0.1, 0.1))
+
+
+def test_intervals_of_a_sequence_are_within_limits_or_a_turn() -> None:
+    """1.96 x 1.6 deviations; a value is determined by less than half of its limits or of a turn."""
+    kinematics = SimpleNamespace(
+        names=("free", "bend", "slide"), covers_full_turn=np.array([True, False, False]),
+        lower=np.array([-np.pi, -0.5, 0.0]), upper=np.array([np.pi, 1.0, 0.4]),
+    )  # fmt: skip
+    values = np.array([[9.0, 9.0, 9.0, 9.0], [3.0, 0.8, 0.1, 7.0]])
+    factor = 1.96 * 1.6
+    for deviations, ends, known in (
+        ((0.1, 0.05, 0.02), [(3.0 - 0.1 * factor, 3.0 + 0.1 * factor),
+                             (0.8 - 0.05 * factor, 0.8 + 0.05 * factor),
+                             (0.1 - 0.02 * factor, 0.1 + 0.02 * factor)], [True, True, True]),
+        ((2.0, 0.4, 0.1), [(3.0 - np.pi, 3.0 + np.pi), (-0.4544, 1.0), (0.0, 0.4)],
+         [False, False, False]),
+        ((0.45, 0.1, 0.05), [(3.0 - 0.45 * factor, 3.0 + 0.45 * factor),
+                             (0.8 - 0.1 * factor, 1.0), (0.0, 0.1 + 0.05 * factor)],
+         [True, True, False]),
+    ):  # fmt: skip
+        rows = np.array([np.zeros(4), [*deviations, 1.0]])
+        fitted = SimpleNamespace(parameters=values)
+        found = FittedSequence(SimpleNamespace(kinematics=kinematics), fitted, rows).estimates(1)
+        assert [one.name for one in found] == ["free", "bend", "slide"]
+        np.testing.assert_allclose([(one.low, one.high) for one in found], ends, atol=1e-9)
+        assert [one.determined for one in found] == known
+        assert [one.covers_full_turn for one in found] == [True, False, False]

@@ -268,4 +268,6 @@ def _comparison_warnings(path: Path, camera: EpisodeCamera, joints: JointLog) ->
     ratio = (end - begin) / (last - first) if last > first else 1.0
     for unit, scale in (("ms", 1e3), ("microseconds", 1e6), ("ns", 1e9)):
         short += f": are its times in {unit}?" if 0.7 * scale < ratio < 1.4 * scale else ""
+        is_larger = 0.7 * scale < 1.0 / max(ratio, 1e-12) < 1.4 * scale
+        text += f": are the pictures' times in {unit}?" if is_larger else ""
     return [text] if outside else [short] if is_short else []

@@ -350,6 +350,11 @@ def open_episode(
         )
     inside = sorted(one.name for one in path.iterdir()) if path.is_dir() else []
     bags = [path / name for name in inside if name.endswith(BAGS)]
+    if kind in ("", "folder") and any((path / "data").rglob("*.parquet")):
+        raise SceneError(
+            f"{path}: has the tables of a LeRobot data set, but no {INFO}, which says what they "
+            "hold: copy the data set's folder meta"
+        )
     if kind == "lerobot":
         found = open_lerobot(path, log, episode)
     elif kind == "droid":

@@ -255,6 +255,7 @@ def test_anomalies_of_times_are_warned_of():
     for times, joints, expected in (
         (TIMES[2:-2] + 0.013, log(TIMES), None),
         (TIMES + 1.71, log(TIMES), "17 of 20 pictures are before or after the log (1.710 to"),
+        (1e3 * TIMES, log(TIMES), "s): are the pictures' times in ms?"),
         (TIMES[:14], log(TIMES), "camera 'a': its pictures cover only a part of the log"),
         (
             TIMES + 1.7e9,

@@ -345,3 +345,10 @@ def test_truncated_files_are_named(tmp_path, name):
     path.mkdir()
     with pytest.raises(SceneError, match=f"{path.name}"):
         open_episode(tmp_path)
+
+
+def test_a_data_set_without_its_description_is_named(tmp_path):
+    write_set(tmp_path)
+    shutil.rmtree(tmp_path / "meta")
+    with pytest.raises(SceneError, match=r"LeRobot data set, but no meta/info\.json"):
+        open_episode(tmp_path)

@@ -1,6 +1,8 @@
 """Records of frames, summaries and warnings, from given numbers."""
 
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,6 +27,7 @@ from drake_pose.files.records import (
     summarize,
     user_units,
 )
+from drake_pose.files.writer import ResultWriter
 from drake_pose.search import JointEstimate, PoseMode, PoseSet
 from tests.body.models import joint, link, urdf, write
 
@@ -251,3 +254,16 @@ def test_borders_are_pixels_before_another_segment():
         assert picture[v, u] == 9 * (body[v, u] and differs)
     overlay._draw_borders(picture, body, None, 5)
     assert not (picture == 5).any()
+
+
+def test_frames_are_told_as_they_are_finished():
+    """Before the first one, and after each: how many of those asked for are done."""
+    told, done = [], {"0": record(), "9": record()}
+    stub = SimpleNamespace(records=done, folder=None)
+    stub.add = lambda one: done.__setitem__(one.frame, one)
+    given = [(replace(record(), frame=name), {}) for name in ("1", "2")]
+    asked = ["0", "1", "2"]
+    ResultWriter.add_all(stub, given, asked, lambda *one: told.append(one))
+    assert [one[:3] for one in told] == [(1, 3, ""), (2, 3, "1"), (3, 3, "2")]
+    assert [one[3] for one in told] == [None, given[0][0], given[1][0]]
+    ResultWriter.add_all(stub, given, asked, None)

@@ -493,3 +493,50 @@ def test_pictures_count_as_used_where_they_were_compared():
     nothing = report_page._camera_row(estimate, "d", states)
     assert nothing["mean"] is nothing["lowest"] is nothing["worst"] is None
     assert nothing["warnings"] == [2]
+
+
+def test_axes_of_plots_are_in_the_figure_and_frames_are_labelled():
+    """About six names, of at most twenty letters; the axis spans all frames."""
+    for height, left in ((1.5, 0.09), (3.0, 0.2)):
+        figure, axes = report_page.new_plot(height, left)
+        box = axes.get_position()
+        assert (box.x0, box.x1) == pytest.approx((left, 0.985))
+        # The same space below and above for labels, whatever the height [inch].
+        assert height * box.y0 == pytest.approx(0.3)
+        assert height * (1.0 - box.y1) == pytest.approx(0.08)
+        assert figure.get_size_inches() == pytest.approx((6.4, height))
+    for count, step in ((5, 1), (6, 1), (7, 2), (40, 7)):
+        _, axes = report_page.new_plot()
+        names = [f"{k:04d}" + "x" * 30 for k in range(count)]
+        report_page._mark_frames(axes, names)
+        assert axes.get_xticks().tolist() == [*range(0, count, step)]
+        labels = [one.get_text() for one in axes.get_xticklabels()]
+        assert labels == [name[:20] for name in names[::step]]
+        assert axes.get_xlim() == (-0.5, count - 0.5)
+    _, axes = report_page.new_plot()
+    report_page._mark_frames(axes, [])
+    assert axes.get_xlim() == (-0.5, 0.5)
+
+
+def test_axes_have_a_margin_and_a_legend_for_several_curves():
+    names = ["a", "b", "c"]
+    values = np.array([1.0, 2.0, 3.0])
+    (axes,) = plot_curves(names, [("one", values)], joined=True).axes
+    assert axes.get_ylim() == pytest.approx((1.0 - 0.16, 3.0 + 0.16))
+    assert axes.get_legend() is None
+    (axes,) = plot_curves(names, [("one", values), ("two", values)], joined=True).axes
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["one", "two"]
+    (axes,) = plot_curves(names, [("one", np.full(3, 5.0))], joined=True).axes
+    assert axes.get_ylim() == pytest.approx((5.0 - 0.008, 5.0 + 0.008))
+    (axes,) = plot_curves(names, [("one", np.full(3, np.nan))], joined=True).axes
+    assert axes.get_ylim() == pytest.approx((-0.08, 1.08))
+    # Limits within 30 % of the curves' span are near.
+    for limits, ends in (((0.41, 3.61), (0.41, 3.0)), ((0.39, 3.59), (1.0, 3.59))):
+        (axes,) = plot_curves(names, [("one", values)], joined=True, limits=limits).axes
+        margin = 0.08 * (ends[1] - ends[0])
+        assert axes.get_ylim() == pytest.approx((ends[0] - margin, ends[1] + margin))
+    wide, own = (
+        plot_curves(names, [("measured", values), ("one", values)], joined=False).axes[0].lines
+    )
+    assert (wide.get_markersize(), own.get_markersize(), own.get_linestyle()) == (16, 8, "None")
+    assert wide.get_linewidth() > own.get_linewidth()

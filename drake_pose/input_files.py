@@ -8,7 +8,7 @@ import errno
 import hashlib
 import io
 import stat
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -197,6 +197,23 @@ def read_yaml(
         raise error_type(f"{path}: not a YAML file: {' '.join(str(error).split())}") from error
     except RecursionError:
         raise error_type(f"{path}: nested too deeply") from None
+
+
+def named_fields(
+    value: Any, known: Collection[str], where: str, error_type: type[DrakePoseError]
+) -> dict[str, Any]:
+    """Return a value of a YAML file, checked to be a mapping with no other keys than ``known``.
+
+    Raises error_type, begun by ``where``: it is no mapping, or has other keys.
+    """
+    if not isinstance(value, dict):
+        raise error_type(f"{where}: expected a mapping of {', '.join(known)}")
+    unknown = [str(key)[:40] for key in value if key not in known]
+    if unknown:
+        raise error_type(
+            f"{where}: unknown field {', '.join(unknown)}; there are: {', '.join(known)}"
+        )
+    return value
 
 
 def typed_entry(

@@ -22,6 +22,7 @@ from drake_pose.camera.models import (
 )
 from drake_pose.camera.pose_files import RecordedPose, recorded_poses, recording_names, same_camera
 from drake_pose.errors import CameraError, listed
+from drake_pose.input_files import named_fields
 
 _SPAN = ("part_of", "from", "until")
 _COMMON = ("width", "height", "center_x", "center_y")
@@ -350,12 +351,7 @@ def _read_camera(name: str, entry: Any, path: Path) -> Camera:
     missing = [field for field in required if field not in entry]
     if missing:
         raise CameraError(f"{where}: a {projection} camera needs {', '.join(missing)}")
-    unknown = [str(field)[:40] for field in entry if field not in (*required, *optional)]
-    if unknown:
-        raise CameraError(
-            f"{where}: unknown field {', '.join(unknown)}; a {projection} camera has: "
-            f"{', '.join((*required, *optional))}"
-        )
+    named_fields(entry, (*required, *optional), f"{where} ({projection})", CameraError)
     pose = "X_WC"
     if "link" in entry or "X_LC" in entry:
         if not isinstance(entry.get("link"), str) or "X_LC" not in entry or "X_WC" in entry:

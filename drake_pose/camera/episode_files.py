@@ -29,7 +29,7 @@ from drake_pose.camera.picture_files import (
 from drake_pose.camera.pose_files import same_camera
 from drake_pose.camera.sources import CAMERAS, TIME_STAMPS, read_time_stamps
 from drake_pose.errors import CameraError, SceneError, SettingsError, listed
-from drake_pose.input_files import read_csv, read_number, read_yaml
+from drake_pose.input_files import named_fields, read_csv, read_number, read_yaml
 
 JOINT_TABLE = "joint_angles.csv"
 """Name of the joint table in a recording's folder."""
@@ -213,14 +213,8 @@ def read_sequence(path: Path, sequence: bool = False) -> tuple[bool, float | Non
     """
     if not os.path.lexists(path):
         return sequence, None
-    content = read_yaml(path, SceneError)
     fields = ("sequence", "frame_rate_hz")
-    if not isinstance(content, dict):
-        raise SceneError(f"{path}: expected a mapping with {', '.join(fields)}")
-    if unknown := [str(field)[:40] for field in content if field not in fields]:
-        raise SceneError(
-            f"{path}: unknown field {', '.join(unknown)}; a scene has: {', '.join(fields)}"
-        )
+    content = named_fields(read_yaml(path, SceneError), fields, str(path), SceneError)
     sequence = content.get("sequence", sequence)
     if not isinstance(sequence, bool):
         raise SceneError(f"{path}: sequence must be true or false")

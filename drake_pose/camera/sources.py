@@ -29,7 +29,7 @@ from drake_pose.camera.picture_files import (
     threshold_mask,
 )
 from drake_pose.errors import CameraError, SceneError, SettingsError, listed
-from drake_pose.input_files import read_csv, read_yaml
+from drake_pose.input_files import named_fields, read_csv, read_yaml
 
 CAMERAS, SOURCES, TIME_STAMPS = "cameras.yaml", "sources.yaml", "timestamps.csv"
 """Names of files: calibrated cameras, image sources, and times of a folder's frames."""
@@ -533,11 +533,8 @@ def _read_entry(camera: Camera, entry: Any, path: Path) -> SourceSpecification:
     sources.yaml. Raises SceneError: a field is missing, unknown or invalid.
     """
     where = f"{path}: camera '{camera.name}'"
-    if not isinstance(entry, dict):
-        raise SceneError(f"{where}: expected a mapping with kind, location and more")
     fields = ("kind", "location", "rate_hz", "masks", "background", "offset")
-    if strange := [str(field)[:40] for field in entry if field not in fields]:
-        raise SceneError(f"{where}: unknown field {strange[0]}; a source has {', '.join(fields)}")
+    named_fields(entry, fields, where, SceneError)
     kind, location = entry.get("kind"), entry.get("location")
     if isinstance(location, bool) or not isinstance(location, str | int) or location == "":
         raise SceneError(f"{where}: location must be a path, or a device's number or address")

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from drake_pose.errors import SettingsError
 from drake_pose.files.records import describe_job, file_digest
 from drake_pose.files.settings import EpisodeSettings, EstimateSettings, FromText
-from drake_pose.input_files import read_yaml
+from drake_pose.input_files import named_fields, read_yaml
 from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.registration.settings import AuditSettings
 
@@ -59,9 +59,8 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
 
     Raises SettingsError: the message names the file, scene and setting at fault.
     """
-    content = _checked_mapping(
-        read_yaml(path, SettingsError), str(path), ("chunk", "defaults", "scenes")
-    )
+    known = ("chunk", "defaults", "scenes")
+    content = named_fields(read_yaml(path, SettingsError), known, str(path), SettingsError)
     scenes = content.get("scenes")
     if not isinstance(scenes, dict) or not scenes:
         raise SettingsError(f"{path}: has no scenes; expected 'scenes:' with NAME: settings")
@@ -77,7 +76,8 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
     ]
     of_audits = [one.name for one in fields(AuditSettings)]
     keys = tuple(dict.fromkeys((*own, *of_estimates, *of_audits, "episodes")))
-    defaults = _checked_mapping(content.get("defaults") or {}, f"{path}: defaults", keys)
+    given = content.get("defaults") or {}
+    defaults = named_fields(given, keys, f"{path}: defaults", SettingsError)
     jobs = []
     for name, entry in scenes.items():
         where = f"{path}: scene '{str(name)[:60]}'"
@@ -86,7 +86,7 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
                 f"{where}: its name becomes a folder's: a text without slashes that does not "
                 "begin with a dot; put numbers in quotes"
             )
-        values = {**defaults, **_checked_mapping(entry or {}, where, keys)}
+        values = {**defaults, **named_fields(entry or {}, keys, where, SettingsError)}
         named = [(name, values)]
         if (numbers := values.pop("episodes", None)) is not None:
             first, _, last = str(numbers).partition(":")
@@ -99,21 +99,6 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
         for one, given in named:
             jobs.append(_scene_job(one, given, own, length, where, path.parent.absolute()))
     return tuple(jobs)
-
-
-def _checked_mapping(value: Any, where: str, known: tuple[str, ...]) -> dict[str, Any]:
-    """Return a value of a YAML file, checked to be a mapping with no other keys than ``known``.
-
-    Raises SettingsError: it is not a mapping, or has other keys; the message begins with ``where``.
-    """
-    if not isinstance(value, dict):
-        raise SettingsError(f"{where}: expected NAME: VALUE lines")
-    unknown = [str(key)[:40] for key in value if key not in known]
-    if unknown:
-        raise SettingsError(
-            f"{where}: there is no setting {', '.join(unknown)}; there is: {', '.join(known)}"
-        )
-    return value
 
 
 def _scene_job(
@@ -199,10 +184,11 @@ def _convert(value: Any, hint: Any, where: str, base: Path) -> Any:
         texts = value if isinstance(value, list) else [value]
         return tuple(_convert(one, arguments[0], where, base) for one in texts)
     if isinstance(origin, type) and issubclass(origin, Mapping):
-        pairs = _checked_mapping(value, where, tuple(value) if isinstance(value, dict) else ())
+        if not isinstance(value, dict):
+            raise SettingsError(f"{where}: expected NAME: VALUE lines")
         return {
             str(name): _convert(one, arguments[1], f"{where}: {name}", base)
-            for name, one in pairs.items()
+            for name, one in value.items()
         }
     kinds: dict[Any, tuple[Any, str]] = {
         bool: (bool, "true or false"),

@@ -289,7 +289,10 @@ def test_job_file_gives_the_settings(tmp_path):
         ("scenes: {a: {}}", "scene 'a': 'scene' is missing"),
         ("scenes: {../a: {scene: a}}", "slashes"),
         ("scenes: {1: {scene: a}}", "quotes"),
-        ("scenes: {a: {scene: a, methode: beam}}", "no setting methode; there is: scene, model"),
+        (
+            "scenes: {a: {scene: a, methode: beam}}",
+            "unknown field methode; there are: scene, model",
+        ),
         ("scenes: {a: {scene: a, time_limit: wide}}", "time_limit: must be a number"),
         ("scenes: {a: {scene: a, time_limit: true}}", "time_limit: must be a number"),
         ("scenes: {a: {scene: a, track: 1}}", "track: must be true or false"),
@@ -300,7 +303,7 @@ def test_job_file_gives_the_settings(tmp_path):
         ("scenes: {a: {scene: a, root_position: here}}", "scene 'a': root_position"),
         ("scenes: {a: {scene: a}}\nchunk: 0", "chunk: must be a whole number"),
         ("scenes: {a: {scene: a}}\ndefaults: {model: 3}", "model: must be a text"),
-        ("scene: {a: {scene: a}}", "no setting scene"),
+        ("scene: {a: {scene: a}}", "unknown field scene"),
         (
             "scenes: {a: {scene: a, audit: j.csv, time_limit: 5}}",
             "an audit has no setting time_limit",

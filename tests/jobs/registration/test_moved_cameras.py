@@ -10,8 +10,12 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from drake_pose.camera.camera_files import load_cameras
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.jobs.registration.audit import audit_scene
+from drake_pose.jobs.registration.moved_cameras import _parts, motion_warnings
 from drake_pose.jobs.registration.register import register_scene
+from drake_pose.registration.camera_motion import Nudge, PictureMotion
+from drake_pose.registration.recording import Recording
 from tests.benchmarks.registration import pose_error
 from tests.registration.episodes import PaintedEpisode, painted_episode
 from tests.registration.recordings import write_episode
@@ -75,3 +79,51 @@ def test_an_audit_tells_when_and_how_far_a_camera_was_moved(nudged):
     assert moved["name"] == "camera"
     assert f"'camera' moved at {painted.times[FIRST]:.2f} s by" in moved["text"]
     assert moved["angle_deg"] == pytest.approx(DEGREES, abs=4.0 * moved["angle_sd_deg"])
+
+
+def moving(times: np.ndarray | None) -> tuple[Recording, PictureMotion]:
+    """Return a recording of nine pictures, and two nudges of its camera."""
+    names = tuple(f"{k}" for k in range(9))
+    recording = Recording(names, lambda _: np.zeros((9, 1)), lambda _: np.zeros((1, 1, 3)), times)
+    turns = np.array([[0.1, 0.0, 0.0], [0.0, 0.2, 0.0]])
+    nudges = (Nudge(2, 4, 3.0, turns[0]), Nudge(5, 6, 5.0, turns[1]))
+    return recording, PictureMotion(nudges, 0.7, 1.3)
+
+
+def test_parts_lie_between_nudges_with_the_cameras_rotations() -> None:
+    """Pictures taken during a nudge belong to no part; names that are taken are left out."""
+    times = 10.0 + 0.5 * np.arange(9)
+    recording, motion = moving(times)
+    found = _parts("eye", recording, motion, {"eye", "eye_2"})
+    assert [*found] == ["eye", "eye_3", "eye_4"]
+    first, second, third = found.values()
+    assert [one.pictures for one in found.values()] == [slice(0, 3), slice(4, 6), slice(6, 9)]
+    assert [(one.since, one.until) for one in found.values()] == [
+        (10.0, 11.0), (12.0, 12.5), (13.0, 14.0)
+    ]  # fmt: skip
+    np.testing.assert_array_equal(first.rotation, np.eye(3))
+    # The background's directions turn against the camera.
+    back = [Rotation.from_rotvec(-one.rotation).as_matrix() for one in motion.nudges]
+    np.testing.assert_allclose(second.rotation, back[0])
+    np.testing.assert_allclose(third.rotation, back[0] @ back[1])
+    assert {(one.of, one.is_whole, one.drift, one.shake) for one in found.values()} == {
+        ("eye", False, 0.7, 1.3)
+    }
+    untimed, _ = moving(None)
+    (whole,) = _parts("eye", untimed, PictureMotion(()), ()).values()
+    assert (whole.is_whole, whole.since, whole.pictures) == (True, None, slice(0, 9))
+
+
+def test_motions_are_told_with_their_time_and_angle() -> None:
+    camera = PinholeCamera("eye", 320, 240, 250.0, 350.0, 159.5, 119.5, np.eye(4))
+    recording, motion = moving(10.0 + 0.5 * np.arange(9))
+    first, second, drift, shake = motion_warnings(camera, recording, motion)
+    assert "'eye' moved at 12.00 s, between pictures 2 and 4" in first
+    assert "shifted by 3.0 pixels, as by a turn of 5.73 degrees" in first
+    assert "at 13.00 s" in second
+    # A pixel is a three hundredth of a radian.
+    assert f"0.7 pixels, a turn by {np.degrees(0.7 / 300.0):.2f} degrees" in drift
+    assert f"1.3 pixels, a turn by {np.degrees(1.3 / 300.0):.2f} degrees" in shake
+    untimed, _ = moving(None)
+    assert "'eye' moved between pictures 2 and 4" in motion_warnings(camera, untimed, motion)[0]
+    assert motion_warnings(camera, recording, PictureMotion(())) == []

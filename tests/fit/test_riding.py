@@ -180,3 +180,35 @@ def test_colours_of_the_body_are_means_where_it_is_seen_twice(wrist) -> None:
     window, again = known.foreground(pictures[1], riding.gains[1], part)
     np.testing.assert_array_equal(window, found[part])
     np.testing.assert_array_equal(again, whole)
+
+
+def test_estimates_have_the_noise_of_what_changes_least() -> None:
+    """The body, a fifth of the picture, keeps its colours but for noise; the world does not."""
+    rng, size, noise = np.random.default_rng(5), (48, 64), 6.0
+    body = np.full((*size, 3), (180.0, 90.0, 60.0))
+    pictures = worlds(8)[:, : size[0], : size[1]].astype(float)
+    pictures[:, 24:, 10:44] = body[24:, 10:44]
+    pictures = (pictures + noise * rng.normal(size=pictures.shape)).clip(0, 255).astype(np.uint8)
+    riding = RidingPictures.estimate(pictures, np.ones((8, 8)))
+    np.testing.assert_allclose(riding.colours, np.median(pictures, axis=0))
+    inner = riding.deviations[28:44, 14:40]
+    # Of the median differences' largest channel, the twentieth that is least, as of a normal one.
+    changes = np.median(np.abs(riding.pictures - riding.colours).max(axis=-1), axis=0)
+    assert inner.min() == pytest.approx(1.4826 * np.quantile(changes, 0.05), rel=0.05)
+    assert noise * 0.6 < inner.min() < noise * 1.5
+    # A pixel's kind says whether it repeats its median colour; equal colours are of one group.
+    kinds = np.moveaxis(riding.sums.kinds, -1, 0)
+    off = np.abs(riding.pictures - riding.colours).max(axis=-1) / riding.deviations
+    np.testing.assert_array_equal(kinds % 2 == 1, off < MODEL.match_deviations)
+    assert (kinds % 2)[:, 28:44, 14:40].mean() > 0.9 > 2.0 * (kinds % 2)[:, :20].mean()
+    groups = kinds // 2
+    assert len(np.unique(groups)) <= 12
+    means = [riding.pictures[groups == k].mean(axis=0) for k in range(groups.max() + 1)]
+    nearest = ((riding.pictures[:, :, :, None] - means) ** 2).sum(axis=-1).argmin(axis=-1)
+    assert np.mean(nearest == groups) > 0.9
+    np.testing.assert_array_equal(
+        riding.sums.counts, np.bincount(kinds.ravel(), minlength=len(riding.sums.counts))
+    )
+    length, weight = riding.contour_terms(100.0, 4.0)
+    assert weight / length == pytest.approx(2.0 / 100.0)
+    assert riding.max_gain == pytest.approx(0.35 * 8 * 48 * 64)

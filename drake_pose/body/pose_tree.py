@@ -346,11 +346,18 @@ class PoseTree:
     ) -> tuple[Array, Array]:
         """Return ``positions_from`` with the root's origin at ``root_position`` (3,) [m].
 
-        ``values``: each node's values (k_i,) [rad or m]. No new tree is built unless the plant's
-        base is fixed.
+        ``values``: each node's values (k_i,) [rad or m]; those of slides that place the root are
+        replaced. No new tree is built unless the plant's base is fixed or has such slides.
         """
         if self._base.kind == "constant":
-            return self.with_root_position(root_position).positions_from(values)
+            moved = self.with_root_position(root_position)
+            placed = [
+                np.array(
+                    [moved.held.get(k, one) for k, one in zip(node.positions, own, strict=True)]
+                )
+                for node, own in zip(self.nodes, values, strict=True)
+            ]
+            return moved.positions_from(placed)
         X_WN = self.node_poses(values)
         shift = root_position - X_WN[0, :3, 3]
         for index in range(len(self.nodes)):

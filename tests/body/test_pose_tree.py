@@ -308,7 +308,7 @@ def test_tiny_interval_is_refused_before_allocation():
         axis_samples(-1.0, 1.0, 1e-12, is_angle=True)
 
 
-@pytest.mark.parametrize("name", ["floating", "welded", "all_joints"])
+@pytest.mark.parametrize("name", ["floating", "jointed", "welded", "all_joints"])
 def test_a_placed_root_moves_the_whole_body(models, name):
     """By Drake's plant: the root's origin is at the place, and all else keeps its relative pose."""
     model, rng = models[name], np.random.default_rng(3)

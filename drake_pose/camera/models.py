@@ -193,10 +193,18 @@ class PinholeCamera(_PosedCamera):
 
     def resized(self, width: int, height: int) -> "PinholeCamera":
         """Return the camera of the same images resized to a width and height [pixel]."""
-        x, y = width / self.width, height / self.height
+        scaled = self.with_scaled_intrinsics(width / self.width, height / self.height)
+        return dataclasses.replace(scaled, width=width, height=height)
+
+    def with_scaled_intrinsics(self, x: float, y: float) -> "PinholeCamera":
+        """Return the camera with intrinsics of images x times as wide and y times as high.
+
+        Its width and height stay.
+        """
         return dataclasses.replace(
-            self, width=width, height=height, focal_x=x * self.focal_x, focal_y=y * self.focal_y,
-            center_x=x * (self.center_x + 0.5) - 0.5, center_y=y * (self.center_y + 0.5) - 0.5,
+            self, focal_x=x * self.focal_x, focal_y=y * self.focal_y,
+            center_x=x * (self.center_x + HALF_PIXEL) - HALF_PIXEL,
+            center_y=y * (self.center_y + HALF_PIXEL) - HALF_PIXEL,
         )  # fmt: skip
 
     def mirrored(self) -> "PinholeCamera":

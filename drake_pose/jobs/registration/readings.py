@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array
-from drake_pose.camera.models import HALF_PIXEL, Camera, PinholeCamera, inverse_pose
+from drake_pose.camera.models import Camera, PinholeCamera, inverse_pose
 from drake_pose.registration.large_errors import Correction, unchanged
 from drake_pose.registration.online_registration import pose_difference
 from drake_pose.registration.posed_frames import MultiViewFrame
@@ -163,13 +163,7 @@ def _intrinsics_corrections(
 
 def _of_size(size: float, camera: PinholeCamera) -> PinholeCamera:
     """Return a camera whose intrinsics, as given, are those of pictures `size` times as large."""
-    center_x, center_y = (
-        (one + HALF_PIXEL) / size - HALF_PIXEL for one in (camera.center_x, camera.center_y)
-    )
-    return replace(
-        camera, focal_x=camera.focal_x / size, focal_y=camera.focal_y / size, center_x=center_x,
-        center_y=center_y,
-    )  # fmt: skip
+    return camera.with_scaled_intrinsics(1.0 / size, 1.0 / size)
 
 
 def _with_exchanged_center(camera: PinholeCamera) -> PinholeCamera:

@@ -114,29 +114,29 @@ def camera_set(job: SceneJob) -> tuple[Any, ...] | None:
     return folder, job.model, job.camera_file, settings.cameras
 
 
+@keys_in_messages()
 def perform(task: Task) -> Outcome:
     """Run a task, unless its result folder exists; an error becomes part of the outcome."""
     begin = time.perf_counter()
     seconds = 0.0
-    with keys_in_messages():
-        try:
-            if task.place.is_dir():
-                _require_same_masks(task)
-            else:
-                _make(task)
-                seconds = time.perf_counter() - begin
-            return Outcome(None, seconds, _totals(task))
-        except (Exception, SystemExit) as error:  # noqa: BLE001
-            # A failed DRAKE_DEMAND raises SystemExit, which would end the worker.
-            return Outcome(describe_failure(error), time.perf_counter() - begin)
+    try:
+        if task.place.is_dir():
+            _require_same_masks(task)
+        else:
+            _make(task)
+            seconds = time.perf_counter() - begin
+        return Outcome(None, seconds, _totals(task))
+    except (Exception, SystemExit) as error:  # noqa: BLE001
+        # A failed DRAKE_DEMAND raises SystemExit, which would end the worker.
+        return Outcome(describe_failure(error), time.perf_counter() - begin)
 
 
+@keys_in_messages()
 def describe_failure(error: BaseException) -> str:
     """Return the message of a task's error; that of unexpected ones begins with their type."""
     if isinstance(error, DrakePoseError):
-        with keys_in_messages():
-            notes = getattr(error, "__notes__", ())
-            return for_caller("; ".join((str(error), *notes)))
+        notes = getattr(error, "__notes__", ())
+        return for_caller("; ".join((str(error), *notes)))
     if isinstance(error, SystemExit):
         return f"a DRAKE_DEMAND failed in Drake: {error}"
     return f"{type(error).__name__}: {error}"

@@ -9,6 +9,9 @@ from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
+# A camera's place, and the point in the arm at which it looks [m].
+PLACE, MIDDLE = np.array([1.6, 0.4, 0.5]), np.array([0.0, 0.0, 0.4])
+
 
 def looking_at(place: np.ndarray, middle: np.ndarray, roll: float) -> PinholeCamera:
     """Return a camera at a place (3,) that looks at a point (3,), rolled about its axis [rad]."""

@@ -6,8 +6,10 @@ from typing import Any
 import pytest
 
 from drake_pose.body import ArticulatedModel, load_model
+from drake_pose.registration.posed_frames import PosedFrames
 from drake_pose.registration.recording import Recording
 from drake_pose.registration.register import RegistrationBody
+from tests.registration.arm_pictures import MIDDLE, PLACE, looking_at, see
 from tests.registration.episodes import LATE, PaintedEpisode, painted_episode
 from tests.search.arms import arm_urdf
 
@@ -43,3 +45,11 @@ def recording(episode: PaintedEpisode) -> Callable[..., Recording]:
         return Recording(**(given | changes))
 
     return record
+
+
+@pytest.fixture(scope="module")
+def posed(model: ArticulatedModel, body: RegistrationBody) -> PosedFrames:
+    """Two frames of the arm in one camera."""
+    camera = looking_at(PLACE, MIDDLE, 0.1)
+    frames = see(model, body, camera, 2, 4)
+    return PosedFrames(body.kinematics, body.coarse, camera, frames, 0.02)

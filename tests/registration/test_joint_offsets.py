@@ -27,9 +27,8 @@ from drake_pose.registration.joint_offsets import (
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import CameraSearch, RegisteredCamera
 from drake_pose.registration.shared_fit import SHARED, SharedFit, SharedValues
-from tests.registration.arm_pictures import errors, looking_at, see
+from tests.registration.arm_pictures import MIDDLE, errors, looking_at, see
 
-MIDDLE = np.array([0.0, 0.0, 0.4])
 NAMES = ("shoulder_turn", "roll_turn", "elbow_turn")
 
 

@@ -48,19 +48,10 @@ from drake_pose.registration.standing_object import (
     require_rotation,
 )
 from drake_pose.silhouette.scoring import draw_mask
-from tests.registration.arm_pictures import errors, looking_at, see
+from tests.registration.arm_pictures import MIDDLE, PLACE, errors, looking_at
 from tests.search.arms import arm_cameras
 
-MIDDLE = np.array([0.0, 0.0, 0.4])
-PLACE = np.array([1.6, 0.4, 0.5])
 STEP = AnnealingStage(0.02, 0.02)
-
-
-@pytest.fixture(scope="module")
-def posed(model: ArticulatedModel, body: RegistrationBody) -> PosedFrames:
-    camera = looking_at(PLACE, MIDDLE, 0.1)
-    frames = see(model, body, camera, 2, 4)
-    return PosedFrames(body.kinematics, body.coarse, camera, frames, 0.02)
 
 
 def with_zero(posed: PosedFrames) -> SharedFit:

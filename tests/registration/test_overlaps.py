@@ -14,17 +14,7 @@ from drake_pose.registration.register import (
     suggest_pose,
 )
 from drake_pose.silhouette.scoring import draw_mask
-from tests.registration.arm_pictures import looking_at, see
-
-MIDDLE = np.array([0.0, 0.0, 0.4])
-PLACE = np.array([1.6, 0.4, 0.5])
-
-
-@pytest.fixture(scope="module")
-def posed(model, body: RegistrationBody) -> PosedFrames:
-    camera = looking_at(PLACE, MIDDLE, 0.1)
-    frames = see(model, body, camera, 2, 4)
-    return PosedFrames(body.kinematics, body.coarse, camera, frames, 0.02)
+from tests.registration.arm_pictures import MIDDLE, PLACE, looking_at
 
 
 def test_poses_are_distinct_if_points_are_apart_in_pictures(posed: PosedFrames) -> None:

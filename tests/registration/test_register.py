@@ -14,7 +14,7 @@ from drake_pose.registration.register import (
     uniform_rotations,
 )
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from tests.registration.arm_pictures import errors, looking_at, see
+from tests.registration.arm_pictures import MIDDLE, errors, looking_at, see
 
 PLACES = {
     "beside": (np.array([1.6, 0.4, 0.5]), 0.1),
@@ -76,7 +76,6 @@ class TestUniformRotations:
         assert np.degrees(nearest.max()) < 16.0
 
 
-MIDDLE = np.array([0.0, 0.0, 0.4])
 BEHIND = ((-2.0, -2.0, -1.0), (-0.2, 2.0, 2.0))
 
 

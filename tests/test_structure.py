@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from tests import sums
+
 PACKAGE = Path(__file__).resolve().parents[1] / "drake_pose"
 
 # A subpackage may import those before it in this order, except the pairs in NOT_IMPORTED.
@@ -100,6 +102,49 @@ def test_array_types_are_defined_once():
     assert {"Array", "Mask", "Picture"} <= names
     others = {path: names & assigned(path) for path in FILES if path.name != "arrays.py"}
     assert {path: found for path, found in others.items() if found} == {}
+
+
+def test_no_sum_of_the_tree_grows():
+    # Smaller sums are written by `python -m tests.sums`; a feature pays for itself.
+    counted, most = sums.count(PACKAGE.parent), sums.read_table()
+    assert counted.keys() == most.keys()
+    assert {name: n for name, n in counted.items() if n > most[name]} == {}
+
+
+def test_sums_of_a_small_tree(tmp_path):
+    (tmp_path / "drake_pose").mkdir()
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests" / "test_one.py").write_text("\n\n\n")
+    (tmp_path / "drake_pose" / "one.py").write_text(
+        '''"""A docstring
+of two lines."""
+
+import math
+
+
+class FitSettings:
+    """Settings."""
+
+    width: int = 7
+    name: str = "a"
+
+
+# A comment.
+def _once(a, b=0.7, *, c=True, d=5):
+    def inner(e=3):
+        return 7.5 * e  # 12, 0.5 and 90 are plain.
+
+    return inner(a) + b + 90 - 0.5
+
+
+def _twice():
+    return _once(1) + _recursive(_recursive(12))
+'''
+    )
+    assert sums.count(tmp_path) == {
+        "lines": 23, "lines_of_code": 9, "files": 1, "classes": 1, "chosen_numbers": 5,
+        "numbers_in_functions": 1, "functions_with_one_caller": 2, "lines_of_tests": 3,
+    }  # fmt: skip
 
 
 def test_no_folder_has_too_many_files():

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from drake_pose.systems.person import PersonTracker
     from drake_pose.systems.silhouette_matcher import SilhouetteMatcher, SilhouetteTracker
     from drake_pose.systems.truncated_ekf import TruncatedEkf, plant_motion
+    from drake_pose.systems.walk import Walker
 
 __version__ = VERSION
 
@@ -78,6 +79,7 @@ _HOMES = {
     "TruncatedEkf": "systems.truncated_ekf",
     "TruncatedFilter": "filtering.truncated_filter",
     "View": "search",
+    "Walker": "systems.walk",
     "audit_scene": "jobs.registration.audit",
     "bundled_model": "body.model_files",
     "camera_to_drake": "camera.drake",

@@ -17,12 +17,11 @@ from rich.console import Console, ConsoleOptions
 from rich.text import Text
 
 from drake_pose.commands.batch import batch
-from drake_pose.commands.common import UsageError, say
+from drake_pose.commands.common import GONE, UsageError, say
 from drake_pose.commands.estimate import capture, demo, empty_room, estimate
 from drake_pose.commands.papers import date, kameda, reproduce_all, shimada
 from drake_pose.commands.prepare import check, masks, undistort
 from drake_pose.commands.register import audit, register
-from drake_pose.commands.walk import walk
 from drake_pose.errors import DrakePoseError, SettingsError, options_in_messages
 from drake_pose.version import VERSION
 
@@ -89,7 +88,7 @@ app = _program(
     equally well. No training and no GPU are needed. For a first result run drake-pose demo.
 
     Exit status: 0 success, 1 failure (the message names the cause), 2 wrong usage.""",
-    estimate, capture, register, audit, masks, batch, walk, demo, check, undistort, empty_room,
+    estimate, capture, register, audit, masks, batch, demo, check, undistort, empty_room,
 )  # fmt: skip
 app.command(
     _program(
@@ -125,6 +124,11 @@ def _run(words: Sequence[str] | None) -> None:
     try:
         command, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
     except (CycloptsError, SettingsError) as error:
+        given = sys.argv[1:] if words is None else words
+        options = [word.partition("=")[0] for word in given if word.startswith("--")]
+        for word in (*given[:1], *options):
+            if word in GONE:
+                _stop(f"{word} is gone: {GONE[word]}", 2)
         _stop(str(error), 2)
     except KeyboardInterrupt:
         # Parsing imports modules, which may compile kernels.

@@ -1,1 +1,1 @@
-"""Jobs of the commands: estimate, capture, register, audit, masks, batch, walk."""
+"""Jobs of the commands: estimate, capture, register, audit, masks, batch."""

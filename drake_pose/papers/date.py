@@ -443,7 +443,7 @@ def walk_by(model: ArticulatedModel, q: Array) -> tuple[Array, Array, Array]:
     """
     builder = DiagramBuilder()
     source = builder.AddSystem(TrajectorySource(held_positions(q, PERIOD)))
-    walker = builder.AddSystem(Walker(model, q[0], PERIOD, on_spot=True))
+    walker = builder.AddSystem(Walker(model, PERIOD, on_spot=True))
     builder.Connect(source.get_output_port(), walker.GetInputPort("positions"))
     ports = [walker.GetOutputPort(name) for name in ("command", "walker_pose", "rest")]
     logs = [LogVectorOutput(port, builder, PERIOD) for port in ports]

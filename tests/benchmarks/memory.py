@@ -20,7 +20,6 @@ COMMANDS = (
     "reproduce kameda --images 3 --angles continuous --views 4",
     "reproduce shimada --runs 5",
     "reproduce date --frames 60",
-    "walk --simulate --no-browser --seconds 20 --speed 0",
 )
 """Command lines that need only the project's own data; results go to the current folder."""
 

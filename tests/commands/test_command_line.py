@@ -103,6 +103,20 @@ def test_a_signal_during_parsing_is_reported_in_one_line(monkeypatch: pytest.Mon
     assert result.output == "drake-pose: error: interrupted before anything was written\n"
 
 
+@pytest.mark.parametrize(
+    ("line", "instead"),
+    [
+        ("walk results/person", "Walker"),
+    ],
+)
+def test_what_is_gone_names_what_to_use_instead(line: str, instead: str) -> None:
+    result = run_command(line.split())
+    assert result.exit_code == 2
+    assert " is gone: " in result.stderr
+    assert instead in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
 def test_version() -> None:
     result = run_command(["--version"])
     assert result.stdout == f"drake-pose {drake_pose.__version__}\n"

@@ -1,22 +1,17 @@
 import math
-import struct
 
 import numpy as np
 import pytest
-from pydrake.geometry import Box, Cylinder, Ellipsoid, Meshcat, MeshcatParams, Role, Sphere
+from pydrake.geometry import Box, Cylinder, Ellipsoid, Role, Sphere
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
-from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.body import bundled_model, load_model
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.person.date.walking import WALK
 from drake_pose.systems.walk import (
-    KEYS,
     Walker,
-    WalkKeys,
     add_garden,
-    build_walk,
     garden_obstacles,
     view_from_behind,
     walker_transform,
@@ -29,34 +24,23 @@ PERIOD = 1 / 30
 SPOT = [0.8 * math.sin(math.pi * k / 8) for k in range(1, 24)]
 
 
-@pytest.fixture(scope="module")
-def page():
-    return Meshcat(MeshcatParams(host="localhost"))
-
-
 def standing(person, x=0.0, head_deg=0.0, **degrees):
     return posed(person, x, head_y=head_deg, **degrees)
 
 
-def walked(person, page, stances, seconds_each=1.0, **how):
-    """Return a walk that shows each stance for a time."""
-    times = seconds_each * np.arange(len(stances) + 1)
-    path = PiecewisePolynomial.ZeroOrderHold(times, np.array([*stances, stances[-1]]).T)
-    return Bench(build_walk(person, page, path, np.array([standing(person)]), PERIOD, **how))
-
-
-def run(person, page, stances):
+def run(person, stances):
     """Return the walker's pose and the command after each stance of 1 s."""
-    walk, found = walked(person, page, stances), []
-    for k in range(1, len(stances) + 1):
-        walk.advance(k - 0.5 * PERIOD)
-        found.append([walk["walker_pose"], walk["command"]])
+    walker, found = Bench(Walker(person, PERIOD)), []
+    for k, q in enumerate(stances):
+        walker.give(positions=q)
+        walker.advance(k + 1 - 0.5 * PERIOD)
+        found.append([walker["walker_pose"], walker["command"]])
     return found
 
 
 def test_on_spot_requires_steps_for_a_command(person):
     """Neither standing ahead nor steps at the rest position alone are a command."""
-    walker = Bench(Walker(person, standing(person), PERIOD, on_spot=True))
+    walker = Bench(Walker(person, PERIOD, on_spot=True))
     simulator = Simulator(walker.system, walker.context)
     frames = [(0.0, 0.0), *[(0.3, 0.0)] * 20, *[(0.3, s) for s in SPOT], *[(0.0, s) for s in SPOT]]
     found = []
@@ -72,17 +56,11 @@ def test_on_spot_requires_steps_for_a_command(person):
     assert found[-1] == 0
 
 
-def drawn_pose(page, path):
-    """Return the transform (4, 4) sent to the browser: MessagePack that ends in 16 numbers."""
-    packed = page._GetPackedTransform(path)[-16 * 9 :]
-    return np.array([one[0] for one in struct.iter_unpack(">xd", packed)]).reshape(4, 4).T
-
-
-def test_gestures_walk_and_turn(person, page):
+def test_gestures_walk_and_turn(person):
     lost = np.full(len(person.position_names), np.nan)
     seen = [standing(person, *one) for one in ((0.1,), (0.4,), (0.1, 40.0), (-0.2,))]
     stances = [*seen[:3], lost, seen[3]]
-    found = run(person, page, stances)
+    found = run(person, stances)
     assert [tuple(command) for _, command in found] == [(0, 0), (0, 1), (1, 0), (0, 0), (0, -1)]
     ways = np.diff([pose for pose, _ in found], axis=0)
     np.testing.assert_allclose(ways[0], [WALK.speed, 0.0, 0.0], atol=0.05)
@@ -91,62 +69,13 @@ def test_gestures_walk_and_turn(person, page):
     heading = found[2][0][2]
     back = -WALK.speed * np.array([math.cos(heading), math.sin(heading), 0.0])
     np.testing.assert_allclose(ways[3], back, atol=0.06)
-    assert page.HasPath("/drake/walker/avatar")
-    assert page.HasPath("/drake/place/garden")
-    # A person at rest at x = 0.1 m is shown at the walker's position.
-    X_PR, (x, y, heading) = drawn_pose(page, "/drake/walker"), found[-1][0]
-    np.testing.assert_allclose(X_PR @ [0.1, 0.0, 0.0, 1.0], [x, y, 0.0, 1.0], atol=0.06)
-    np.testing.assert_allclose(X_PR[:2, 0], [math.cos(heading), math.sin(heading)], atol=0.06)
 
 
-def test_a_corrected_face_direction_turns_the_rest_stance(person, page):
+def test_a_corrected_face_direction_turns_the_rest_stance(person):
     """There is no command to turn, and ahead is where the person faces now."""
     stances = [standing(person, 0.0, 179.0), standing(person), standing(person, 0.4)]
-    found = run(person, page, stances)
+    found = run(person, stances)
     assert [tuple(command) for _, command in found] == [(0, 0), (0, 0), (0, 1)]
-
-
-def test_the_rest_stance_is_where_the_person_stands_still(person, page):
-    ways = [standing(person, x) for x in np.linspace(-0.5, 0.0, 30)]
-    stances = [*ways, *[standing(person)] * 40, *[standing(person, 0.4)] * 30]
-    walk = walked(person, page, stances, PERIOD, settle=1.0)
-    walker = walk.system.GetSubsystemByName("walker")
-    rest = Bench(walker, walker.GetMyContextFromRoot(walk.advance(1.5).context))
-    assert np.isnan(rest["rest"]).all()
-    walk.advance(3.2)
-    assert rest["rest"][3] == pytest.approx(0.0, abs=0.09)
-    assert tuple(walk["command"]) == (0, 1)
-
-
-def press(page, button):
-    """Send the browser's message for a button: a map of two strings as MessagePack."""
-    texts = ["type", "button", "name", button]
-    packed = b"".join(bytes([0xA0 + len(text)]) + text.encode() for text in texts)
-    page._InjectWebsocketMessage(message=b"\x82" + packed)
-
-
-def test_keys_walk_without_a_captured_person(person):
-    page = Meshcat(MeshcatParams(host="localhost"))
-    stride = np.array([standing(person, head_deg=d) for d in (5.0, 10.0, 5.0, 0.0)])
-    walk = Bench(build_walk(person, page, None, stride, PERIOD))
-    assert set(page.GetButtonNames()) == set(KEYS)
-    np.testing.assert_allclose(walk.advance(1.0)["walker_pose"], WALK.start)
-    press(page, "ahead")
-    press(page, "left")
-    x, y, heading = walk.advance(3.0)["walker_pose"]
-    # A press counts for about half a second, on an arc to the left.
-    assert 0.5 < np.hypot(x - WALK.start[0], y - WALK.start[1]) / WALK.speed < 0.7
-    assert 0.5 < heading / WALK.turn_rate < 0.7
-    assert y > 0.02
-    # Meanwhile a stride is shown to its end, where the person stands.
-    keys = Bench(WalkKeys(page, stride, PERIOD))
-    np.testing.assert_array_equal(keys["positions"], stride[-1])
-    press(page, "behind")
-    for k in range(30):
-        keys.update()
-        held = k < 0.55 / PERIOD
-        assert keys["keys"].tolist() == [0.0, -1.0 if held else 0.0]
-        np.testing.assert_array_equal(keys["positions"], stride[k % 4 if k < 20 else -1])
 
 
 def test_a_person_at_rest_is_shown_at_the_walkers_pose():
@@ -225,11 +154,8 @@ def test_the_view_is_from_behind_and_above_inside_the_walls():
 
 
 def test_invalid_periods_and_bodies_are_refused(person):
-    q = standing(person)
     with pytest.raises(SettingsError, match="period"):
-        Walker(person, q, 0.0)
-    with pytest.raises(SettingsError, match="settle"):
-        Walker(person, q, PERIOD, settle=-1.0)
+        Walker(person, 0.0)
     arm = load_model(bundled_model("hand"), check=False)
     with pytest.raises(UnknownNameError, match="head"):
-        Walker(arm, arm.default_positions, PERIOD)
+        Walker(arm, PERIOD)

@@ -98,7 +98,7 @@ def capture_live(
     elif settings.fit_shape:
         shape = _fit_first_frames(scene, settings, model.pose_tree(), on_report)
     tracker = tracker_of_person(model.pose_tree(), shape)
-    with closing(scene.open_sensors(tolerance=settings.tolerance)) as sensors:
+    with closing(scene.open_sensors(settings.tolerance)) as sensors:
         if setup is None:
             kind, cameras = "silhouette", scene.cameras
             diagram = build_silhouette_capture(
@@ -168,7 +168,7 @@ def _fit_first_frames(
     """
     if not shape_values(tree).any():
         return None
-    sensors = scene.open_sensors(tolerance=settings.tolerance)
+    sensors = scene.open_sensors(settings.tolerance)
     frames: list[dict[str, Mask]] = []
     builder = DiagramBuilder()
     seers = add_silhouette_sensors(builder, sensors, scene.cameras, scene.backgrounds)
@@ -238,7 +238,7 @@ def find_registered_pose(
     ring = {name: one for name, one in cameras.items() if name != face}
     blank = CaptureSetup(load_skeleton(model), ring, backgrounds=scene.backgrounds)
     best, shown = _best_registered_frame(
-        blank, ring, scene.open_sensors(tolerance=settings.tolerance), on_report
+        blank, ring, scene.open_sensors(settings.tolerance), on_report
     )
     if best is None:
         raise SettingsError(

@@ -40,15 +40,10 @@ class LiveScene:
     # Background models by camera, without cameras whose sources deliver masks.
     backgrounds: Mapping[str, Background]
 
-    def open_sensors(
-        self, live: bool | None = None, tolerance: float | None = None
-    ) -> PictureCapture:
+    def open_sensors(self, tolerance: float | None) -> PictureCapture:
         """Open the sources and return their sensor system.
 
-        Args:
-            live: whether frames follow the computer's clock; None: if any source is live.
-            tolerance: maximum difference of the times of synchronised pictures [s]; None: the
-                default of ``LiveSettings.tolerance``.
+        ``tolerance``: as in ``LiveSettings``.
 
         Raises:
             SceneError: a source cannot be opened; sources opened before are closed.
@@ -56,7 +51,7 @@ class LiveScene:
         """
         with ExitStack() as opened:
             sources = _open_sources(self.specifications, opened)
-            sensors = PictureCapture(sources, self.cameras, live=live, tolerance=tolerance)
+            sensors = PictureCapture(sources, self.cameras, tolerance=tolerance)
             opened.pop_all()
         return sensors
 
@@ -147,49 +142,46 @@ def take_empty_room(folder: Path, count: int, patience: float = 30.0) -> dict[st
 
 def run_live(
     diagram: Diagram,
-    sensors: PictureCapture | None,
+    sensors: PictureCapture,
     seconds: float | None,
-    on_report: Callable[[str], None] = lambda _: None,
-    monitor: Callable[[Context], EventStatus | None] | None = None,
-    speed: float = 0.0,
+    on_report: Callable[[str], None],
+    monitor: Callable[[Context], EventStatus | None],
     largest_lag: float = 0.2,
 ) -> bool:
     """Simulate a diagram until its recordings end, the time is over, or Ctrl-C.
 
+    Recordings are simulated as fast as possible, live cameras by the computer's clock.
+
     Args:
         diagram: the diagram.
-        sensors: its sensor system; None: it has none.
+        sensors: its sensor system.
         seconds: duration [s], of the clock if the sensors are live, else simulated; None:
             unlimited.
         on_report: called with messages about cameras and pictures.
         monitor: called with the diagram's context after every step; ends the run by returning
-            ReachedTermination; None: no monitor.
-        speed: simulated time per real time without live cameras; 0: as fast as possible.
+            ReachedTermination.
         largest_lag: delay to the clock beyond which a simulation skips ahead [s].
 
     Returns whether Ctrl-C ended the run.
     """
     simulator = Simulator(diagram)
-    if monitor is not None:
-        simulator.set_monitor(monitor)
-    is_live = sensors is not None and sensors.live
-    speed = 1.0 if is_live else speed
-    simulator.set_target_realtime_rate(speed)
+    simulator.set_monitor(monitor)
+    is_live = sensors.live
+    simulator.set_target_realtime_rate(float(is_live))
     context = simulator.get_context()
-    period = 0.5 if sensors is None else sensors.period
     end = math.inf if seconds is None else seconds
     try:
         simulator.Initialize()
         begin = start = time.monotonic()
         while (time.monotonic() - start if is_live else context.get_time()) < end:
-            goal = context.get_time() + period
+            goal = context.get_time() + sensors.period
             status = simulator.AdvanceTo(goal if is_live else min(goal, end))
-            for report in [] if sensors is None else sensors.take_reports():
+            for report in sensors.take_reports():
                 on_report(report)
             if status.reason() == SimulatorStatus.ReturnReason.kReachedTerminationCondition:
                 break
-            lag = time.monotonic() - begin - context.get_time() / speed if speed else 0.0
-            if lag > largest_lag:
+            lag = time.monotonic() - begin - context.get_time()
+            if is_live and lag > largest_lag:
                 simulator.ResetStatistics()
                 begin += lag
     except KeyboardInterrupt:

@@ -13,15 +13,6 @@ from drake_pose.files.settings import within
 CaptureMethod = Literal["person", "paper"]
 """person: a fit to all silhouettes at once; paper: the stages of Date et al. as published."""
 
-Seconds = Annotated[float | None, within(0.01)]
-Shape = Annotated[
-    Path | None,
-    Parameter(
-        metavar="RESULT",
-        help="Use the link lengths and radius scales of this earlier result of capture with the "
-        "same person. Live capture (sources.yaml) only.",
-    ),
-]
 _OF_PYTHON = Parameter(parse=False)
 
 
@@ -37,9 +28,11 @@ class LiveSettings:
         SettingsError: a time is not positive, or an option lacks the other one that it needs.
     """
 
-    seconds: Seconds = None
+    seconds: Annotated[float | None, within(0.01)] = None
     """Stop after this time [s]. Live capture (sources.yaml) only."""
-    shape: Shape = None
+    shape: Annotated[Path | None, Parameter(metavar="RESULT")] = None
+    """Use the link lengths and radius scales of this earlier result of capture with the same
+    person. Live capture (sources.yaml) only."""
     fit_shape: Annotated[bool, Parameter(negative="--no-fit-shape")] = True
     """--fit-shape: fit link lengths and radius scales to the first frames. --no-fit-shape: keep the
     model's. Live capture only."""

@@ -92,13 +92,7 @@ def count_steps(lift: float, steps: Array, seconds: float) -> Array:
     return np.array([foot, since, count])
 
 
-def apply_command(
-    pose: Array,
-    command: tuple[int, int],
-    seconds: float,
-    obstacles: Array,
-    half_size: float = WALK.half_size,
-) -> Array:
+def apply_command(pose: Array, command: tuple[int, int], seconds: float, obstacles: Array) -> Array:
     """Return the walker's pose (3,) after a command was followed for a time; heading in -pi..pi.
 
     Turning and walking together give an exact arc. The walker slides along walls and obstacles.
@@ -108,7 +102,6 @@ def apply_command(
         command: from recognise_command.
         seconds: for which the command was followed [s].
         obstacles: (n, 3) x, y and radius of round obstacles [m].
-        half_size: half the side of the place [m].
     """
     turn = command[0] * WALK.turn_rate * seconds
     middle = pose[2] + 0.5 * turn
@@ -119,7 +112,7 @@ def apply_command(
         distance, allowed = float(np.linalg.norm(away)), radius + WALK.body_radius
         if 0.0 < distance < allowed:
             place = place + away * (allowed / distance - 1.0)
-    limit = half_size - WALK.body_radius
+    limit = WALK.half_size - WALK.body_radius
     heading = math.atan2(math.sin(pose[2] + turn), math.cos(pose[2] + turn))
     return np.array([*np.clip(place, -limit, limit), heading])
 

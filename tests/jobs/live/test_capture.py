@@ -2,11 +2,12 @@ import json
 
 import numpy as np
 import pytest
+from pydrake.systems.framework import DiagramBuilder
 
 from drake_pose.body import bundled_model, load_model
 from drake_pose.errors import OutputError, SceneError, SettingsError, UnknownNameError
 from drake_pose.jobs.live.capture import capture_live
-from drake_pose.jobs.live.scene import load_live_scene, take_empty_room
+from drake_pose.jobs.live.scene import load_live_scene, run_live, take_empty_room
 from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.pose_tracker import KnownShape, tracker_of_person
 from tests.cli import run_command
@@ -186,3 +187,23 @@ def test_empty_room_is_taken_once(person, tmp_path):
     assert done.exit_code == 0, done.output
     assert len(list((tmp_path / "empty").glob("*/*.png"))) == 4
     assert set(load_live_scene(tmp_path).backgrounds) == {"camera_0", "camera_1"}
+
+
+def test_a_slow_computer_skips_ahead(studio, monkeypatch):
+    clock = {"now": 0.0}
+    monkeypatch.setattr("drake_pose.jobs.live.scene.time.monotonic", lambda: clock["now"])
+    sensors = load_live_scene(studio).open_sensors(None)
+    builder = DiagramBuilder()
+    builder.AddSystem(sensors)
+    diagram = builder.Build()
+    sensors.live = True
+    times = []
+
+    def work(context):
+        if not times or context.get_time() > times[-1]:
+            times.append(context.get_time())
+            clock["now"] += 1.0
+
+    run_live(diagram, sensors, 10.0, lambda _: None, work)
+    # Each period takes a second of the clock; simulated time does not catch up.
+    assert len(times) == pytest.approx(10, abs=1)

@@ -149,8 +149,8 @@ def test_path_equals_that_of_many_small_steps(command):
 def test_walls_and_obstacles_are_not_walked_through():
     pose, obstacles = np.array([-4.0, 0.05, 0.0]), np.array([[0.0, 0.0, 0.5]])
     nearest = math.inf
-    for _ in range(400):
-        pose = apply_command(pose, (0, 1), 1 / 30, obstacles, 5.0)
+    for _ in range(700):
+        pose = apply_command(pose, (0, 1), 1 / 30, obstacles)
         nearest = min(nearest, float(np.hypot(*pose[:2])))
     assert nearest == pytest.approx(0.5 + WALK.body_radius, abs=1e-9)
-    assert pose[0] == pytest.approx(5.0 - WALK.body_radius)
+    assert pose[0] == pytest.approx(WALK.half_size - WALK.body_radius)

@@ -205,13 +205,7 @@ class PoseTree:
             raise UnknownNameError("node", name, names, str(self.model.path))
         return names.index(name)
 
-    def grid(
-        self,
-        node: int,
-        interval: float,
-        intervals: Mapping[str, float] | None = None,
-        length_interval: float = 0.05,
-    ) -> Array:
+    def grid(self, node: int, interval: float, length_interval: float = 0.05) -> Array:
         """Return a node's sampling grid (n, k): every combination of its values' samples.
 
         A value is sampled by ``axis_samples``; a held value has one sample. The last value changes
@@ -220,25 +214,17 @@ class PoseTree:
         Args:
             node: index of the node.
             interval: sampling interval of angles [rad].
-            intervals: intervals [rad or m] of single positions or root values, by name; None: none.
             length_interval: sampling interval of lengths [m].
 
-        Raises SettingsError: an interval is not positive, or the grid is too large;
-        UnknownNameError: a name in ``intervals`` does not exist.
+        Raises SettingsError: an interval is not positive, or the grid is too large.
         """
-        intervals = intervals or {}
-        known = [name for node in self.nodes for name in node.value_names]
-        known += [name for name in self.model.position_names if name not in known]
-        for name in intervals:
-            if name not in known:
-                raise UnknownNameError("joint", name, known, str(self.model.path))
-        named = {"interval": interval, "length_interval": length_interval, **intervals}
+        named = {"interval": interval, "length_interval": length_interval}
         for name, value in named.items():
             if not (np.isfinite(value) and value > 0.0):
                 raise SettingsError(
                     f"sampling interval '{name}' is {value}: give a positive number"
                 )
-        placement, names = self.placements[node], self.nodes[node].value_names
+        placement = self.placements[node]
         rotation = placement.rotation
         if rotation is not None:
             interval = rotation.interval or interval
@@ -246,8 +232,8 @@ class PoseTree:
                 return even_rotations(interval)
         lower, upper = self.value_bounds(node)
         axes = []
-        for k, name in enumerate(names):
-            spacing = intervals.get(name, interval if placement.is_angle[k] else length_interval)
+        for k in range(len(lower)):
+            spacing = interval if placement.is_angle[k] else length_interval
             is_angle = bool(placement.periodic[k])
             if lower[k] == upper[k]:
                 axes.append([float(lower[k])])

@@ -247,12 +247,7 @@ def run_experiment(
             seconds -= more
         if isinstance(search, BeamSearch):
             # With tighter time limits the figures would depend on the machine.
-            limits = ExaminationSettings(
-                proof_time_limit=60.0,
-                mode_time_limit=60.0,
-                proof_poses=1_000_000,
-                mode_poses=100_000,
-            )
+            limits = ExaminationSettings(proof_poses=1_000_000, mode_poses=100_000, time_limit=60.0)
             start = time.process_time()
             result = examine(search.body, seen, result, limits)
             more = time.process_time() - start

@@ -145,8 +145,8 @@ class BeamSearch:
         self,
         views: Sequence[View],
         root_position: np.ndarray | None = None,
-        count: int = 30,
-        overlap: float = 0.7,
+        count: int = 4,
+        overlap: float = 0.5,
         time_limit: float = np.inf,
     ) -> list[list[np.ndarray]]:
         """Return the best whole poses that differ visibly, best first.

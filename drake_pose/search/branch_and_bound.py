@@ -223,7 +223,7 @@ class _BranchAndBound:
         partial = self.store.start()
         while len(self._layers) < len(self.nodes):
             try:
-                self.store.reserve()
+                self.store.reserve(0)
                 partial, node, pairs = self._choose(partial)
                 partial = self._place(partial, node, pairs)
             except LimitReached:

@@ -150,7 +150,7 @@ class PoseMode:
         node_values: Sequence[np.ndarray],
         J: float,
         joints: tuple[JointEstimate, ...],
-        size: float = 1.0,
+        size: float,
     ) -> "PoseMode":
         """Make a mode of its representative's values (k_i,) of each node, with J [pixel].
 

@@ -16,7 +16,12 @@ from drake_pose.search.beam_search import BeamSearch
 from drake_pose.search.estimates import PoseSet
 from drake_pose.search.parts import NeighbourhoodSearch, PartSearch
 from drake_pose.search.refinement import RefinementBody, RefinementProblem, descend
-from drake_pose.search.settings import PASSES, ExactSearchSettings
+from drake_pose.search.settings import (
+    COARSE_PASSES,
+    FINE_PASSES,
+    LAST_PASSES,
+    ExactSearchSettings,
+)
 from drake_pose.search.views_fit import FittedPose, describe_modes
 
 
@@ -65,7 +70,7 @@ class ExactSearch:
             if left <= 0.0:
                 return None
             views = problem.views
-            starts = grid.best_poses(views, root_position, settings.starts, settings.overlap, left)
+            starts = grid.best_poses(views, root_position, time_limit=left)
             poses = [self.body.parameters(start, root_position) for start in starts]
             found = self._descend(problem, poses, deadline)
             if found is None:
@@ -89,7 +94,7 @@ class ExactSearch:
         None if J is hopelessly large after the coarse passes.
         """
         freedom, length = self.body.freedom(), problem.border_length
-        coarse = [descend(problem, pose, freedom, PASSES.coarse) for pose in poses]
+        coarse = [descend(problem, pose, freedom, COARSE_PASSES) for pose in poses]
         start = min((parameters for parameters, _, _ in coarse), key=problem.J)
         first_J = float(problem.J(start))
         size = float(np.sqrt(problem.area / len(problem.views)))
@@ -103,9 +108,9 @@ class ExactSearch:
 
     def refine(self, problem: RefinementProblem, start: np.ndarray, deadline: float) -> ExactPose:
         """Refine ``start`` (m + 4,), and place parts anew until ``deadline`` (perf_counter)."""
-        fine, _, steps = descend(problem, start, self.body.freedom(), PASSES.fine)
+        fine, _, steps = descend(problem, start, self.body.freedom(), FINE_PASSES)
         neighbourhood = NeighbourhoodSearch(problem, self._parts)
-        good = self._settings.good * problem.border_length
+        good = self._settings.noise * problem.border_length
         parameters, J = neighbourhood.improve(fine, good, deadline)
         return ExactPose(parameters, J, float(problem.J(start)), steps, neighbourhood)
 
@@ -118,7 +123,7 @@ class ExactSearch:
             ``reached`` with the parameters and J of the best of three poses: its own, the given
             parameters, and their refinement.
         """
-        last, _, steps = descend(problem, parameters, self.body.freedom(), PASSES.last)
+        last, _, steps = descend(problem, parameters, self.body.freedom(), LAST_PASSES)
         best = min((reached.parameters, parameters, last), key=problem.J)
         return reached._replace(
             parameters=self.body.nearest_turns(best),
@@ -135,7 +140,7 @@ class ExactSearch:
         """
         settings, others = self._settings, []
         for _ in range(settings.replacements):
-            limit = reached.J + settings.tolerance * problem.border_length
+            limit = reached.J + settings.noise * problem.border_length
             others = reached.neighbourhood.others(reached.parameters, limit, settings.same)
             if not others or problem.J(others[0]) >= reached.J:
                 break
@@ -174,7 +179,7 @@ def find_intervals(
     body, kinematics = problem.body, problem.body.kinematics
     count = len(kinematics.names)
     free = body.freedom()
-    equations, squares = problem.equations(parameters, free, PASSES.fine[-1])
+    equations, squares = problem.equations(parameters, free, FINE_PASSES[-1], 0)
     # The variance [pixel^2] is at least that of a border distributed uniformly between two pixel
     # centres. The factor accounts for the correlation of neighbouring distances.
     variance = settings.noise_factor**2 * max(1.0 / 12.0, squares)
@@ -208,5 +213,5 @@ def find_intervals(
             ends = np.full(count, -np.inf), np.full(count, np.inf)
         modes.append(FittedPose(poses[0], 0.0, *ends, len(poses)))
         Js.append(float(problem.J(first)))
-    tolerance = settings.tolerance * problem.border_length
+    tolerance = settings.noise * problem.border_length
     return describe_modes(kinematics, tree or body.tree, modes, Js, tolerance, fits)

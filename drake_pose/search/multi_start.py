@@ -26,7 +26,6 @@ import numpy as np
 from drake_pose.body import PoseTree, bundled_model, load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import ParallelCamera
-from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import simplify_outlines, simplify_surfaces
 from drake_pose.search.beam_search import BeamSearch
 from drake_pose.search.coarse_search import CoarsePoses, CoarseSearch
@@ -37,6 +36,8 @@ from drake_pose.search.refinement import RefinementProblem
 from drake_pose.search.sampled_body import SampledBody
 from drake_pose.search.self_motions import counter_turns, flips
 from drake_pose.search.settings import (
+    COARSE_STAGES,
+    MEDIUM_STAGES,
     TOLERANT_STAGES,
     BeamSearchSettings,
     ExactSearchSettings,
@@ -391,7 +392,7 @@ class _MultiStartRun:
 
         limbs = [one for one in below if 2 * len(one) <= len(X_WN)]
         tried += itertools.chain.from_iterable(map_ordered(search_again, limbs))
-        stage = AnnealingStage(settings.medium[0].scale, settings.coarse[0].spacing)
+        stage = COARSE_STAGES[-1]
         best: list[FittedPose] = []
         for group, count in ((flipped, settings.flipped), (tried, settings.alternatives)):
             costs = map_ordered(lambda one: self._fit.cost(one, stage), group)
@@ -402,7 +403,7 @@ class _MultiStartRun:
             return refine_best(self._fit, starts, settings.alternative_passes, self._proceed)
 
         def refine(one: np.ndarray) -> FittedPose | None:
-            return self._fit.refine(one, settings.medium) if self._proceed() else None
+            return self._fit.refine(one, MEDIUM_STAGES) if self._proceed() else None
 
         return [one for one in map_ordered(refine, starts) if one is not None]
 

@@ -265,7 +265,7 @@ class PoseStore:
         self._node_keys = keys[2 * self.words : -2]
         self._beyond_keys = keys[-2:]
 
-    def reserve(self, size: int = 0) -> None:
+    def reserve(self, size: int) -> None:
         """Add ``size`` [byte] to the memory in use, and check the limits.
 
         Raises LimitReached: if memory, time or the number of drawn poses exceeds its limit.
@@ -280,21 +280,25 @@ class PoseStore:
         if late or used > self.limits.memory or drawn > self.limits.poses:
             raise LimitReached
 
-    def _batches(self, missing: np.ndarray, batch: int) -> Iterator[np.ndarray]:
-        """Yield ``missing`` poses (n,) of a parent in parts of ``batch``, until LimitReached."""
+    def _batches(
+        self, missing: np.ndarray, samples: int, most: int = 100_000
+    ) -> Iterator[np.ndarray]:
+        """Yield ``missing`` poses (n,) of a parent in parts, until LimitReached.
+
+        ``samples``: number of poses drawn for each. ``most``: number drawn between checks.
+        """
+        batch = max(1, most // samples)
         for begin in range(0, len(missing), batch):
-            self.reserve()
+            self.reserve(0)
             yield missing[begin : begin + batch]
 
-    def pose_groups(self, node: int, parents: np.ndarray, batch: int = 100_000) -> np.ndarray:
+    def pose_groups(self, node: int, parents: np.ndarray) -> np.ndarray:
         """Return (n, 2) the range [first, end) of the node's poses for each pose of its parent.
 
-        Missing ones are drawn, ``batch`` between checks of limits. ``parents``: (n,); zeros: a
-        root.
+        Missing ones are drawn. ``parents``: (n,); zeros: a root.
         """
-        known = self._groups[node]
-        batch = max(1, batch // len(self.body.sampled.X_PN[node]))
-        for missing in self._batches(known.missing(parents), batch):
+        known, samples = self._groups[node], len(self.body.sampled.X_PN[node])
+        for missing in self._batches(known.missing(parents), samples):
             counts = self._draw(node, missing)
             ends = len(self.nodes[node].samples) - counts.sum() + np.cumsum(counts)
             known.make(missing, np.column_stack([ends - counts, ends]))
@@ -306,15 +310,15 @@ class PoseStore:
             [stored.samples[poses[..., i]] for i, stored in enumerate(self.nodes)], axis=-1
         )
 
-    def reach_rows(self, node: int, parents: np.ndarray, batch: int = 20_000) -> np.ndarray:
+    def reach_rows(self, node: int, parents: np.ndarray) -> np.ndarray:
         """Return (n,) rows of ``reach_runs`` of a node, for poses ``parents`` (n,) of its parent.
 
         A row has the pixels in the projection of a ball that contains the node and its descendants
-        at all samples. ``batch``: number of balls drawn between checks of the limits.
+        at all samples.
         """
         known, views = self._reach_rows[node], self.bits.bit_views
         ball = self.body.reach_balls[node]
-        for missing in self._batches(known.missing(parents), batch):
+        for missing in self._batches(known.missing(parents), 1):
             runs = np.empty((len(missing), len(views), 3), dtype=np.int64)
             used, pieces = len(self.reach_words), [self.reach_words]
             X_WP = self._parent_poses(node, missing)

@@ -23,7 +23,7 @@ from drake_pose.body import PoseTree
 from drake_pose.fit.surfaces import simplify_rigid_parts
 from drake_pose.search.estimates import View
 from drake_pose.search.refinement import Freedom, RefinementBody, RefinementProblem, descend
-from drake_pose.search.settings import NeighbourhoodSettings
+from drake_pose.search.settings import ExactSearchSettings, NeighbourhoodSettings
 from drake_pose.silhouette.outline import pack
 from drake_pose.silhouette.scoring import prefix_sums
 from drake_pose.silhouette.span_kernel import score
@@ -530,7 +530,7 @@ class NeighbourhoodSearch:
         starts = [self.search.mirror(parameters, part, view) for view in problem.views]
         if erring and not part.exchanged:
             starts += self.search.propose(problem, parameters, part)
-        rough, near = [], J + settings.second_excess * length
+        rough, near = [], J + ExactSearchSettings.noise * length
         for start in starts:
             if part.exchanged:
                 refined, cost, _ = descend(problem, start, freedom, settings.mirrored)
@@ -553,9 +553,7 @@ class NeighbourhoodSearch:
                 found.append((float(problem.J(refined)), refined))
         columns = freedom.columns
         self._others += [
-            (other_J, freedom, other[columns])
-            for other_J, other in found
-            if other_J <= J + settings.stored_excess * length
+            (other_J, freedom, other[columns]) for other_J, other in found if other_J <= near
         ]
         least, best = min(found, key=lambda pair: pair[0], default=(np.inf, parameters))
         if least > J + settings.whole_excess * length:

@@ -184,9 +184,9 @@ def find_modes(
     samples: np.ndarray,
     J: float,
     tolerance: float | None = None,
-    most: int = 32,
     limits: BoundLimits | None = None,
     within: PosesWithin | None = None,
+    most: int = 32,
 ) -> GridPoseSet:
     """Find all poses of the grid that are as good as the best, and group them into modes.
 
@@ -198,10 +198,10 @@ def find_modes(
         tolerance: greatest excess of the objective of a pose that is as good [pixel]. None: if the
             best pose is within ``renderer_tolerance``, all poses within that; else 5 % of the
             contours' length.
-        most: greatest number of modes that are described.
         limits: limits of the search; None: the defaults.
         within: all exact poses, if they are known; they are then the set, up to their limit of J,
             and ``tolerance`` is ignored. None: the set is searched.
+        most: greatest number of modes that are described.
 
     Returns the set. If a better pose than the known one is found, the set holds the poses within
     the tolerance of the better one.
@@ -285,17 +285,12 @@ class ExaminationSettings:
     """Parameters of the proof of optimality and of the search for all poses as good.
 
     Args:
-        proof_time_limit: time after which the proof is given up [s]; None: no limit; 0: no proof is
-            tried. A pose with J = 0 needs no proof.
-        mode_time_limit: time limit of the search for all poses as good [s]; None: no limit. When it
-            is reached the set is incomplete and no joint is determined.
-        proof_poses: number of drawn poses of nodes after which the proof is given up. Unlike a
-            time limit it gives the same result on every machine.
+        proof_poses: number of drawn poses of nodes after which the proof is given up. A pose with
+            J = 0 needs no proof.
         mode_poses: the same limit for the search for all poses as good; the default takes about two
-            seconds.
-        memory: memory limit of each of the two; reaching it has the effect of the time limit
-            [byte].
-        modes: greatest number of modes that are described.
+            seconds. When it is reached the set is incomplete and no joint is determined.
+        time_limit: time after which each of the two is given up [s]; None: no limit. Unlike the
+            limits above its effect depends on the machine.
         tolerance: greatest excess of J of a pose that is as good [pixel]; None: chosen by
             ``find_modes``.
 
@@ -303,23 +298,18 @@ class ExaminationSettings:
         SettingsError: if a value is out of its range.
     """
 
-    proof_time_limit: float | None = None
-    mode_time_limit: float | None = None
     proof_poses: int = 25_000
     mode_poses: int = 50_000
-    memory: int = BoundLimits.memory
-    modes: int = 32
+    time_limit: float | None = None
     tolerance: float | None = None
 
     def __post_init__(self) -> None:
         require_at_least(0, tolerance=self.tolerance)
-        require_at_least(1, modes=self.modes)
-        self.limits("mode"), self.limits("proof")
+        self.limits(self.proof_poses), self.limits(self.mode_poses)
 
-    def limits(self, step: str) -> BoundLimits:
-        """Return the limits of a step: "proof", or "mode" for the search for all poses as good."""
-        poses, seconds = getattr(self, f"{step}_poses"), getattr(self, f"{step}_time_limit")
-        return BoundLimits(poses=poses, memory=self.memory, time_limit=seconds)
+    def limits(self, poses: int) -> BoundLimits:
+        """Return the limits of a step with this limit of drawn poses."""
+        return BoundLimits(poses=poses, time_limit=self.time_limit)
 
 
 def examine(
@@ -354,13 +344,13 @@ def examine(
     if samples is None:
         raise SettingsError("the pose to be examined is not on the body's sampling grid")
     J, lower_bound, spent = result.J, 0.0, result.J > 0.0
-    if within is None and J > 0.0 and settings.proof_time_limit != 0.0:
-        better = branch_and_bound(body, views, J - 1.0, settings.limits("proof"))
+    if within is None and J > 0.0:
+        better = branch_and_bound(body, views, J - 1.0, settings.limits(settings.proof_poses))
         if better.graph.best_J < J:
             J, samples = better.graph.best_J, better.graph.central()
         lower_bound, spent = J if better.complete else better.lower_bound, better.limited
     answer = find_modes(
-        body, views, samples, J, settings.tolerance, settings.modes, settings.limits("mode"),
+        body, views, samples, J, settings.tolerance, settings.limits(settings.mode_poses),
         within if settings.tolerance is None else None,
     )  # fmt: skip
     best = answer.modes[0]

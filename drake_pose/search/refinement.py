@@ -179,7 +179,7 @@ class RefinementProblem:
         parameters: np.ndarray,
         freedom: Freedom,
         part: Pass,
-        offset: int = 0,
+        offset: int,
         fixed_borders: Sequence[Border] | None = None,
     ) -> tuple[Equations, float]:
         """Return the normal equations of the distances along raster lines.

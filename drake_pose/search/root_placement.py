@@ -38,7 +38,13 @@ from drake_pose.search.root_places import (
     slide_root,
 )
 from drake_pose.search.sampled_body import SampledBody
-from drake_pose.search.settings import PASSES, BeamSearchSettings, RootPlacementSettings, Stage
+from drake_pose.search.settings import (
+    COARSE_PASSES,
+    FINE_PASSES,
+    BeamSearchSettings,
+    RootPlacementSettings,
+    Stage,
+)
 from drake_pose.workers import map_ordered
 
 
@@ -337,20 +343,18 @@ class RootPlacementSearch:
         def before(step: Callable[[_PlacedPose], Any], one: _PlacedPose) -> Any:
             return step(one) if time.perf_counter() < deadline else None
 
-        settle = partial(before, lambda one: self._settle(one, PASSES.coarse, moves))
+        settle = partial(before, lambda one: self._settle(one, COARSE_PASSES, moves))
         pool = [one for one in map_ordered(settle, starts) if one is not None]
         pool.sort(key=attrgetter("J"))
 
         def search_again(one: _PlacedPose) -> list[_PlacedPose]:
             # The beam search with the root where it is.
-            p_WR, settings = self._root_of(one), self._placement
+            p_WR = self._root_of(one)
             starts = (
                 replace(one, parameters=self._refined.parameters(values, p_WR))
-                for values in self._grid.best_poses(
-                    one.views, p_WR, settings.poses_again, settings.overlap
-                )
+                for values in self._grid.best_poses(one.views, p_WR)
             )
-            return [self._settle(start, PASSES.coarse, moves) for start in starts]
+            return [self._settle(start, COARSE_PASSES, moves) for start in starts]
 
         again = partial(before, search_again)
         # The best pose for each distinct root position.
@@ -411,13 +415,13 @@ class RootPlacementSearch:
         ``moves``: whether the root's position is refined. ``deadline``: perf_counter() [s] after
         which no further part is placed anew.
         """
-        near = self._settle(start, PASSES.fine[:2], moves)
+        near = self._settle(start, FINE_PASSES[:2], moves)
         problem = RefinementProblem(self._refined, near.views)
         good = self._placement.good_E_total * problem.area
         neighbourhood = NeighbourhoodSearch(problem, self._parts)
         parameters, J = neighbourhood.improve(near.parameters, good, deadline)
         better = replace(near, parameters=parameters, J=float(J))
-        end = self._settle(better, PASSES.fine, moves)
+        end = self._settle(better, FINE_PASSES, moves)
         return min(start, near, better, end, key=attrgetter("J"))
 
 

@@ -134,9 +134,7 @@ class SampledTree:
         For a node whose joints mimic its parent's, k is 0 and n the parent's number of samples.
         """
         settings, source = self._settings, self.tree.source(node)
-        values = self.tree.grid(
-            source, settings.interval, settings.intervals, settings.length_interval
-        )
+        values = self.tree.grid(source, settings.interval, settings.length_interval)
         own = values if source == node else values[:, :0]
         return own, self.tree.relative_transforms(node, values)
 

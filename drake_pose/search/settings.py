@@ -6,8 +6,7 @@ docstring names, so that settings do not depend on the size of the images.
 
 import math
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -23,8 +22,6 @@ class GridSettings:
     Args:
         interval: sampling interval of every angle [rad]; the paper's is 20 degrees.
         length_interval: sampling interval of every prismatic position [m].
-        intervals: sampling intervals of single positions, by name [rad or m]; they take precedence
-            over the two above.
 
     Raises:
         SettingsError: if a value is out of its range.
@@ -32,11 +29,9 @@ class GridSettings:
 
     interval: float = math.radians(20.0)
     length_interval: float = 0.05
-    intervals: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         require_positive(interval=self.interval, length_interval=self.length_interval)
-        require_positive(**{f"interval of {name}": one for name, one in self.intervals.items()})
 
 
 @dataclass(frozen=True)
@@ -138,23 +133,17 @@ class Pass:
     slack: float = 0.0  # Dead zone: distances up to this have hardly any weight [pixel].
 
 
-class RefinementPasses(NamedTuple):
-    """Passes of a refinement by pixels: from a coarse pose, from a near one, and to the optimum.
-
-    A pixel is wrong if the contour is more than half a pixel from the border on the pixel's raster
-    line. A smaller distance carries no information: the border is uniformly distributed between two
-    pixel centres. A least-squares pose leaves 0.02 to 0.03 of the border's pixels wrong. A pose
-    within half a pixel on all lines leaves 0.005 to 0.015 wrong and is half as far from the true
-    pose. The slack of the last passes is 0.4 instead of 0.5 pixels, so that the pose does not end
-    on the bounds of this region.
-    """
-
-    coarse: tuple[Pass, ...] = (Pass(8, 4, 50.0, 300.0), Pass(8, 4, 10.0, 100.0))
-    fine: tuple[Pass, ...] = (Pass(5, 2, 6.0, 30.0), Pass(6, 2, 3.0, 10.0), Pass(8, 1, 2.0, 5.0))
-    last: tuple[Pass, ...] = (Pass(5, 2, 2.0, 5.0), Pass(15, 1, 1.0, 0.5, slack=0.4))
-
-
-PASSES = RefinementPasses()
+# Passes of a refinement by pixels: from a coarse pose, from a near one, and to the optimum.
+#
+# A pixel is wrong if the contour is more than half a pixel from the border on the pixel's raster
+# line. A smaller distance carries no information: the border is uniformly distributed between two
+# pixel centres. A least-squares pose leaves 0.02 to 0.03 of the border's pixels wrong. A pose
+# within half a pixel on all lines leaves 0.005 to 0.015 wrong and is half as far from the true
+# pose. The slack of the last passes is 0.4 instead of 0.5 pixels, so that the pose does not end on
+# the bounds of this region.
+COARSE_PASSES = (Pass(8, 4, 50.0, 300.0), Pass(8, 4, 10.0, 100.0))
+FINE_PASSES = (Pass(5, 2, 6.0, 30.0), Pass(6, 2, 3.0, 10.0), Pass(8, 1, 2.0, 5.0))
+LAST_PASSES = (Pass(5, 2, 2.0, 5.0), Pass(15, 1, 1.0, 0.5, slack=0.4))
 
 
 class NeighbourhoodSettings(NamedTuple):
@@ -168,11 +157,7 @@ class NeighbourhoodSettings(NamedTuple):
     final: tuple[Pass, ...] = (Pass(6, 1, 1.0, 0.5, slack=0.4),)  # Passes of alternative poses.
     whole: tuple[Pass, ...] = (Pass(3, 3, 6.0, 50.0), Pass(3, 2, 2.0, 5.0))  # All parts move.
     refined: int = 2  # Number of placements that get the second passes.
-    # Greatest excess over the current J after the first passes, after the second ones, and of an
-    # alternative pose that is stored.
-    first_excess: float = 0.15
-    second_excess: float = 0.03
-    stored_excess: float = 0.03
+    first_excess: float = 0.15  # Greatest excess over the current J after the first passes.
     repaired_excess: float = 0.35  # Mirrored poses up to this excess have their parts placed anew,
     repair_tries: int = 6  # with this number of tries.
     whole_excess: float = 0.01  # Poses up to this excess are refined with all parts moving.
@@ -199,12 +184,10 @@ class RootPlacementSettings(NamedTuple):
     quota: float = 0.05  # Greatest fraction of the hypotheses with the same root position.
     starts: int = 24  # Number of poses refined by the coarse passes.
     finalists: int = 3  # Number of root positions searched again, and of poses refined to the end.
-    poses_again: int = 4  # Number of poses of each search with a known root.
     coarse_pixels: int = 1500  # Area of a silhouette in the coarse images [pixel].
     root_factor: int = 2  # Beam width after the root, as a multiple of the beam width.
     root_spare: int = 2  # Rotations tried at each position, as a multiple of its quota.
     spare: int = 8  # Hypotheses made before the quota is applied, as a multiple of the beam width.
-    overlap: float = 0.5  # See ``BeamSearch.best_poses``.
     good_E_total: float = 0.004  # The search ends at a pose with a smaller E_total.
 
 
@@ -227,19 +210,18 @@ class ExactSearchSettings:
     # of a fitted pose. Bodies drawn by Drake have .54 to .99 (``tests/silhouettes``), real arms and
     # people .1 to .51.
     coinciding: float = 0.53
-    starts: int = 4  # Number of poses of each beam search that are refined.
-    overlap: float = 0.5  # See ``BeamSearch.best_poses``.
     # The search gives up if J after the coarse passes exceeds the larger of these two: the second
     # is a fraction of the square root of the mean silhouette area [pixel].
     hopeless: float = 1.5
     hopeless_fraction: float = 0.017
-    good: float = 0.03  # The search ends at a pose with a smaller J, which is pixel noise.
+    # Pixel noise: the search ends at a pose with a smaller J, and poses whose J exceeds the best by
+    # less are as good.
+    noise: float = 0.03
     exact: float = 0.18  # A pose with a smaller J is the answer.
     plausible: float = 0.5  # Above this J the pose of the robust fit is the answer.
     # Two grids agree if the ratio of their Js is smaller: the model itself does not fit.
     agreement: float = 1.1
     replacements: int = 3  # Greatest number of times that an alternative replaces the best pose.
-    tolerance: float = 0.03  # Greatest excess of J of a pose that is as good as the best.
     same: float = 0.1  # Poses are equal if no value differs by more [rad or m].
     confidence: float = 0.95  # Probability that an interval contains the true value.
     # Ratio of the actual standard deviation to that of statistically independent distances.
@@ -247,8 +229,8 @@ class ExactSearchSettings:
     misfit: float = 0.025  # Above this J no value is determined: another pose may be right.
 
 
-_COARSE = (AnnealingStage(0.1, 0.04, 3), AnnealingStage(0.05, 0.04, 3))
-_MEDIUM = (AnnealingStage(0.05, 0.026, 4), AnnealingStage(0.025, 0.026, 4))
+COARSE_STAGES = (AnnealingStage(0.1, 0.04, 3), AnnealingStage(0.05, 0.04, 3))
+MEDIUM_STAGES = (AnnealingStage(0.05, 0.026, 4), AnnealingStage(0.025, 0.026, 4))
 
 
 @dataclass(frozen=True)
@@ -261,20 +243,23 @@ class MultiStartSettings:
     """
 
     interval: float = math.radians(15.0)  # Sampling interval of angles in the coarse search [rad].
-    coarse: tuple[AnnealingStage, ...] = _COARSE
-    medium: tuple[AnnealingStage, ...] = _MEDIUM
     final: tuple[AnnealingStage, ...] = (AnnealingStage(0.0125, 0.0125, 6),)
     starts: int = 40  # Number of coarse poses that are fitted.
     finalists: int = 4  # Number of poses that are fitted to the end.
     # Stages, and the number of poses kept after them: in one view, and in several.
     passes: tuple[tuple[tuple[tuple[AnnealingStage, ...], int], ...], ...] = (
-        ((_COARSE, 12), (_MEDIUM, 12)),
-        ((_COARSE[:1], 20), (_COARSE[1:], 12), (_MEDIUM[:1], 6), (_MEDIUM[1:], 6)),
+        ((COARSE_STAGES, 12), (MEDIUM_STAGES, 12)),
+        (
+            (COARSE_STAGES[:1], 20),
+            (COARSE_STAGES[1:], 12),
+            (MEDIUM_STAGES[:1], 6),
+            (MEDIUM_STAGES[1:], 6),
+        ),
     )
     # Stages of alternative poses in several views, and the number kept after them.
     alternative_passes: tuple[tuple[tuple[AnnealingStage, ...], int], ...] = (
-        (_MEDIUM[:1], 4),
-        (_MEDIUM[1:], 4),
+        (MEDIUM_STAGES[:1], 4),
+        (MEDIUM_STAGES[1:], 4),
     )
     # Coarse poses differ if some node's image is at least this far away.
     separation: float = 0.13
@@ -296,11 +281,6 @@ class RobustSettings(NamedTuple):
 
     # Stage at which costs of poses are compared.
     comparison: AnnealingStage = AnnealingStage(0.0125, 0.026, 2)
-    # Stages at which the other values follow a value that is moved.
-    follow: tuple[AnnealingStage, ...] = (
-        AnnealingStage(0.025, 0.026, 2),
-        AnnealingStage(0.0125, 0.026, 2),
-    )
     measure: AnnealingStage = AnnealingStage(0.025, 0.0125)  # Stage at which errors are measured.
     # Difference of costs that is significant [standard deviations].
     significance: float = 1.96
@@ -309,7 +289,6 @@ class RobustSettings(NamedTuple):
     moved: tuple[float, float] = (math.radians(3.0), 0.01)
     longest_steps: tuple[float, float] = (0.5, 0.1)  # Longest step of a moved value [rad, m].
     step_factor: float = 1.6  # Ratio of successive steps.
-    one_sided: float = 0.975  # Probability that a value lies below its interval's upper end.
     camera_freedom: int = 6  # Degrees of freedom of a camera's error.
 
     @staticmethod

@@ -42,7 +42,7 @@ from drake_pose.search.estimates import (
     joint_estimates,
 )
 from drake_pose.search.self_motions import Flip, flips
-from drake_pose.search.settings import RobustSettings
+from drake_pose.search.settings import ExactSearchSettings, RobustSettings
 from drake_pose.silhouette.outline import Outline
 from drake_pose.workers import map_ordered
 
@@ -250,6 +250,12 @@ def describe_modes(
     return PoseSet(described, joints(modes), tolerance, False, len(described))
 
 
+def interval_widths(covariance: np.ndarray, degrees_of_freedom: int) -> np.ndarray:
+    """Return half the widths (m,) of intervals by a covariance (m, m), with Student's quantile."""
+    one_sided = 0.5 + 0.5 * ExactSearchSettings.confidence
+    return np.asarray(stdtrit(degrees_of_freedom, one_sided) * np.sqrt(np.diag(covariance)))
+
+
 def covariance_pose_set(
     tree: PoseTree, pose: PoseEstimate, covariance: np.ndarray, image_count: int
 ) -> PoseSet:
@@ -264,9 +270,7 @@ def covariance_pose_set(
     """
     kinematics, settings = TreeKinematics(tree), RobustSettings()
     values = kinematics.flatten(pose.node_values)
-    widths = stdtrit(settings.camera_freedom * image_count, settings.one_sided) * np.sqrt(
-        np.diag(covariance)
-    )
+    widths = interval_widths(covariance, settings.camera_freedom * image_count)
     lower, upper = kinematics.local_limits(values)
     mode = FittedPose(
         values, low=np.maximum(values - widths, lower), high=np.minimum(values + widths, upper)
@@ -398,8 +402,7 @@ class RobustModes:
             self._sizes = estimate_sizes(residuals, kinematics.is_angle)
         covariance = values_covariance(residuals, self._sizes, free, kinematics.is_angle)
         low, high = values.copy(), values.copy()
-        degrees_of_freedom = settings.camera_freedom * self._fit.camera_count
-        widths = stdtrit(degrees_of_freedom, settings.one_sided) * np.sqrt(np.diag(covariance))
+        widths = interval_widths(covariance, settings.camera_freedom * self._fit.camera_count)
         low[free], high[free] = values[free] - widths, values[free] + widths
         wide = widths > np.where(kinematics.is_angle[free], *settings.moved)
 
@@ -434,6 +437,9 @@ class RobustModes:
         becomes significant, unless the value's limit or the end of the time comes first.
         """
         settings = self._settings
+        # The others follow in two stages; the last is that at which costs are compared.
+        last = settings.comparison
+        stages = (replace(last, scale=2.0 * last.scale), last)
         longest = settings.longest_steps[0 if self._kinematics.is_angle[index] else 1]
         lower, upper = self._kinematics.lower.copy(), self._kinematics.upper.copy()
         # An angle that turns around is moved by at most half a turn.
@@ -441,7 +447,7 @@ class RobustModes:
         step, found, worse = width, [values], 0.0
         while lower[index] < found[-1][index] < upper[index] and self._proceed():
             trial = np.clip(found[-1] + min(step, longest) * along, lower, upper)
-            fitted = self._fit.refine(trial, settings.follow, held=(index,)).values
+            fitted = self._fit.refine(trial, stages, held=(index,)).values
             costs = self._fit.tile_costs(fitted, settings.comparison)
             before, worse = worse, vuong_statistic(costs, self._best_costs)
             if worse > settings.significance:

@@ -139,9 +139,7 @@ def test_screw_is_not_periodic(tmp_path):
     node = next(i for i, one in enumerate(tree.nodes) if "screw" in one.value_names)
     column = tree.nodes[node].value_names.index("screw")
     assert not tree.covers_full_turn(node)[column]
-    grid = tree.grid(
-        node, 1.0, {name: 10.0 for name in tree.nodes[node].value_names if name != "screw"}
-    )
+    grid = tree.grid(node, 1.0)
     np.testing.assert_allclose(np.unique(grid[:, column]), np.arange(-9.0, 10.0))
     without = JOINTS_SDF.replace(
         "<limit><lower>-3</lower><upper>3</upper><effort>0</effort></limit>", ""

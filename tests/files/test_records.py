@@ -198,7 +198,7 @@ def test_pose_sets_are_recorded_with_values_of_each_mode(model):
     joints = tuple(JointEstimate(name, name != "reach", 0.1, 0.4) for name in names)
     values = [np.array([0.2]) for node in tree.nodes for _ in node.value_names]
     split = TreeKinematics(tree).split(np.concatenate(values))
-    mode = PoseMode.of_values(tree, split, 1.0, joints)
+    mode = PoseMode.of_values(tree, split, 1.0, joints, 1.0)
     told = record_pose_set(PoseSet((mode,), joints, 0.0, False, 5), tree)
     assert told["mode_count"] == 5
     for name in ("bend", "reach", "turn"):

@@ -113,12 +113,9 @@ def test_time_limit_returns_a_pose_and_is_reported(maker):
         (Stage, {"hypotheses": 1, "outside_fraction": -0.1}),
         (Stage, {"hypotheses": 1, "outside_weight": 0}),
         (ExaminationSettings, {"tolerance": -1.0}),
-        (ExaminationSettings, {"modes": 0}),
         (ExaminationSettings, {"proof_poses": 0}),
-        (ExaminationSettings, {"memory": 0}),
-        (ExaminationSettings, {"proof_time_limit": -1.0}),
-        (ExaminationSettings, {"mode_time_limit": float("nan")}),
-        (ExaminationSettings, {"proof_time_limit": float("inf")}),
+        (ExaminationSettings, {"time_limit": -1.0}),
+        (ExaminationSettings, {"time_limit": float("nan")}),
     ],
 )
 def test_settings_out_of_range_are_refused(kind, values):
@@ -224,9 +221,7 @@ def test_examination_refuses_a_pose_off_the_grid(maker):
         examine(search.body, problem.views, moved, ExaminationSettings())
 
 
-@pytest.mark.parametrize(
-    "limit", [{"proof_poses": 1}, {"memory": 8_000}, {"proof_time_limit": 0.0}]
-)
+@pytest.mark.parametrize("limit", [{"proof_poses": 1}, {"time_limit": 0.0}])
 def test_limits_give_a_valid_lower_bound_and_no_false_proof(maker, limit):
     search = search_of(maker, None)
     generator = np.random.default_rng(12)

@@ -86,6 +86,6 @@ def test_an_overlap_above_one_keeps_all_poses(maker, problem):
 def test_alternatives_to_an_exact_pose_are_found(maker):
     search = BeamSearch(maker.tree, settings())
     problem = maker.show([grid[1] for grid in search.sampled.values])
-    poses = search.best_poses(problem.views, count=6)
+    poses = search.best_poses(problem.views, count=6, overlap=OVERLAP)
     assert objectives(problem, poses)[0] == 0.0
     assert len(poses) == 6

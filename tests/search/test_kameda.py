@@ -40,7 +40,7 @@ def sliders(tmp_path):
 
 
 def slider_search(tree, **settings):
-    return PaperSearch(tree, PaperSearchSettings(intervals={"right": 0.05, "up": 0.04}, **settings))
+    return PaperSearch(tree, PaperSearchSettings(length_interval=0.04, **settings))
 
 
 def test_step_6_goes_back_to_the_nearest_ancestor_with_an_untried_candidate(tmp_path):
@@ -58,7 +58,7 @@ def test_step_6_goes_back_to_the_nearest_ancestor_with_an_untried_candidate(tmp_
         joint("weld_like", "prismatic", "first", "arm", (0.0, 0.0), axis="0 1 0"),
     )
     search = PaperSearch(
-        model.pose_tree(), PaperSearchSettings(intervals={"slide": 0.2}, outside_limit=20.0)
+        model.pose_tree(), PaperSearchSettings(length_interval=0.2, outside_limit=20.0)
     )
     camera = front_camera()
     mask = silhouette(search, camera, [np.array([0.2]), np.array([0.0])])
@@ -150,6 +150,6 @@ def test_bad_input_is_refused(sliders):
     with pytest.raises(MaskError, match=r"front.*\(80, 100\)"):
         View(camera, np.ones((100, 80), dtype=bool))
     for bad in ({"interval": 0.0}, {"candidate_limit": 0}, {"outside_limit": -1.0},
-                {"run_limit": 0}, {"interval": math.nan}, {"intervals": {"up": -1.0}}):  # fmt: skip
-        with pytest.raises(SettingsError, match=next(iter(bad)).rstrip("s")):
+                {"run_limit": 0}, {"interval": math.nan}, {"length_interval": -1.0}):  # fmt: skip
+        with pytest.raises(SettingsError, match=next(iter(bad))):
             PaperSearchSettings(**bad)

@@ -11,7 +11,7 @@ from drake_pose.search import View
 from drake_pose.search.exact_search import find_intervals
 from drake_pose.search.parts import NeighbourhoodSearch, PartSearch, find_parts, find_reflections
 from drake_pose.search.refinement import Pass, RefinementBody, RefinementProblem, descend
-from drake_pose.search.settings import PASSES
+from drake_pose.search.settings import COARSE_PASSES, FINE_PASSES, LAST_PASSES
 from drake_pose.silhouette.outline import TreeSurfaces
 from drake_pose.silhouette.scoring import draw_mask
 from tests.search.bodies import forked_body
@@ -98,7 +98,7 @@ def test_one_step_reverts_a_small_change(body, kind):
     for one, j in enumerate(freedom.columns):
         moved = true.copy()
         moved[j] += step
-        equations, _ = problem.equations(moved, freedom, Pass(1, 1, 3.0, 1.0))
+        equations, _ = problem.equations(moved, freedom, Pass(1, 1, 3.0, 1.0), 0)
         off.append(abs(equations.g[0, one] / equations.H[0, one, one] / step - 1.0))
     # Pixels, and parts that the change covers and uncovers, cause errors.
     assert np.median(off) < 0.1
@@ -116,7 +116,7 @@ def test_a_refined_pose_is_a_local_optimum_within_the_limits(body):
         start = np.clip(start, body.lower, body.upper)
         start[-4:] = 0.0
         freedom = body.freedom()
-        refined, _, steps = descend(problem, start, freedom, PASSES.coarse + PASSES.fine)
+        refined, _, steps = descend(problem, start, freedom, COARSE_PASSES + FINE_PASSES)
         assert steps > 0
         assert np.all(refined >= body.lower)
         assert np.all(refined <= body.upper)
@@ -156,8 +156,8 @@ def test_slack_leaves_fewer_wrong_pixels_than_least_squares(body):
         start = true + 0.02 * np.random.default_rng(seed).normal(size=len(true))
         start[-4:] = 0.0
         start = np.clip(start, body.lower, body.upper)
-        squares, _, _ = descend(problem, start, freedom, PASSES.fine)
-        last, _, _ = descend(problem, squares, freedom, PASSES.last)
+        squares, _, _ = descend(problem, start, freedom, FINE_PASSES)
+        last, _, _ = descend(problem, squares, freedom, LAST_PASSES)
         off, before = (np.median(np.abs(p - true)[freedom.columns]) for p in (last, squares))
         gains.append([problem.J(last) / problem.J(squares), off / before])
     ratios, errors = np.median(gains, axis=0)
@@ -237,7 +237,7 @@ def test_a_mirrored_body_has_nearly_the_same_silhouette(body, search):
         true = random_pose(body, seed, fraction=0.3)
         problem = problem_of(body, true, [camera])
         reflected = search.mirror(true, whole[0], problem.views[0])
-        other, _, _ = descend(problem, reflected, body.freedom(), PASSES.coarse + PASSES.fine)
+        other, _, _ = descend(problem, reflected, body.freedom(), COARSE_PASSES + FINE_PASSES)
         assert np.abs(other - true).max() > 0.3
         ratios.append(problem.J(other) / problem.area)
     # Joint limits prevent some poses from being mirrored.
@@ -250,7 +250,7 @@ def test_intervals_of_exact_masks_contain_the_true_values(body, search):
     for seed in (21, 22, 23):
         true = random_pose(body, seed)
         problem = problem_of(body, true, cameras)
-        refined, _, _ = descend(problem, true, body.freedom(), PASSES.fine + PASSES.last)
+        refined, _, _ = descend(problem, true, body.freedom(), FINE_PASSES + LAST_PASSES)
         neighbourhood = NeighbourhoodSearch(problem, search)
         neighbourhood.improve(refined, 0.0, everywhere=True)
         others = neighbourhood.others(refined, 2.0 * problem.J(refined) + 40.0, 0.1)

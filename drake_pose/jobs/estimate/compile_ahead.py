@@ -19,6 +19,7 @@ from drake_pose.fit.kernel import assemble_normal_equations, compare_contours
 from drake_pose.fit.surfaces import simplify_surfaces
 from drake_pose.search import MultiStartSearch, ViewsFit
 from drake_pose.search.multi_start import small_match
+from drake_pose.search.settings import MEDIUM_STAGES
 from drake_pose.silhouette.outline import TreeSurfaces, pack
 
 
@@ -47,7 +48,7 @@ def main() -> None:
     X_WN = tree.node_poses(tree.default_values())
     compare_contours(pack(surfaces), X_WN, *views, np.ones((1, 4)), 0, 1.0, False)
     fit, search = ViewsFit(TreeKinematics(tree), surfaces, [view]), MultiStartSearch(tree)
-    fit.refine(fit.kinematics.flatten(tree.default_values()), search.settings.medium)
+    fit.refine(fit.kinematics.flatten(tree.default_values()), MEDIUM_STAGES)
     search.match([view])
 
 

@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     from drake_pose.files.records import FrameRecord
     from drake_pose.files.writer import OnFrame, OnStage
 
-GONE = {"walk": "use the system Walker in a diagram, as tutorials/people.md shows"}
-"""What to use instead of commands and options that are gone."""
-
 SPREAD = Parameter("*")
 """Makes each field of a settings class an option of its own."""
 

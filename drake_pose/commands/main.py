@@ -9,6 +9,7 @@ import re
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import NoReturn
 
 from cyclopts import App, CycloptsError, Parameter
@@ -17,12 +18,13 @@ from rich.console import Console, ConsoleOptions
 from rich.text import Text
 
 from drake_pose.commands.batch import batch
-from drake_pose.commands.common import GONE, UsageError, say
+from drake_pose.commands.common import UsageError, say
 from drake_pose.commands.estimate import capture, demo, empty_room, estimate
 from drake_pose.commands.papers import date, kameda, reproduce_all, shimada
 from drake_pose.commands.prepare import check, masks, undistort
 from drake_pose.commands.register import audit, register
 from drake_pose.errors import DrakePoseError, SettingsError, options_in_messages
+from drake_pose.files.settings import say_gone
 from drake_pose.version import VERSION
 
 
@@ -124,12 +126,10 @@ def _run(words: Sequence[str] | None) -> None:
     try:
         command, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
     except (CycloptsError, SettingsError) as error:
-        given = sys.argv[1:] if words is None else words
-        options = [word.partition("=")[0] for word in given if word.startswith("--")]
-        for word in (*given[:1], *options):
-            if word in GONE:
-                _stop(f"{word} is gone: {GONE[word]}", 2)
-        _stop(str(error), 2)
+        given = " ".join(sys.argv[1:] if words is None else words).replace("=", " ").split()
+        heads = [one for k, one in enumerate(given) if k == 0 or one.startswith("--")]
+        pairs = [f"{one} {then}" for one, then in pairwise(given) if one in heads]
+        _stop(say_gone([*heads, *pairs]) or str(error), 2)
     except KeyboardInterrupt:
         # Parsing imports modules, which may compile kernels.
         _stop("interrupted before anything was written")

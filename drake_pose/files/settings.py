@@ -26,6 +26,18 @@ RootTurns = Literal["fixed", "free"] | Mapping[Axis, tuple[float, float]]
 Corner = tuple[float, float, float]
 """Position x, y, z [m]."""
 
+GONE = {
+    "walk": "use the system Walker in a diagram, as tutorials/people.md shows",
+}
+"""What to use instead of commands, options ("--name") and values ("--name value") that are gone.
+
+The keys of job files are those of the options."""
+
+
+def say_gone(names: Iterable[str]) -> str | None:
+    """Return what to use instead of the first of the names that is in GONE; None if none is."""
+    return next((f"{one} is gone: {GONE[one]}" for one in names if one in GONE), None)
+
 
 @dataclass(frozen=True)
 class FromText:

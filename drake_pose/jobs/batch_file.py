@@ -1,6 +1,6 @@
 """The job file of `drake-pose batch`: scenes to be estimated or audited, with their settings."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from types import UnionType
@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from drake_pose.errors import SettingsError
 from drake_pose.files.records import describe_job, file_digest
-from drake_pose.files.settings import EpisodeSettings, EstimateSettings, FromText
+from drake_pose.files.settings import EpisodeSettings, EstimateSettings, FromText, say_gone
 from drake_pose.input_files import named_fields, read_yaml
 from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.registration.settings import AuditSettings
@@ -77,7 +77,7 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
     of_audits = [one.name for one in fields(AuditSettings)]
     keys = tuple(dict.fromkeys((*own, *of_estimates, *of_audits, "episodes")))
     given = content.get("defaults") or {}
-    defaults = named_fields(given, keys, f"{path}: defaults", SettingsError)
+    defaults = _named_settings(given, keys, f"{path}: defaults")
     jobs = []
     for name, entry in scenes.items():
         where = f"{path}: scene '{str(name)[:60]}'"
@@ -86,7 +86,7 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
                 f"{where}: its name becomes a folder's: a text without slashes that does not "
                 "begin with a dot; put numbers in quotes"
             )
-        values = {**defaults, **named_fields(entry or {}, keys, where, SettingsError)}
+        values = {**defaults, **_named_settings(entry or {}, keys, where)}
         named = [(name, values)]
         if (numbers := values.pop("episodes", None)) is not None:
             first, _, last = str(numbers).partition(":")
@@ -99,6 +99,14 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
         for one, given in named:
             jobs.append(_scene_job(one, given, own, length, where, path.parent.absolute()))
     return tuple(jobs)
+
+
+def _named_settings(value: Any, known: Collection[str], where: str) -> dict[str, Any]:
+    """Return settings by name, as `named_fields`; the message names what replaces gone ones."""
+    keys = value if isinstance(value, dict) else ()
+    if gone := say_gone(f"--{key}".replace("_", "-") for key in keys):
+        raise SettingsError(f"{where}: {gone}")
+    return named_fields(value, known, where, SettingsError)
 
 
 def _scene_job(

@@ -21,7 +21,7 @@ import yaml
 
 from drake_pose.commands.batch import batch
 from drake_pose.errors import ClusterError, OutputError, SettingsError
-from drake_pose.files.settings import EstimateSettings
+from drake_pose.files.settings import GONE, EstimateSettings
 from drake_pose.jobs.batch import run_batch
 from drake_pose.jobs.batch_file import SceneJob, read_job
 from drake_pose.jobs.batch_tasks import Outcome, Task, perform, plan_scene
@@ -319,6 +319,15 @@ def test_job_file_is_checked(text, words, tmp_path):
     with pytest.raises(SettingsError, match=r"jobs\.yaml") as caught:
         read_job(path)
     assert words in str(caught.value)
+
+
+def test_keys_that_are_gone_name_what_to_use_instead(tmp_path, monkeypatch):
+    monkeypatch.setitem(GONE, "--old-key", "use the new one")
+    path = tmp_path / "jobs.yaml"
+    for text in ("scenes: {a: {scene: a, old_key: 1}}", "scenes: {a: {}}\ndefaults: {old_key: 1}"):
+        path.write_text(text)
+        with pytest.raises(SettingsError, match="--old-key is gone: use the new one"):
+            read_job(path)
 
 
 def finish(task: Task) -> Outcome:

@@ -117,7 +117,7 @@ def test_a_models_repr_is_one_line(model):
         ("(--joints FILE): --hold elbow=VALUE", "(joints=FILE): hold={'elbow': VALUE}"),
         ("in the zeros (--zeros all)?", "in the zeros (zeros='all')?"),
         ("leave --no-track out (--keep-out)", "leave track=False out (keep_out)"),
-        ("(drake-pose masks --box 1) or --out", "(drake-pose masks --box 1) or out"),
+        ("(drake-pose masks --largest) or --out", "(drake-pose masks --largest) or out"),
     ],
 )
 def test_messages_name_arguments_in_python_and_options_on_the_command_line(cli_text, python_text):

@@ -199,8 +199,8 @@ def load_camera_file(
     if lenses and not distorted:
         raise CameraError(
             f"{path}: camera '{next(iter(lenses))}' has distortion, but undistorted pictures and "
-            "masks are needed here: undistort the pictures, which also writes cameras without "
-            f"distortion (drake-pose undistort RECORDING --cameras {path} --out SCENE)"
+            "masks are needed here: straighten the pictures with cv2.undistort, and give the "
+            "camera matrix of the straight ones (tutorials/commands.md)"
         )
     return CameraFile(cameras, tuple(unplaced), links, lenses)
 

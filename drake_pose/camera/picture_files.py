@@ -192,7 +192,7 @@ def threshold_mask(picture: Picture, where: str, error_type: type[DrakePoseError
     if between > 0.1:
         raise error_type(
             f"{where}: {between:.0%} of it is neither dark nor light, so it is a picture and not a "
-            "mask: segment the object first (drake-pose masks --background, --box, --model)"
+            "mask: segment the object first (drake-pose masks --background, or a network)"
         )
     return np.asarray(grey >= 128, dtype=np.bool_)
 

@@ -21,7 +21,7 @@ from drake_pose.commands.batch import batch
 from drake_pose.commands.common import UsageError, say
 from drake_pose.commands.estimate import capture, demo, empty_room, estimate
 from drake_pose.commands.papers import date, kameda, reproduce_all, shimada
-from drake_pose.commands.prepare import check, masks, undistort
+from drake_pose.commands.prepare import check, masks
 from drake_pose.commands.register import audit, register
 from drake_pose.errors import DrakePoseError, SettingsError, options_in_messages
 from drake_pose.files.settings import say_gone
@@ -90,7 +90,7 @@ app = _program(
     equally well. No training and no GPU are needed. For a first result run drake-pose demo.
 
     Exit status: 0 success, 1 failure (the message names the cause), 2 wrong usage.""",
-    estimate, capture, register, audit, masks, batch, demo, check, undistort, empty_room,
+    estimate, capture, register, audit, masks, batch, demo, check, empty_room,
 )  # fmt: skip
 app.command(
     _program(
@@ -129,6 +129,7 @@ def _run(words: Sequence[str] | None) -> None:
         given = " ".join(sys.argv[1:] if words is None else words).replace("=", " ").split()
         heads = [one for k, one in enumerate(given) if k == 0 or one.startswith("--")]
         pairs = [f"{one} {then}" for one, then in pairwise(given) if one in heads]
+        pairs += [f"{given[0]} {one}" for one in heads[1:]]
         _stop(say_gone([*heads, *pairs]) or str(error), 2)
     except KeyboardInterrupt:
         # Parsing imports modules, which may compile kernels.

@@ -1,4 +1,4 @@
-"""The commands `drake-pose check`, `masks` and `undistort`."""
+"""The commands `drake-pose check` and `masks`."""
 
 from __future__ import annotations
 
@@ -75,25 +75,6 @@ def check(file: Path, /, *, package: Packages | None = None, json: Json = False)
     say("drake-pose: the model is fit for use")
 
 
-def undistort(
-    folder: Path, /, *, cameras: Path, out: Annotated[Path, Parameter(alias="-o")]
-) -> None:
-    """Remove lens distortion from pictures.
-
-        drake-pose undistort RECORDING --cameras calibration.toml --out SCENE
-
-    Args:
-        folder: Folder with images/<camera>/<frame>.png or .jpg.
-        cameras: Camera file with distortion, as ROS, Kalibr, OpenCV, anipose, Pose2Sim or Caliscope
-            write it, or cameras.yaml.
-        out: Folder for the undistorted pictures and their cameras.yaml.
-    """
-    from drake_pose.jobs.undistort import undistort_pictures
-
-    written = undistort_pictures(folder, cameras, out)
-    say(f"drake-pose: {len(written)} pictures written to {out}")
-
-
 def masks(
     source: Path,
     /,
@@ -106,17 +87,14 @@ def masks(
     """Make a scene of masks, from masks of other tools or from pictures.
 
     Masks of other tools are COCO files, black and white pictures, or black and white videos. In
-    pictures and videos the object is segmented by one of: a background picture of the empty room
-    (--background), a box (--box), or the object's model (--model and --start), whose pose and mask
-    are estimated alternately. --background median takes each pixel's median over the recording,
-    which works only if the body does not stay in one place; the command warns if it does.
+    pictures and videos the object is what differs from a picture of the empty room (--background).
+    --background median takes each pixel's median over the recording, which works only if the body
+    does not stay in one place; the command warns if it does.
 
     Files in SCENE: masks/; cameras.yaml; scene.yaml; overlay/ (the pictures with the masks'
     contours: look at them); summary.json (area and warnings of each mask, and why it was rejected).
 
-    Example, a photograph with the object in a box:
-
-        drake-pose masks photograph.jpg --out scene --box 120,80,300,260
+        drake-pose masks RECORDING --background median --out scene
 
     Args:
         source: Folder with images/<camera>/<frame>.png or .jpg, with videos/<camera>.mp4, or with

@@ -11,7 +11,6 @@ import math
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
@@ -27,9 +26,13 @@ Corner = tuple[float, float, float]
 """Position x, y, z [m]."""
 
 GONE = {
+    "masks --box": "take the masks of a segmentation network, or paint them",
+    "masks --model": "take the masks of a segmentation network, or paint them",
+    "undistort": "use cv2.undistort, as tutorials/commands.md shows",
     "walk": "use the system Walker in a diagram, as tutorials/people.md shows",
 }
-"""What to use instead of commands, options ("--name") and values ("--name value") that are gone.
+"""What to use instead of commands, their options ("--name", "command --name") and values ("--name
+value") that are gone.
 
 The keys of job files are those of the options."""
 
@@ -405,10 +408,10 @@ class EstimateSettings(CaptureSettings, EpisodeSettings):
 @readable
 @dataclass(frozen=True, kw_only=True)
 class MaskSettings:
-    """Settings for making masks; without a segmentation method the source holds masks.
+    """Settings for making masks; without a background the source holds masks.
 
     Raises:
-        SettingsError: two segmentation methods at once, or an option of another method.
+        SettingsError: classes of annotations are given with a background.
     """
 
     cameras: Path | None = None
@@ -422,41 +425,13 @@ class MaskSettings:
     """Picture of the empty room, or folder with <camera>.png or <camera>/<frame>.png; median: each
     pixel's median over the pictures, in which the body must move. Default: SOURCE/background, if it
     exists."""
-    box: Annotated[
-        tuple[float, ...] | None, from_text(partial(parse_numbers, count=4), "X,Y,W,H")
-    ] = None
-    """Box around the object in all pictures: left, top, width, height [pixel]."""
-    model: Annotated[Path | None, Parameter(alias="-m")] = None
-    """Model file of the object (URDF, SDFormat, MJCF or .dmd.yaml): its pose and mask are estimated
-    alternately."""
-    start: Path | None = None
-    """Rough joint positions in every frame [rad or m]: CSV file with the column frame, or time [s],
-    and one for each joint."""
-    start_error: Annotated[float, Parameter(metavar="DEG")] = 5.0
-    """Standard deviation of the errors of the angles in --start [deg]."""
-    hold: Positions = field(default_factory=dict)
-    """Hold this joint at a known position [deg or m]; repeat for several."""
-    packages: Packages = field(default_factory=dict)
     largest: bool = False
     """Keep only the largest connected region of each mask."""
 
     def __post_init__(self) -> None:
         take_single_names(self)
-        if self.box is not None and not (len(self.box) == 4 and all(map(math.isfinite, self.box))):
-            raise SettingsError(f"box must be 4 numbers, not {self.box}")
-        ways = [one for one in ("background", "box", "model") if getattr(self, one) is not None]
-        if len(ways) > 1:
-            text = f"--{ways[0]} and --{ways[1]} are two segmentation methods: give one"
-            raise SettingsError(for_caller(text))
-        if self.classes and ways:
-            text = f"--class needs a COCO file and excludes --{ways[0]}"
-            raise SettingsError(for_caller(text))
-        if (self.model is None) != (self.start is None):
-            text = "--model and --start (rough joint positions) need each other"
-            raise SettingsError(for_caller(text))
-        if not (math.isfinite(self.start_error) and self.start_error > 0.0):
-            text = "--start-error must be a positive number of degrees"
-            raise SettingsError(for_caller(text))
+        if self.classes and self.background is not None:
+            raise SettingsError(for_caller("--class needs a COCO file and excludes --background"))
 
     def as_json(self) -> Mapping[str, Any]:
         """Return the settings that are not at their defaults as plain JSON values."""

@@ -10,7 +10,7 @@ import numpy as np
 from drake_pose.arrays import Picture
 from drake_pose.camera.camera_files import CameraFile, load_camera_file
 from drake_pose.camera.episode import Episode
-from drake_pose.camera.episode_files import open_episode, picture_times, recording_format
+from drake_pose.camera.episode_files import open_episode, recording_format
 from drake_pose.camera.picture_files import (
     SUFFIXES,
     VIDEOS,
@@ -21,7 +21,7 @@ from drake_pose.camera.picture_files import (
 from drake_pose.errors import SceneError
 from drake_pose.jobs.estimate.measurements import frames_of
 from drake_pose.silhouette.mask_pictures import AnnotatedPicture, Annotations, read_coco
-from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, SCENE_FILE, common_rate
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, common_rate
 
 
 @dataclass(frozen=True)
@@ -56,18 +56,6 @@ class Source:
             return common_rate(self.videos)
         steps = np.diff(next(iter(self.episode.cameras.values())).times)
         return (1.0 / float(np.median(steps)) if len(steps) else None), self.episode.warnings
-
-    def times(self) -> dict[str, float]:
-        """Return the time [s] of each frame by name, that of its first camera; nan: unknown.
-
-        Raises SceneError: a file is unreadable.
-        """
-        scene, found = self.path / SCENE_FILE, dict[str, float]()
-        for name in (*self.pictures, *self.videos):
-            found = picture_times(self.pictures.get(name) or self.videos[name], scene) | found
-        for camera in self.episode.cameras.values() if self.episode else ():
-            found = dict(zip(frames_of(camera), camera.times.tolist(), strict=True)) | found
-        return found
 
     def read(self, camera: str) -> Iterator[tuple[str, str, Picture]]:
         """Yield each frame of a camera: name, origin for messages, and picture (H, W, 3) uint8 RGB.

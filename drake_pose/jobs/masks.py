@@ -1,11 +1,9 @@
-"""Masks for a scene: read from other tools, or segmented by background, box or model."""
+"""Masks for a scene: read from other tools, or segmented by a background."""
 
 import math
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,8 +12,6 @@ import numpy as np
 import yaml
 
 from drake_pose.arrays import Mask, Picture
-from drake_pose.body import load_model
-from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.picture_files import (
     SUFFIXES,
     find_pictures,
@@ -24,7 +20,6 @@ from drake_pose.camera.picture_files import (
     threshold_mask,
 )
 from drake_pose.errors import (
-    CameraError,
     DrakePoseError,
     MaskError,
     OutputError,
@@ -33,26 +28,21 @@ from drake_pose.errors import (
     UnknownNameError,
 )
 from drake_pose.files.folder import OVERLAY, write_file, write_summary, writes_folder
-from drake_pose.files.settings import EstimateSettings, MaskSettings
-from drake_pose.jobs.estimate.inputs import make_tree
+from drake_pose.files.settings import MaskSettings
 from drake_pose.jobs.mask_sources import Source, open_source
-from drake_pose.jobs.registration.positions import read_known_positions
-from drake_pose.search import PoseAndMask, PoseAndMaskSettings
 from drake_pose.silhouette.pictures.masks import encode_mask, intersection_over_union
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
-from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, SCENE_FILE, in_order
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, SCENE_FILE
 from drake_pose.silhouette.segmentation import (
     Background,
     background_of_recording,
     background_support,
-    grab_cut_box,
     learn_background,
     person_region,
 )
 
 MIN_AGREEMENT = 0.85
-"""Minimum IoU of a mask and an independent segmentation of its picture, below which it is
-doubtful."""
+"""Minimum IoU of masks by two thresholds, below which they are doubtful."""
 _PARTIAL = "masks.part"
 
 Find = Callable[[str, Picture], tuple[Mask, float, tuple[str, ...]]]
@@ -60,16 +50,15 @@ Find = Callable[[str, Picture], tuple[Mask, float, tuple[str, ...]]]
 
 
 class FoundMask(NamedTuple):
-    """The mask of one picture, or why it was rejected."""
+    """The mask of one picture."""
 
     camera: str  # The camera's name.
     frame: str  # The frame's name.
     where: str  # Origin of the picture, for messages.
     mask: Mask  # (H, W) bool.
     picture: Picture | None = None  # (H, W, 3) RGB; None if only the mask is given.
-    refusal: str = ""  # Why the mask is rejected; "" if it is accepted.
     warnings: tuple[str, ...] = ()  # Messages for the user.
-    # Lowest IoU with masks of slightly different settings, or with the colours; nan if not known.
+    # Lowest IoU with masks by other thresholds; nan if not known.
     agreement: float = math.nan
 
 
@@ -130,7 +119,7 @@ def make_masks(
     try:
         for done, found in enumerate(find_masks(opened, settings), 1):
             mask = largest_patch(found.mask) if settings.largest else found.mask
-            refusal = found.refusal or refuse_mask(mask)
+            refusal = refuse_mask(mask)
             warnings = [*found.warnings, *([] if refusal else doubt_mask(mask))]
             entry: dict[str, Any] = {"refusal": refusal} if refusal else {"area": int(mask.sum())}
             entry |= {"warnings": warnings} if warnings else {}
@@ -152,8 +141,7 @@ def make_masks(
             raise MaskError(first + (f" (and {len(more)} more)" if more else ""))
         warnings = [*(f"{text}; no mask is written" for text in refused), *doubts]
         warnings += opened.rate()[1]
-        if settings.model is None:
-            warnings += [text for name, own in cameras.items() for text in _doubt_camera(name, own)]
+        warnings += [text for name, own in cameras.items() for text in _doubt_camera(name, own)]
         if opened.cameras is None and set(cameras) != {""}:
             warnings.append(
                 f"{folder}: there is no {CAMERA_FILE} for the cameras {', '.join(cameras)}, which "
@@ -182,8 +170,8 @@ def _doubt_camera(name: str, frames: Mapping[str, Mapping[str, Any]]) -> Iterato
         usual = float(np.median([known[frame] for frame in bad]))
         yield (
             f"camera '{name or 'camera'}', frame {frame_ranges(bad, list(frames))} ({len(bad)} of "
-            f"{len(frames)}): the masks are doubtful: a slightly different box or threshold gives "
-            f"other masks (IoU {usual:.0%}); check the overlays"
+            f"{len(frames)}): the masks are doubtful: a slightly different threshold gives other "
+            f"masks (IoU {usual:.0%}); check the overlays"
         )
 
 
@@ -266,31 +254,23 @@ def find_masks(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
     Raises DrakePoseError: the message names the file, camera or frame at fault.
     """
     background = settings.background
-    way = replace(settings, largest=False, cameras=None, episode=None)
-    if way == MaskSettings():
+    if background is None and not settings.classes:
         # Without a segmentation method, a folder of background pictures implies one.
         room = source.path / "background"
         background = room if room.is_dir() else None
-    if background is None and settings.box is None and settings.model is None:
+    if background is None:
         yield from _read_given(source, settings)
         return
     if source.annotated:
         raise SceneError(f"{source.path}: has annotations; segmentation needs pictures")
-    if background is None and settings.box is None:
-        yield from _find_by_model(source, settings)
-        return
-    find: Find = (
-        _by_empty_room(source, background)
-        if background is not None
-        else partial(_by_box, settings.box or ())
-    )
+    find = _by_empty_room(source, background)
     for camera in source.names:
         for frame, where, picture in source.read(camera):
             try:
                 mask, agreement, warnings = find(camera, picture)
             except (SceneError, SettingsError) as error:
                 raise type(error)(f"{where}: {error}") from error
-            yield FoundMask(camera, frame, where, mask, picture, "", warnings, agreement)
+            yield FoundMask(camera, frame, where, mask, picture, warnings, agreement)
 
 
 def _read_given(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
@@ -324,41 +304,6 @@ def _read_given(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
     for camera in (name for name in source.names if name not in source.pictures):
         for frame, where, picture in source.read(camera):
             yield FoundMask(camera, frame, where, threshold_mask(picture, where, MaskError))
-
-
-def _by_box(
-    box: Sequence[float],
-    _: str,
-    picture: Picture,
-    usual: tuple[float, float] = (0.03, 0.95),
-    margins: Sequence[float] = (-0.05, 0.05),
-) -> tuple[Mask, float, tuple[str, ...]]:
-    """Segment a picture by GrabCut in a box.
-
-    Args:
-        box: left, top, width and height [pixel].
-        _: the camera's name; not used.
-        picture: (H, W, 3) uint8 RGB.
-        usual: minimum and maximum fraction of its box that an object fills.
-        margins: enlargements of the box for comparison, as fractions of its sides.
-
-    Returns mask, agreement and warnings, as in FoundMask.
-    """
-    mask, (x, y, w, h) = grab_cut_box(picture, box), box
-    part = mask.sum() / (w * h)
-    again = []
-    for margin in margins:
-        # A larger box may leave no background around it.
-        with suppress(SettingsError):
-            other = (x - margin * w, y - margin * h, w + 2.0 * margin * w, h + 2.0 * margin * h)
-            again.append(grab_cut_box(picture, other))
-    is_good = part == 0.0 or usual[0] <= part <= usual[1]
-    warnings = (
-        ()
-        if is_good
-        else (f"the mask fills {part:.1%} of its box; change the box or use another method",)
-    )
-    return mask, _least_overlap(mask, again), warnings
 
 
 def _least_overlap(mask: Mask, others: Iterable[Mask]) -> float:
@@ -495,86 +440,3 @@ def _doubt_median(
             "masks; give pictures of the empty room",
         )
     return texts
-
-
-def _find_by_model(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
-    """Yield the masks of the body ``settings.model``, from the initial poses ``settings.start``."""
-    file = source.cameras
-    if file is None:
-        raise CameraError(
-            f"{source.path}: segmentation by a model needs cameras; add {CAMERA_FILE}, or give "
-            "--cameras"
-        )
-    for name in source.names:
-        where = f"{source.camera_file}: camera '{name}'"
-        if name in file.links:
-            raise CameraError(
-                f"{where} is mounted on a link, but segmentation by a model needs static cameras"
-            )
-        if name in file.unplaced:
-            raise CameraError(f"{where} needs its pose X_WC")
-    assert settings.model is not None
-    assert settings.start is not None
-    cameras = [file.cameras[name] for name in source.names]
-    body = load_model(settings.model, package_paths=settings.packages)
-    kinematics = TreeKinematics(make_tree(body, EstimateSettings(hold=settings.hold)))
-    table = read_known_positions(settings.start, kinematics, times=source.times)
-    recorded = {
-        name: {frame: (where, picture) for frame, where, picture in source.read(name)}
-        for name in source.names
-    }
-    frames = in_order(frame for own in recorded.values() for frame in own)
-    starts = [
-        table.of(one, next(name for name in recorded if one in recorded[name])) for one in frames
-    ]
-    pictures = [
-        [own[one][1] if one in own else None for own in recorded.values()] for one in frames
-    ]
-    how = PoseAndMaskSettings(angle=math.radians(settings.start_error))
-    poses = PoseAndMask(kinematics, cameras, how).run(pictures, starts)
-    found, warned = dict(zip(frames, poses, strict=True)), table.warnings
-    for c, (name, own) in enumerate(recorded.items()):
-        for frame, pose in found.items():
-            mask, agreement = pose.masks[c], pose.agreements[c]
-            if mask is None:
-                continue
-            refusal, warnings = _check_pose(agreement, kinematics.names, pose.deviations)
-            where, picture = own[frame]
-            every_warning = (*warned, *warnings)
-            yield FoundMask(name, frame, where, mask, picture, refusal, every_warning, agreement)
-            warned = ()
-
-
-def _check_pose(
-    agreement: float,
-    names: Sequence[str],
-    deviations: np.ndarray,
-    doubtful: float = 0.9,
-    max_deviations: float = 3.0,
-) -> tuple[str, tuple[str, ...]]:
-    """Return why a model's mask is rejected ("" from MIN_AGREEMENT on), and warnings if it is not.
-
-    Args:
-        agreement: IoU of the model's silhouette and the segmentation by colour.
-        names: (m,) names of the values.
-        deviations: (m,) deviations of the values from their starts [standard deviations].
-        doubtful: agreement below which there is a warning.
-        max_deviations: deviation above which there is a warning [standard deviations].
-    """
-    if agreement < MIN_AGREEMENT:
-        return (
-            "pose and colours do not agree: the IoU of the model's silhouette and the segmentation "
-            f"by colour is {agreement:.0%}; check the start, the model, and whether the object is "
-            "occluded",
-            (),
-        )
-    warnings, off = [], np.abs(deviations)
-    if agreement < doubtful:
-        warnings.append(f"pose and colours hardly agree (IoU {agreement:.0%}); check the overlay")
-    worst = int(np.argmax(off))
-    if off[worst] > max_deviations:
-        warnings.append(
-            f"joint {names[worst]} is {off[worst]:.1f} standard deviations (--start-error) from "
-            "its start; check the overlay"
-        )
-    return "", tuple(warnings)

@@ -22,7 +22,6 @@ from drake_pose.search.estimates import (
 )
 from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.multi_start import MultiStartSearch
-from drake_pose.search.pose_and_mask import FoundPose, PoseAndMask, PoseAndMaskSettings
 from drake_pose.search.pose_modes import (
     ExaminationSettings,
     GridPoseSet,

@@ -142,7 +142,7 @@ def test_images_are_undistorted_by_the_lens_model(tmp_path):
     assert np.abs(found - recorded[:, :, 0]).max() > 8
     assert np.abs(found - shade(rays))[2:-2, 2:-2].max() < 3
     # Masks must be of undistorted images.
-    with pytest.raises(CameraError, match=r"camera 'a' has distortion.*drake-pose undistort"):
+    with pytest.raises(CameraError, match=r"camera 'a' has distortion.*cv2.undistort"):
         load_camera_file(file)
     for text, message in (
         (f"{LENS}, distortion: [1, 2, 3]", "camera 'a': distortion must be a list of OpenCV's"),

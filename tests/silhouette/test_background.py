@@ -1,4 +1,4 @@
-"""Segmentation by background models, boxes and outlines, on synthetic pictures."""
+"""Segmentation by background models and outlines, on synthetic pictures."""
 
 import cv2
 import numpy as np
@@ -14,9 +14,6 @@ from drake_pose.silhouette.segmentation import (
     background_of_recording,
     background_support,
     find_regions,
-    foreground_log_ratios,
-    grab_cut,
-    grab_cut_box,
     learn_background,
     person_region,
 )
@@ -115,104 +112,6 @@ def test_moving_object_is_not_in_the_median_background():
         background_of_recording(pictures[:2])
 
 
-def test_log_ratios_hold_across_exposures():
-    """A square moves in a room; half of the pictures are redder and darker."""
-    room = texture(np.random.default_rng(2))
-    pictures, masks = passing(room, 255.0 - room, 8)
-    for k in (1, 3, 5, 7):
-        pictures[k] = (pictures[k] * np.array([0.9, 0.7, 0.6])).astype(np.uint8)
-    probabilities = [
-        cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 5.0).clip(0.01, 0.99) for mask in masks
-    ]
-    differs = np.abs(255.0 - 2.0 * room).max(axis=2) > 60.0
-    every = foreground_log_ratios(pictures, probabilities, range(8))
-    for ratio, mask in zip(every, masks, strict=True):
-        assert (ratio[~mask] < 0.0).mean() > 0.97
-        assert (ratio[mask & differs] > 0.0).mean() > 0.97
-    # A subset of pictures gives the same ratios where their body is likely.
-    some = foreground_log_ratios(pictures, probabilities, [5, 2])
-    for ratio, k in zip(some, (5, 2), strict=True):
-        near = probabilities[k] > 0.02
-        np.testing.assert_array_equal(ratio[near], every[k][near])
-    alone = foreground_log_ratios(pictures[:1], probabilities[:1], [0])
-    assert not alone[0].any()
-
-
-def test_log_ratios_match_their_definition():
-    """Pixel by pixel, with medians of the pictures that show the background."""
-    rng, count, size = np.random.default_rng(6), 5, (6, 7)
-    colours = rng.uniform(40.0, 200.0, (*size, 3))
-    gain = np.array([[1.0, 1.0, 1.0], [0.8, 0.9, 1.1], [1.2, 1.0, 0.9], [1.0, 0.8, 1.0], [1, 1, 1]])
-    pictures = [
-        (colours * one + rng.normal(0.0, 5.0, colours.shape)).clip(0, 255).astype(np.uint8)
-        for one in gain
-    ]
-    probabilities = [rng.choice([0.0, 0.02, 0.2, 0.9], size).astype(np.float32) for _ in gain]
-    for one in probabilities:
-        one[:2] = 0.0
-    wanted = [1, 3]
-    found = foreground_log_ratios(pictures, probabilities, wanted, break_even=2.0, bounds=(-2.5, 7))
-    always = np.max(probabilities, axis=0) < 0.05
-    floats = np.array(pictures, float)
-    usual = np.median(floats[:, always], axis=0)
-    gains = np.median((floats[:, always] + 1.0) / (usual + 1.0), axis=1)
-    even = np.minimum(floats / gains[:, None, None], 255.0)
-    for k, ratio in zip(wanted, found, strict=True):
-        for v, u in np.ndindex(*size):
-            if max(probabilities[j][v, u] for j in wanted) < 0.011:
-                assert ratio[v, u] == -2.5
-                continue
-            shown = [j for j in range(count) if probabilities[j][v, u] < 0.1]
-            if len(shown) < 2:
-                assert ratio[v, u] == 0.0
-                continue
-            middle = np.median(even[shown, v, u], axis=0)
-            spread = 1.4826 * np.median(np.abs(even[shown, v, u] - middle), axis=0).mean()
-            sd = 9.0 if len(shown) == 2 else max(4.0, spread)
-            squares = ((even[k, v, u] - middle) ** 2).mean() / sd**2
-            assert ratio[v, u] == pytest.approx(
-                np.clip(0.5 * (squares - 4.0), -2.5, 7), rel=1e-4, abs=1e-4
-            )
-    # Of more pictures than allowed every n-th gives the background.
-    repeated = [k for k in range(count) for _ in range(3)]
-    some, all_of_them = (
-        foreground_log_ratios(
-            [pictures[k] for k in repeated],
-            [probabilities[k] for k in repeated],
-            [3],
-            max_count=most,
-        )[0]
-        for most in (5, 15)
-    )
-    np.testing.assert_allclose(
-        some[3:], found_once(pictures, probabilities)[3:], rtol=1e-4, atol=1e-4
-    )
-    assert np.abs(some - all_of_them).max() > 0.01
-
-
-def found_once(pictures, probabilities):
-    return foreground_log_ratios(pictures, probabilities, [1])[0]
-
-
-def test_strided_grab_cut_learns_colours_from_few_pixels():
-    rng, true = np.random.default_rng(4), np.zeros((90, 120), bool)
-    true[30:60, 40:90] = True
-    colours = np.where(true[:, :, None], (60, 80, 190), (200, 180, 70))
-    picture = (colours + 12.0 * rng.standard_normal(colours.shape)).clip(0, 255).astype(np.uint8)
-    labels = np.full(true.shape, cv2.GC_BGD, np.uint8)
-    labels[20:70, 30:100] = cv2.GC_PR_FGD
-    labels[40:45, 50:60] = cv2.GC_FGD
-    given = labels.copy()
-    for stride in (1, 3):
-        found = grab_cut(picture, labels, stride=stride)
-        assert intersection_over_union(found, true) > 0.99
-        np.testing.assert_array_equal(labels, given)
-        assert not found[:20].any()
-    # Nothing is uncertain: the labels are the answer.
-    labels[labels == cv2.GC_PR_FGD] = cv2.GC_BGD
-    np.testing.assert_array_equal(grab_cut(picture, labels), labels == cv2.GC_FGD)
-
-
 def test_components_are_filled_and_neither_tiny_nor_huge():
     """At most the area is limited after filling, at least before."""
     above = np.zeros((100, 100), bool)
@@ -264,20 +163,6 @@ def test_regions_of_large_pictures_have_sharp_edges(width):
     best = max(find_regions(picture, 6), key=lambda one: intersection_over_union(one, disc))
     assert intersection_over_union(best, disc) > 0.98
     assert len(find_regions(picture, 2)) == 2
-
-
-def test_box_around_an_object_segments_it():
-    rng, true = np.random.default_rng(3), np.zeros((120, 160), bool)
-    true[30:90, 40:110] = True
-    true[50:60, 60:80] = False
-    colours = np.where(true[:, :, None], (60, 80, 190), (200, 180, 70))
-    picture = (colours + 12.0 * rng.standard_normal(colours.shape)).clip(0, 255).astype(np.uint8)
-    assert intersection_over_union(grab_cut_box(picture, (30, 20, 95, 85)), true) > 0.97
-    for box in ((300, 20, 95, 85), (30, 20, 95, 1), (30, 20, 1, 85)):
-        with pytest.raises(SettingsError, match="outside the picture, 160 x 120 pixels"):
-            grab_cut_box(picture, box)
-    with pytest.raises(SettingsError, match="whole picture"):
-        grab_cut_box(picture, (0, 0, 160, 120))
 
 
 def drawn(at_border, width):

@@ -3,7 +3,7 @@
 import math
 import os
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -29,16 +29,14 @@ from drake_pose.camera.picture_files import frame_key
 from drake_pose.camera.servo_readings import Column
 from drake_pose.errors import SceneError, SettingsError
 from drake_pose.files.records import base_pose
-from drake_pose.files.settings import EpisodeSettings, EstimateSettings
+from drake_pose.files.settings import EstimateSettings
 from drake_pose.fit.parameters import carried_joints
 from drake_pose.jobs.estimate.inputs import make_tree, missing_for_person
 from drake_pose.jobs.estimate.measurements import (
     MeasuredPositions,
     check_units,
     followers_of,
-    has_times,
     read_measured_positions,
-    timed_positions,
 )
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.jobs.registration.settings import RegistrationSettings
@@ -116,7 +114,6 @@ def read_known_positions(
     kinematics: TreeKinematics,
     unobserved: bool = False,
     table: MeasuredPositions | None = None,
-    times: Callable[[], Mapping[str, float]] | None = None,
 ) -> KnownPositions:
     """Return the positions in a table with columns for the frame and each joint that is not held.
 
@@ -125,16 +122,11 @@ def read_known_positions(
         kinematics: of the pose tree; its held values are added.
         unobserved: whether columns of joints that move no visible part are allowed.
         table: the table's contents; None: it is read.
-        times: returns the time [s] of each frame, by name, for a table with a column `time`; the
-            columns of its joints may have other names and units. None: such a table is refused.
 
     Raises SceneError: the table cannot be read, lacks a joint, has an unusable column, or is not in
     radians and metres; UnknownNameError: the model has no joint of a column's name.
     """
     model = kinematics.tree.model
-    warnings: tuple[str, ...] = ()
-    if table is None and times is not None and has_times(path):
-        table, _, warnings = timed_positions(path, times(), kinematics.tree, EpisodeSettings())
     table = table or read_measured_positions(path, model.position_names)
     held = {model.position_names[index] for index in kinematics.tree.held}
     needed = [name for name in kinematics.names if name not in held]
@@ -167,7 +159,7 @@ def read_known_positions(
     is_held = np.array(columns) < 0
     rows = table.values.items()
     values = {k: np.where(is_held, kinematics.lower, row[columns]) for k, row in rows}
-    warnings += check_units(path, model, kinematics.names, values)
+    warnings = check_units(path, model, kinematics.names, values)
     columns_of = {name: Column(name) for name in needed}
     rows_of_table = np.array([*table.values.values()]).reshape(-1, len(table.names))
     log = JointLog(table.names, None, rows_of_table)

@@ -1,20 +1,31 @@
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from drake_pose.body import load_model
+from drake_pose.camera.camera_files import load_cameras
 from drake_pose.errors import SceneError, UnknownNameError
 from drake_pose.files.records import BASE_COLUMNS, FIT_COLUMNS
+from drake_pose.files.settings import EpisodeSettings, EstimateSettings
 from drake_pose.input_files import read_csv
+from drake_pose.jobs.estimate.inputs import make_tree
 from drake_pose.jobs.estimate.measurements import (
     check_units,
+    frame_times,
     has_times,
     is_episode,
     left_out_warnings,
     read_joint_centres,
     read_measured_positions,
+    timed_positions,
 )
+from drake_pose.silhouette.pictures.scenes import find_images, load_scene
+from tests.camera.recordings import write_video
+from tests.jobs.masks.rooms import moving, write_pictures
+from tests.jobs.scenes import NAMES
 
 CENTRES = "frame,joint,x,y,z\n0,ankle,1,2,3\n0,knee,4,5,6\n7,ankle,-1,-2,-3\n"
 
@@ -184,3 +195,33 @@ def test_a_folder_is_an_episode_unless_it_has_masks(tmp_path: Path, monkeypatch)
     told = left_out_warnings(["a", "b"], {"a"})
     assert len(told) == 1
     assert "camera 'b' has no X_WC" in told[0]
+
+
+def test_a_table_with_times_is_read_at_the_times_of_the_pictures(tmp_path: Path) -> None:
+    """In degrees and by similar names; times by rate, by time stamps and of a video."""
+    filmed, film, start = write_pictures(tmp_path / "a", moving(8)), tmp_path / "b", tmp_path / "c"
+    rows = [f"{0.05 * k},{k},{-2 * k}" for k in range(40)]
+    written(start, "\n".join([f"time,{NAMES[0]}_joint,{NAMES[1].upper()}", *rows]))
+    written(filmed.folder / "scene.yaml", "sequence: true\nframe_rate_hz: 10\n")
+    write_video(film / "videos/front.mp4", range(8), 0.2 + 0.1 * np.arange(8))
+    written(film / "scene.yaml", "sequence: true")
+    cameras = load_cameras(filmed.folder / "cameras.yaml")
+    tree = make_tree(load_model(filmed.model), EstimateSettings())
+    for path, late in ((filmed.folder, 0.0), (filmed.folder, 0.2), (film, 0.2)):
+        if path is filmed.folder and late:
+            stamped = [f"{k:04d},{late + 0.1 * k}" for k in range(8)]
+            table = path / "images" / "front" / "timestamps.csv"
+            written(table, "\n".join(["frame,time", *stamped]))
+        times = frame_times(replace(load_scene(path, cameras), images=find_images(path, ["front"])))
+        np.testing.assert_allclose([*times.values()], late + 0.1 * np.arange(8), atol=1e-6)
+        found, _, warnings = timed_positions(start, times, tree, EpisodeSettings())
+        expected = np.radians(20.0 * (late + 0.1 * np.arange(8))[:, None] * [1.0, -2.0])
+        np.testing.assert_allclose([found.values[k] for k in range(8)], expected, atol=1e-6)
+        assert any("assumed to be in deg" in text for text in warnings)
+    with pytest.raises(SceneError, match="has times, but those of the pictures are not known"):
+        timed_positions(start, {"0": np.nan}, tree, EpisodeSettings())
+    frames = [f"{k},{9 - k},{0.1 * k},0" for k in range(8)]
+    written(start, "\n".join([f"frame,time,{NAMES[0]},{NAMES[1]}", *frames[::-1]]))
+    times = {f"{k:04d}": 0.0 for k in range(8)}
+    found, _, _ = timed_positions(start, times, tree, EpisodeSettings())
+    np.testing.assert_allclose([found.values[k][0] for k in range(8)], 0.1 * np.arange(8))

@@ -1,4 +1,4 @@
-"""Scenes of masks, read from other tools or segmented by background or box."""
+"""Scenes of masks, read from other tools or segmented by a background."""
 
 import filecmp
 import json
@@ -16,7 +16,6 @@ from drake_pose.errors import (
     MaskError,
     OutputError,
     SceneError,
-    SettingsError,
 )
 from drake_pose.jobs.masks import doubt_mask, largest_patch, refuse_mask
 from tests.camera.recordings import numbered, write_video
@@ -104,44 +103,6 @@ def test_changed_light_and_pictures_of_another_size_are_named(pictures, tmp_path
     with pytest.raises(SceneError, match=r"0000\.png"):
         make_masks(pictures, tmp_path / "again")
     assert not any((tmp_path / "again").glob("**/*.png"))
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"background": "median", "box": (1, 2, 3, 4)}, "two segmentation methods"),
-        ({"background": "median", "classes": ("1",)}, "classes needs a COCO file"),
-        ({"box": (1, 2, 3)}, "4 numbers"),
-    ],
-)
-def test_two_segmentation_methods_are_refused(settings, words):
-    with pytest.raises(SettingsError, match=words):
-        MaskSettings(**settings)
-
-
-@pytest.fixture
-def still(tmp_path):
-    """A picture of a blue box with a hole on a yellow table, and its true mask."""
-    rng = np.random.default_rng(3)
-    true = np.zeros((120, 160), bool)
-    true[30:90, 40:110] = True
-    true[50:60, 60:80] = False
-    colours = np.where(true[:, :, None], (60, 80, 190), (200, 180, 70))
-    picture = (colours + 12.0 * rng.standard_normal(colours.shape)).clip(0, 255).astype(np.uint8)
-    path = tmp_path / "still.png"
-    cv2.imwrite(str(path), picture[:, :, ::-1])
-    return path, true
-
-
-def test_box_segments_a_still(still, tmp_path, out):
-    path, true = still
-
-    words = ["masks", path, "-o", out, "--box"]
-    run_to_end(*words, "30,20,95,85")
-    assert iou(load_scene(out).read("camera", "still"), true) > 0.97
-    words[3] = tmp_path / "none"
-    assert "still.png: the box" in run_to_end(*words, "300,20,95,85", status=1).stderr
-    run_to_end(*words, "1,2,3", status=2)
 
 
 def test_empty_and_full_masks_are_rejected_and_two_objects_warned_of():
@@ -288,8 +249,8 @@ def test_masks_in_a_video_become_a_sequence(tmp_path, out, two_views):
 def test_an_episode_of_a_data_set_is_a_source(tmp_path, out):
     write_v21(tmp_path)
     with pytest.raises(SceneError, match="choose an episode"):
-        make_masks(tmp_path, out, MaskSettings(box=(8, 8, 40, 40)))
-    result = make_masks(tmp_path, out, MaskSettings(box=(8, 8, 40, 40), episode=1))
+        make_masks(tmp_path, out, MaskSettings(background="median"))
+    result = make_masks(tmp_path, out, MaskSettings(background="median", episode=1))
     frames = [f"{k:06d}" for k in range(LENGTHS[1])]
     assert {name: [*own] for name, own in result.summary["cameras"].items()} == {
         "top": frames,
@@ -303,7 +264,10 @@ def test_a_camera_without_pictures_uses_its_video(tmp_path, out):
         (tmp_path / "images" / "a").mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(tmp_path / "images" / "a" / f"{k}.png"), numbered(k))
         write_video(tmp_path / "videos" / f"{name}.mp4", range(3))
-    result = make_masks(tmp_path, out, MaskSettings(box=(8, 8, 40, 40)))
+    room = numbered(0)
+    room[:20, :20] = 90
+    cv2.imwrite(str(tmp_path / "room.png"), room)
+    result = make_masks(tmp_path, out, MaskSettings(background=tmp_path / "room.png"))
     counts = {name: len(own) for name, own in result.summary["cameras"].items()}
     assert counts == {"a": 2, "b": 3}
 

@@ -223,14 +223,13 @@ def capture(
 
     No measurement of the person is needed: link lengths and radius scales are fitted to the first
     frames. The command is estimate with the bundled person as the model; frames are a sequence
-    unless scene.yaml has sequence: false. Pictures or videos need a mask of the first frame only,
-    in two or more cameras, and none with --start. If the folder has sources.yaml beside
-    cameras.yaml, frames are captured as they arrive, from live cameras in real time, until Ctrl-C.
+    unless scene.yaml has sequence: false. If the folder has sources.yaml beside cameras.yaml,
+    frames are captured as they arrive, from live cameras in real time, until Ctrl-C.
 
         drake-pose capture STUDIO --out results/person --seconds 60
 
     Args:
-        scene: Folder with cameras.yaml and masks, pictures or videos; or with a sources.yaml.
+        scene: Folder with cameras.yaml and masks, or with a sources.yaml.
         model: Model of a person with landmarks.yaml beside it. Default: the bundled person.
         method: person: fit the person to all silhouettes at once; paper: detect skin in colour
             pictures and search for elbows and knees, as published by Date et al.
@@ -242,15 +241,15 @@ def capture(
     of_person = bool(live.shape or not live.fit_shape)
     if method != "person" and (of_masks or of_person):
         raise UsageError(
-            "--camera, --frame, --every, --truth, --start, --no-track, --resume, --shape "
+            "--camera, --frame, --every, --truth, --no-track, --resume, --shape "
             "and --no-fit-shape need --method person"
         )
     if method == "person" and live.faces is not None:
         raise UsageError("--face-camera and --faces need --method paper")
     if has_sources and of_masks:
         raise UsageError(
-            "--camera, --frame, --every, --truth, --start, --no-track and --resume need a folder "
-            f"of masks or pictures, but {scene} has a sources.yaml"
+            "--camera, --frame, --every, --truth, --no-track and --resume need a folder "
+            f"of masks, but {scene} has a sources.yaml"
         )
     if method == "person" and not has_sources and live != LiveSettings():
         raise UsageError(f"{scene} has no sources.yaml, which options of live capture need")

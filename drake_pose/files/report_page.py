@@ -125,13 +125,10 @@ def _describe_method(scene: Scene, estimate: SceneEstimate) -> str:
     Tracking is by colour if the scene has pictures (``scene.images``).
     """
     method, states = str(estimate.summary["method"]), estimate.records.values()
-    if method == "person" and scene.images:
-        method = "person_by_colour"
     text = {
         "beam": "searched by beam search and contour fits",
         "paper": "searched as published by Kameda et al.",
         "person": "one person, fitted to all silhouettes at once",
-        "person_by_colour": "one person, tracked by colour",
         "paper_capture": "one person, tracked by skin colour as published by Date et al.",
     }[method]
     tracked = sum(record.found and record.stopped_by == "tracked" for record in states)

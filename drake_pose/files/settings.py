@@ -30,6 +30,7 @@ GONE = {
     "masks --model": "take the masks of a segmentation network, or paint them",
     "undistort": "use cv2.undistort, as tutorials/commands.md shows",
     "walk": "use the system Walker in a diagram, as tutorials/people.md shows",
+    "capture --start": "a person is captured from masks of every frame",
 }
 """What to use instead of commands, their options ("--name", "command --name") and values ("--name
 value") that are gone.
@@ -307,9 +308,6 @@ class CaptureSettings(SceneSettings):
     track: Annotated[bool, Parameter(negative="--no-track")] = True
     """Track the body through a sequence, and search only in the first frame and after a loss;
     --no-track: search in every frame."""
-    start: Path | None = None
-    """Joint positions in the first frame of a sequence [rad or m]: CSV file with the column frame,
-    or time [s], and one for each joint. Rows of other frames are used after a loss."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -350,6 +348,9 @@ class EstimateSettings(CaptureSettings, EpisodeSettings):
         SettingsError: the method does not exist or lacks an option, or a number is out of range.
     """
 
+    start: Path | None = None
+    """Joint positions in the first frame of a sequence [rad or m]: CSV file with the column frame,
+    or time [s], and one for each joint. Rows of other frames are used after a loss."""
     hold: Positions = field(default_factory=dict)
     """Hold this joint at a known position [deg or m]; repeat for several."""
     unseen: Annotated[tuple[str, ...], Parameter(metavar="LINK")] = ()

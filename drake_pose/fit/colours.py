@@ -16,15 +16,14 @@ This module keeps no state: a tracker stores the histograms and passes them in.
 """
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.arrays import Array, Floats, Mask, Picture
+from drake_pose.arrays import Array, Floats, Picture
 from drake_pose.camera.models import Camera
 from drake_pose.compiled import compiled, default_arguments
 from drake_pose.errors import SettingsError
@@ -39,8 +38,7 @@ from drake_pose.fit.kernel import (
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import Placement
 from drake_pose.silhouette.contour_points import sample_contour
-from drake_pose.silhouette.outline import Outline, PackedOutlines
-from drake_pose.silhouette.scoring import draw_labels
+from drake_pose.silhouette.outline import PackedOutlines
 
 COLOURS = 4096
 """Number of bins of a colour histogram: 16 levels each of red, green and blue."""
@@ -103,78 +101,6 @@ def colour_numbers(pixels: Picture) -> NDArray[np.intp]:
     numbers |= green
     numbers |= blue >> 4
     return numbers.astype(np.intp)
-
-
-@dataclass(frozen=True, eq=False)
-class PartColours:
-    """Characteristic colours of a body's parts, learnt from any cameras at a known pose."""
-
-    is_own: Mask  # (nodes, COLOURS) whether a colour is characteristic of a part.
-    # (nodes,) fraction of the part's pixels with these colours at that pose; nan: the part was
-    # occluded.
-    usual_fractions: Array
-
-    @staticmethod
-    def learn(
-        histograms: Iterable[Floats],
-        outlines: Sequence[Outline],
-        X_WN: Array,
-        views: Iterable[tuple[Camera, Picture]],
-    ) -> "PartColours":
-        """Learn the colours of parts.
-
-        ``histograms``: (nodes, 3, COLOURS) of each camera, rows by ``Colour``. ``X_WN``: (nodes, 4,
-        4) known poses. ``views``: cameras, and an image (H, W, 3) of each.
-        """
-        # A characteristic colour covers at least this fraction of the part's pixels.
-        is_own = np.any([one[:, Colour.ON] > 4e-4 for one in histograms], axis=0)
-        own = PartColours(is_own, np.ones(len(is_own)))
-        return PartColours(is_own, own._fractions(outlines, X_WN, views))
-
-    def relative_fractions(
-        self, outlines: Sequence[Outline], X_WN: Array, views: Iterable[tuple[Camera, Picture]]
-    ) -> Array:
-        """Return (nodes,) fraction of pixels with own colours, over the usual fraction.
-
-        The values are divided by their median, because illumination changes affect all parts. They
-        are nan for parts that are occluded here or were when learnt. Arguments as of ``learn``.
-        """
-        fractions = self._fractions(outlines, X_WN, views) / self.usual_fractions
-        return np.asarray(fractions / max(float(np.nanmedian([*fractions, 1.0])), 1e-9))
-
-    def _fractions(
-        self, outlines: Sequence[Outline], X_WN: Array, views: Iterable[tuple[Camera, Picture]]
-    ) -> Array:
-        """Return (nodes,) fraction of each part's pixels with own colours in all views.
-
-        It is nan for parts with fewer than 100 visible pixels. Arguments as of ``learn``.
-        """
-        counts = np.zeros((2, len(outlines)))
-        for camera, picture in views:
-            labels = draw_labels(outlines, range(1, 1 + len(outlines)), camera.X_CW @ X_WN, camera)
-            _count_own(labels, picture, self.is_own, counts)
-        return np.where(counts[1] < 100, np.nan, counts[0] / np.maximum(counts[1], 1.0))
-
-
-@compiled
-def _count_own(labels: NDArray[np.int16], picture: Picture, is_own: Mask, counts: Array) -> None:
-    """Add each part's pixels with own colours, and all of its pixels.
-
-    Args:
-        labels: (H, W) index of the part from 1 on, 0 beside the body.
-        picture: (H, W, 3 or 4) image.
-        is_own: (nodes, COLOURS) whether a colour is the part's own.
-        counts: (2, nodes) numbers of pixels, added to in place.
-    """
-    for row in range(labels.shape[0]):
-        for column in range(labels.shape[1]):
-            part = labels[row, column] - 1
-            if part >= 0:
-                red, green, blue = picture[row, column, :3]
-                # As `colour_numbers`.
-                number = ((red & 240) << 4) | (green & 240) | (blue >> 4)
-                counts[0, part] += is_own[part, number]
-                counts[1, part] += 1.0
 
 
 def search_line_step(number: int) -> int:
@@ -321,8 +247,8 @@ def update_histograms(
         if picture is not None:
             learn_colours(
                 placement.packed, placement.X_WN, (packed[0][c], packed[1][c]), picture, updated[c],
-                LINES.spacing, np.array(LINES.strip_widths), rate, max_residual, 0,
-                np.zeros((0, 0), np.bool_), *default_arguments(learn_colours),
+                LINES.spacing, np.array(LINES.strip_widths), rate, max_residual,
+                *default_arguments(learn_colours),
             )  # fmt: skip
     return updated
 
@@ -487,8 +413,6 @@ def learn_colours(
     strip_widths: Array,
     rate: float,
     max_residual: float,
-    step: int,
-    region: Mask,
     rare: float = 1e-4,
     fewest: float = 20.0,
 ) -> None:
@@ -506,12 +430,7 @@ def learn_colours(
         rate: weight of the new colours against the old histograms; where a node's histogram is
             empty, it becomes the new colours.
         max_residual: a line whose edge is further from the contour than this is ignored [pixel];
-            inf, or with a region: no line is ignored, and no edge is located.
-        step: distance between the edge offsets [pixel] that are evaluated to locate the edge, on
-            both sides of which colours are then counted; 0: colours are counted on both sides of
-            the contour, and the edge is only compared with ``max_residual``, with a step of 1.
-        region: (H, W) known silhouette of the body, which decides what is on the body and what is
-            beside it; (0, 0): unknown.
+            inf: no line is ignored.
         rare: added to frequencies, so that rarer colours count as unobserved [fraction of pixels].
         fewest: minimum number of pixels on a side of a node's contour for an update.
     """
@@ -521,33 +440,24 @@ def learn_colours(
     totals = np.zeros((len(histograms), 2))
     scratch = np.empty((3, 2 * LINES.blocks + 2))
     for i in range(len(uv)):
-        node, middle = nodes[i], 0.0
-        if max_residual < np.inf and not len(region):
+        node = nodes[i]
+        if max_residual < np.inf:
             edge, variance = _find_edge(
-                picture, histograms[node], uv[i], normals[i], clearances[i], max(step, 1), scratch
+                picture, histograms[node], uv[i], normals[i], clearances[i], 1, scratch
             )
             if variance > 0.0 and abs(edge) > max_residual:
                 continue
-            if variance > 0.0 and step > 0:
-                middle = edge
         for side in range(2):
             sign = -1.0 if side == Colour.ON else 1.0
             pixels = int(min(strip_widths[side], clearances[i, side] - 1.0))
             for k in range(1, pixels):
-                r = middle + sign * k
+                r = sign * k
                 u, v = uv[i, 0] + r * normals[i, 0], uv[i, 1] + r * normals[i, 1]
                 colour = _colour(picture, u, v)
                 if colour < 0:
                     break
-                where = side
-                if len(region):
-                    where = (
-                        Colour.ON
-                        if region[math.floor(v + 0.5), math.floor(u + 0.5)]
-                        else Colour.BESIDE
-                    )
-                counts[node, where, colour] += 1.0
-                totals[node, where] += 1.0
+                counts[node, side, colour] += 1.0
+                totals[node, side] += 1.0
     for node in range(len(histograms)):
         for side in range(2):
             frequencies, total = histograms[node, side], totals[node, side]

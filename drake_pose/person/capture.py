@@ -1,9 +1,9 @@
 """Capture of a recording of one person of unknown proportions, robust to faults of the recording.
 
-With masks (`capture_person`): find the person in a few frames, track forwards and backwards from
-the best one, fit the shape joints, and track all frames again. With few masks (`capture_by_colour`)
-the person's colours replace them. `capture_checked` cuts other persons out of the masks first,
-leaves out a camera that disagrees with the others, and then captures the recording once more.
+`capture_person` finds the person in a few frames, tracks forwards and backwards from the best one,
+fits the shape joints, and tracks all frames again. `capture_checked` cuts other persons out of the
+masks first, leaves out a camera that disagrees with the others, and then captures the recording
+once more.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -12,11 +12,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.arrays import Array, Mask, Picture
+from drake_pose.arrays import Array, Mask
 from drake_pose.body import PoseTree
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
-from drake_pose.fit.colours import PartColours
 from drake_pose.fit.contour_fit import ContourFit, PoseFit
 from drake_pose.fit.evidence import EdgePoints, find_edge_points
 from drake_pose.person.faults import (
@@ -39,18 +38,8 @@ from drake_pose.person.pose_tracker import (
     shape_values,
 )
 from drake_pose.person.search import LENIENT
-from drake_pose.person.views import (
-    ColourViews,
-    FrameViews,
-    KnownColours,
-    SilhouetteView,
-    edge_spacing,
-    see_silhouette,
-)
+from drake_pose.person.views import FrameViews, SilhouetteView, edge_spacing, see_silhouette
 from drake_pose.silhouette.outline import Outline
-
-ReadPictures = Callable[[int], Mapping[str, Picture]]
-"""Returns the pictures (H, W, 3) of a frame by camera; frames count from 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,11 +65,7 @@ class PersonCapture:
         return PersonCapture(q, np.zeros(count), shape, fit.outlines, fit.tree, q.copy())
 
     def store(
-        self,
-        frame: int,
-        tracker: PersonPoseTracker,
-        state: TrackState,
-        seen: FrameViews | ColourViews,
+        self, frame: int, tracker: PersonPoseTracker, state: TrackState, seen: FrameViews
     ) -> None:
         """Store pose and deviations of a tracker's state, fitted to views `seen`, in a row."""
         lengths = None if self.shape is None else self.shape.covariance
@@ -339,82 +324,6 @@ def spread_over(frames: Sequence[int], count: int) -> list[int]:
     """Return `count` of the frames, evenly spread; all if there are fewer."""
     picked = np.linspace(0, len(frames) - 1, min(count, len(frames)))
     return [frames[int(k)] for k in picked]
-
-
-def capture_by_colour(
-    tree: PoseTree,
-    cameras: Mapping[str, Camera],
-    count: int,
-    pictures: ReadPictures,
-    starts: Mapping[int, Array],
-    masked: Mapping[int, Mapping[str, Mask]],
-    known: PersonCapture | None,
-    on_frame: Callable[[int], None] | None = None,
-) -> tuple[PersonCapture, Array]:
-    """Capture a recording with masks in few frames only, by the person's colours.
-
-    Masks or given positions start the track, and start it again after a loss.
-
-    Args:
-        tree: of a model with a person's landmarks.
-        cameras: by name.
-        count: number of frames, all of which are tracked as a sequence.
-        pictures: returns a frame's pictures (H, W, 3) by camera.
-        starts: approximate positions (nq,) of the plant by frame [rad, m]; they are used where no
-            mask is and the person is not tracked.
-        masked: masks (H, W) by frame and camera, for the frames that have some.
-        known: the capture of the masked frames, its rows in the order of `masked`, which also gives
-            the shape; None: there are no masks, and shape joints stay as in the start.
-        on_frame: called after each frame with its index.
-
-    Returns the capture, nan where the person is lost; and (frames,) RMS distances of the contours
-    over all cameras [pixel], nan in frames that were not tracked by colour.
-    """
-    shape = None if known is None else known.shape
-    fit = ContourFit(tree, None if known is None else known.outlines, NOISE)
-    tracker = PersonPoseTracker(
-        fit, LENIENT, shape_values(tree), None if shape is None else shape.values
-    )
-    known_indices = {frame: k for k, frame in enumerate(masked)}
-    captured, distances = PersonCapture.empty(count, shape, fit), np.full(count, np.nan)
-    state: TrackState | None = None
-    colours: KnownColours = {}
-    part_colours: PartColours | None = None
-    for frame in range(count):
-        seen = pictures(frame)
-        views = ColourViews([cameras[name] for name in seen], list(seen.values()), colours)
-        index = known_indices.get(frame)
-        if known is not None and index is not None and np.isfinite(known.q[index]).all():
-            values, last = tracker.values(known.q[index]), state
-            state = tracker.start(values)
-            if last is not None and not last.is_lost:
-                state = replace(state, step=values - last.values)
-            captured.q[frame] = known.q[index]
-            captured.inlier_ratios[frame] = known.inlier_ratios[index]
-            captured.deviations[frame] = known.deviations[index]
-            colours = views.updated_colours(fit, values, masked[frame])
-            shown = zip(views.cameras, views.pictures, strict=True)
-            X_WN = fit.kinematics.poses(values)
-            part_colours = PartColours.learn(colours.values(), fit.outlines, X_WN, shown)
-        else:
-            if state is not None:
-                state = tracker.follow_by_colour(state, views, part_colours)
-            if frame in starts and (state is None or state.is_lost):
-                began = tracker.start(tracker.values(starts[frame]))
-                if not views.known:
-                    learned = views.updated_colours(fit, began.values)
-                    views = ColourViews(views.cameras, views.pictures, learned)
-                state = tracker.follow_by_colour(began, views)
-            if state is not None and state.is_lost:
-                captured.inlier_ratios[frame] = state.inlier_ratio
-                state = replace(state, step=np.zeros(len(state.values)))
-            elif state is not None:
-                colours = views.updated_colours(fit, state.values)
-                captured.store(frame, tracker, state, views)
-                distances[frame] = tracker.distance_by_colour(state.values, views)
-        if on_frame is not None:
-            on_frame(frame)
-    return captured, distances
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,6 @@ from drake_pose.arrays import Array, Indices, Mask
 from drake_pose.body import PoseTree
 from drake_pose.camera.models import Camera
 from drake_pose.errors import ModelError, UnknownNameError
-from drake_pose.fit.colours import PartColours
 from drake_pose.fit.contour_fit import (
     Comparison,
     ContourFit,
@@ -33,13 +32,12 @@ from drake_pose.fit.contour_fit import (
 )
 from drake_pose.fit.covariance import surface_deformations
 from drake_pose.fit.evidence import NO_EDGE, EdgePoints, Observation, pack_evidence
-from drake_pose.fit.kernel import Sum
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import RADIUS_SCALE_PREFIX, BodyParameters
 from drake_pose.fit.problem import Problem, Unknowns
 from drake_pose.fit.surfaces import with_radius_scales
 from drake_pose.person.search import EXACT, LENIENT, BodyPlan, PersonSearch, PersonSettings
-from drake_pose.person.views import ColourViews, FrameViews
+from drake_pose.person.views import FrameViews
 from drake_pose.silhouette.outline import Outline
 
 
@@ -160,17 +158,11 @@ class TrackState:
     # Number of successive frames with a low inlier ratio. Negative: the person was found anew, and
     # the remaining headings are tried in as many frames.
     troubled_frames: int = 0
-    # Lowest inlier ratio of a part, or lowest relative fraction of a limb's own colours, where the
-    # person is tracked by colours; otherwise 1.
-    worst_part: float = 1.0
 
     @property
     def is_lost(self) -> bool:
         """Whether the inlier ratio is too low for the pose to be valid."""
-        return (
-            self.inlier_ratio < PersonSettings.lost_below * self.usual_ratio
-            or self.worst_part < PersonSettings.part_lost_below
-        )
+        return self.inlier_ratio < PersonSettings.lost_below * self.usual_ratio
 
 
 class PersonPoseTracker:
@@ -237,13 +229,13 @@ class PersonPoseTracker:
         return self.plan.trunk_middle(self.fit.kinematics.poses(values))
 
     def deviations(
-        self, values: Array, seen: FrameViews | ColourViews, held_covariance: Array | None = None
+        self, values: Array, seen: FrameViews, held_covariance: Array | None = None
     ) -> Array:
         """Return standard deviations (nq,) of the plant's positions [rad, m], by one frame alone.
 
         Args:
             values: (m,) of a frame's state; the plant's other positions get 0.
-            seen: silhouettes or colours that the frame was fitted to.
+            seen: silhouettes that the frame was fitted to.
             held_covariance: (h, h) covariance of the held values; None: they are exact.
         """
         placement = self.fit.body.place(values)
@@ -304,59 +296,8 @@ class PersonPoseTracker:
             troubled_frames=remaining,
         )
 
-    def follow_by_colour(
-        self, last: TrackState, colours: ColourViews, part_colours: PartColours | None = None
-    ) -> TrackState:
-        """Return the state after a frame of colour pictures.
-
-        A limb that does not show its own colours is placed anew where they show. If no placement
-        shows enough of them, `worst_part` says so, and the person is lost.
-
-        Args:
-            last: state after the last frame.
-            colours: pictures of the frame, and the colours known by camera.
-            part_colours: own colours of each part; None: unknown, and no limb is searched.
-        """
-        fitted, shown = self._fit_predicted(last, colours), 1.0
-        if part_colours is not None:
-
-            def shows(values: Array) -> Array:
-                """Return each node's fraction (nodes,) of own colours, over the usual; or nan."""
-                seen = zip(colours.cameras, colours.pictures, strict=True)
-                return part_colours.relative_fractions(
-                    self.fit.outlines, self.fit.kinematics.poses(values), seen
-                )
-
-            enough, ratios = self.settings.part_lost_below, shows(fitted.values)
-            for limb in self.plan.limbs.values():
-                worst = float(np.nanmin([*ratios[limb.nodes], 1.0]))
-                if worst < enough:
-                    placed = self.search.place_by_colour(
-                        fitted.values, limb, colours, part_colours.is_own
-                    )
-                    scored = [(one, np.nan_to_num(shows(one.values))) for one in placed]
-                    shown_again = [one for one in scored if one[1][limb.nodes].min() >= enough]
-                    if shown_again:
-                        fitted, ratios = max(shown_again, key=lambda one: one[0].closeness)
-                        worst = 1.0
-                shown = min(shown, worst)
-        step = fitted.values - last.values
-        lengths, fitting = fitted.sums[:-1, [Sum.COMPARED, Sum.FITTING]].T
-        seen_enough = lengths >= self.settings.min_contour
-        least = np.min(fitting / np.maximum(lengths, 1e-9), where=seen_enough, initial=shown)
-        return TrackState(
-            fitted.values, step, fitted.inlier_ratio, last.usual_ratio, worst_part=float(least)
-        )
-
-    def distance_by_colour(self, values: Array, colours: ColourViews) -> float:
-        """Return the contour's RMS distance [pixel] at values (m,) from colours; nan: no edge."""
-        placement = self.fit.body.place(values)
-        sums = colours.compare(self.fit, placement, self.settings.follow[-1]).sums
-        squares, weight = sums[:, :, [Sum.SQUARES, Sum.WEIGHT]].sum(axis=(0, 1))
-        return float(np.sqrt(squares / weight)) if weight > 0.0 else float("nan")
-
-    def _fit_predicted(self, last: TrackState, seen: FrameViews | ColourViews) -> PoseFit:
-        """Fit a frame's silhouettes or colours from the pose that the last state predicts."""
+    def _fit_predicted(self, last: TrackState, seen: FrameViews) -> PoseFit:
+        """Fit a frame's silhouettes from the pose that the last state predicts."""
         expected = last.values + self.settings.step_fraction * last.step
         prior = Prior(expected, self._information)
         compare = partial(seen.compare, self.fit)

@@ -16,11 +16,10 @@ from drake_pose.arrays import Array, Indices, Mask, halton_sequence
 from drake_pose.body import landmarks_of_nodes, load_landmarks
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.errors import ModelError, SettingsError
-from drake_pose.fit.colours import colour_numbers
 from drake_pose.fit.contour_fit import ContourFit, PoseFit, Prior
 from drake_pose.fit.kernel import Sum
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.person.views import ColourViews, FrameViews, sum_at_points
+from drake_pose.person.views import FrameViews, sum_at_points
 from drake_pose.silhouette.scoring import draw_mask
 
 PERSON_LANDMARKS = (
@@ -48,12 +47,8 @@ class PersonSettings:
     # Limbs are searched again where the inlier ratio is below the usual one by this.
     retry_below: float = 0.03
     lost_below: float = 0.75  # The person is lost below this fraction of the usual inlier ratio.
-    # A person tracked by colour is lost where a part's ratio is below this.
-    part_lost_below: float = 0.4
     memory: float = 60.0  # Number of frames over which the usual inlier ratio is averaged.
     usual_ratio: float = 0.95  # Usual inlier ratio at the start.
-    # Least contour of a part in all cameras for the part's ratio to count [m].
-    min_contour: float = 0.3
     headings: int = 12  # Number of headings, evenly spread, in which a lost person is searched.
     headings_per_frame: int = 3  # Number of them in each frame of a sequence.
     limbs_per_frame: int = 2  # Number of doubtful limbs searched in each frame of a sequence.
@@ -67,7 +62,6 @@ class PersonSettings:
     # Fraction of the fresh starts that is fitted, the most promising first.
     fitted_fraction: float = 0.5
     searched_starts: int = 3  # Number of fresh starts whose doubtful limbs are searched.
-    placements: int = 3  # Number of placements of a limb by its colours that are fitted.
     # Limb poses with tips farther apart than this are distinct [m].
     distinct_distance: float = 0.25
     # Limb poses with no point farther apart than this are about the same [m].
@@ -142,7 +136,6 @@ class BodyPlan:
     Attributes:
         along: places of the points on a limb: 0 at the root, 1 at the middle joint, 2 at the end;
             the middle of a hand or foot lies beyond 2.
-        upper_samples: number of points on a limb's first half; the others follow.
         trunk: index of the node that the limbs hang on.
         heading: index of the value that turns the whole body about the vertical; None: none does.
 
@@ -151,7 +144,6 @@ class BodyPlan:
     """
 
     along = np.array([0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6, 1.8, 2.0, 2.25])
-    upper_samples = int(np.count_nonzero(along <= 1.0))
 
     def __init__(self, kinematics: TreeKinematics) -> None:
         self.kinematics = kinematics
@@ -426,7 +418,7 @@ class PersonSearch:
         ]
         return self._fit.fit(frame.scoring_edges, values, stages, prior, self._held)
 
-    def refine(self, values: Array, frame: FrameViews | ColourViews) -> PoseFit:
+    def refine(self, values: Array, frame: FrameViews) -> PoseFit:
         """Fit a frame from a coarse guess (m,), with a weak prior about it."""
         prior, stages = Prior(values, 0.1 * self._information), self._settings.search
         return self._fit.fit(partial(frame.compare, self._fit), values, stages, prior, self._held)
@@ -493,29 +485,6 @@ class PersonSearch:
                 if len(found) == count:
                     break
         return found
-
-    def place_by_colour(
-        self, values: Array, limb: PlannedLimb, views: ColourViews, own: Mask
-    ) -> list[PoseFit]:
-        """Place a limb where its own colours show most, and fit; return at most `placements` fits.
-
-        `values` (m,) is the pose of the rest of the body; `own` (nodes, COLOURS), which colours are
-        each node's own.
-        """
-        places = limb.points_at(self._fit.kinematics.poses(values)[self._plan.trunk])
-        half, first, scores = len(limb.nodes) // 2, self._plan.upper_samples, np.zeros(len(places))
-        for camera, picture in zip(views.cameras, views.pictures, strict=True):
-            colours = colour_numbers(picture)
-            for nodes, points in (
-                (limb.nodes[:half], np.s_[:, :first]),
-                (limb.nodes[half:], np.s_[:, first:]),
-            ):
-                pixel_scores = np.where(own[nodes].any(axis=0), 1, -1).astype(np.int8)[colours]
-                weights = np.ascontiguousarray(limb.weights[points])
-                here = np.ascontiguousarray(places[points])
-                scores += sum_at_points(camera, pixel_scores, here, weights)[0]
-        chosen = self._distinct_poses(values, limb, scores, self._settings.placements)
-        return [self.refine(one, views) for one in chosen]
 
     def _similar_poses(self, values: Array) -> list[Array]:
         """Return values (m,) of similar silhouettes: arms, legs, or front and back exchanged."""

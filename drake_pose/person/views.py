@@ -1,12 +1,9 @@
 """Several cameras' observations of a person in one frame, and the rays of their pixels.
 
-`FrameViews` compares a body's contours with the edges of silhouettes. `ColourViews` needs no
-silhouettes: colour histograms of the body and of the background beside it locate the edge on search
-lines across the body's contour. Search lines are as long as the fit's scale.
+`FrameViews` compares a body's contours with the edges of silhouettes.
 """
 
-import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
@@ -14,141 +11,19 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.arrays import Array, Mask, Picture
+from drake_pose.arrays import Array, Mask
 from drake_pose.camera.models import Camera, ParallelCamera
-from drake_pose.compiled import compiled, default_arguments
-from drake_pose.fit.colours import (
-    check_picture,
-    compare_lines,
-    learn_colours,
-    uninformed_histograms,
-)
+from drake_pose.compiled import compiled
 from drake_pose.fit.contour_fit import (
     Comparison,
     ContourFit,
     Views,
     compare_views,
-    pack_cameras,
     pack_views,
-    pixels_per_metre,
 )
 from drake_pose.fit.evidence import EdgePoints, find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import Placement
-
-# (nodes, 3, COLOURS) colour histograms by camera: on each part, beside it, and their ratio.
-KnownColours = Mapping[str, NDArray[np.float32]]
-
-
-class ColourViews:
-    """Colour pictures of one frame, compared with a body whose colours are known.
-
-    Args:
-        cameras: cameras that have a picture.
-        pictures: (H, W, 3 or 4) picture of each camera, red, green, blue (and alpha).
-        known: colour histograms by camera; a camera without them is not compared.
-        spacing: distance between search lines along the contour, at the body's root [m].
-
-    Raises:
-        SettingsError: a picture has another size than its camera, or is not of bytes.
-    """
-
-    def __init__(
-        self,
-        cameras: Sequence[Camera],
-        pictures: Sequence[Picture],
-        known: KnownColours,
-        spacing: float = 0.015,
-    ) -> None:
-        self.cameras = tuple(cameras)
-        self.pictures = [
-            check_picture(camera, picture)
-            for camera, picture in zip(cameras, pictures, strict=True)
-        ]
-        self.known, self._spacing = known, spacing
-        self._packed = pack_cameras(cameras)
-
-    def compare(
-        self, fit: ContourFit, placement: Placement, step: AnnealingStage, offset: float = 0.2
-    ) -> Comparison:
-        """Compare a body's contour with the edges that the colours show.
-
-        Args:
-            fit: weighs contours by its noise.
-            placement: the body at a pose.
-            step: its scale is the reach of search lines [m]; its spacing is not used, but theirs.
-            offset: distance between candidate edges on a search line, as a fraction of the scale.
-
-        Returns the comparison; 0 for cameras without known colours.
-        """
-        count, nodes = len(self.cameras), len(placement.X_WN)
-        weights = fit.weights(self._packed, placement, replace(step, spacing=self._spacing))
-        A, b = np.zeros((count, nodes, 12, 12)), np.zeros((count, nodes, 12))
-        sums, wide = np.zeros((count, nodes + 1, 6)), np.zeros((count, nodes, 13))
-        for c, camera in enumerate(self.cameras):
-            if camera.name in self.known:
-                compare_lines(
-                    placement.packed, placement.X_WN, self._camera(c), self.pictures[c],
-                    self.known[camera.name], weights[c], max(1, round(offset * weights[c, 1])),
-                    A[c], b[c], sums[c], wide[c], *default_arguments(compare_lines),
-                )  # fmt: skip
-        return Comparison(A, b, sums, wide, placement)
-
-    def updated_colours(
-        self,
-        fit: ContourFit,
-        values: Array,
-        regions: Mapping[str, Mask] | None = None,
-        *,
-        rate: float = 0.1,
-        widths: tuple[float, float] = (0.05, 0.10),
-        counted: float = 0.006,
-        agreeing: float = 0.03,
-        least_widths: tuple[float, float] = (6.0, 12.0),
-        least_agreeing: float = 2.5,
-    ) -> KnownColours:
-        """Return the colour histograms by camera, updated by this frame's pictures.
-
-        Args:
-            fit: the body.
-            values: (m,) values of the pose tree in this frame [rad or m].
-            regions: (H, W) region of the person by camera, where known. A camera without a region
-                and without histograms learns from both sides of the body's contour.
-            rate: weight of this frame's colours in the histograms; 1 for a camera with a region or
-                without histograms.
-            widths: widths of the counted strips inside and outside of the edge [m].
-            counted: distance between candidate edges on a search line [m].
-            agreeing: search lines whose edge is farther from the body's contour are ignored [m].
-            least_widths: lower bounds of `widths` [pixel].
-            least_agreeing: lower bound of `agreeing` [pixel].
-        """
-        placement = fit.body.place(values)
-        scales = pixels_per_metre(self._packed, placement.X_WN[0, :3, 3])
-        learned = dict(self.known)
-        for c, camera in enumerate(self.cameras):
-            region = (regions or {}).get(camera.name)
-            known = learned.get(camera.name)
-            size = float(scales[c])
-            surely = known is None or region is not None
-            nodes = len(placement.X_WN)
-            histograms = uninformed_histograms(1, nodes)[0] if known is None else known.copy()
-            learn_colours(
-                placement.packed, placement.X_WN, self._camera(c), self.pictures[c], histograms,
-                max(2.0, self._spacing * size),
-                np.maximum(np.multiply(widths, size), least_widths),
-                1.0 if surely else rate,
-                math.inf if surely else max(agreeing * size, least_agreeing),
-                max(1, round(counted * size)),
-                np.zeros((0, 0), np.bool_) if region is None else np.ascontiguousarray(region),
-                *default_arguments(learn_colours),
-            )  # fmt: skip
-            learned[camera.name] = histograms
-        return learned
-
-    def _camera(self, c: int) -> tuple[Array, Array]:
-        """Return X_CW (4, 4) and kernel parameters (8,) of the camera with index c."""
-        return self._packed[0][c], self._packed[1][c]
-
 
 EDGE_POINTS = 120.0
 """Number of edge points per picture height by default."""

@@ -1,6 +1,6 @@
 """Capture of a person from all silhouettes at once, as Drake systems: pictures in, poses out."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -12,22 +12,18 @@ from pydrake.systems.framework import Context, DiagramBuilder, System
 from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera, camera_tuple
 from drake_pose.errors import SettingsError
-from drake_pose.fit.colours import COLOURS
 from drake_pose.fit.contour_fit import inlier_ratio_of
 from drake_pose.person.figures import keep_views
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.person.views import (
     EDGE_POINTS,
-    ColourViews,
     FrameViews,
     SilhouetteView,
     edge_spacing,
     see_silhouette,
-    shows_somebody,
 )
 from drake_pose.silhouette.segmentation import Background
 from drake_pose.systems.bodies import add_avatar, body_poses
-from drake_pose.systems.cameras import ColourPorts
 from drake_pose.systems.picture_capture import PersonRegion, connect_images
 from drake_pose.systems.ports import (
     MemorySystem,
@@ -44,22 +40,18 @@ class PersonTracker(MemorySystem):
     .. pydrake_system::
 
         name: PersonTracker
-        input_ports: [silhouette_<camera>, color_image_<camera> (of color_cameras), time]
+        input_ports: [silhouette_<camera>, time]
         output_ports: [estimated_positions, last_positions, body_poses, inlier_ratio, time, visible,
           others, deviations (if asked for)]
 
     A periodic update fits the pose to the current pictures; output ports read the result. All input
-    ports are optional. If fewer than two cameras give a silhouette with somebody in it, a known
-    person is tracked by the colours in ``color_image_<camera>``, which are learned from frame to
-    frame. Silhouettes of one set of synchronised frames are enough for that, or ``set_person``. A
-    person lost by colour is searched in the next silhouettes.
+    ports are optional.
 
     Other persons are cut out. A camera in which the person and another are one figure is ignored if
     three other cameras see the person alone; otherwise it does not count for ``inlier_ratio``.
 
     Input ports:
         silhouette_<camera> (SilhouetteView): from a SilhouetteSensor; None: no picture.
-        color_image_<camera> (ImageRgba8U): for the cameras in ``color_cameras``.
         time (1): time stamp of the pictures [s]. Nothing is new while it is NaN or unchanged; if it
             is not connected, each update has new pictures.
 
@@ -79,12 +71,10 @@ class PersonTracker(MemorySystem):
         cameras: calibrated, in the order of the input ports, or by name.
         period: time between two updates [s].
         with_deviations: whether there is an output port ``deviations``.
-        color_cameras: names of the cameras that have a port for a colour image.
         watch_frames: number of frames for which others are looked for after they were visible; this
             is slow.
 
     Raises:
-        UnknownNameError: a name in ``color_cameras`` is no camera's.
         SettingsError: there are fewer than two cameras, two have the same name, or the period is
             not positive.
     """
@@ -95,7 +85,6 @@ class PersonTracker(MemorySystem):
         cameras: Sequence[Camera] | Mapping[str, Camera],
         period: float,
         with_deviations: bool = False,
-        color_cameras: Collection[str] = (),
         watch_frames: int = 15,
     ) -> None:
         super().__init__()
@@ -106,11 +95,6 @@ class PersonTracker(MemorySystem):
         self._with_deviations, self._watch_frames = with_deviations, watch_frames
         self._views = self.add_camera_inputs({c.name: f"silhouette_{c.name}" for c in cameras})
         self.add_input("time", 1)
-        self._colours = ColourPorts(
-            self, cameras, color_cameras, lambda one: f"color_image_{one.name}"
-        )
-        # The learned colours are state, so that a simulation can be repeated.
-        self._colours_shape = (len(self._colours.cameras), len(tracker.fit.outlines), 3, COLOURS)
         model = tracker.fit.tree.model
         values = tracker.values(model.default_positions)
         unknown = np.full(len(model.default_positions), np.nan)
@@ -131,7 +115,6 @@ class PersonTracker(MemorySystem):
             "values": values,
             "step": np.zeros(len(values)),
             **{name: np.zeros(1) for name in scalars},
-            "colours": np.zeros(int(np.prod(self._colours_shape))),
         }
         self.declare_vectors(outputs | inner, outputs, period)
         last = self.GetOutputPort("last_positions")
@@ -165,20 +148,8 @@ class PersonTracker(MemorySystem):
         views = self._views(context)
         cameras = [camera for camera in self._cameras if camera.name in views]
         separated = _SeparatedViews(FrameViews(cameras, list(views.values())))
-        colours = self._colour_views(context, known["colours"])
-        seen: FrameViews | ColourViews
-        found: TrackState | None
-        if len(separated.views.showing) < 2 and colours is not None and last is not None:
-            if not colours.known and not last.is_lost:
-                # These are the first pictures after set_person.
-                learned = colours.updated_colours(self._tracker.fit, last.values)
-                colours = ColourViews(colours.cameras, colours.pictures, learned)
-            found, seen = self._tracker.follow_by_colour(last, colours), colours
-            separated = _SeparatedViews(FrameViews((), ()))
-            visible = {one.name for one in seen.cameras}
-        else:
-            found, separated = self._follow(last, separated, known["watched"][0] > 0)
-            seen, visible = separated.views, {*separated.views.showing, *separated.merged}
+        found, separated = self._follow(last, separated, known["watched"][0] > 0)
+        visible = {*separated.views.showing, *separated.merged}
         changed = {
             "time": np.array([time]),
             "visible": np.array([float(camera.name in visible) for camera in self._cameras]),
@@ -202,15 +173,7 @@ class PersonTracker(MemorySystem):
         if not found.is_lost:
             changed["last_positions"] = self._tracker.positions(found.values)
             if self._with_deviations:
-                changed["deviations"] = self._tracker.deviations(found.values, seen)
-            if colours is not None:
-                regions = {k.name: view.region for k, view in clean.pairs if shows_somebody(view)}
-                learned = colours.updated_colours(self._tracker.fit, found.values, regions)
-                packed = known["colours"].reshape(self._colours_shape)
-                for k, name in enumerate(self._colours.cameras):
-                    if name in learned:
-                        packed[k] = learned[name]
-                changed["colours"] = packed
+                changed["deviations"] = self._tracker.deviations(found.values, separated.views)
         return changed
 
     def _packed(self, person: TrackState) -> dict[str, Array]:
@@ -227,16 +190,6 @@ class PersonTracker(MemorySystem):
             "step": person.step,
             **{name: np.array([float(number)]) for name, number in numbers.items()},
         }
-
-    def _colour_views(self, context: Context, colours: Array) -> ColourViews | None:
-        """Return the context's pictures with ``colours`` learned so far; None without a picture."""
-        pictures = self._colours.pictures(context)
-        if not pictures:
-            return None
-        packed = zip(self._colours.cameras, colours.reshape(self._colours_shape), strict=True)
-        known = {name: one.astype(np.float32) for name, one in packed if one.any()}
-        cameras = [camera for camera in self._cameras if camera.name in pictures]
-        return ColourViews(cameras, [pictures[camera.name] for camera in cameras], known)
 
     def _follow(
         self, last: TrackState | None, separated: "_SeparatedViews", is_watching: bool

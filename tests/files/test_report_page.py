@@ -436,7 +436,6 @@ def test_the_answer_counts_frames_and_joints(records, answer):
         ("beam", {}, ("end", "tracked"), "tracked in 1 frames, 1 searched by beam search and "
          "contour fits"),
         ("beam", {}, ("tracked", "tracked"), "tracked in 2 frames"),
-        ("person", {"x": 1}, ("end", "end"), "one person, tracked by colour"),
         ("person", {}, ("end", "end"), "one person, fitted to all silhouettes at once"),
         ("beam", {"x": 1}, ("tracked", "tracked"), "tracked by colour in 2 frames"),
     ],

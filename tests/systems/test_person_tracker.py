@@ -5,13 +5,12 @@ from pydrake.systems.analysis import Simulator
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.camera.models import circle_of_cameras
-from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.errors import SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.person.views import edge_spacing, see_silhouette
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.systems.bodies import body_poses
-from drake_pose.systems.cameras import build_camera_rig, picture_to_colour_image
+from drake_pose.systems.cameras import build_camera_rig
 from drake_pose.systems.person import PersonTracker, build_silhouette_capture
 from tests.person.persons_in_view import posed, see, stepping
 from tests.systems.bench import Bench
@@ -200,40 +199,3 @@ def test_invalid_arguments_are_refused(cameras, tracker):
         PersonTracker(tracker, several[:1], 0.1)
     with pytest.raises(SettingsError, match="period"):
         PersonTracker(tracker, several, 0.0)
-    with pytest.raises(UnknownNameError, match="elsewhere"):
-        PersonTracker(tracker, several, 0.1, color_cameras=["elsewhere"])
-
-
-def test_a_person_who_is_set_is_tracked_by_colour_images(person, cameras, tracker, renderers):
-    system = PersonTracker(
-        tracker, list(cameras.values()), 0.1, with_deviations=True, color_cameras=list(cameras)
-    )
-    run = Bench(system)
-    system.set_person(run.context, tracker.start(tracker.values(posed(person))))
-    patches = np.random.default_rng(4).integers(0, 120, (12, 16, 3))
-    room = patches.repeat(20, axis=0).repeat(20, axis=1)
-
-    def show(q, light=1.0):
-        shown = {
-            f"color_image_{name}": picture_to_colour_image(
-                (light * np.where(one.mask(q)[..., None], (240, 150, 60), room)).astype(np.uint8)
-            )
-            for name, one in renderers.items()
-        }
-        return run.advance(run.context.get_time() + 0.1, **shown)["estimated_positions"]
-
-    x, arm = (person.position_index(name) for name in ("position_x", "left_upper_arm_z"))
-    for k in range(4):
-        q = posed(person, x=0.02 * k, left_upper_arm_z=4.0 * k)
-        found = show(q)
-    assert found[x] == pytest.approx(0.06, abs=0.01)
-    assert np.degrees(found[arm]) == pytest.approx(12.0, abs=4.0)
-    assert run["visible"].all()
-    assert np.all((run["deviations"] >= 0.0) & (run["deviations"] < np.pi))
-    for lost in (False, True):
-        if lost:
-            assert np.isnan(show(q, light=0.0)).all()
-        # The last positions are kept.
-        for pose, one in zip(run["body_poses"], body_poses(person.plant, found), strict=True):
-            assert pose.IsNearlyEqualTo(one, 1e-9)
-    assert show(q)[x] == pytest.approx(0.06, abs=0.01)

@@ -56,6 +56,7 @@ from drake_pose.silhouette.outline import Outline
 from drake_pose.silhouette.pictures.masks import compare_masks
 from drake_pose.silhouette.pictures.scene_checks import (
     check_upright,
+    frame_ranges,
     leave_out_unreadable,
     read_scene,
 )
@@ -332,13 +333,21 @@ def read_inputs(
             model, settings = leave_out_links(model, settings)
         truth, of_truth = _read_truth(scene_path, truth_path, model, frames)
         starts = {}
-    starts = _read_starts(settings, scene, frames, model) or starts
     tracked = scene.sequence and settings.track
-    _check_start(scene, frames, starts, settings.track)
-    if (scene.images or not starts) and follows_person(scene, model, settings):
+    if follows_person(scene, model, settings):
+        few = [frame for frame in frames if scene.images and len(scene.cameras_of(frame)) < 2]
+        if few:
+            raise SceneError(
+                f"{scene.path}: frame {frame_ranges(few, frames)} has pictures, but masks of fewer "
+                "than two cameras, and a person is captured from masks: make them (drake-pose "
+                "masks), or leave these frames out (--frame)"
+            )
         upright = check_upright(scene.cameras.values())
         warnings = (*scene.warnings, *of_truth, *upright, *model.warnings)
-        return EstimateInputs(scene, model, frames, tracked, None, truth, warnings, None, starts)
+        scene = replace(scene, images={})
+        return EstimateInputs(scene, model, frames, tracked, None, truth, warnings)
+    starts = _read_starts(settings, scene, frames, model) or starts
+    _check_start(scene, frames, starts, settings.track)
     centres: Mapping[str, np.ndarray] | None = None
     position, root = None, settings.root_position
     if isinstance(root, tuple) and len(root) == 2:

@@ -1,28 +1,21 @@
-"""Estimates of one person with several cameras, by silhouettes or colours, and their warnings."""
+"""Estimates of one person with several cameras, and their warnings."""
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.body import landmark_positions, load_landmarks
-from drake_pose.errors import MaskError, SceneError
+from drake_pose.errors import MaskError
 from drake_pose.files.records import FrameRecord, record_modes
 from drake_pose.files.writer import Drawn, OnStage, ResultWriter
 from drake_pose.jobs.estimate.inputs import EstimateInputs, draw_parts
-from drake_pose.person.capture import (
-    CheckedCapture,
-    PersonCapture,
-    capture_by_colour,
-    capture_checked,
-)
+from drake_pose.person.capture import CheckedCapture, PersonCapture, capture_checked
 from drake_pose.person.faults import CameraFault, RigFault
 from drake_pose.person.figures import ReadFrame, ViewFaults
 from drake_pose.search import PoseEstimate
-from drake_pose.silhouette.pictures.masks import count_edge_pixels
 from drake_pose.silhouette.pictures.scene_checks import (
     describe_unreadable,
     frame_ranges,
@@ -51,7 +44,7 @@ def follow_person(
 
     Raises:
         ModelError: the model has no landmarks of a person.
-        SceneError: no mask can be read, or the first frame of pictures has fewer than two masks.
+        SceneError: no mask can be read.
         SettingsError: in no frame two cameras see a person.
     """
     if result.records.keys() >= set(inputs.frames):
@@ -60,16 +53,11 @@ def follow_person(
     inputs = replace(inputs, frames=tuple(one for one in inputs.scene.frames if one in asked))
     reader = _Reader(inputs, on_stage)
     begin = time.perf_counter()
-    if inputs.scene.images:
-        captured, read, faults, distances = _follow_colours(inputs, reader)
-    else:
-        checked = capture_checked(
-            inputs.model.pose_tree(), inputs.scene.cameras, reader, len(inputs.frames),
-            inputs.tracked, reader.count_followed,
-        )  # fmt: skip
-        captured, read = checked.captured, checked.read
-        faults = describe_faults(checked, inputs.frames)
-        distances = np.full(len(inputs.frames), np.nan)
+    checked = capture_checked(
+        inputs.model.pose_tree(), inputs.scene.cameras, reader, len(inputs.frames),
+        inputs.tracked, reader.count_followed,
+    )  # fmt: skip
+    captured, faults = checked.captured, describe_faults(checked, inputs.frames)
     reader.on_stage = None
     seconds = (time.perf_counter() - begin) / len(inputs.frames)
     result.records.clear()
@@ -83,53 +71,13 @@ def follow_person(
         values = [captured.tree.values_from_positions(q) for q in captured.q]
         nodes = [np.array(own) for own in zip(*values, strict=True)]
         for index, X_WN in enumerate(captured.tree.node_poses_batch(nodes)):
-            own = X_WN, read(index), reader, float(distances[index])
-            yield _record_frame(inputs, captured, index, *own, seconds, overlay)
+            masks = checked.read(index)
+            yield _record_frame(inputs, captured, index, X_WN, masks, reader, seconds, overlay)
         unread = describe_unreadable(reader.refused, inputs.scene.frames)
         doubts = describe_alternatives(captured, inputs.frames)
         result.warnings += (*unread, *faults, *doubts)
 
     return inputs, finished()
-
-
-def _follow_colours(
-    inputs: EstimateInputs, reader: "_Reader"
-) -> tuple[PersonCapture, ReadFrame, tuple[str, ...], Array]:
-    """Track a person by colour through pictures with few masks.
-
-    ``inputs``: the inputs, of a scene with pictures. ``reader``: reads the masks of each frame.
-    Returns the capture, a reader of masks, warnings, and the mean distance (frames,) of the
-    contours [pixel].
-    """
-    scene, frames = inputs.scene, inputs.frames
-    masked = [k for k, frame in enumerate(frames) if len(scene.cameras_of(frame)) > 1]
-    if frames[0] not in inputs.starts and 0 not in masked:
-        raise SceneError(
-            f"{scene.path}: the first frame, '{frames[0]}', has masks of fewer than two cameras, "
-            "by which the person is found; add masks (drake-pose masks), or --start FILE.csv"
-        )
-    tree = inputs.model.pose_tree()
-    masked = [k for k in masked if len(reader(k)) > 1]
-    checked: CheckedCapture | None = None
-    faults: tuple[str, ...] = ()
-    if masked:
-        checked = capture_checked(tree, scene.cameras, lambda k: reader(masked[k]), len(masked))
-        faults = describe_faults(checked, [frames[k] for k in masked])
-    captured, distances = capture_by_colour(
-        tree, scene.cameras, len(frames), lambda index: inputs.pictures(frames[index]),
-        {frames.index(frame): q for frame, q in inputs.starts.items()},
-        {} if checked is None else {k: checked.read(place) for place, k in enumerate(masked)},
-        None if checked is None else checked.captured, reader.count_followed,
-    )  # fmt: skip
-    lost = [frame for frame, q in zip(frames, captured.q, strict=True) if np.isnan(q).any()]
-    if lost:
-        text = (
-            f"frame {frame_ranges(lost, frames)}: the person is lost: too little of the contour "
-            "fits the colours; add masks of two cameras in the first of these frames, or its row "
-            "in --start FILE.csv"
-        )
-        faults += (text,)
-    return captured, reader, faults, distances
 
 
 class _Reader:
@@ -185,34 +133,26 @@ def _record_frame(
     X_WN: Array,
     masks: Mapping[str, Mask],
     reader: ReadFrame,
-    distance: float,
     seconds: float,
     overlay: bool,
 ) -> tuple[FrameRecord, Drawn]:
     """Return the record and overlays of a frame of a captured person.
 
     ``index``: of the frame. ``X_WN``: (nodes, 4, 4) the body's nodes in the world [m]. ``masks``:
-    by camera, of those used. ``distance``: of the contours [pixel], if the frame was tracked by
-    colour; else nan. ``seconds``: time per frame [s]. ``overlay``: whether overlays are drawn.
+    by camera, of those used. ``seconds``: time per frame [s]. ``overlay``: whether overlays are
+    drawn.
     """
     scene, frame, q = inputs.scene, inputs.frames[index], captured.q[index]
-    shown: dict[str, NDArray[np.generic]] = inputs.pictures(frame) if overlay else {}
+    shown: dict[str, Mask] = {}
     # Overlays show cameras that were left out as well.
     if overlay and len(masks) < len(scene.cameras_of(frame)):
         shown |= reader(index)
     if overlay:
         shown |= masks
-    found, by_colour = bool(np.isfinite(q).all()), not masks and np.isfinite(distance)
-    names = {} if not found else scene.cameras if by_colour else {**masks, **shown}
-    seen = [scene.cameras[name] for name in names]
+    found = bool(np.isfinite(q).all())
+    seen = [scene.cameras[name] for name in ({**masks, **shown} if found else {})]
     parts = draw_parts(captured.outlines, X_WN, seen, by_part=overlay)
-    wrong, area = np.nan, 1.0
-    if found and by_colour:
-        # Without masks, E_total is the area between both contours divided by the body's area.
-        bodies = [own >= 0 for own in parts.values()]
-        area = float(sum(map(np.count_nonzero, bodies))) or 1.0
-        wrong = sum(map(count_edge_pixels, bodies)) * distance
-    pose = PoseEstimate(found, q, np.eye(4), (), wrong, area, stopped_by=FOLLOWED, seconds=seconds)
+    pose = PoseEstimate(found, q, np.eye(4), (), np.nan, 1.0, stopped_by=FOLLOWED, seconds=seconds)
     answers = ((q, captured.deviations[index]), *captured.alternatives.get(index, ()))
     known = record_modes(inputs.model, answers if found else answers[:1])
     return inputs.record_frame(

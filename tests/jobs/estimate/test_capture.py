@@ -219,11 +219,24 @@ def test_options_of_the_search_choose_the_search(
         estimate_scene(recording.folder, recording.person.path, None, settings)
 
 
+def test_pictures_with_few_masks_are_refused(own_recording: PersonScene) -> None:
+    folder = own_recording.folder
+    for mask in sorted(folder.glob("masks/*/*.png")):
+        picture = folder / "images" / mask.parent.name / mask.name
+        picture.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(mask, picture)
+        if mask.stem != "0000" and mask.parent.name != "camera_0":
+            mask.unlink()
+    with pytest.raises(SceneError, match=r"frame 0001-0002 has pictures, but masks of fewer"):
+        estimate_scene(folder, own_recording.person.path)
+
+
 def test_scenes_and_options_unfit_for_the_method_person_are_refused(
     recording: PersonScene, out: Path
 ) -> None:
-    with pytest.raises(SettingsError, match="leave hold out"):
-        EstimateSettings(method="person", hold={"head_y": 1.0})
+    for name, value in {"hold": {"head_y": 1.0}, "start": Path("start.csv")}.items():
+        with pytest.raises(SettingsError, match=f"leave {name} out"):
+            EstimateSettings(method="person", **{name: value})
     hand = bundled_model("hand")
     with pytest.raises(ModelError, match=r"left_ankle.*landmarks\.yaml"):
         estimate_scene(recording.folder, hand, out, EstimateSettings(method="person"))

@@ -24,7 +24,6 @@ from drake_pose.camera.pose_files import RecordedPose, recorded_poses, recording
 from drake_pose.errors import CameraError, listed
 from drake_pose.input_files import named_fields
 
-_SPAN = ("part_of", "from", "until")
 _COMMON = ("width", "height", "center_x", "center_y")
 _REQUIRED = {
     "pinhole": (*_COMMON, "focal_x", "focal_y"),
@@ -33,7 +32,6 @@ _REQUIRED = {
 _OPTIONAL = {
     "pinhole": (
         "X_WC", "link", "X_LC", "projection", "clipping_near", "pixel_centers", "distortion",
-        *_SPAN,
     ),
     "parallel": ("X_WC", "projection", "pixel_centers"),
 }  # fmt: skip
@@ -49,8 +47,7 @@ def load_cameras(
 
     A pinhole camera has `width height focal_x focal_y center_x center_y` [pixel, pixel centres at
     integers, or at i + 0.5 with `pixel_centers: drake`] and `X_WC` (4 x 4) [m]; `projection:
-    pinhole` and `clipping_near` [m] are optional, as are `part_of`, `from` and `until` of
-    ``dump_cameras``. A parallel camera has `projection: parallel` and
+    pinhole` and `clipping_near` [m] are optional. A parallel camera has `projection: parallel` and
     `pixels_per_metre` instead of focal lengths.
 
     Drake's files are recognised by their fields: a Scenario (``cameras:``, possibly below one
@@ -251,7 +248,6 @@ def dump_cameras(
     cameras: Mapping[str, Camera] | Iterable[Camera],
     links: Mapping[str, str] | None = None,
     unplaced: Iterable[str] = (),
-    spans: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> str:
     """Return the text of a camera file.
 
@@ -260,17 +256,11 @@ def dump_cameras(
         links: link of each camera that is mounted on one, by the camera's name, whose X_WC is
             written as X_LC; None: no camera is.
         unplaced: names of cameras that are written without a pose.
-        spans: of a camera that was moved meanwhile, for its name in each part of the recording: the
-            recorded camera (`part_of`), and the times of the part's first and last picture (`from`,
-            `until`) [s]. None: no camera was moved.
     """
     content = {camera.name: describe_camera(camera) for camera in camera_tuple(cameras)}
     for name, link in (links or {}).items():
         if name in content:
             content[name] |= {"link": link, "X_LC": content[name].pop("X_WC")}
-    for name, span in (spans or {}).items():
-        if name in content:
-            content[name] |= span
     for name in content.keys() & {*unplaced}:
         del content[name]["X_WC"]
     return yaml.safe_dump(content, sort_keys=False)

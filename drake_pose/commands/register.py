@@ -55,7 +55,7 @@ def register(
     data set, a raw folder of DROID, or a ROS bag. The robot must move in view of a static camera,
     or carry the camera (--on) over a scene that stands still. Without a --target the time offset
     between pictures and joints is estimated as well, and the focal length if it is unknown. A
-    static camera that was nudged meanwhile is registered as two cameras with one clock.
+    static camera that was nudged meanwhile is refused; the message names the frames of each part.
 
     From masks, focal length and principal point of each camera must be known, and the masks must be
     free of distortion. Five poses that differ much are enough. Cameras that have an X_WC keep it; a

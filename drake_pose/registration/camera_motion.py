@@ -93,21 +93,6 @@ class PictureMotion(NamedTuple):
     shake: float = 0.0
 
 
-class CameraPart(NamedTuple):
-    """A part of a recording in which its camera was not moved; it may be the whole recording."""
-
-    of: str  # The recorded camera's name.
-    pictures: slice  # Indices of the part's pictures in the recording.
-    rotation: Array  # (3, 3) approximate rotation of the camera, in its frame of the first part.
-    # since, until: times of the part's first and last picture [s]; None: not logged.
-    since: float | None
-    until: float | None
-    is_whole: bool  # Whether it is the whole recording.
-    # drift, shake: of ``PictureMotion`` [pixel].
-    drift: float
-    shake: float
-
-
 def find_camera_motion(
     read: Callable[[int], Picture], count: int, camera: PinholeCamera
 ) -> PictureMotion:

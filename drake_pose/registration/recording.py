@@ -53,22 +53,6 @@ class Recording:
         """Return the same recording with offsets (m,) [rad or m] added to all values."""
         return replace(self, values_at=lambda offset: self.values_at(offset) + joint_offsets)
 
-    def part(self, pictures: slice) -> "Recording":
-        """Return the recording of successive pictures; the slice needs a start."""
-
-        def values_at(offset: float | Array) -> Array:
-            offsets = np.zeros(len(self.names))
-            offsets[pictures] = offset
-            return self.values_at(offsets)[pictures]
-
-        times = None if self.times is None else self.times[pictures]
-        first = pictures.start
-        return Recording(self.names[pictures], values_at, lambda k: self.read(first + k), times)
-
-    def at_offset(self, offset: float) -> "Recording":
-        """Return the recording without times, with the values at a known time offset [s]."""
-        return replace(self, values_at=lambda _: self.values_at(offset), times=None)
-
     def with_drift(self, drift: float, since: float) -> "Recording":
         """Return the recording with time offsets that grow by `drift` [s/s], from 0 at `since` [s].
 

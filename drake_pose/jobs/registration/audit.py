@@ -30,12 +30,6 @@ from drake_pose.jobs.registration.diagnosis import (
 )
 from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs, still_joints
 from drake_pose.jobs.registration.large_errors import SceneComparison
-from drake_pose.jobs.registration.moved_cameras import (
-    motion_findings,
-    register_recordings,
-    say_refused,
-    split_moved_cameras,
-)
 from drake_pose.jobs.registration.result import (
     describe_pose,
     describe_run,
@@ -43,7 +37,13 @@ from drake_pose.jobs.registration.result import (
     write_overlays,
 )
 from drake_pose.jobs.registration.settings import AuditSettings
-from drake_pose.jobs.registration.tracks import describe_pictures
+from drake_pose.jobs.registration.tracks import (
+    describe_pictures,
+    register_recordings,
+    say_refused,
+    turn_of,
+    watch_cameras,
+)
 from drake_pose.jobs.registration.words import (
     describe_common_finding,
     describe_frame_finding,
@@ -116,7 +116,7 @@ def audit_scene(
     settings, begin = settings or AuditSettings(), time.perf_counter()
     table, file, folder = (None if one is None else Path(one) for one in (joints, cameras, out))
     with use_workers(settings.workers), noted_warnings() as noted:
-        inputs = split_moved_cameras(read_inputs(Path(scene), Path(model), table, file, settings))
+        inputs = watch_cameras(read_inputs(Path(scene), Path(model), table, file, settings))
         noted += (*inputs.warnings, *still_joints(inputs))
         pictures = _Pictures()
         if inputs.recordings:
@@ -242,7 +242,6 @@ def _find_cameras(
             body,
             inputs,
             searched,
-            warnings,
             refused,
             offset_joints=offset_joints,
             before=None if before is None else before.found,
@@ -253,7 +252,14 @@ def _find_cameras(
         Finding("refused", name, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, text=say_refused(why))
         for name, why in refused.items()
     ]
-    findings += motion_findings(body, inputs, pictures)
+    for camera in inputs.searched_cameras:
+        motion = inputs.motions[camera.name]
+        for pixels, what in ((motion.drift, "drifts"), (motion.shake, "shakes")):
+            if pixels:
+                angle = turn_of(camera, pixels)
+                findings.append(
+                    Finding("moved", camera.name, angle, 0.0, 0.0, 0.0, pixels, 0.0, text=what)
+                )
     for given in (camera for camera in inputs.given_cameras if camera.name in pictures):
         name, recording, result = given.name, inputs.recordings[given.name], pictures[given.name]
         values = np.array([frame.values + result.joint_offsets for frame in result.frames])
@@ -261,8 +267,7 @@ def _find_cameras(
         is_near = difference.pixels < near * result.fit.fit.views[0].size
         compared.append(given if is_near else result.found.camera)
         findings += [] if is_near or difference.p_value > DIAGNOSIS.significance else [difference]
-        # The parts of a recording have one clock.
-        findings += compare_clock(body, result, recording) if inputs.parts[name].of == name else []
+        findings += compare_clock(body, result, recording)
         segmented, _, lost = evaluate_pictures(body, result, result.found)
         for frame in segmented:
             known = frame.name if alone else f"{name}-{frame.name}"

@@ -44,7 +44,7 @@ from drake_pose.jobs.registration.positions import (
     read_target,
 )
 from drake_pose.jobs.registration.settings import ALL, AuditSettings, RegistrationSettings
-from drake_pose.registration.camera_motion import CameraPart
+from drake_pose.registration.camera_motion import PictureMotion
 from drake_pose.registration.joint_offsets import (
     require_frame_count,
     require_parameters,
@@ -75,7 +75,7 @@ class RegistrationInputs:
         assumed_focal: names of cameras without a given focal length, which have a usual one.
         left_out: names of cameras without X_WC that are not to be registered.
         recordings: an episode's pictures with the joint log, by camera; empty for masks.
-        parts: of an episode's recordings, by the name of the camera in each part.
+        motions: how an episode's cameras moved that should stand still, by camera.
         audited_frames: names of the frames to be audited.
         frames: frames that have been read, with the masks of searched and known cameras.
         visible_nodes: names of the tree's nodes that masks show; None: all.
@@ -102,7 +102,7 @@ class RegistrationInputs:
     assumed_focal: frozenset[str] = frozenset()
     left_out: tuple[str, ...] = ()
     recordings: Mapping[str, Recording] = field(default_factory=dict)
-    parts: Mapping[str, CameraPart] = field(default_factory=dict)
+    motions: Mapping[str, PictureMotion] = field(default_factory=dict)
     audited_frames: tuple[str, ...] = ()
     frames: tuple[MultiViewFrame, ...] = ()
     visible_nodes: tuple[str, ...] | None = None

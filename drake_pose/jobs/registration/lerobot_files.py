@@ -74,18 +74,12 @@ def lerobot_files(
         files[f"{FOLDER}/{file.relative_to(path)}"] = file.read_bytes()
     info, written = json.loads((path / INFO).read_bytes()), set[str]()
     for camera in cameras:
-        part = inputs.parts.get(camera.name)
-        reason = ""
-        if part is not None and not part.is_whole:
-            reason = "it was moved during the episode"
-        elif not isinstance(camera, PinholeCamera) or camera.name in inputs.lenses:
-            reason = "its pictures are distorted"
-        if reason:
+        if not isinstance(camera, PinholeCamera) or camera.name in inputs.lenses:
             notes.append(
-                f"--export lerobot: camera '{camera.name}' is left out of {FOLDER}/{INFO}, as "
-                f"{reason}: use cameras.yaml"
+                f"--export lerobot: camera '{camera.name}' is left out of {FOLDER}/{INFO}, as its "
+                "pictures are distorted: use cameras.yaml"
             )
-        elif isinstance(camera, PinholeCamera):
+        else:
             key = camera_key(info["features"], camera.name)
             feature = info["features"][key]
             written.add(key)
@@ -97,7 +91,7 @@ def lerobot_files(
                 f"--export lerobot: camera '{named}' is left out of {FOLDER}/{INFO}, as it has no "
                 "pose"
             )
-        if named in {*inputs.left_out, *(part.of for part in inputs.parts.values())}:
+        if named in {*inputs.left_out, *inputs.recordings}:
             # The data set's own pose would look like one that was found.
             (info["features"][key].get("info") or {}).pop("camera_extrinsics", None)
     files[f"{FOLDER}/{INFO}"] = json.dumps(info, indent=4) + "\n"

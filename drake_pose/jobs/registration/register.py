@@ -30,11 +30,6 @@ from drake_pose.jobs.registration.diagnosis import (
 )
 from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs, still_joints
 from drake_pose.jobs.registration.lerobot_files import lerobot_files, require_data_set
-from drake_pose.jobs.registration.moved_cameras import (
-    register_recordings,
-    say_refused,
-    split_moved_cameras,
-)
 from drake_pose.jobs.registration.odd_links import odd_link_warnings
 from drake_pose.jobs.registration.positions import (
     corrected_urdf,
@@ -46,7 +41,6 @@ from drake_pose.jobs.registration.result import (
     compared_frames,
     describe_camera,
     describe_parameters,
-    describe_part,
     describe_run,
     suggest_picture,
     write_result,
@@ -57,7 +51,10 @@ from drake_pose.jobs.registration.tracks import (
     describe_tracks,
     draw_tracks,
     picture_warnings,
+    register_recordings,
+    say_refused,
     track_warnings,
+    watch_cameras,
 )
 from drake_pose.person.pose_tracker import shape_parts, shape_values
 from drake_pose.registration.bundle import adjust_bundle
@@ -150,7 +147,7 @@ def register_scene(
     with use_workers(settings.workers), noted_warnings() as noted:
         inputs = read_inputs(Path(scene), Path(model), table, file, settings)
         if settings.on is None:
-            inputs = split_moved_cameras(inputs)
+            inputs = watch_cameras(inputs)
         noted += (*inputs.warnings, *still_joints(inputs))
         work = _Registration(inputs, settings, on_camera)
         check_exports(settings.exports, [*inputs.known_cameras, *inputs.searched_cameras])
@@ -265,7 +262,7 @@ class _Registration:
             frames, start = list[MultiViewFrame](), time.perf_counter()
             focal = [*inputs.recordings] if self._settings.focal else []
             for result in register_recordings(
-                self.body, inputs, inputs.searched_cameras, self.warnings, self.refused, focal,
+                self.body, inputs, inputs.searched_cameras, self.refused, focal,
                 inputs.offset_joints,
             ):  # fmt: skip
                 name = result.found.camera.name
@@ -475,7 +472,6 @@ class _Registration:
                 if name in self.tracks
                 else describe_pictures(self.pictures.get(name), name in self.target_pictures)
             )
-            | describe_part(self.inputs.parts.get(name))
             for name, camera in self.registered.items()
         }
 

@@ -27,7 +27,6 @@ from drake_pose.input_files import csv_text
 from drake_pose.jobs.registration.inputs import RegistrationInputs
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.jobs.registration.words import describe_reading
-from drake_pose.registration.camera_motion import CameraPart
 from drake_pose.registration.joint_offsets import KinematicParameter
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import (
@@ -119,20 +118,6 @@ def suggest_picture(
     values = zip(body.kinematics.names, suggested[0].tolist(), strict=True)
     positions = {k: one for k, one in values if k not in TARGET_POSITIONS}
     return {"positions": positions, "difference": suggested[1]}, []
-
-
-def describe_part(part: CameraPart | None) -> dict[str, Any]:
-    """Return a camera's part of summary.json on its motion; empty for None or a static camera."""
-    if part is None or (part.is_whole and not (part.drift or part.shake)):
-        return {}
-    moving = {"drift_px": part.drift, "shake_px": part.shake}
-    return _describe_span(part) | moving
-
-
-def _describe_span(part: CameraPart) -> dict[str, Any]:
-    """Return entries on a part: the recorded camera, and the times [s] if they are known."""
-    times = {"from": part.since, "until": part.until}
-    return {"part_of": part.of} | {name: one for name, one in times.items() if one is not None}
 
 
 def describe_parameters(
@@ -256,8 +241,7 @@ def write_result(
     links = {name: part["link"] for name, part in parts.items() if "link" in part}
     formats = summary["settings"]["exports"]
     write_exports(path, formats, inputs, cameras.values(), links, pictures or {})
-    spans = {k: _describe_span(part) for k, part in inputs.parts.items() if not part.is_whole}
-    write_file(path, CAMERA_FILE, dump_cameras(cameras, links, spans=spans))
+    write_file(path, CAMERA_FILE, dump_cameras(cameras, links))
 
 
 def write_overlays(

@@ -1,6 +1,8 @@
 """Cameras registered in pictures of the robot or of a standing scene: summary and warnings."""
 
 import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,15 +11,24 @@ import numpy as np
 
 from drake_pose.arrays import Array
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.camera.models import Camera
-from drake_pose.errors import listed
+from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.errors import RegistrationError, listed
 from drake_pose.files.folder import OVERLAY, write_file
 from drake_pose.files.overlay import EXCESS_RGB, encode_png
+from drake_pose.jobs.registration.inputs import RegistrationInputs
 from drake_pose.jobs.registration.result import describe_parameters
 from drake_pose.jobs.registration.words import describe_drift
-from drake_pose.registration.picture_acceptance import PictureRegistration
+from drake_pose.registration.camera_motion import PictureMotion, find_camera_motion
+from drake_pose.registration.picture_acceptance import PictureRegistration, PictureStart
+from drake_pose.registration.picture_registration import (
+    fit_pictures,
+    register_near,
+    register_pictures,
+)
 from drake_pose.registration.picture_search import rotation_between
-from drake_pose.registration.register import evenly_spaced
+from drake_pose.registration.recording import Recording
+from drake_pose.registration.register import RegistrationBody, evenly_spaced
+from drake_pose.registration.shared_fit import SHARED
 from drake_pose.registration.standing_scene.track_registration import TrackRegistration
 
 SCENE = "scene"
@@ -28,6 +39,120 @@ GRIPPER = "gripper"
 
 BOTH = "scene and gripper"
 """The `evidence` of a camera that was registered from both."""
+
+
+def watch_cameras(inputs: RegistrationInputs) -> RegistrationInputs:
+    """Return an episode's inputs with its cameras' motions, and warnings of drift and shake.
+
+    A scene of masks is returned as it is.
+    """
+    motions, warnings = dict[str, PictureMotion](), list[str]()
+    for camera in inputs.searched_cameras if inputs.recordings else ():
+        recording, who = inputs.recordings[camera.name], f"camera '{camera.name}'"
+        motion = find_camera_motion(recording.read, len(recording.names), camera)
+        motions[camera.name] = motion
+        turns = [math.degrees(turn_of(camera, one)) for one in (motion.drift, motion.shake)]
+        if motion.drift:
+            warnings.append(
+                f"{who} drifts: its background shifts slowly by {motion.drift:.1f} pixels, a turn "
+                f"by {turns[0]:.2f} degrees or the like; the pose found is a mean; fix the camera, "
+                "or give fewer pictures (--frame)"
+            )
+        if motion.shake:
+            warnings.append(
+                f"{who} shakes: from picture to picture its background shifts by "
+                f"{motion.shake:.1f} pixels, a turn by {turns[1]:.2f} degrees or the like; the "
+                "pose found is a mean; fix the camera"
+            )
+    return replace(inputs, motions=motions, warnings=(*inputs.warnings, *warnings))
+
+
+def turn_of(camera: PinholeCamera, pixels: float) -> float:
+    """Return the camera's turn [rad] that shifts the middle of its pictures by `pixels`."""
+    return pixels / float(np.mean(camera.kernel_parameters()[1:3]))
+
+
+def require_unmoved(camera: PinholeCamera, recording: Recording, motion: PictureMotion) -> None:
+    """Refuse a camera that was nudged while it took pictures: no pose holds for all of them.
+
+    Raises RegistrationError: names the pictures, and the frames of each part without a nudge.
+    """
+    names, nudges = recording.names, motion.nudges
+    if not nudges:
+        return
+    texts = []
+    for nudge in nudges:
+        at = "" if recording.times is None else f"at {recording.times[nudge.after]:.2f} s, "
+        degrees = math.degrees(float(np.linalg.norm(nudge.rotation)))
+        texts.append(
+            f"{at}between pictures {names[nudge.before]} and {names[nudge.after]}, which shifted "
+            f"its background by {nudge.pixels:.1f} pixels, as a turn by {degrees:.2f} degrees does"
+        )
+    begins = [0, *(nudge.after for nudge in nudges)]
+    ends = [*(nudge.before for nudge in nudges), len(names) - 1]
+    parts = [f"--frame {names[a]}:{names[b]}" for a, b in zip(begins, ends, strict=True)]
+    raise RegistrationError(
+        f"camera '{camera.name}' moved {'; and '.join(texts)}: no pose holds for all pictures; "
+        f"take each part by itself, with --camera {camera.name} and {', '.join(parts[:-1])} or "
+        f"{parts[-1]}. Nothing was written"
+    )
+
+
+def register_recordings(
+    body: RegistrationBody,
+    inputs: RegistrationInputs,
+    cameras: Sequence[PinholeCamera],
+    refused: dict[str, RegistrationError],
+    focal: Collection[str] = (),
+    offset_joints: Sequence[str] = (),
+    before: Mapping[str, PictureRegistration] | None = None,
+    near: Mapping[str, tuple[Array, float]] | None = None,
+) -> Iterator[PictureRegistration]:
+    """Register cameras of an episode, one after another.
+
+    Args:
+        body: the robot's surfaces.
+        inputs: the episode, with the cameras' motions.
+        cameras: those of the searched cameras that are registered.
+        refused: output: by camera, the error if it was moved, or if no pose explains its pictures.
+        focal: names of cameras whose focal length is fitted; an unknown focal length always is.
+        offset_joints: names of joints whose offsets are fitted.
+        before: earlier registrations by camera, from which fits start; None: poses are searched.
+        near: by camera, X_WC (4, 4) as found in another episode, and the fraction explained by
+            chance there. A fit starts at the pose; if it fails, the pose is searched. None: all
+            poses are searched.
+
+    Raises RegistrationError: every camera is refused.
+    """
+    accepted = False
+    for camera in cameras:
+        name, recording = camera.name, inputs.recordings[camera.name]
+        prior, guessed = SHARED.focal_deviation if name in focal else 0.0, False
+        if name in inputs.assumed_focal:
+            prior, guessed = SHARED.guessed_focal_deviation, True
+        try:
+            require_unmoved(camera, recording, inputs.motions[name])
+            if before is not None:
+                start = PictureStart.of(before[name])
+                result = fit_pictures(body, start, recording, prior, offset_joints)
+            elif near is not None and name in near:
+                X_WC, by_chance = near[name]
+                begun = replace(camera, X_WC=X_WC)
+                result = register_near(body, begun, recording, by_chance, prior, offset_joints)
+            else:
+                result = register_pictures(body, camera, recording, prior, offset_joints, guessed)
+        except RegistrationError as error:
+            refused[name] = error
+            continue
+        accepted = True
+        yield result
+    if not accepted:
+        raise next(iter(refused.values()))
+
+
+def say_refused(why: RegistrationError) -> str:
+    """Return the message of a camera's error, for a result in which other cameras are written."""
+    return str(why).replace(" Nothing was written", "")
 
 
 def describe_pictures(result: PictureRegistration | None, found: bool = False) -> dict[str, Any]:

@@ -75,9 +75,6 @@ def describe_common_finding(finding: Finding) -> str:
     if finding.kind == "reading":
         return f"{finding.name}{pixels}"
     if finding.kind == "moved" and not finding.link:
-        if finding.shift_sd:
-            error = describe_error(replace(finding, kind="camera"), f"moved {finding.text}")
-            return f"{error}{pixels}"
         angle = f"{math.degrees(finding.angle):.2f} degrees"
         return f"camera '{finding.name}' {finding.text}, as by turns of {angle}{pixels}"
     if finding.kind == "moved":

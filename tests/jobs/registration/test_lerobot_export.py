@@ -10,11 +10,11 @@ import pyarrow.parquet
 import pytest
 
 from drake_pose.camera.lerobot_tables import camera_fields
+from drake_pose.camera.models import Lens
 from drake_pose.errors import CameraError, SettingsError
 from drake_pose.jobs.registration.inputs import read_inputs
 from drake_pose.jobs.registration.lerobot_files import lerobot_files, require_data_set
 from drake_pose.jobs.registration.settings import AuditSettings, RegistrationSettings
-from drake_pose.registration.camera_motion import CameraPart
 from tests.registration.episodes import painted_episode
 from tests.registration.recordings import NAMES, write_episode
 
@@ -148,11 +148,10 @@ def test_what_is_left_out_is_said(recorded, tmp_path):
     feature = json.loads(files["lerobot/meta/info.json"])["features"][KEY]
     assert "camera_intrinsics" in feature["info"]
     assert "camera_extrinsics" not in feature["info"]
-    halves = {k: CameraPart("camera", slice(0, 8), np.eye(3), 0.0, 1.0, False, 0.0, 0.0)
-              for k in ("camera", "camera_2")}  # fmt: skip
-    cameras = [replace(painted.camera, name=name) for name in halves]
-    files, notes = lerobot_files(replace(inputs, parts=halves), cameras, None, {})
-    assert all(f"'{k}' is left out" in one for k, one in zip(halves, notes[1:], strict=True))
+    lens = Lens(320, 240, np.eye(3), np.array([0.1]))
+    bent = replace(read(other, painted, units="normalised"), lenses={"camera": lens})
+    files, notes = lerobot_files(bent, [painted.camera], None, {})
+    assert "'camera' is left out of lerobot/meta/info.json, as its pictures are dist" in notes[1]
     assert "camera_extrinsics" not in files["lerobot/meta/info.json"]
     named = read(folder, painted, joint_map=folder / "arm.json")
     assert named.mapped.log.servos.path == folder / "arm.json"

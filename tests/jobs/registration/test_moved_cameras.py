@@ -3,18 +3,22 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import cv2
 import numpy as np
 import pytest
-import yaml
 from scipy.spatial.transform import Rotation
 
 from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.camera.models import PinholeCamera
+from drake_pose.errors import RegistrationError
+from drake_pose.jobs.registration import tracks
 from drake_pose.jobs.registration.audit import audit_scene
-from drake_pose.jobs.registration.moved_cameras import _parts, motion_warnings
+from drake_pose.jobs.registration.inputs import read_inputs
 from drake_pose.jobs.registration.register import register_scene
+from drake_pose.jobs.registration.settings import RegistrationSettings
+from drake_pose.jobs.registration.tracks import require_unmoved, watch_cameras
 from drake_pose.registration.camera_motion import Nudge, PictureMotion
 from drake_pose.registration.recording import Recording
 from tests.benchmarks.registration import pose_error
@@ -46,90 +50,66 @@ def nudged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, PaintedEpiso
     return folder / "scene", painted, R
 
 
-def test_parts_of_a_recording_are_two_cameras(nudged, tmp_path):
-    scene, painted, R = nudged
-    out = tmp_path / "out"
-    found = register_scene(scene, painted.path, out=out, overlay=False)
-    (text,) = [one for one in found.warnings if "moved" in one]
-    assert text.startswith(f"camera 'camera' moved at {painted.times[FIRST]:.2f} s, between")
-    written = yaml.safe_load((out / "cameras.yaml").read_text())
-    spans = {
-        name: [one[key] for key in ("part_of", "from", "until")] for name, one in written.items()
-    }
-    times = painted.times
-    assert spans == {
-        "camera": ["camera", times[0], times[FIRST - 1]],
-        "camera_2": ["camera", times[FIRST], times[-1]],
-    }
-    true = {"camera": painted.camera.X_WC, "camera_2": painted.camera.X_WC.copy()}
-    true["camera_2"][:3, :3] @= R
-    for name, camera in load_cameras(out / "cameras.yaml").items():
-        error = pose_error(camera.X_WC, true[name])
-        assert np.degrees(np.linalg.norm(error[:3])) < 0.5
-        assert np.linalg.norm(error[3:]) < 0.015
-        assert (np.abs(error) < 4.0 * np.sqrt(np.diag(found.registered[name].covariance))).all()
-    # One clock, and every picture is in one part only.
-    parts = found.summary["cameras"]
-    assert parts["camera"]["time_offset_s"] == parts["camera_2"]["time_offset_s"]
-    assert not {*parts["camera"]["frames"]} & {*parts["camera_2"]["frames"]}
+@pytest.mark.parametrize("command", [register_scene, audit_scene])
+def test_a_nudged_camera_is_refused_with_the_frames_of_each_part(nudged, command, tmp_path):
+    scene, painted, _ = nudged
+    text = (
+        rf"'camera' moved at {painted.times[FIRST]:.2f} s, between pictures 0017 and 0018, .*"
+        r"no pose holds .* cameras camera and frames 0000:0017 or frames 0018:0029\."
+    )
+    with pytest.raises(RegistrationError, match=text):
+        command(scene, painted.path, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
-def test_an_audit_tells_when_and_how_far_a_camera_was_moved(nudged):
-    scene, painted, _ = nudged
-    audit = audit_scene(scene, painted.path)
-    (moved,) = [one for one in audit.summary["findings"] if one["what"] == "moved"]
-    assert moved["name"] == "camera"
-    assert f"'camera' moved at {painted.times[FIRST]:.2f} s by" in moved["text"]
-    assert moved["angle_deg"] == pytest.approx(DEGREES, abs=4.0 * moved["angle_sd_deg"])
+def test_each_named_part_of_a_nudged_recording_gives_its_pose(nudged):
+    scene, painted, R = nudged
+    turned = painted.camera.X_WC.copy()
+    turned[:3, :3] @= R
+    for frames, true in (("0000:0017", painted.camera.X_WC), ("0018:0029", turned)):
+        settings = RegistrationSettings(cameras="camera", frames=frames)
+        found = register_scene(scene, painted.path, settings=settings)
+        assert not [one for one in found.warnings if "moved" in one]
+        camera = found.registered["camera"]
+        error = pose_error(camera.camera.X_WC, true)
+        assert np.degrees(np.linalg.norm(error[:3])) < 0.5
+        assert np.linalg.norm(error[3:]) < 0.015
+        assert (np.abs(error) < 4.0 * np.sqrt(np.diag(camera.covariance))).all()
 
 
-def moving(times: np.ndarray | None) -> tuple[Recording, PictureMotion]:
-    """Return a recording of nine pictures, and two nudges of its camera."""
-    names = tuple(f"{k}" for k in range(9))
-    recording = Recording(names, lambda _: np.zeros((9, 1)), lambda _: np.zeros((1, 1, 3)), times)
-    turns = np.array([[0.1, 0.0, 0.0], [0.0, 0.2, 0.0]])
-    nudges = (Nudge(2, 4, 3.0, turns[0]), Nudge(5, 6, 5.0, turns[1]))
-    return recording, PictureMotion(nudges, 0.7, 1.3)
-
-
-def test_parts_lie_between_nudges_with_the_cameras_rotations() -> None:
-    """Pictures taken during a nudge belong to no part; names that are taken are left out."""
-    times = 10.0 + 0.5 * np.arange(9)
-    recording, motion = moving(times)
-    found = _parts("eye", recording, motion, {"eye", "eye_2"})
-    assert [*found] == ["eye", "eye_3", "eye_4"]
-    first, second, third = found.values()
-    assert [one.pictures for one in found.values()] == [slice(0, 3), slice(4, 6), slice(6, 9)]
-    assert [(one.since, one.until) for one in found.values()] == [
-        (10.0, 11.0), (12.0, 12.5), (13.0, 14.0)
-    ]  # fmt: skip
-    np.testing.assert_array_equal(first.rotation, np.eye(3))
-    # The background's directions turn against the camera.
-    back = [Rotation.from_rotvec(-one.rotation).as_matrix() for one in motion.nudges]
-    np.testing.assert_allclose(second.rotation, back[0])
-    np.testing.assert_allclose(third.rotation, back[0] @ back[1])
-    assert {(one.of, one.is_whole, one.drift, one.shake) for one in found.values()} == {
-        ("eye", False, 0.7, 1.3)
-    }
-    untimed, _ = moving(None)
-    (whole,) = _parts("eye", untimed, PictureMotion(()), ()).values()
-    assert (whole.is_whole, whole.since, whole.pictures) == (True, None, slice(0, 9))
-
-
-def test_motions_are_told_with_their_time_and_angle() -> None:
+def test_every_nudge_is_told_with_its_size_and_every_part_with_its_frames() -> None:
+    """Pictures that are taken during a nudge belong to no part."""
     camera = PinholeCamera("eye", 320, 240, 250.0, 350.0, 159.5, 119.5, np.eye(4))
-    recording, motion = moving(10.0 + 0.5 * np.arange(9))
-    first, second, drift, shake = motion_warnings(camera, recording, motion)
-    assert "'eye' moved at 12.00 s, between pictures 2 and 4" in first
-    assert "shifted by 3.0 pixels, as by a turn of 5.73 degrees" in first
-    assert "at 13.00 s" in second
-    # A pixel is a three hundredth of a radian.
-    assert f"0.7 pixels, a turn by {np.degrees(0.7 / 300.0):.2f} degrees" in drift
-    assert f"1.3 pixels, a turn by {np.degrees(1.3 / 300.0):.2f} degrees" in shake
-    untimed, _ = moving(None)
-    assert "'eye' moved between pictures 2 and 4" in motion_warnings(camera, untimed, motion)[0]
-    assert motion_warnings(camera, recording, PictureMotion(())) == []
+    nudges = (
+        Nudge(2, 4, 3.0, np.array([0.1, 0.0, 0.0])),
+        Nudge(5, 6, 5.0, np.array([0.0, 0.2, 0.0])),
+    )
+    names = tuple(f"p{k}" for k in range(9))
+    recording = Recording(
+        names, lambda _: np.zeros((9, 1)), lambda _: np.zeros((1, 1, 3)), 10.0 + 0.5 * np.arange(9)
+    )
+    with pytest.raises(RegistrationError) as error:
+        require_unmoved(camera, recording, PictureMotion(nudges))
+    text = str(error.value)
+    assert "at 12.00 s, between pictures p2 and p4, which shifted its background by 3.0" in text
+    assert "at 13.00 s, between pictures p5 and p6" in text
+    assert f"a turn by {np.degrees(0.2):.2f} degrees" in text
+    assert "--frame p0:p2, --frame p4:p5 or --frame p6:p8." in text
+    with pytest.raises(RegistrationError, match="'eye' moved between pictures p2 and p4"):
+        require_unmoved(camera, replace(recording, times=None), PictureMotion(nudges))
+    require_unmoved(camera, recording, PictureMotion((), 0.7, 1.3))
+
+
+def test_drift_and_shake_are_warned_of_with_their_turns(nudged) -> None:
+    scene, painted, _ = nudged
+    inputs = read_inputs(scene, painted.path, None, None, RegistrationSettings())
+    motion = PictureMotion((), 0.7, 1.3)
+    with mock.patch.object(tracks, "find_camera_motion", return_value=motion):
+        drift, shake = watch_cameras(inputs).warnings[len(inputs.warnings) :]
+    for text, pixels in ((drift, 0.7), (shake, 1.3)):
+        angle = np.degrees(pixels / painted.camera.focal_x)
+        assert f"by {pixels} pixels, a turn by {angle:.2f} degrees" in text
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,6 @@ from drake_pose.jobs.registration.result import (
     body_drawer,
     describe_camera,
     describe_parameters,
-    describe_part,
 )
 from drake_pose.jobs.registration.tracks import describe_tracks, draw_tracks, track_warnings
 from drake_pose.jobs.registration.words import (
@@ -36,7 +35,6 @@ from drake_pose.jobs.registration.words import (
     describe_frame_finding,
     describe_reading,
 )
-from drake_pose.registration.camera_motion import CameraPart
 from drake_pose.registration.findings import Finding, FrameDiagnosis
 from drake_pose.registration.joint_offsets import KinematicParameter, undetermined
 from drake_pose.registration.posed_frames import PosedFrame
@@ -121,8 +119,6 @@ def test_the_verb_is_that_of_the_sentence() -> None:
          "by 2.5 pixels"),
         (off("moved", "c", 2 * DEGREE, 0.0, DEGREE, text="then"), "camera 'c' then, as by turns of "
          "2.00 degrees, which moves outlines by 2.5 pixels"),
-        (off("moved", "c", 2 * DEGREE, 0.01, DEGREE, 0.002, text="then"), "camera 'c' moved then "
-         "by 2.00 +- 1.00 degrees and 10.0 +- 2.0 mm, which moves outlines by 2.5 pixels"),
         (off("joint", "a", DEGREE, 0.0, DEGREE, text="; x"), "joint 'a' reads 1.00 +- 1.00 degrees "
          "too low in all frames that agree, which moves outlines by 2.5 pixels; x"),
     ],
@@ -480,15 +476,6 @@ def test_parameters_are_summarised_in_their_units() -> None:
     assert told["lengths"]["arm"]["value_percent"] == pytest.approx(1.0)
     assert told["lengths"]["leg"]["high_percent"] is told["lengths"]["leg"]["value_percent"] is None
     assert not told["lengths"]["leg"]["determined"]
-
-
-def test_parts_of_a_recording_are_told_with_their_times() -> None:
-    part = CameraPart("left", slice(3, 9), np.eye(3), 1.5, None, False, 0.4, 0.0)
-    assert describe_part(part) == {"part_of": "left", "from": 1.5, "drift_px": 0.4, "shake_px": 0.0}
-    whole = part._replace(is_whole=True, until=4.0)
-    assert describe_part(whole)["until"] == 4.0
-    assert describe_part(whole._replace(shake=0.6, drift=0.0))["shake_px"] == 0.6
-    assert describe_part(whole._replace(drift=0.0)) == describe_part(None) == {}
 
 
 def test_bodies_are_drawn_with_the_index_of_the_shown_node(body: RegistrationBody) -> None:

@@ -53,7 +53,6 @@ class HandSilhouetteSettings:
     # [pixel].
     beside: float = 2.0
     rounds: int = 4  # Iterations of the robust fit.
-    shortest: float = 5.0  # Segments shorter in the image have no line [pixel].
 
     # The cross-entropy search for a pose.
     searches: int = 3  # Largest number of searches.
@@ -133,7 +132,7 @@ def match_axes(
     # d rho / d alpha is minus the position along the axis.
     J = np.zeros((count, 2, 2))
     J[:, 0, 1], J[:, 1, 0], J[:, 1, 1] = 1.0, 1.0, -(c * middle[:, 0] + s * middle[:, 1])
-    lines[(C[:, 1, 1] > HAND.max_angle_deviation**2) | (size < HAND.shortest)] = np.nan
+    lines[(C[:, 1, 1] > HAND.max_angle_deviation**2) | (size < HandObservation.shortest)] = np.nan
     tips = rough.ends[rough.tips, 1] - origin + solution[count:]
     tip_covariances = covariance[count:] + HAND.min_tip_deviation**2 * np.eye(2)
     # The end of a segment that points at the camera may be its joint.

@@ -97,7 +97,7 @@ def linearise_over(
     )
 
 
-def numerical_jacobian(function: Function, x: Array, is_angle: Mask, size: float = 1.0) -> Array:
+def numerical_jacobian(function: Function, x: Array, is_angle: Mask, size: float) -> Array:
     """Return the Jacobian (m, n) of a function at x (n,) by central differences.
 
     Args:

@@ -77,7 +77,8 @@ class FunctionMotion:
         value = np.asarray(self.function(x), dtype=np.float64)
         if self.jacobian is not None:
             return value, np.asarray(self.jacobian(x), dtype=np.float64)
-        return value, numerical_jacobian(self.function, x, np.zeros(value.shape, dtype=np.bool_))
+        no_angles = np.zeros(value.shape, dtype=np.bool_)
+        return value, numerical_jacobian(self.function, x, no_angles, 1.0)
 
 
 def constant_velocity(

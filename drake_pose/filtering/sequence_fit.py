@@ -53,11 +53,9 @@ class SequenceSettings:
     start_distance: float = 0.2  # Starts closer than this in all elements are the same [rad].
     # Starts whose E_total in the first frame exceeds the best by more are dropped.
     worse_start: float = 0.03
-    # tracked_starts, fitted_starts: largest number of starts that are tracked, and fitted.
-    tracked_starts: int = 6
+    tracked_starts: int = 6  # Largest number of starts that are tracked, and then fitted.
     # E_total equivalent of one squared standard deviation of a joint from its prior.
     prior_weight: float = 0.0003
-    fitted_starts: int = 6
     # Fits with a cost above this multiple of the best are dropped. With a hand of other proportions
     # of flesh, the better of two fits may be the wrong one.
     worse_fit: float = 1.3
@@ -186,7 +184,7 @@ def fit_sequence(
 ) -> list[FittedSequence]:
     """Return the explanations of one camera's masks, sorted by cost, ascending.
 
-    The first ``SEQUENCE.fitted_starts`` are fitted to frames about ``SEQUENCE.memory`` apart. Fits
+    All starts are fitted to frames about ``SEQUENCE.memory`` apart. Fits
     that differ and cost at most ``SEQUENCE.worse_fit`` times the lowest are then fitted to all.
 
     Args:
@@ -220,7 +218,7 @@ def fit_sequence(
         return FittedSequence(body, *found)
 
     coarse = []
-    for states in starts[: SEQUENCE.fitted_starts]:
+    for states in starts:
         begin = np.array([observation.parameters(states[k]) for k in picked.tolist()])
         coarse.append(fit(picked, begin, False))
     coarse.sort(key=lambda one: one.fitted.cost)

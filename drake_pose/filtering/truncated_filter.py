@@ -328,7 +328,9 @@ class TruncatedFilter:
                     motion.predict, truncated.mean, names, names, no_angles, "the motion"
                 )
             self._checked = True
-        return FilterState(0, (self._finish(Hypothesis(checked, checked), checked, truncated),))
+        return FilterState(
+            0, (self._finish(Hypothesis(checked, checked), checked, truncated, 0.0),)
+        )
 
     def predict(self, state: FilterState) -> FilterState:
         """Return the state whose hypotheses have made one step of the motion: (6)."""
@@ -494,7 +496,7 @@ class TruncatedFilter:
         return alive, rejected
 
     def _finish(
-        self, hypothesis: Hypothesis, free: Belief, result: Truncated, log_likelihood: float = 0.0
+        self, hypothesis: Hypothesis, free: Belief, result: Truncated, log_likelihood: float
     ) -> Hypothesis:
         """Return a hypothesis after its update, weighted by the likelihood and by the limits.
 

@@ -131,7 +131,7 @@ class FunctionObservation:
         if self.jacobian is not None:
             return value, np.asarray(self.jacobian(x), dtype=np.float64)
         is_angle = self.wraps if value.shape == self.wraps.shape else np.zeros(0, dtype=np.bool_)
-        return value, numerical_jacobian(self.function, x, is_angle)
+        return value, numerical_jacobian(self.function, x, is_angle, 1.0)
 
     def mirrors(self, belief: Belief) -> list[Array]:
         """Return no mirrored states."""

@@ -158,12 +158,8 @@ class NeighbourhoodSettings(NamedTuple):
     whole: tuple[Pass, ...] = (Pass(3, 3, 6.0, 50.0), Pass(3, 2, 2.0, 5.0))  # All parts move.
     refined: int = 2  # Number of placements that get the second passes.
     first_excess: float = 0.15  # Greatest excess over the current J after the first passes.
-    repaired_excess: float = 0.35  # Mirrored poses up to this excess have their parts placed anew,
-    repair_tries: int = 6  # with this number of tries.
     whole_excess: float = 0.01  # Poses up to this excess are refined with all parts moving.
     least_decrease: float = 0.003  # A smaller decrease of J is no improvement.
-    # Alternative poses up to this above their limit are refined with all parts moving.
-    alternative_excess: float = 0.015
     same_error: float = 0.1  # Errors of a part are equal if they differ by a smaller fraction.
     least_error: float = 0.001  # Parts with less error are not placed anew [fraction of the area].
     rounds: int = 2  # Number of tries of each part; doubled where all parts must be tried.

@@ -1,293 +1,41 @@
-"""Tracking of a pose tree by its contour in masks and pictures of any number of cameras.
+"""Tracking of a pose tree by its contour, with a search where that fails.
 
-``ContourObservation`` turns a frame into a linear measurement of the state, by comparing the
-model's contour with edges. ``ContourTracker`` feeds these to a ``TruncatedFilter``.
+``ContourTracker`` feeds the contours of masks and pictures to a ``TruncatedFilter``;
+``MatchAndTrack`` begins a track by a search, and searches again after a loss.
 """
 
 import math
-from collections.abc import Sequence
+import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from drake_pose.arrays import Array, Floats, Mask, Picture
-from drake_pose.errors import SettingsError, require_positive
-from drake_pose.filtering.body_state import LOG_SCALE, BodyState
+from drake_pose.body import PoseTree
+from drake_pose.camera.models import Camera
+from drake_pose.errors import require_positive
+from drake_pose.filtering.contour_observation import (
+    LOG_SCALE,
+    ContourEvidence,
+    ContourMeasurement,
+    ContourObservation,
+)
 from drake_pose.filtering.motion import LinearMotion
 from drake_pose.filtering.state import Belief
 from drake_pose.filtering.truncated_filter import FilterSettings, FilterState, TruncatedFilter
 from drake_pose.filtering.update import LinearObservation
-from drake_pose.fit.colours import (
-    LINES,
-    add_pictures,
-    check_picture,
-    part_distances,
-    search_line_step,
-    uninformed_histograms,
-    update_histograms,
-    weigh_parts,
+from drake_pose.fit.colours import LINES, search_line_step
+from drake_pose.search import (
+    TRACKED,
+    UNEXPLAINED,
+    MultiStartSearch,
+    PoseEstimate,
+    PoseSearch,
+    View,
+    covariance_pose_set,
 )
-from drake_pose.fit.contour_fit import (
-    Comparison,
-    Noise,
-    Views,
-    camera_weights,
-    compare_views,
-    normal_equations,
-    pack_cameras,
-    pack_views,
-)
-from drake_pose.fit.covariance import distances, error_unit, estimate_sizes, values_covariance
-from drake_pose.fit.evidence import NO_EDGE, find_edge_points
-from drake_pose.fit.kernel import REACH, Sum
-from drake_pose.fit.levenberg_marquardt import AnnealingStage
-
-
-@dataclass(frozen=True)
-class ContourSettings:
-    """Settings of contour measurements."""
-
-    spacing: float = 3.0  # Distance between two contour points [pixel].
-    # Smallest standard deviation of a mask's edge about the body's contour [pixel].
-    deviation: float = 0.7
-    # Contour length over which errors are correlated; its points count as one [pixel].
-    correlation: float = 12.0
-    reach: float = 40.0  # Largest distance between the model's contour and a mask's edge [pixel].
-    robust_width: float = 2.5  # Scale of the Geman-McClure weight [standard deviations].
-    # Directions of the state with less than this fraction of the largest information are dropped.
-    negligible: float = 1e-12
-
-
-CONTOUR = ContourSettings()
-
-
-# Weight 1 per pixel of contour.
-_PLAIN = Noise(deviation=1.0, correlation=0.5)
-
-
-class ContourEvidence(NamedTuple):
-    """The evidence of a frame.
-
-    Attributes:
-        views: the cameras, and the edge points of their masks.
-        pictures: for each camera, the picture if there is no mask, else None.
-        colours: colour histograms of the body before this frame; None: pictures are not used.
-    """
-
-    views: Views
-    pictures: tuple[Picture | None, ...]
-    colours: Floats | None
-
-    @property
-    def has_pictures(self) -> bool:
-        """Whether a picture can be compared."""
-        return self.colours is not None and any(one is not None for one in self.pictures)
-
-
-@dataclass(frozen=True, eq=False)
-class ContourMeasurement(LinearObservation):
-    """The measurement that a frame's contours give, linearised at one state.
-
-    The distances of hundreds of contour points are summed to normal equations. Their factorisation
-    gives one scalar measurement with variance 1 for each observable direction of the state.
-    """
-
-    y: Array  # (k,) measured values; the predicted value at ``at`` is 0.
-    inlier_ratio: float  # Fraction of the visible model contour with an edge nearby.
-    distance: float  # Robustly weighted root mean square distance of contour and edges [pixel].
-    # (nodes,) the same by part, in pictures [pixel]; 0 where evidence is too weak.
-    part_distances: Array
-    compared: Comparison  # The comparison of the contours at ``at``.
-
-
-class ContourObservation(BodyState):
-    """Turns masks and pictures into measurements of a tree's state, with ``fit.colours``."""
-
-    def gather_evidence(
-        self,
-        masks: Sequence[Mask | None],
-        pictures: Sequence[Picture | None] | None = None,
-        colours: Floats | None = None,
-    ) -> ContourEvidence:
-        """Return the evidence of a frame; edge points are found once for all its measurements.
-
-        Args:
-            masks: for each of ``cameras`` (H, W) or None.
-            pictures: for each camera (H, W, 3 or 4) or None; used for cameras without a mask. None:
-                no pictures.
-            colours: colour histograms of the body; None: pictures are not used.
-
-        Raises SettingsError: the number or size of masks or pictures does not fit the cameras.
-        """
-        pictures = [None] * len(masks) if pictures is None else pictures
-        for kind, given in (("masks", masks), ("pictures", pictures)):
-            if len(given) != len(self.cameras):
-                raise SettingsError(f"{len(self.cameras)} {kind} expected, got {len(given)}")
-        edges, compared = [], []
-        for camera, mask, picture in zip(self.cameras, masks, pictures, strict=True):
-            if mask is not None and mask.shape != (camera.height, camera.width):
-                raise SettingsError(
-                    f"camera '{camera.name}': mask of {mask.shape[1]} x {mask.shape[0]} pixels, "
-                    f"{camera.width} x {camera.height} expected"
-                )
-            edges.append(NO_EDGE if mask is None else find_edge_points(mask, 0.5 * CONTOUR.spacing))
-            compared.append(
-                None if picture is None or mask is not None else check_picture(camera, picture)
-            )
-        return ContourEvidence(pack_views(self.cameras, edges), tuple(compared), colours)
-
-    def uninformed_histograms(self) -> Floats:
-        """Return the colour histograms of a body without observations."""
-        return uninformed_histograms(len(self.cameras), len(self._body.outlines))
-
-    def update_histograms(
-        self,
-        pictures: Sequence[Picture | None],
-        x: Array,
-        colours: Floats,
-        pose_is_known: bool = False,
-        excluded_parts: Mask | None = None,
-    ) -> Floats:
-        """Return the body's colour histograms updated by a frame.
-
-        Args:
-            pictures: for each camera (H, W, 3 or 4) or None.
-            x: (n,) the state in this frame.
-            colours: the histograms before this frame.
-            pose_is_known: whether the state is certain, so that the old histograms are discarded.
-            excluded_parts: (nodes,) parts whose histograms stay unchanged; None: none.
-
-        Raises SettingsError: a picture does not fit its camera.
-        """
-        checked = [
-            None if picture is None else check_picture(camera, picture)
-            for camera, picture in zip(self.cameras, pictures, strict=True)
-        ]
-        placed = self._body.place(self.parameters(x))
-        known = update_histograms(placed, self.cameras, checked, colours, pose_is_known)
-        if excluded_parts is not None:
-            known[:, excluded_parts] = colours[:, excluded_parts]
-        return known
-
-    def measure(
-        self,
-        evidence: ContourEvidence,
-        x: Array,
-        distance: float | None = None,
-        iteration: int = 0,
-        excluded_parts: Mask | None = None,
-    ) -> ContourMeasurement | None:
-        """Compare the model's contour at a state with a frame.
-
-        Args:
-            evidence: the frame.
-            x: (n,) the state.
-            distance: root mean square distance found by the previous measurement [pixel]; None:
-                edges are searched in the whole reach.
-            iteration: number of measurements of this frame made before; search lines in pictures
-                become finer with it.
-            excluded_parts: (nodes,) parts that are not measured in pictures; None: none.
-
-        Returns the measurement; None if no edge is near the contour in any mask or picture.
-        """
-        width = CONTOUR.reach / REACH
-        if distance is not None:
-            width = min(width, CONTOUR.robust_width * max(CONTOUR.deviation, distance))
-        found = self._compare(evidence, x, width, iteration)
-        if found is None:
-            return None
-        shown = np.array([picture is not None for picture in evidence.pictures])
-        if excluded_parts is not None:
-            off = np.ix_(shown, excluded_parts)
-            found[0].A[off], found[0].b[off] = 0.0, 0.0
-        return self._compress(x, *found, part_distances(found[0].sums[shown]))
-
-    def _compare(
-        self, evidence: ContourEvidence, x: Array, width: float, iteration: int
-    ) -> tuple[Comparison, float] | None:
-        """Compare the contours of the body at a state x (n,) with a frame.
-
-        ``width``: scale of the robust cost [pixel]. ``iteration``: number of measurements made
-        before. Returns the comparison, and the weighted RMS distance [pixel]; None: no edge is
-        near.
-        """
-        step = AnnealingStage(width, CONTOUR.spacing)
-        placed = self._body.place(self.parameters(x))
-        weights = camera_weights(evidence.views.cameras, placed, step, _PLAIN, 1.0)
-        compared = compare_views(evidence.views, placed, weights)
-        if evidence.colours is not None and evidence.has_pictures:
-            pixels = search_line_step(iteration)
-            # Coarse search lines are so wide that denser ones would be redundant.
-            lines = AnnealingStage(width, LINES.spacing * min(pixels, 2))
-            correlation = _PLAIN.correlation * LINES.correlation / CONTOUR.correlation
-            noise = replace(_PLAIN, correlation=correlation)
-            add_pictures(
-                compared, self.cameras, evidence.pictures, evidence.colours, lines, noise, pixels
-            )
-            weigh_parts(compared, CONTOUR.deviation, evidence.pictures)
-        squares, weight = compared.sums[:, :, [Sum.SQUARES, Sum.WEIGHT]].sum(axis=(0, 1))
-        return None if weight <= 0.0 else (compared, math.sqrt(squares / weight))
-
-    def _compress(
-        self, x: Array, compared: Comparison, distance: float, parts: Array
-    ) -> ContourMeasurement:
-        """Return a comparison at a state as at most n independent measurements of variance 1.
-
-        Args:
-            x: (n,) the state.
-            compared: the comparison of the contours there.
-            distance: root mean square distance of the contours [pixel].
-            parts: ``ContourMeasurement.part_distances``.
-        """
-        H, g = normal_equations(compared, len(self._body.names))
-        index = self._parameter_index
-        scale = max(CONTOUR.deviation, distance)
-        # Residuals are computed from both contours, so each gets half of the weight.
-        weight = 0.5 / (scale**2 * CONTOUR.correlation)
-        prior_curvature, prior_slope = self._prior_information
-        slopes = weight * g[index] + prior_curvature @ x[self._state_index] - prior_slope
-        curvature = weight * H[np.ix_(index, index)] + prior_curvature
-        size, turns = np.linalg.eigh(curvature)
-        observable = size > CONTOUR.negligible * max(float(size[-1]), 1e-300)
-        root, turns = np.sqrt(size[observable]), turns[:, observable]
-        slope = np.zeros((len(root), len(self.layout)))
-        slope[:, self._state_index] = root[:, None] * turns.T
-        contour = compared.sums[:, :-1].sum(axis=(0, 1))
-        return ContourMeasurement(
-            names=tuple(f"contour_{k}" for k in range(len(root))),
-            variances=np.ones(len(root)),
-            wraps=np.zeros(len(root), dtype=np.bool_),
-            h=np.zeros(len(root)),
-            y=-(turns.T @ slopes) / root,
-            H=slope,
-            at=x,
-            inlier_ratio=float(contour[Sum.FITTING] / max(contour[Sum.COMPARED], 1e-9)),
-            distance=distance,
-            part_distances=parts,
-            compared=compared,
-        )
-
-    def covariance(self, measured: ContourMeasurement, area: float) -> Array:
-        """Return the covariance (m, m) of the tree's values from one frame's measurement alone.
-
-        It is 0 for values that are not free. Errors of surfaces, masks and cameras are correlated,
-        see ``fit.covariance``.
-
-        ``measured``: the measurement. ``area``: total area of all silhouettes [pixel].
-        """
-        unit = error_unit(math.sqrt(area / len(self.cameras)))
-        index, size = self._parameter_index, len(self._body.names)
-        is_angle = np.array([self.is_angle(name) for name in self._element_names])
-        moves = measured.compared.placement.dense(size)[:, index]
-        cameras = pack_cameras(self.cameras)
-        errors = distances(self._body.outlines, cameras, measured.compared, moves, unit)
-        sizes = estimate_sizes(errors, is_angle)
-        covariance, count = np.zeros((size, size)), len(self._kinematics.names)
-        covariance[np.ix_(index, index)] = values_covariance(
-            errors, sizes, np.arange(len(index)), is_angle
-        )
-        return covariance[:count, :count]
+from drake_pose.silhouette.pictures.masks import count_edge_pixels
 
 
 @dataclass(frozen=True)
@@ -542,3 +290,305 @@ class ContourTracker:
         moved = found - expected.best.mean
         belief = Belief(found, expected.best.covariance + np.outer(moved, moved))
         return replace(self.filter.start(belief), step=state.step)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerState:
+    """The state of ``MatchAndTrack`` after a frame."""
+
+    track: Track | None = None  # The contour track; None before the first pose.
+    reference: float = 0.0  # E_total after the last match; a track with a much larger one is lost.
+    matches: int = 0  # Number of searches so far.
+    # Number of consecutive frames, up to this one, that no pose explains; the track is predicted
+    # through them.
+    unexplained: int = 0
+    # Number of following frames in which the search is repeated because it reached its time limit.
+    retries: int = 0
+
+
+def make_tracker(
+    tree: PoseTree, cameras: Sequence[Camera], period: float, settings: TrackingSettings
+) -> ContourTracker:
+    """Return a tracker of a pose tree's contour; ``period``: time between two frames [s].
+
+    Raises SettingsError: there is no camera, the period is not positive, or the tree has no free
+    value.
+    """
+    prior_weight = 0.0 if settings.rest_time is None else period / settings.rest_time
+    observation = ContourObservation(
+        tree, cameras, settings.root_moves, settings.scale_unknown, prior_weight
+    )
+    return ContourTracker(observation, period, settings)
+
+
+@dataclass(frozen=True, eq=False)
+class _GivenFrame:
+    """The evidence of a frame."""
+
+    views: Sequence[View]  # The cameras that have a mask, with it; for the search.
+    # (3,) the root's known position in the world [m]; None: as in the tree.
+    root_position: Array | None
+    observation: ContourObservation  # The body with its root there.
+    masks: list[Mask | None]  # For each camera (H, W) or None.
+    # For each camera (H, W, 3 or 4) or None; None: no pictures.
+    pictures: list[Picture | None] | None
+    begin: float  # Time at which the processing of the frame started [s].
+
+
+class MatchAndTrack:
+    """Tracks a body from frame to frame, and searches for it where tracking fails.
+
+    A frame that no pose explains, because the body is hidden or there is no evidence, leaves the
+    track predicted: its standard deviations grow, and the frame's pose is not found. A pose from
+    the search replaces the prediction only if it explains the masks about as well as earlier poses
+    did, or after ``TrackingSettings.patience``.
+
+    Args:
+        search: used in the first frame and when the track is lost; it has the pose tree.
+        cameras: all cameras of the sequence.
+        period: time between two frames [s].
+        settings: None: TrackingSettings().
+        search_time: time limit of a ``MultiStartSearch`` [s]; None: the search's own. A search that
+            reaches it is repeated in the next frames.
+
+    Raises:
+        SettingsError: there is no camera, the period is not positive, or the tree has no free
+            value.
+    """
+
+    def __init__(
+        self,
+        search: PoseSearch,
+        cameras: Sequence[Camera],
+        period: float,
+        settings: TrackingSettings | None = None,
+        search_time: float | None = None,
+    ) -> None:
+        self.settings, self._period = settings or TrackingSettings(), period
+        if search_time is not None and isinstance(search, MultiStartSearch):
+            search = search.with_time_limit(search_time)
+        self._search = search
+        self.tracker = make_tracker(search.tree, cameras, period, self.settings)
+
+    def next(
+        self,
+        last: TrackerState,
+        views: Sequence[View],
+        root_position: Array | None = None,
+        pictures: Mapping[str, Picture] | None = None,
+        start: Array | None = None,
+    ) -> tuple[TrackerState, PoseEstimate]:
+        """Process the next frame.
+
+        Args:
+            last: the state after the previous frame; TrackerState() before the first.
+            views: the cameras' masks; may be empty if there are pictures.
+            root_position: (3,) known position of the root in the world [m]; None: as in the tree.
+            pictures: pictures (H, W, 3 or 4) by name of the camera; the colours along the contour
+                are used for cameras without a mask. None: no pictures.
+            start: (nq,) approximate positions in this frame, if known; the search is then used only
+                if the masks do not fit them.
+
+        Returns:
+            The new state, and the pose. ``stopped_by`` is TRACKED if the pose was tracked. If no
+                pose explains the masks, or there is no evidence, ``found`` is false and the pose is
+                the prediction, or ``start`` if given. A track lost in pictures without masks is
+                continued with ``found`` false until its contour fits again.
+
+        Raises SettingsError: masks or pictures do not fit the cameras.
+        """
+        begin, observation = time.perf_counter(), self.tracker.observation
+        names = [camera.name for camera in observation.cameras]
+        given = {view.camera.name: view.mask for view in views}
+        if root_position is not None:
+            observation = observation.with_root_position(root_position)
+        masks = [given.get(name) for name in names]
+        shown = [pictures.get(name) for name in names] if pictures else None
+        frame = _GivenFrame(views, root_position, observation, masks, shown, begin)
+        tracked: tuple[Track, PoseEstimate] | None = None
+        if last.track is not None:
+            track = self._follow(last.track, frame, False)
+            tracked = track, self._result(track, frame)
+            if not self._is_lost(*tracked, last.reference, frame):
+                if last.retries and views:
+                    return self._match(last, tracked, frame, None)
+                return TrackerState(track, last.reference, last.matches), tracked[1]
+        if start is not None:
+            started = self._begin(start, last, frame)
+            if started[1].found or not views:
+                return started
+        if not views:
+            if tracked is None:
+                default = self._search.tree.model.default_positions
+                nowhere = self.tracker.observation.state(default)
+                result = self._result(self.tracker.start(nowhere), frame)
+                return last, replace(result, found=False)
+            # With unexplained = 0 the next frame with evidence is searched at once.
+            return replace(last, track=tracked[0], unexplained=0), replace(tracked[1], found=False)
+        return self._match(last, tracked, frame, start)
+
+    def with_intervals(self, state: TrackerState, pose: PoseEstimate) -> PoseEstimate:
+        """Return a tracked pose with the joints' intervals from this frame's contours alone.
+
+        ``state`` and ``pose`` are what ``next`` returned for the frame. Without a measurement the
+        pose is returned unchanged.
+        """
+        track = state.track
+        if track is None or track.measurement is None:
+            return pose
+        observation = self.tracker.observation
+        own = observation.covariance(track.measurement, pose.area)
+        pictures = len(observation.cameras)
+        return replace(pose, pose_set=covariance_pose_set(self._search.tree, pose, own, pictures))
+
+    def _match(
+        self,
+        last: TrackerState,
+        tracked: tuple[Track, PoseEstimate] | None,
+        frame: _GivenFrame,
+        start: Array | None,
+    ) -> tuple[TrackerState, PoseEstimate]:
+        """Return the better of the tracked pose, if any, and the search's, and the state after it.
+
+        If neither explains the masks, return the given start or the prediction, as not found.
+
+        Args:
+            last: the state after the previous frame.
+            tracked: the track and its pose in this frame; None: there was no track.
+            start: (nq,) approximate positions in this frame; None: unknown.
+        """
+        settings, last_track = self.settings, last.track
+        unexplained = last.unexplained + 1
+        pause = max(1, round(settings.search_pause / self._period))
+        found, matches = [] if tracked is None else [tracked], last.matches
+        retries = max(0, last.retries - 1)
+        if last_track is None or last.retries or unexplained % pause == 1 % pause:
+            matches += 1
+            matched = self._search.match(frame.views, frame.root_position)
+            found += self._search_candidates(matched, last_track, frame)
+            if matched.stopped_by != "time_limit":
+                retries = 0
+            elif not last.retries:
+                retries = settings.retries
+            if not found and last_track is None and start is None:
+                return TrackerState(None, 0.0, matches, 0, retries), matched
+        limit = self._limit(last.reference)
+        explained = [one for one in found if last_track is None or one[1].E_total <= limit]
+        if not explained and unexplained * self._period > settings.patience:
+            explained = found
+        if start is not None and (last_track is None or not explained):
+            # Measured positions are kept if no pose explains the masks.
+            explained = [one for one in found if one[1].E_total <= self._limit(0.0)]
+        if explained:
+            track, result = min(explained, key=lambda pair: pair[1].E_total)
+            return TrackerState(track, result.E_total, matches, 0, retries), result
+        if start is not None:
+            track = self.tracker.start(self._state(start, last, frame))
+        else:
+            assert last_track is not None
+            track = self._follow(last_track, frame, False, ignore_evidence=True)
+        result = replace(self._result(track, frame), found=False)
+        return TrackerState(track, last.reference, matches, unexplained, retries), result
+
+    def _search_candidates(
+        self, matched: PoseEstimate, last: Track | None, frame: _GivenFrame
+    ) -> list[tuple[Track, PoseEstimate]]:
+        """Return the pose of a search, tracked in its frame and as it is; empty if not found.
+
+        Args:
+            matched: the search's pose.
+            last: the track before this frame, whose turns the angles take; None: there is none.
+        """
+        if not matched.found:
+            return []
+        x = frame.observation.state(matched.q, matched.X_WB, matched.scale)
+        if last is not None:
+            # A search does not know the number of full turns of an angle.
+            x = frame.observation.unwrapped(x, last.state.best.mean)
+            node_values = frame.observation.node_values(x)
+            turns = [
+                2.0 * np.pi * np.round((now - then) / (2.0 * np.pi))
+                for now, then in zip(node_values, matched.node_values, strict=True)
+            ]
+            matched = matched.turned(self._search.tree, turns)
+        first = self.tracker.start(x)
+        refined = self._follow(first, frame, True)
+        # The pose was refined from the search's, so that the search's pose set still applies.
+        tracked = replace(self._result(refined, frame), pose_set=matched.pose_set)
+        # The unrefined pose may fit better; it keeps the colours learned in this frame.
+        return [(refined, tracked), (replace(first, colours=refined.colours), matched)]
+
+    def _begin(
+        self, start: Array, last: TrackerState, frame: _GivenFrame
+    ) -> tuple[TrackerState, PoseEstimate]:
+        """Return the state and pose of a track that starts at positions ``start`` (nq,).
+
+        ``last``: the state after the previous frame. The pose is not ``found`` if it is lost.
+        """
+        track = self._follow(self.tracker.start(self._state(start, last, frame)), frame, True)
+        result = self._result(track, frame)
+        reference = result.E_total if frame.views else UNEXPLAINED
+        found = not self._is_lost(track, result, reference, frame)
+        return TrackerState(track, reference, last.matches), replace(result, found=found)
+
+    def _state(self, start: Array, last: TrackerState, frame: _GivenFrame) -> Array:
+        """Return the state (n,) at positions ``start`` (nq,), angles in the last track's turns."""
+        x = frame.observation.state(start)
+        if last.track is None:
+            return x
+        return frame.observation.unwrapped(x, last.track.state.best.mean)
+
+    def _follow(
+        self, track: Track, frame: _GivenFrame, first: bool, ignore_evidence: bool = False
+    ) -> Track:
+        """Return the track after a frame; ``first``: it begins; ``ignore_evidence``: predict."""
+        if ignore_evidence:
+            masks = [None] * len(frame.masks)
+            return self.tracker.follow(track, masks, first, frame.root_position)
+        return self.tracker.follow(track, frame.masks, first, frame.root_position, frame.pictures)
+
+    def _is_lost(
+        self, track: Track, result: PoseEstimate, reference: float, frame: _GivenFrame
+    ) -> bool:
+        """Return whether evidence is missing, the track left the contour, or E_total is high.
+
+        ``reference``: E_total after the last match.
+        """
+        explains = not frame.views or result.E_total <= self._limit(reference)
+        is_bare = all(one is None for one in (*frame.masks, *(frame.pictures or ())))
+        return is_bare or track.lost or not explains
+
+    @staticmethod
+    def _limit(reference: float) -> float:
+        """Return the largest E_total of a pose that explains the masks, given ``reference``."""
+        return min(1.5 * reference + 0.1, UNEXPLAINED)
+
+    def _difference(self, track: Track, frame: _GivenFrame) -> tuple[float, float]:
+        """Return the area where body and evidence differ, and the silhouettes' area [pixel].
+
+        With masks these are areas of pixels. With pictures alone the first is the length of the
+        body's contours times their distance from edges (infinite without a measurement), and the
+        second the area of the drawn body.
+        """
+        observation, x = frame.observation, track.state.best.mean
+        if frame.views:
+            return observation.difference(x, [(view.camera, view.mask) for view in frame.views])
+        J, area = 0.0, 0.0
+        if track.measurement is None:
+            return math.inf, 1.0
+        for camera in observation.cameras:
+            drawn = observation.draw(x, camera)
+            area += int(np.count_nonzero(drawn))
+            J += count_edge_pixels(drawn) * track.measurement.distance
+        return J, max(area, 1.0)
+
+    def _result(self, track: Track, frame: _GivenFrame) -> PoseEstimate:
+        """Return a track's pose as an estimate that is ``found``, with J and area in a frame."""
+        observation, x = frame.observation, track.state.best.mean
+        q, X_WB = observation.positions(x)
+        J, area = self._difference(track, frame)
+        return PoseEstimate(
+            found=True, q=q, X_WB=X_WB, node_values=observation.node_values(x), J=float(J),
+            area=float(area), stopped_by=TRACKED, seconds=time.perf_counter() - frame.begin,
+            root_position=observation.root_position(x), scale=observation.scale(x),
+        )  # fmt: skip

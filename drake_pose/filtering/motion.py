@@ -14,14 +14,15 @@ from scipy.linalg import expm
 
 from drake_pose.arrays import Array
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.linearisation import (
+from drake_pose.filtering.state import (
+    Belief,
     Function,
     Linear,
+    StateLayout,
     function_without_jacobian,
     linearise_over,
     numerical_jacobian,
 )
-from drake_pose.filtering.state import Belief, StateLayout
 
 
 class MotionModel(Protocol):

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array, Indices, Mask
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.filtering.contour_tracker import ContourObservation, ContourTracker, Track
+from drake_pose.filtering.contour_observation import ContourObservation
+from drake_pose.filtering.contour_tracker import ContourTracker, Track
 from drake_pose.fit.contour_fit import Noise
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
@@ -74,7 +75,7 @@ class TrackedStart:
     states: tuple[Array, ...]  # State (n,) in each frame.
     track: Track  # The track after the last frame.
     errors: tuple[float, ...]  # E_total in each frame.
-    prior_distances: tuple[float, ...]  # ``BodyState.prior_distance`` in each frame.
+    prior_distances: tuple[float, ...]  # ``ContourObservation.prior_distance`` in each frame.
 
     @property
     def x(self) -> Array:

@@ -16,9 +16,8 @@ import numpy as np
 from drake_pose.arrays import Array
 from drake_pose.errors import SettingsError, require_at_least, require_choice
 from drake_pose.filtering.inequalities import Inequalities, inner_point
-from drake_pose.filtering.linearisation import Linear, require_jacobian
 from drake_pose.filtering.motion import LinearMotion, MotionModel, require_models, step_from
-from drake_pose.filtering.state import Belief, StateLayout, make_belief
+from drake_pose.filtering.state import Belief, Linear, StateLayout, make_belief, require_jacobian
 from drake_pose.filtering.truncated_normal import (
     Truncated,
     clip,

@@ -22,15 +22,16 @@ from scipy.special import chdtri
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.filtering.linearisation import (
+from drake_pose.filtering.state import (
+    Belief,
     Function,
     Linear,
+    factor_of,
     function_without_jacobian,
     linearise_over,
     numerical_jacobian,
     wrapped_difference,
 )
-from drake_pose.filtering.state import Belief, factor_of
 from drake_pose.filtering.truncated_normal import Truncated, untruncated
 
 Truncate = Callable[[Belief, Array], Truncated]

@@ -13,8 +13,7 @@ from pydrake.systems.sensors import ImageLabel16I
 from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera, camera_tuple
 from drake_pose.errors import SettingsError, require_at_least
-from drake_pose.filtering.contour_tracker import TrackingSettings
-from drake_pose.filtering.match_and_track import MatchAndTrack, TrackerState
+from drake_pose.filtering.contour_tracker import MatchAndTrack, TrackerState, TrackingSettings
 from drake_pose.search import TRACKED, PoseEstimate, PoseSearch, View
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.systems.bodies import body_poses

@@ -18,12 +18,8 @@ from drake_pose.files.overlay import draw_shapes
 from drake_pose.files.records import user_units
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.writer import OnStage
-from drake_pose.filtering.contour_tracker import (
-    ContourObservation,
-    ContourTracker,
-    TrackingSettings,
-)
-from drake_pose.filtering.match_and_track import make_tracker
+from drake_pose.filtering.contour_observation import ContourObservation
+from drake_pose.filtering.contour_tracker import ContourTracker, TrackingSettings, make_tracker
 from drake_pose.filtering.sequence_fit import (
     SEQUENCE,
     TrackedStart,

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from drake_pose.filtering.hand import HAND_STATE
-from drake_pose.filtering.linearisation import Linear
-from drake_pose.filtering.state import Belief
+from drake_pose.filtering.state import Belief, Linear
 from drake_pose.filtering.truncated_filter import Hypothesis, merge_duplicates, normalise, prune
 from drake_pose.filtering.update import (
     RepeatedView,

@@ -5,9 +5,8 @@ import pytest
 
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.filtering.inequalities import from_bounds
-from drake_pose.filtering.linearisation import linearise_over
 from drake_pose.filtering.motion import FunctionMotion, LinearMotion, constant_velocity
-from drake_pose.filtering.state import Belief, StateLayout
+from drake_pose.filtering.state import Belief, StateLayout, linearise_over
 from drake_pose.filtering.truncated_filter import FilterSettings, TruncatedFilter
 from drake_pose.filtering.update import FunctionObservation
 from tests.benchmarks import filters

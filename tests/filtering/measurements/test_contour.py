@@ -3,9 +3,12 @@ import pytest
 
 from drake_pose.body import load_model
 from drake_pose.errors import SettingsError
-from drake_pose.filtering import contour_tracker
-from drake_pose.filtering.body_state import ROOT_SHIFT
-from drake_pose.filtering.contour_tracker import ContourObservation, ContourSettings
+from drake_pose.filtering import contour_observation
+from drake_pose.filtering.contour_observation import (
+    ROOT_SHIFT,
+    ContourObservation,
+    ContourSettings,
+)
 from drake_pose.filtering.inequalities import from_model
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.body.models import LIMB_URDF, joint, link, urdf, write, write_limb
@@ -72,7 +75,7 @@ def test_jacobian_equals_finite_differences_of_the_contour(body, monkeypatch):
     """Of the measured distances, without robust weights."""
     camera = front_camera(400, shift=0.2)
     plain = ContourSettings(spacing=1.0, deviation=30.0)
-    monkeypatch.setattr(contour_tracker, "CONTOUR", plain)
+    monkeypatch.setattr(contour_observation, "CONTOUR", plain)
     observation = ContourObservation(body.pose_tree(), [camera])
     truth = observation.state(np.array([0.2, 0.9, -0.6]))
     mask = observation.draw(truth, camera)

@@ -17,8 +17,7 @@ from drake_pose.filtering.hand import (
     plant_positions,
 )
 from drake_pose.filtering.hand_silhouette import HAND, HandSilhouette, match_axes
-from drake_pose.filtering.linearisation import wrapped_difference
-from drake_pose.filtering.state import Belief
+from drake_pose.filtering.state import Belief, wrapped_difference
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.papers.shimada import experiment_filter
 from drake_pose.papers.shimada_sequences import first_guess, true_states

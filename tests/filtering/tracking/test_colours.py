@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.contour_tracker import ContourObservation, ContourTracker
+from drake_pose.filtering.contour_observation import ContourObservation
+from drake_pose.filtering.contour_tracker import ContourTracker
 from drake_pose.fit import colours
 from drake_pose.fit.colours import COLOURS, LINES, Colour, part_distances, weigh_parts
 from drake_pose.fit.contour_fit import Comparison

@@ -5,12 +5,14 @@ import pytest
 
 from drake_pose.camera.models import circle_of_cameras
 from drake_pose.errors import SettingsError
+from drake_pose.filtering.contour_observation import ContourObservation
 from drake_pose.filtering.contour_tracker import (
-    ContourObservation,
     ContourTracker,
+    MatchAndTrack,
+    TrackerState,
     TrackingSettings,
+    make_tracker,
 )
-from drake_pose.filtering.match_and_track import MatchAndTrack, TrackerState, make_tracker
 from drake_pose.filtering.state import Belief
 from drake_pose.search import TRACKED, PaperSearch, PaperSearchSettings, PoseEstimate, View
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer

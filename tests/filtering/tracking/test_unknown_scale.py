@@ -9,12 +9,13 @@ import pytest
 from drake_pose.body import RootRotation
 from drake_pose.camera.models import circle_of_cameras
 from drake_pose.errors import SettingsError
+from drake_pose.filtering.contour_observation import ContourObservation
 from drake_pose.filtering.contour_tracker import (
-    ContourObservation,
     ContourTracker,
+    MatchAndTrack,
+    TrackerState,
     TrackingSettings,
 )
-from drake_pose.filtering.match_and_track import MatchAndTrack, TrackerState
 from drake_pose.filtering.sequence_fit import (
     SEQUENCE,
     FittedSequence,

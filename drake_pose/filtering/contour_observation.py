@@ -1,13 +1,18 @@
-"""The free values of a pose tree as a filter's state: limits, prior, poses and silhouettes."""
+"""The free values of a pose tree as a filter's state, measured by contours in masks and pictures.
+
+``ContourObservation`` turns a frame into a linear measurement of the state, by comparing the
+model's contour with edges.
+"""
 
 import copy
 import math
 from collections.abc import Iterable, Sequence
-from typing import TypeVar
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.arrays import Array, Mask
+from drake_pose.arrays import Array, Floats, Mask, Picture
 from drake_pose.body import PlantKinematics, PoseTree
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, ParallelCamera
@@ -23,13 +28,36 @@ from drake_pose.filtering.inequalities import (
     warn_if_unlimited,
 )
 from drake_pose.filtering.state import StateLayout
+from drake_pose.filtering.update import LinearObservation
+from drake_pose.fit.colours import (
+    LINES,
+    add_pictures,
+    check_picture,
+    part_distances,
+    search_line_step,
+    uninformed_histograms,
+    update_histograms,
+    weigh_parts,
+)
+from drake_pose.fit.contour_fit import (
+    Comparison,
+    Noise,
+    Views,
+    camera_weights,
+    compare_views,
+    normal_equations,
+    pack_cameras,
+    pack_views,
+)
+from drake_pose.fit.covariance import distances, error_unit, estimate_sizes, values_covariance
+from drake_pose.fit.evidence import NO_EDGE, find_edge_points
+from drake_pose.fit.kernel import REACH, Sum
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import BodyParameters
 from drake_pose.fit.surfaces import MANY, simplify_rigid_parts
 from drake_pose.search import slide_root
 from drake_pose.silhouette.outline import PackedSurfaces, TreeSurfaces
 from drake_pose.silhouette.scoring import draw_packed
-
-Self = TypeVar("Self", bound="BodyState")
 
 ROOT_SHIFT = ("root_shift_x", "root_shift_y", "root_shift_z")
 """Shift of the root in the world from its place in the pose tree [m]."""
@@ -40,8 +68,67 @@ LOG_SCALE = "log_scale"
 _ROOT = (*ROOT_SHIFT, LOG_SCALE)
 
 
-class BodyState:
-    """The free values of a pose tree as a filter's state x (n,), with cameras that observe them.
+@dataclass(frozen=True)
+class ContourSettings:
+    """Settings of contour measurements."""
+
+    spacing: float = 3.0  # Distance between two contour points [pixel].
+    # Smallest standard deviation of a mask's edge about the body's contour [pixel].
+    deviation: float = 0.7
+    # Contour length over which errors are correlated; its points count as one [pixel].
+    correlation: float = 12.0
+    reach: float = 40.0  # Largest distance between the model's contour and a mask's edge [pixel].
+    robust_width: float = 2.5  # Scale of the Geman-McClure weight [standard deviations].
+    # Directions of the state with less than this fraction of the largest information are dropped.
+    negligible: float = 1e-12
+
+
+CONTOUR = ContourSettings()
+
+
+# Weight 1 per pixel of contour.
+_PLAIN = Noise(deviation=1.0, correlation=0.5)
+
+
+class ContourEvidence(NamedTuple):
+    """The evidence of a frame.
+
+    Attributes:
+        views: the cameras, and the edge points of their masks.
+        pictures: for each camera, the picture if there is no mask, else None.
+        colours: colour histograms of the body before this frame; None: pictures are not used.
+    """
+
+    views: Views
+    pictures: tuple[Picture | None, ...]
+    colours: Floats | None
+
+    @property
+    def has_pictures(self) -> bool:
+        """Whether a picture can be compared."""
+        return self.colours is not None and any(one is not None for one in self.pictures)
+
+
+@dataclass(frozen=True, eq=False)
+class ContourMeasurement(LinearObservation):
+    """The measurement that a frame's contours give, linearised at one state.
+
+    The distances of hundreds of contour points are summed to normal equations. Their factorisation
+    gives one scalar measurement with variance 1 for each observable direction of the state.
+    """
+
+    y: Array  # (k,) measured values; the predicted value at ``at`` is 0.
+    inlier_ratio: float  # Fraction of the visible model contour with an edge nearby.
+    distance: float  # Robustly weighted root mean square distance of contour and edges [pixel].
+    # (nodes,) the same by part, in pictures [pixel]; 0 where evidence is too weak.
+    part_distances: Array
+    compared: Comparison  # The comparison of the contours at ``at``.
+
+
+class ContourObservation:
+    """The free values of a pose tree as a filter's state x (n,), measured by contours in cameras.
+
+    Masks and pictures give measurements of the state; pictures with ``fit.colours``.
 
     A state holds the free values [rad or m], root shift and log scale, then the rates of all these.
 
@@ -150,7 +237,7 @@ class BodyState:
             parts.append(load_couplings(file, model.position_names).restricted_to(names))
         return warn_if_unlimited(stack(parts, names), str(model.path))
 
-    def with_root_position(self: Self, root_position: Array) -> Self:
+    def with_root_position(self, root_position: Array) -> "ContourObservation":
         """Return a copy whose root is at another known position (3,) in the world [m]."""
         other = copy.copy(self)
         other._known_shift = np.asarray(root_position, dtype=np.float64) - self._root(self._values)
@@ -283,3 +370,188 @@ class BodyState:
     def node_poses(self, x: Array) -> Array:
         """Return X_WN (nodes, 4, 4) at a state (n,), scaled by its log scale."""
         return self._body.place(self.parameters(x)).X_WN
+
+    def gather_evidence(
+        self,
+        masks: Sequence[Mask | None],
+        pictures: Sequence[Picture | None] | None = None,
+        colours: Floats | None = None,
+    ) -> ContourEvidence:
+        """Return the evidence of a frame; edge points are found once for all its measurements.
+
+        Args:
+            masks: for each of ``cameras`` (H, W) or None.
+            pictures: for each camera (H, W, 3 or 4) or None; used for cameras without a mask. None:
+                no pictures.
+            colours: colour histograms of the body; None: pictures are not used.
+
+        Raises SettingsError: the number or size of masks or pictures does not fit the cameras.
+        """
+        pictures = [None] * len(masks) if pictures is None else pictures
+        for kind, given in (("masks", masks), ("pictures", pictures)):
+            if len(given) != len(self.cameras):
+                raise SettingsError(f"{len(self.cameras)} {kind} expected, got {len(given)}")
+        edges, compared = [], []
+        for camera, mask, picture in zip(self.cameras, masks, pictures, strict=True):
+            if mask is not None and mask.shape != (camera.height, camera.width):
+                raise SettingsError(
+                    f"camera '{camera.name}': mask of {mask.shape[1]} x {mask.shape[0]} pixels, "
+                    f"{camera.width} x {camera.height} expected"
+                )
+            edges.append(NO_EDGE if mask is None else find_edge_points(mask, 0.5 * CONTOUR.spacing))
+            compared.append(
+                None if picture is None or mask is not None else check_picture(camera, picture)
+            )
+        return ContourEvidence(pack_views(self.cameras, edges), tuple(compared), colours)
+
+    def uninformed_histograms(self) -> Floats:
+        """Return the colour histograms of a body without observations."""
+        return uninformed_histograms(len(self.cameras), len(self._body.outlines))
+
+    def update_histograms(
+        self,
+        pictures: Sequence[Picture | None],
+        x: Array,
+        colours: Floats,
+        pose_is_known: bool = False,
+        excluded_parts: Mask | None = None,
+    ) -> Floats:
+        """Return the body's colour histograms updated by a frame.
+
+        Args:
+            pictures: for each camera (H, W, 3 or 4) or None.
+            x: (n,) the state in this frame.
+            colours: the histograms before this frame.
+            pose_is_known: whether the state is certain, so that the old histograms are discarded.
+            excluded_parts: (nodes,) parts whose histograms stay unchanged; None: none.
+
+        Raises SettingsError: a picture does not fit its camera.
+        """
+        checked = [
+            None if picture is None else check_picture(camera, picture)
+            for camera, picture in zip(self.cameras, pictures, strict=True)
+        ]
+        placed = self._body.place(self.parameters(x))
+        known = update_histograms(placed, self.cameras, checked, colours, pose_is_known)
+        if excluded_parts is not None:
+            known[:, excluded_parts] = colours[:, excluded_parts]
+        return known
+
+    def measure(
+        self,
+        evidence: ContourEvidence,
+        x: Array,
+        distance: float | None = None,
+        iteration: int = 0,
+        excluded_parts: Mask | None = None,
+    ) -> ContourMeasurement | None:
+        """Compare the model's contour at a state with a frame.
+
+        Args:
+            evidence: the frame.
+            x: (n,) the state.
+            distance: root mean square distance found by the previous measurement [pixel]; None:
+                edges are searched in the whole reach.
+            iteration: number of measurements of this frame made before; search lines in pictures
+                become finer with it.
+            excluded_parts: (nodes,) parts that are not measured in pictures; None: none.
+
+        Returns the measurement; None if no edge is near the contour in any mask or picture.
+        """
+        width = CONTOUR.reach / REACH
+        if distance is not None:
+            width = min(width, CONTOUR.robust_width * max(CONTOUR.deviation, distance))
+        found = self._compare(evidence, x, width, iteration)
+        if found is None:
+            return None
+        shown = np.array([picture is not None for picture in evidence.pictures])
+        if excluded_parts is not None:
+            off = np.ix_(shown, excluded_parts)
+            found[0].A[off], found[0].b[off] = 0.0, 0.0
+        return self._compress(x, *found, part_distances(found[0].sums[shown]))
+
+    def _compare(
+        self, evidence: ContourEvidence, x: Array, width: float, iteration: int
+    ) -> tuple[Comparison, float] | None:
+        """Compare the contours of the body at a state x (n,) with a frame.
+
+        ``width``: scale of the robust cost [pixel]. ``iteration``: number of measurements made
+        before. Returns the comparison, and the weighted RMS distance [pixel]; None: no edge is
+        near.
+        """
+        step = AnnealingStage(width, CONTOUR.spacing)
+        placed = self._body.place(self.parameters(x))
+        weights = camera_weights(evidence.views.cameras, placed, step, _PLAIN, 1.0)
+        compared = compare_views(evidence.views, placed, weights)
+        if evidence.colours is not None and evidence.has_pictures:
+            pixels = search_line_step(iteration)
+            # Coarse search lines are so wide that denser ones would be redundant.
+            lines = AnnealingStage(width, LINES.spacing * min(pixels, 2))
+            correlation = _PLAIN.correlation * LINES.correlation / CONTOUR.correlation
+            noise = replace(_PLAIN, correlation=correlation)
+            add_pictures(
+                compared, self.cameras, evidence.pictures, evidence.colours, lines, noise, pixels
+            )
+            weigh_parts(compared, CONTOUR.deviation, evidence.pictures)
+        squares, weight = compared.sums[:, :, [Sum.SQUARES, Sum.WEIGHT]].sum(axis=(0, 1))
+        return None if weight <= 0.0 else (compared, math.sqrt(squares / weight))
+
+    def _compress(
+        self, x: Array, compared: Comparison, distance: float, parts: Array
+    ) -> ContourMeasurement:
+        """Return a comparison at a state as at most n independent measurements of variance 1.
+
+        Args:
+            x: (n,) the state.
+            compared: the comparison of the contours there.
+            distance: root mean square distance of the contours [pixel].
+            parts: ``ContourMeasurement.part_distances``.
+        """
+        H, g = normal_equations(compared, len(self._body.names))
+        index = self._parameter_index
+        scale = max(CONTOUR.deviation, distance)
+        # Residuals are computed from both contours, so each gets half of the weight.
+        weight = 0.5 / (scale**2 * CONTOUR.correlation)
+        prior_curvature, prior_slope = self._prior_information
+        slopes = weight * g[index] + prior_curvature @ x[self._state_index] - prior_slope
+        curvature = weight * H[np.ix_(index, index)] + prior_curvature
+        size, turns = np.linalg.eigh(curvature)
+        observable = size > CONTOUR.negligible * max(float(size[-1]), 1e-300)
+        root, turns = np.sqrt(size[observable]), turns[:, observable]
+        slope = np.zeros((len(root), len(self.layout)))
+        slope[:, self._state_index] = root[:, None] * turns.T
+        contour = compared.sums[:, :-1].sum(axis=(0, 1))
+        return ContourMeasurement(
+            names=tuple(f"contour_{k}" for k in range(len(root))),
+            variances=np.ones(len(root)),
+            wraps=np.zeros(len(root), dtype=np.bool_),
+            h=np.zeros(len(root)),
+            y=-(turns.T @ slopes) / root,
+            H=slope,
+            at=x,
+            inlier_ratio=float(contour[Sum.FITTING] / max(contour[Sum.COMPARED], 1e-9)),
+            distance=distance,
+            part_distances=parts,
+            compared=compared,
+        )
+
+    def covariance(self, measured: ContourMeasurement, area: float) -> Array:
+        """Return the covariance (m, m) of the tree's values from one frame's measurement alone.
+
+        It is 0 for values that are not free. Errors of surfaces, masks and cameras are correlated,
+        see ``fit.covariance``.
+
+        ``measured``: the measurement. ``area``: total area of all silhouettes [pixel].
+        """
+        unit = error_unit(math.sqrt(area / len(self.cameras)))
+        index, size = self._parameter_index, len(self._body.names)
+        is_angle = np.array([self.is_angle(name) for name in self._element_names])
+        moves = measured.compared.placement.dense(size)[:, index]
+        cameras = pack_cameras(self.cameras)
+        errors = distances(self._body.outlines, cameras, measured.compared, moves, unit)
+        sizes = estimate_sizes(errors, is_angle)
+        covariance, count = np.zeros((size, size)), len(self._kinematics.names)
+        covariance[np.ix_(index, index)] = values_covariance(
+            errors, sizes, np.arange(len(index)), is_angle
+        )
+        return covariance[:count, :count]

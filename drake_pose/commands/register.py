@@ -67,7 +67,7 @@ def register(
     Files in the output folder: report.html (start here); cameras.yaml, which estimate reads;
     registration.yaml (6 x 6 covariance, other poses); summary.json; overlay/; overlay_as_given/;
     for an episode masks/ and joint_angles.csv, which make the folder a scene; with --export ros/,
-    mujoco.xml, drake.yaml, rerun.rrd or lerobot/.
+    mujoco.xml, drake.yaml or lerobot/.
 
     Examples, a robot arm before one camera, and an episode of DROID:
 

@@ -1,13 +1,11 @@
-"""Animations of estimates: replay.html, a Meshcat page without server, and rerun recordings."""
+"""Animations of estimates: replay.html, a Meshcat page without server."""
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
-from importlib import import_module
+from collections.abc import Sequence
 from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import (
     Mesh,
     Meshcat,
@@ -22,14 +20,10 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from drake_pose.body import ArticulatedModel, PoseTree, TriangleMesh
+from drake_pose.body import ArticulatedModel
 from drake_pose.body.meshes import shape_mesh, write_obj
-from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.camera.models import HALF_PIXEL, Camera, ParallelCamera, PinholeCamera
-from drake_pose.errors import OutputError
-from drake_pose.files.overlay import EXCESS_RGB
+from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.fit.surfaces import reduce_meshes
-from drake_pose.registration.posed_frames import MultiViewFrame
 from drake_pose.systems.bodies import add_meshcat_skin, add_posed_plant, body_poses
 
 _BODY_PATH, _MEASURED_PATH = "visualizer", "measured"
@@ -206,92 +200,3 @@ def _draw_camera(
     start, end = (p_W[[line[side] for line in lines]].T for side in (0, 1))
     blue = Rgba(0.0, 0.45, 0.70, 1.0)
     meshcat.SetLineSegments(f"cameras/{camera.name}", start, end, 2.0, blue)
-
-
-Pictures = Mapping[str, Mapping[str, NDArray[np.uint8]]]
-"""Pictures (H, W, 3) by camera and frame."""
-
-
-def import_rerun() -> Any:
-    """Return the module rerun.
-
-    Raises OutputError: rerun-sdk is not installed.
-    """
-    try:
-        return import_module("rerun")
-    except ImportError as error:
-        raise OutputError(
-            f"recordings for rerun need rerun-sdk: pip install 'drake_pose[rerun]' ({error})"
-        ) from error
-
-
-def make_recording(
-    tree: PoseTree, cameras: Iterable[Camera], frames: Sequence[MultiViewFrame], pictures: Pictures
-) -> bytes:
-    """Return the bytes of a .rrd file of a body, cameras and their pictures.
-
-    Args:
-        tree: the body, in the frame of the cameras' X_WC.
-        cameras: cameras; only pinhole cameras are shown.
-        frames: values of the pose tree and masks of each frame, in the order of the timeline
-            `frame`.
-        pictures: pictures by camera and frame; pictures may be missing.
-
-    Raises OutputError: rerun-sdk is not installed.
-    """
-    rr = import_rerun()
-    recording = rr.RecordingStream("drake_pose")
-    stream = recording.memory_recording()
-    recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    for node in tree.nodes:
-        recording.log(["world", "body", node.name], _rerun_mesh(rr, node.mesh), static=True)
-    shown = [one.name for one in cameras if _log_rerun_camera(rr, recording, one)]
-    kinematics = TreeKinematics(tree)
-    for k, frame in enumerate(frames):
-        recording.set_time("frame", sequence=k)
-        recording.log("frame", rr.TextLog(frame.name))
-        values = kinematics.split(frame.values)
-        for node, X_WN, own in zip(tree.nodes, kinematics.poses(frame.values), values, strict=True):
-            recording.log(["world", "body", node.name], _rerun_pose(rr, X_WN))
-            if node.skin is not None:
-                recording.log(["world", "body", node.name], _rerun_mesh(rr, node.surface(own)))
-        for name in (one for one in shown if one in frame.masks):
-            place = ["world", name, "picture"]
-            if (picture := pictures.get(name, {}).get(frame.name)) is not None:
-                recording.log(place, rr.Image(picture).compress(jpeg_quality=90))
-            mask = frame.masks[name].astype(np.uint8)
-            recording.log([*place, "mask"], rr.SegmentationImage(mask))
-    return bytes(stream.drain_as_bytes())
-
-
-def _log_rerun_camera(rr: Any, recording: Any, camera: Camera) -> bool:
-    """Log a pinhole camera's pose and intrinsics; log nothing and return False for another camera.
-
-    ``rr`` is the module rerun, ``recording`` its RecordingStream.
-    """
-    if not isinstance(camera, PinholeCamera):
-        return False
-    place = ["world", camera.name]
-    recording.log(place, _rerun_pose(rr, camera.X_WC), static=True)
-    lens = rr.Pinhole(
-        focal_length=[camera.focal_x, camera.focal_y],
-        # The origin of rerun's pixel coordinates is the picture's corner.
-        principal_point=[camera.center_x + HALF_PIXEL, camera.center_y + HALF_PIXEL],
-        resolution=[camera.width, camera.height],
-        camera_xyz=rr.ViewCoordinates.RDF,
-    )
-    recording.log([*place, "picture"], lens, static=True)
-    colours = rr.AnnotationContext([(1, "body", EXCESS_RGB)])
-    recording.log([*place, "picture", "mask"], colours, static=True)
-    return True
-
-
-def _rerun_mesh(rr: Any, mesh: TriangleMesh) -> Any:
-    """Return a mesh as a Mesh3D of the module rerun, ``rr``."""
-    surface = mesh.vertices, mesh.triangles
-    return rr.Mesh3D(vertex_positions=surface[0], triangle_indices=surface[1])
-
-
-def _rerun_pose(rr: Any, X_AB: NDArray[np.float64]) -> Any:
-    """Return a pose (4, 4) as a Transform3D of the module rerun, ``rr``."""
-    return rr.Transform3D(translation=X_AB[:3, 3], mat3x3=X_AB[:3, :3])

@@ -31,6 +31,7 @@ GONE = {
     "undistort": "use cv2.undistort, as tutorials/commands.md shows",
     "walk": "use the system Walker in a diagram, as tutorials/people.md shows",
     "capture --start": "a person is captured from masks of every frame",
+    "--export rerun": "log what drake_pose.load_cameras reads by rerun's own package",
 }
 """What to use instead of commands, their options ("--name", "command --name") and values ("--name
 value") that are gone.

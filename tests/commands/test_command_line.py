@@ -110,6 +110,8 @@ def test_a_signal_during_parsing_is_reported_in_one_line(monkeypatch: pytest.Mon
         ("undistort recording --out a", "cv2.undistort"),
         ("masks a --out b --box=1,2,3,4", "masks --box is gone: take the masks"),
         ("capture scene --out new --start=first.csv", "masks"),
+        ("register scene --model arm.urdf --out out --export rerun", "load_cameras"),
+        ("register scene --model arm.urdf --out out --export=rerun", "load_cameras"),
     ],
 )
 def test_what_is_gone_names_what_to_use_instead(line: str, instead: str) -> None:

@@ -20,7 +20,6 @@ from drake_pose.errors import listed
 from drake_pose.files.folder import OVERLAY, REPORT, without_nan, write_file, write_summary
 from drake_pose.files.overlay import draw_overlay, draw_shapes, encode_png
 from drake_pose.files.records import describe_job, file_digest, versions
-from drake_pose.files.replay import Pictures, import_rerun, make_recording
 from drake_pose.files.report_page import new_plot, overlay_picture, page_template, plot_uri
 from drake_pose.files.settings import percent
 from drake_pose.input_files import csv_text
@@ -240,7 +239,7 @@ def write_result(
     write_file(path, REPORT, make_registration_report(path, summary))
     links = {name: part["link"] for name, part in parts.items() if "link" in part}
     formats = summary["settings"]["exports"]
-    write_exports(path, formats, inputs, cameras.values(), links, pictures or {})
+    write_exports(path, formats, inputs, cameras.values(), links)
     write_file(path, CAMERA_FILE, dump_cameras(cameras, links))
 
 
@@ -476,10 +475,8 @@ def check_exports(formats: Collection[str], cameras: Iterable[Camera]) -> None:
 
     formats: of ``RegistrationSettings.exports``; "lerobot" is ignored here.
 
-    Raises CameraError: a format does not support a camera; OutputError: a library is missing.
+    Raises CameraError: a format does not support a camera.
     """
-    if "rerun" in formats:
-        import_rerun()
     _texts(formats, list(cameras), "world", {})
 
 
@@ -489,7 +486,6 @@ def write_exports(
     inputs: RegistrationInputs,
     cameras: Iterable[Camera],
     links: Mapping[str, str],
-    pictures: Pictures,
 ) -> None:
     """Write exports for other programs into a result folder.
 
@@ -499,7 +495,6 @@ def write_exports(
         inputs: the registration's inputs.
         cameras: cameras with poses in the world, or in the frames of links.
         links: by name of each camera on a link, the link, in whose frame the camera's pose is.
-        pictures: (H, W, 3) by camera and frame name, for `rerun`.
 
     Raises OutputError: an export cannot be written.
     """
@@ -513,15 +508,12 @@ def write_exports(
             break
     for name, text in _texts(formats, cameras, world, links).items():
         write_file(folder, name, text)
-    if "rerun" in formats:
-        recording = make_recording(inputs.tree, cameras, inputs.frames, pictures)
-        write_file(folder, "rerun.rrd", recording)
 
 
 def _texts(
     formats: Collection[str], cameras: list[Camera], world: str, links: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return the texts of exports by path in the result folder; an export for rerun is no text.
+    """Return the texts of exports by path in the result folder.
 
     formats: of the exports. cameras: as of `write_exports`. world: frame of cameras on no link.
     links: by name of each other camera, its link.

@@ -20,7 +20,7 @@ from drake_pose.files.settings import (
 ALL = "all"
 """Stands for the names of all joints, or of all links."""
 
-Export = Literal["ros", "mujoco", "drake", "rerun", "lerobot"]
+Export = Literal["ros", "mujoco", "drake", "lerobot"]
 """Programs for which cameras are exported; LeRobot gets the joints, too."""
 
 
@@ -73,9 +73,9 @@ class RegistrationSettings(AuditSettings):
     several."""
     exports: Annotated[tuple[Export, ...], Parameter("--export")] = ()
     """Export the cameras for this program, too; repeat for several. ros: camera_info and static
-    transforms; mujoco: <camera> elements; drake: CameraConfigs; rerun: a recording with robot,
-    pictures and masks; lerobot, for a LeRobot data set: a joint map and the motors' calibration
-    file, corrected by the offsets of --zeros, and a copy of meta with the cameras."""
+    transforms; mujoco: <camera> elements; drake: CameraConfigs; lerobot, for a LeRobot data set: a
+    joint map and the motors' calibration file, corrected by the offsets of --zeros, and a copy of
+    meta with the cameras."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -3,7 +3,6 @@
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 
-import cv2
 import mujoco
 import numpy as np
 import pytest
@@ -11,15 +10,11 @@ import yaml
 from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
 from pydrake.systems.sensors import CameraConfig
 
-from drake_pose.body import load_model
-from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import CameraError, SettingsError
-from drake_pose.files.replay import make_recording
 from drake_pose.jobs.registration.result import check_exports, write_exports
 from drake_pose.jobs.registration.settings import RegistrationSettings
-from drake_pose.registration.posed_frames import MultiViewFrame
 
 TEXTS = ("ros", "mujoco", "drake")
 
@@ -29,7 +24,7 @@ def written(arm_scene, tmp_path_factory):
     """Exports of the arm's two true cameras."""
     folder = tmp_path_factory.mktemp("exports")
     inputs = arm_scene.read()
-    write_exports(folder, TEXTS, inputs, arm_scene.cameras.values(), {}, {})
+    write_exports(folder, TEXTS, inputs, arm_scene.cameras.values(), {})
     return folder
 
 
@@ -82,55 +77,15 @@ def test_transforms_start_at_the_link_at_the_world_s_origin(tmp_path, arm_scene)
     path.write_text(text.replace('<link name="world"/>', f'<link name="world"/>{base}'))
     inputs = replace(arm_scene, model=path).read()
     cameras = arm_scene.cameras
-    write_exports(tmp_path / "here", ["ros", "drake"], inputs, cameras.values(), {}, {})
+    write_exports(tmp_path / "here", ["ros", "drake"], inputs, cameras.values(), {})
     launch = (tmp_path / "here" / "ros" / "static_transforms.launch.xml").read_text()
     assert launch.count("--frame-id base ") == 2
     links = {"left": "hand"}
-    write_exports(tmp_path / "there", ["ros", "drake"], inputs, cameras.values(), links, {})
+    write_exports(tmp_path / "there", ["ros", "drake"], inputs, cameras.values(), links)
     launch = (tmp_path / "there" / "ros" / "static_transforms.launch.xml").read_text()
     assert launch.count("--frame-id hand ") == 1
     configs = drake_cameras(tmp_path / "there" / "drake.yaml")
     assert [one.X_PB.base_frame for one in configs.values()] == ["hand", None]
-
-
-def test_rerun_recording_has_robot_cameras_and_masks(arm_scene, tmp_path):
-    pytest.importorskip("rerun")
-    from rerun.chunk import RrdReader
-
-    tree = load_model(arm_scene.model, check=False).pose_tree()
-    camera, kinematics = arm_scene.cameras["left"], TreeKinematics(tree)
-    values = np.full((2, len(kinematics.names)), 0.3)
-    masks = np.zeros((2, camera.height, camera.width), bool)
-    masks[1, 100:120, 30:70] = True
-    frames = [MultiViewFrame(f"{k:04d}", values[k], {"left": masks[k]}) for k in range(2)]
-    picture = np.full((camera.height, camera.width, 3), 77, np.uint8)
-    path = tmp_path / "rerun.rrd"
-    path.write_bytes(make_recording(tree, [camera], frames, {"left": {"0001": picture}}))
-    told = {}
-    for chunk in RrdReader(path).stream():
-        batch, own = chunk.to_record_batch(), told.setdefault(chunk.entity_path, {})
-        for key in (key for key in batch.schema.names if ":" in key):
-            own.setdefault(key, []).extend(batch[key].to_pylist())
-    assert {f"/world/body/{node.name}" for node in tree.nodes} <= set(told)
-    for node, X_WN in zip(tree.nodes, kinematics.poses(values[0]), strict=True):
-        own = told[f"/world/body/{node.name}"]
-        assert len(own["Mesh3D:triangle_indices"][0]) == len(node.mesh.triangles)
-        np.testing.assert_allclose(
-            own["Transform3D:translation"][0][0], X_WN[:3, 3], rtol=0, atol=1e-6
-        )
-        # rerun's matrices are in column order.
-        R_WN = np.reshape(own["Transform3D:mat3x3"][0][0], (3, 3)).T
-        np.testing.assert_allclose(R_WN, X_WN[:3, :3], atol=1e-6)
-    np.testing.assert_allclose(
-        told["/world/left"]["Transform3D:translation"][0][0], camera.X_WC[:3, 3], atol=1e-6
-    )
-    lens = told["/world/left/picture"]
-    assert lens["Pinhole:image_from_camera"][0][0][6:8] == [160.0, 120.0]
-    blob = np.array(lens["EncodedImage:blob"][0][0], np.uint8)
-    assert cv2.imdecode(blob, cv2.IMREAD_COLOR).mean() == pytest.approx(77, abs=1)
-    shown = told["/world/left/picture/mask"]["SegmentationImage:buffer"]
-    assert [np.array(one[0], np.uint8).sum() for one in shown] == [0, 800]
-    assert [one[0] for one in told["/frame"]["TextLog:text"]] == ["0000", "0001"]
 
 
 def test_unsupported_exports_are_refused_before_work():

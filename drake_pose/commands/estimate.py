@@ -67,8 +67,8 @@ def estimate(
     Files in the output folder: report.html (start here); poses.csv (for each frame every joint's
     position [rad or m], E_total and seconds); joints.csv (95 % interval of each joint, and whether
     the silhouettes determine it); modes.csv (other poses that fit equally well); summary.json;
-    overlay/; replay.html; for a sequence also a MOT file, and for a person or hand TRC and BVH
-    files. E_total is the area where body and silhouettes differ, divided by the silhouettes' area.
+    overlay/; replay.html; for a sequence also a MOT file, and for a person or hand a TRC
+    file. E_total is the area where body and silhouettes differ, divided by the silhouettes' area.
     Ctrl-C keeps the finished frames.
 
     Example, a robot arm whose base is at the world's origin, and two cameras:

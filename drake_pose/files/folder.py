@@ -21,13 +21,13 @@ MODES = "modes.csv"
 SUMMARY = "summary.json"
 REPLAY, REPORT = "replay.html", "report.html"
 JOINT_CENTRES = "joint_centres.csv"
-TRC, MOT, BVH = "joint_centres.trc", "positions.mot", "motion.bvh"
+TRC, MOT = "joint_centres.trc", "positions.mot"
 OVERLAY, SHAPES = "overlay", "shapes.png"
 
 _Job = TypeVar("_Job", bound=Callable[..., Any])
 
 RESULT_FILES = (
-    POSES, JOINTS, MODES, SUMMARY, REPLAY, REPORT, JOINT_CENTRES, TRC, MOT, BVH, SHAPES
+    POSES, JOINTS, MODES, SUMMARY, REPLAY, REPORT, JOINT_CENTRES, TRC, MOT, SHAPES
 )  # fmt: skip
 """Names of all files that a result may have, without its overlays."""
 

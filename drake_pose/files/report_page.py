@@ -61,7 +61,6 @@ def make_report(
         "joint_centres.csv": "anatomical joint centres in the world [m]",
         "joint_centres.trc": "the same as markers [mm], for motion analysis",
         "positions.mot": "every position over time [deg or m], for motion analysis",
-        "motion.bvh": "skeleton and motion [cm], for animation",
         "shapes.png": "the fitted shape of the body over the model file's",
         "replay.html": "the estimate in three dimensions",
         "summary.json": "settings, versions and all numbers of this page",

@@ -190,9 +190,7 @@ class ResultWriter:
         if self.folder is not None:
             rate_hz = self.scene.frame_rate_hz or USUAL_RATE_HZ
             rate = rate_hz if self.scene.sequence else None
-            self.warnings += write_motion(
-                self.folder, self.model, self.scene.frames, list(records.values()), rate
-            )
+            write_motion(self.folder, self.model, self.scene.frames, list(records.values()), rate)
             found = [record for record in records.values() if record.found]
             if replay and found:
                 self.write(REPLAY, self._replay(found, 1.0 / (rate or 1.0)))

@@ -18,7 +18,7 @@ from tests.jobs.scenes import read_rows, run_estimate
 
 FRAMES = 3
 FILES = {
-    "joint_centres.csv", "joint_centres.trc", "joints.csv", "motion.bvh", "poses.csv",
+    "joint_centres.csv", "joint_centres.trc", "joints.csv", "poses.csv",
     "positions.mot", "report.html", "summary.json",
 }  # fmt: skip
 
@@ -138,7 +138,7 @@ def test_capture_selects_cameras_and_frames_as_estimate_does(
     _, summary = run_estimate(scene, out, *some)
     assert list(summary["frames"]) == ["0000", "0001"]
     assert set(summary["cameras"]) == {"camera_0", "camera_2"}
-    assert not (out / "motion.bvh").exists()
+    assert not (out / "positions.mot").exists()
     assert len(read_rows(out / "joint_centres.csv")) == 2 * 14
 
 
@@ -149,7 +149,7 @@ def test_capture_is_a_sequence_unless_the_scene_says_otherwise(
     for said in ("motion", "stills"):
         out = tmp_path / said
         run_to_end(*own_recording.estimate(out, "capture"), "--no-overlay")
-        assert (out / "motion.bvh").exists() == (said == "motion")
+        assert (out / "positions.mot").exists() == (said == "motion")
         own_recording.folder.joinpath("scene.yaml").write_text("sequence: false\n")
 
 

@@ -13,7 +13,14 @@ from drake_pose.body.landmarks import (
 )
 from drake_pose.body.link_graph import PlantKinematics, chain_transforms, inverse_transforms
 from drake_pose.body.meshes import TriangleMesh, join_meshes, labelled_meshes
-from drake_pose.body.model import TARGET, TARGET_POSITIONS, ArticulatedModel, load_model
+from drake_pose.body.model import (
+    BASE_JOINTS,
+    TARGET,
+    TARGET_POSITIONS,
+    ArticulatedModel,
+    load_model,
+    reshaped,
+)
 from drake_pose.body.model_files import bundled_model, package_folder
 from drake_pose.body.node_skin import ModelSkin
 from drake_pose.body.parsed_model import ParsedModel, link_names, nearest_turn
@@ -22,4 +29,3 @@ from drake_pose.body.pose_tree import PoseTree, require_tree
 from drake_pose.body.report import ModelReport, describe_model, model_warnings
 from drake_pose.body.root import RootRotation
 from drake_pose.body.tree_builder import build_pose_tree
-from drake_pose.body.urdf_shape import BASE_JOINTS, reshaped

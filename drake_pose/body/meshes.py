@@ -298,12 +298,6 @@ def workspace() -> Path:
 def drawable_file(path: Path) -> Path:
     """Return an OBJ file with normals that shows the same surface as ``path``; make it once."""
     path = path.resolve()
-    return _drawable_version(path, path.stat().st_mtime_ns if path.exists() else 0)
-
-
-@functools.cache
-def _drawable_version(path: Path, _modified: int) -> Path:
-    """As ``drawable_file``; the modification time keys the cache."""
     return write_obj(read_mesh_file(path), path.stem)
 
 
@@ -315,19 +309,10 @@ def write_obj(mesh: TriangleMesh, name: str) -> Path:
     """Write an OBJ file with normals in a temporary folder; meshes equal in ``name`` share it."""
     digest = hashlib.sha256(mesh.vertices.tobytes() + mesh.triangles.tobytes()).hexdigest()[:16]
     path = workspace() / f"{re.sub(r'[^A-Za-z0-9_-]', '_', name)}_{digest}.obj"
-    if path not in _written and not path.exists():
-        _write_with_normals(mesh, path)
-    _written[path] = mesh
-    return path
-
-
-def was_written(path: Path) -> bool:
-    """Return whether ``write_obj`` wrote a file."""
-    return path in _written
-
-
-def _write_with_normals(mesh: TriangleMesh, path: Path) -> None:
-    """Write a mesh to an OBJ file; vertex normals are area-weighted means of triangle normals."""
+    if path in _written or path.exists():
+        _written[path] = mesh
+        return path
+    # Vertex normals are area-weighted means of triangle normals.
     triangles = mesh.triangles
     a, b, c = (mesh.vertices[triangles[:, corner]] for corner in range(3))
     area_normals = np.cross(b - a, c - a)
@@ -346,6 +331,8 @@ def _write_with_normals(mesh: TriangleMesh, path: Path) -> None:
         _write_lines(file, "vn %.4g %.4g %.4g\n", normals)
         _write_lines(file, "f %d//%d %d//%d %d//%d\n", np.repeat(triangles + 1, 2, axis=1))
     unfinished.replace(path)
+    _written[path] = mesh
+    return path
 
 
 def _write_lines(file: TextIO, line: str, rows: NDArray[Any]) -> None:
@@ -380,35 +367,22 @@ def shape_mesh(shape: Shape) -> TriangleMesh:
         raise ModelError("an in-memory mesh cannot be read; write it to a file")
     if isinstance(shape, Mesh):
         return read_mesh_file(Path(shape.source().path()), np.asarray(shape.scale3()))
-    if isinstance(shape, Convex):
-        return _convex_mesh(shape)
-    raise ModelError(f"a {type(shape).__name__} cannot be drawn as triangles")
-
-
-def _convex_mesh(shape: Convex) -> TriangleMesh:
-    """Return the convex hull of a mesh file, its polygons split into triangle fans."""
+    if not isinstance(shape, Convex):
+        raise ModelError(f"a {type(shape).__name__} cannot be drawn as triangles")
+    # The convex hull of a mesh file, its polygons split into triangle fans.
     path = Path(shape.source().path())
     read_mesh_file(path)
     try:
         hull = shape.GetConvexHull()
     except RuntimeError as error:
         raise ModelError(f"mesh file {path} has no convex hull: {error}") from error
-    triangles = []
+    fans = list[tuple[int, int, int]]()
     for face in range(hull.num_elements()):
         polygon = hull.element(face)
-        corners = [polygon.vertex(corner) for corner in range(polygon.num_vertices())]
-        triangles += [(corners[0], b, c) for b, c in itertools.pairwise(corners[1:])]
+        first, *others = (polygon.vertex(corner) for corner in range(polygon.num_vertices()))
+        fans += [(first, b, c) for b, c in itertools.pairwise(others)]
     vertices = np.array([hull.vertex(index) for index in range(hull.num_vertices())])
-    return merge_duplicate_vertices(TriangleMesh(vertices, np.array(triangles, dtype=np.int32)))
-
-
-def body_mesh(plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody) -> TriangleMesh:
-    """Return the visual geometry of one of the plant's bodies in its frame, without ground planes.
-
-    ``scene_graph`` is the one with which the plant is registered. Raises ModelError, which names
-    the link: a shape cannot be drawn.
-    """
-    return join_meshes(list(labelled_meshes(plant, scene_graph, body).values()))
+    return merge_duplicate_vertices(TriangleMesh(vertices, np.array(fans, dtype=np.int32)))
 
 
 def labelled_meshes(
@@ -488,20 +462,17 @@ def draws_given_files(scene_graph: SceneGraph) -> bool:
     """Return whether Drake's renderer reads meshes or textures not written by this package."""
     inspector = scene_graph.model_inspector()
     for geometry in inspector.GetAllGeometryIds(Role.kPerception):
-        shape, properties = (
-            inspector.GetShape(geometry),
-            inspector.GetPerceptionProperties(geometry),
-        )
+        shape = inspector.GetShape(geometry)
         is_file = isinstance(shape, (Mesh, Convex)) and shape.source().is_path()
-        if is_file and not was_written(Path(shape.source().path())):
+        if is_file and Path(shape.source().path()) not in _written:
             return True
-        if properties.HasProperty("phong", "diffuse_map"):
+        if inspector.GetPerceptionProperties(geometry).HasProperty("phong", "diffuse_map"):
             return True
     return False
 
 
 def _round_mesh(
-    radii: Array, heights: Array, start_angle: float = 0.0, resolution: int = 50
+    radii: Array, heights: Array, start_angle: float, resolution: int = 50
 ) -> TriangleMesh:
     """Return a closed surface of revolution about z.
 
@@ -524,5 +495,5 @@ def _ellipsoid_mesh(a: float, b: float, c: float) -> TriangleMesh:
     polar = np.linspace(0.0, np.pi, 51)
     sine = np.sin(polar)
     sine[[0, -1]] = 0.0  # Without rounding, so that each pole becomes one vertex.
-    ball = _round_mesh(sine, np.cos(polar))
+    ball = _round_mesh(sine, np.cos(polar), 0.0)
     return TriangleMesh(ball.vertices * (a, b, c), ball.triangles)

@@ -28,9 +28,14 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
-from drake_pose.body.link_files import Limits, sanitise_sdf, sanitise_urdf
+from drake_pose.body.link_files import (
+    Limits,
+    MjcfCoupling,
+    sanitise_mjcf,
+    sanitise_sdf,
+    sanitise_urdf,
+)
 from drake_pose.body.meshes import TriangleMesh, draws_given_files, read_meshes, workspace
-from drake_pose.body.mjcf import MjcfCoupling, sanitise_mjcf
 from drake_pose.body.model_files import FileFinder
 from drake_pose.body.plant_source import add_coupler
 from drake_pose.errors import DrakePoseError, ModelError

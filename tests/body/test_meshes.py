@@ -6,14 +6,14 @@ import struct
 import numpy as np
 import pytest
 import trimesh
-from pydrake.geometry import ReadObjToTriangleSurfaceMesh
+from pydrake.geometry import Box, Cylinder, Ellipsoid, ReadObjToTriangleSurfaceMesh
 
 from drake_pose.body import TriangleMesh, load_model
 from drake_pose.body.meshes import (
-    _round_mesh,
     drawable_file,
     is_watertight,
     read_mesh_file,
+    shape_mesh,
     write_obj,
 )
 from drake_pose.errors import ModelError
@@ -127,13 +127,12 @@ def test_drake_reads_back_written_meshes(tmp_path):
 
 def test_a_round_mesh_and_a_box_enclose_their_volumes_outwards():
     """By the divergence theorem, with triangles counter-clockwise from outside."""
-    for mesh, volume in (
-        (
-            _round_mesh(np.array([0.0, 0.3, 0.3, 0.0]), np.array([0.5, 0.5, -0.5, -0.5])),
-            np.pi * 0.09,
-        ),
-        (_round_mesh(np.array([0.0, 0.4, 0.0]), np.array([0.6, 0.0, -0.6])), np.pi * 0.16 * 0.4),
+    for shape, volume in (
+        (Cylinder(0.3, 1.0), np.pi * 0.09),
+        (Ellipsoid(0.4, 0.4, 0.6), np.pi * 0.128),
+        (Box(1.0, 2.0, 3.0), 6.0),
     ):
+        mesh = shape_mesh(shape)
         a, b, c = mesh.vertices[mesh.triangles].transpose(1, 0, 2)
         found = np.einsum("ni,ni->", a, np.cross(b, c)) / 6.0
         assert found == pytest.approx(volume, rel=0.01)

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body import TARGET_POSITIONS, RootRotation, TriangleMesh, load_model
+from drake_pose.body import BASE_JOINTS, TARGET_POSITIONS, RootRotation, TriangleMesh, load_model
 from drake_pose.body.pose_tree import axis_samples, product_grid
 from drake_pose.body.root import even_rotations
-from drake_pose.body.urdf_shape import BASE_JOINTS, with_base_joints
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 from tests.body.models import (
     FLOATING_URDF,
@@ -395,21 +394,21 @@ def test_base_joints_move_a_model_in_the_world(tmp_path):
     links = link("world", ""), link("foot"), link("arm", SPHERE)
     text = urdf(*links, weld, joint("turn", "revolute", "foot", "arm"))
     plain = load_model(write(tmp_path, text), check=False)
-    moved = with_base_joints(text, [0.1, 0.2, 0.3], [0.4, -0.2, 0.7])
-    model = load_model(write(tmp_path, moved, "moved.urdf"), check=False)
     start = np.eye(4)
     start[:3, :3] = Rotation.from_euler("xyz", [0.4, -0.2, 0.7]).as_matrix()
+    start[:3, 3] = (0.1, 0.2, 0.3)
+    model = plain.with_base_joints(start)
     rng = np.random.default_rng(4)
     for values in (np.zeros(6), rng.uniform(-1.0, 1.0, 6)):
         q = np.zeros(len(model.position_names))
         q[[model.position_index(name) for name in BASE_JOINTS]] = values
         q[model.position_index("turn")] = 0.3
-        move = np.eye(4)
-        move[:3, :3] = Rotation.from_euler("ZYX", values[3:]).as_matrix()
-        move[:3, 3] = values[:3] + np.array([0.1, 0.2, 0.3])
+        placed = start.copy()
+        placed[:3, :3] = Rotation.from_euler("ZYX", values[3:]).as_matrix() @ start[:3, :3]
+        placed[:3, 3] += values[:3]
         poses, before = link_poses(model, q), link_poses(plain, np.array([0.3]))
         for name in ("foot", "arm"):
-            np.testing.assert_allclose(poses[name], move @ start @ before[name], atol=1e-9)
+            np.testing.assert_allclose(poses[name], placed @ before[name], atol=1e-9)
     turns = [model.position_index(name) for name in BASE_JOINTS[3:]]
     np.testing.assert_allclose(model.upper[turns], np.pi)
     shifts = [model.position_index(name) for name in BASE_JOINTS[:3]]

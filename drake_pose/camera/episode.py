@@ -8,8 +8,8 @@ import numpy as np
 
 from drake_pose.arrays import Array, Indices, Picture
 from drake_pose.camera.models import Lens, PinholeCamera
-from drake_pose.camera.motor_calibration import Servos
 from drake_pose.camera.picture_files import frame_key
+from drake_pose.camera.servo_readings import Servos
 from drake_pose.errors import SceneError, UnknownNameError
 
 

@@ -13,11 +13,11 @@ import numpy as np
 from drake_pose.arrays import Array, Mask
 from drake_pose.camera.episode import JointLog
 from drake_pose.camera.models import check_number
-from drake_pose.camera.motor_calibration import Servos
 from drake_pose.camera.servo_readings import (
     Column,
     Encoding,
     ServoJoint,
+    Servos,
     is_gripper_name,
     servo_columns,
     servo_encoding,
@@ -55,6 +55,7 @@ def map_joints(
     *,
     units: str | None = None,
     table: Mapping[str, Column] | None = None,
+    slack: float = 0.1,
 ) -> MappedJoints:
     """Convert a joint log to a model's names, order and units.
 
@@ -67,6 +68,7 @@ def map_joints(
             "steps"; None: inferred from readings and limits.
         table: linear maps of some joints by name, as from `read_joint_map`; the columns of other
             joints are found by `match_names`. None: no maps are given.
+        slack: tolerance of the limits of angles [rad], and of lengths [the limits' length].
 
     Returns the mapped log. Readings outside the joints' limits are kept, with a warning.
 
@@ -97,7 +99,7 @@ def map_joints(
     angular = {name for name, turns in zip(names, is_angle, strict=True) if turns}
     servos = log.servos or Servos()
     joints = _servo_joints(matched, others, limits, angular, servos)
-    encoding, texts = servo_encoding(joints, log.servos, units)
+    encoding, texts = servo_encoding(joints, log.servos, units, slack)
     warnings += texts
     if encoding is not None:
         servo_maps, texts = servo_columns(joints, servos, encoding)
@@ -105,15 +107,14 @@ def map_joints(
         taken = {joint.column for joint in joints}
         matched = {column: joint for column, joint in matched.items() if column not in taken}
     else:
-        matched, texts = _without_openings(
-            matched, others, limits, UNITS.get(units or "rad", 1.0), is_mapped=bool(table)
-        )
+        unit, is_mapped = UNITS.get(units or "rad", 1.0), bool(table)
+        matched, texts = _without_openings(matched, others, limits, unit, slack, is_mapped)
         warnings += texts
     revolute = {column: joint for column, joint in matched.items() if joint in angular}
     if revolute and units is None:
         angles = {column: readings_of[column] for column in revolute}
         low, high = np.array([limits[joint] for joint in revolute.values()]).T
-        units, why = _find_unit(angles, np.array([*others.values()]), low, high)
+        units, why = _find_unit(angles, np.array([*others.values()]), low, high, slack)
         if why:
             warnings.append(
                 f"angles of the joint log are assumed to be in {units}: {why}; if they are not, "
@@ -127,7 +128,7 @@ def map_joints(
         if joint in columns:
             column = columns[joint]
             positions[:, k], clipped[:, k], anomalies = _positions(
-                column, readings_of[column.name], limits[joint], is_angle[k]
+                column, readings_of[column.name], limits[joint], is_angle[k], slack
             )
             warnings += [f"joint '{joint}': column '{column.name}' {text}" for text in anomalies]
     missing = tuple(name for name in names if name not in columns)
@@ -279,9 +280,8 @@ def _without_openings(
     readings: Mapping[str, Array],
     limits: Mapping[str, tuple[float, float]],
     unit: float,
-    *,
+    slack: float,
     is_mapped: bool,
-    slack: float = 0.1,
 ) -> tuple[dict[str, str], list[str]]:
     """Return the matched columns without a gripper's openings, which are not joint positions.
 
@@ -294,10 +294,10 @@ def _without_openings(
         readings: (n,) readings by column.
         limits: lower and upper limit by joint [rad or m].
         unit: unit of the readings [rad].
-        is_mapped: whether a joint map has other joints; then any gripper's column beyond the limits
-            is left out.
         slack: tolerance of the limits, the smaller of this [rad or m] and this fraction of their
             range.
+        is_mapped: whether a joint map has other joints; then any gripper's column beyond the limits
+            is left out.
 
     Returns the joint of each column that is kept, and warnings about the other columns.
     """
@@ -397,8 +397,8 @@ def _find_unit(
     others: Array,
     lower: Array,
     upper: Array,
+    slack: float,
     *,
-    slack: float = 0.1,
     full_turn: float = 2.0 * math.pi,
     normalised: tuple[float, float] = (99.0, 100.001),
     moves: float = 0.5,
@@ -466,8 +466,7 @@ def _positions(
     readings: Array,
     limits: tuple[float, float],
     is_angle: bool,
-    *,
-    slack: float = 0.1,
+    slack: float,
     at_end: float = 1e-6,
 ) -> tuple[Array, Mask, list[str]]:
     """Return a joint's positions (rows,), whether readings are clipped (rows,), and anomalies.
@@ -521,36 +520,29 @@ def read_joint_map(path: Path) -> dict[str, Column]:
     content = read_yaml(path, SceneError)
     if not isinstance(content, dict) or not content:
         raise SceneError(f"{path}: expected a mapping from joints to their columns")
-    columns = {}
+    units, columns = {**UNITS, "m": 1.0, "mm": 1e-3}, dict[str, Column]()
+    ways = [{"from", "to"}, {"scale", "offset"}, {"scale"}, {"offset"}, {"unit"}, set[str]()]
     for joint, entry in content.items():
+        where = f"{path}: joint '{joint}'"
+        given = set(entry) - {"column"} if isinstance(entry, dict) else {None}
+        if given not in ways:
+            known = " or ".join("{" + ", ".join(sorted(map(str, way))) + "}" for way in ways if way)
+            raise SceneError(f"{where}: expected {{column: NAME}} and one of {known}")
+        name, unit = str(entry.get("column", joint)), entry.get("unit", "rad")
+        if unit not in units:
+            raise SceneError(f"{where}: unit must be one of {', '.join(units)}")
         try:
-            columns[str(joint)] = _read_column(str(joint), entry, f"{path}: joint '{joint}'")
+            if "from" in given:
+                (a, b), (c, d) = (_pair(entry[end], end, where) for end in ("from", "to"))
+                scale = (d - c) / (b - a)
+                columns[str(joint)] = Column(name, scale, c - scale * a, (a, b))
+                continue
+            scale = check_number(entry.get("scale", units[unit]), "scale", where)
+            offset = check_number(entry.get("offset", 0.0), "offset", where)
+            columns[str(joint)] = Column(name, scale, offset)
         except CameraError as error:
             raise SceneError(str(error)) from None
     return columns
-
-
-def _read_column(joint: str, entry: Any, where: str) -> Column:
-    """Return the linear map of an entry of a joint map, not yet checked.
-
-    ``joint``: the joint's name, and the default of the column's. Raises CameraError, begun by
-    ``where``: the entry is invalid.
-    """
-    units = {**UNITS, "m": 1.0, "mm": 1e-3}
-    ways = [{"from", "to"}, {"scale", "offset"}, {"scale"}, {"offset"}, {"unit"}, set[str]()]
-    given = set(entry) - {"column"} if isinstance(entry, dict) else {None}
-    if given not in ways:
-        known = " or ".join("{" + ", ".join(sorted(map(str, way))) + "}" for way in ways if way)
-        raise CameraError(f"{where}: expected {{column: NAME}} and one of {known}")
-    name, unit = str(entry.get("column", joint)), entry.get("unit", "rad")
-    if unit not in units:
-        raise CameraError(f"{where}: unit must be one of {', '.join(units)}")
-    if "from" in given:
-        (a, b), (c, d) = (_pair(entry[end], end, where) for end in ("from", "to"))
-        scale = (d - c) / (b - a)
-        return Column(name, scale, c - scale * a, (a, b))
-    scale = check_number(entry.get("scale", units[unit]), "scale", where)
-    return Column(name, scale, check_number(entry.get("offset", 0.0), "offset", where))
 
 
 def _pair(value: Any, field: str, where: str) -> tuple[float, float]:

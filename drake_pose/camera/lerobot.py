@@ -21,8 +21,8 @@ from drake_pose.camera.lerobot_tables import (
     shape_of,
     with_fields,
 )
-from drake_pose.camera.motor_calibration import find_motors
 from drake_pose.camera.picture_files import TimedVideo, import_reader
+from drake_pose.camera.servo_readings import find_motors
 from drake_pose.errors import SceneError, UnknownNameError, listed
 from drake_pose.input_files import pointer_hint, read_regular
 

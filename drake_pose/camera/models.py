@@ -253,48 +253,23 @@ Camera = PinholeCamera | ParallelCamera
 """A camera of either kind."""
 
 
-def intrinsics_warnings(
-    cameras: Iterable[Camera], alike: float = 0.04, other_size: float = 1.25, aside: float = 0.25
-) -> list[str]:
+def intrinsics_warnings(cameras: Iterable[Camera], aside: float = 0.1) -> list[str]:
     """Return a warning for each pinhole camera whose principal point is far from the middle.
 
-    Args:
-        cameras: the cameras.
-        alike: maximum difference of a principal point from the middle of pictures of another size,
-            or of turned pictures, for the warning to name them [size of the pictures].
-        other_size: minimum ratio of the two sizes, or of its inverse.
-        aside: distance from the middle from which there is a warning [size of the pictures]. Those
-            of real lenses are within 0.1.
+    ``aside``: maximum distance from the middle of real lenses [size of the pictures].
     """
     texts = []
     for camera in cameras:
-        if not isinstance(camera, PinholeCamera):
-            continue
-        size = np.array([camera.width, camera.height], float)
-        twice = 2.0 * (np.array([camera.center_x, camera.center_y]) + HALF_PIXEL)
-        ratio = float((twice / size).mean())
-        why = ""
-        if np.abs(twice / size - 1.0).max() < 2.0 * alike:
-            continue
-        if np.abs(twice - size[::-1]).max() < 2.0 * alike * size.min():
-            why = "center_x and center_y seem to be exchanged"
-        elif (
-            max(ratio, 1.0 / max(ratio, 1e-3)) > other_size
-            and np.abs(twice / size / ratio - 1.0).max() < 2.0 * alike
-        ):
-            width, height = twice
-            why = (
-                f"the intrinsics seem to be those of pictures of about {width:.0f} x {height:.0f}: "
-                f"divide focal lengths and principal point by {ratio:.3g}"
-            )
-        elif np.abs(twice / size - 1.0).max() > 2.0 * aside:
-            why = "are the intrinsics those of these pictures?"
-        if why:
+        size = np.array([camera.width, camera.height])
+        centre = np.array([camera.center_x, camera.center_y])
+        twice = 2.0 * (centre + HALF_PIXEL)
+        if isinstance(camera, PinholeCamera) and np.any(np.abs(twice / size - 1.0) > 2.0 * aside):
             texts.append(
-                f"camera '{camera.name}': its principal point {camera.center_x:.0f}, "
-                f"{camera.center_y:.0f} is far from the middle of its pictures of {camera.width} x "
-                f"{camera.height} pixels: {why} (it is right only for pictures that were cut out "
-                "beside the middle)"
+                f"camera '{camera.name}': its principal point {centre[0]:.0f}, {centre[1]:.0f} is "
+                f"far from the middle of its pictures of {size[0]} x {size[1]} pixels; it is the "
+                f"middle of pictures of {twice[0]:.0f} x {twice[1]:.0f}: are the intrinsics those "
+                "of pictures of another size, or center_x and center_y exchanged? (It is right "
+                "only for pictures that were cut out beside the middle.)"
             )
     return texts
 
@@ -333,7 +308,7 @@ FACE_CAMERA = "face"
 
 
 def circle_of_cameras(
-    count: int = 8,
+    count: int,
     *,
     radius: float = 3.0,
     height: float = 1.3,
@@ -445,10 +420,8 @@ class Lens:
     def _maps(self) -> tuple[np.ndarray, np.ndarray]:
         """Source of each pixel of an undistorted image, as cv2.remap takes it."""
         maps = cv2.fisheye.initUndistortRectifyMap if self.fisheye else cv2.initUndistortRectifyMap
-        size = (self.width, self.height)
-        return maps(
-            self.matrix, self.distortion, np.eye(3), self.undistorted_matrix, size, cv2.CV_16SC2
-        )
+        lens, size = (self.matrix, self.distortion), (self.width, self.height)
+        return maps(*lens, np.eye(3), self.undistorted_matrix, size, cv2.CV_16SC2)
 
     def camera(self, name: str, X_WC: Array) -> PinholeCamera:
         """Return the pinhole camera of the undistorted images, at pose X_WC (4, 4)."""

@@ -1,4 +1,7 @@
-"""Convert the readings of servos, as LeRobot records them, to joint angles.
+"""Read the calibration of LeRobot's motors, and convert their readings to joint angles.
+
+Since June 2025 a calibration file is one entry of ``MotorCalibration`` by motor
+(`lerobot/motors/motors_bus.py` of huggingface/lerobot); before it was lists, one entry a motor.
 
 A motor with a calibrated range from low to high [steps] has a position P [steps], to which its
 homing offset is applied. LeRobot (`_normalize` in `lerobot/motors/motors_bus.py`) records it as
@@ -8,18 +11,152 @@ degrees, as (P - (low + high) / 2) 360 / 4095.
 
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Literal, NamedTuple, cast
 
 import numpy as np
 
 from drake_pose.arrays import Array
-from drake_pose.camera.motor_calibration import Motor, Servos
 from drake_pose.errors import SceneError
+from drake_pose.input_files import read_regular
 
 Encoding = Literal["rad", "deg", "normalised", "steps"]
 """What readings are: angles, LeRobot's -100 ... 100 (a gripper's 0 ... 100), or encoder steps."""
+
+
+class Motor(NamedTuple):
+    """A motor's entry in a calibration file."""
+
+    # low, high: ends of its range in homed positions [steps]; nan in lists, which have none, unless
+    # the motor's readings are 0 to 100.
+    low: float
+    high: float
+    homing: int  # Homing offset [steps].
+    is_inverted: bool  # Its drive mode.
+
+
+@dataclass(frozen=True)
+class Servos:
+    """What a LeRobot data set tells of its robot's motors."""
+
+    robot: str = ""  # Type of the robot, `robot_type` in the data set; "": unknown.
+    path: Path | None = None  # The calibration file; None: there is none.
+    # By name of the motor; empty without a file.
+    motors: Mapping[str, Motor] = field(default_factory=dict)
+    has_lists: bool = False  # Whether the file is of the older kind.
+    # Steps of an encoder in a full turn, the same in all motors of LeRobot's arms.
+    turn: int = 4096
+
+    @property
+    def is_so(self) -> bool:
+        """Whether the robot is an SO-100, an SO-101, or an arm with the same joints."""
+        return re.match(r"(bi_)?(so_|so\d|moss|lekiwi)", self.robot.lower()) is not None
+
+    @property
+    def is_dynamixel(self) -> bool:
+        """Whether the motors are known to be Dynamixel's, which invert and home by themselves."""
+        return re.match(r"(bi_)?(koch|omx|aloha|viperx|widowx)", self.robot.lower()) is not None
+
+    @property
+    def full_turns(self) -> tuple[str, ...]:
+        """Motors whose range LeRobot takes to be a full turn, without asking the user."""
+        known = (self.is_so, ("wrist_roll",)), (self.is_dynamixel, ("shoulder_pan", "wrist_roll"))
+        return next((names for is_robot, names in known if is_robot), ())
+
+
+def read_motors(path: Path, robot: str = "", largest: int = 1 << 20) -> Servos | None:
+    """Return a calibration file's motors; None: the file is not one.
+
+    ``path``: a JSON file. ``robot``: type of the robot, if it is known. ``largest``: maximum size
+    of the file [byte]; larger files are none. Raises SceneError: the file cannot be read, or an
+    entry is damaged.
+    """
+    lists = ("motor_names", "homing_offset", "drive_mode")
+    keys, found = {"homing_offset", "range_min", "range_max"}, dict[str, Motor]()
+    try:
+        data = read_regular(path, largest + 1)
+        content = json.loads(data) if len(data) <= largest else None
+    except OSError as error:
+        raise SceneError(f"{path}: cannot read it: {error.strerror}") from error
+    except ValueError:
+        return None
+    if not isinstance(content, dict) or not content:
+        return None
+    has_lists = {*lists} <= {*content}
+    if not has_lists and not all(
+        isinstance(one, dict) and keys <= {*one} for one in content.values()
+    ):
+        return None
+    try:
+        if has_lists:
+            names, homing, modes = (list(content[key]) for key in lists)
+            none = [math.nan] * len(names)
+            ends = [content.get(key) or none for key in ("start_pos", "end_pos")]
+            kinds = content.get("calib_mode") or none
+            rows = zip(names, homing, modes, kinds, *ends, strict=True)
+            for name, home, mode, kind, *own in rows:
+                low, high = own if kind == "LINEAR" else (math.nan, math.nan)
+                found[str(name)] = Motor(float(low), float(high), int(home), bool(mode))
+            return Servos(robot, path, found, has_lists)
+        for name, one in content.items():
+            low, high = float(one["range_min"]), float(one["range_max"])
+            mode = bool(one.get("drive_mode", 0))
+            found[str(name)] = Motor(low, high, int(one["homing_offset"]), mode)
+    except (TypeError, ValueError) as error:
+        raise SceneError(f"{path}: a calibration of motors is damaged: {error}") from error
+    for name, one in found.items():
+        if not one.low < one.high:
+            raise SceneError(
+                f"{path}: motor '{name}': range_min {one.low:g} must be less than range_max "
+                f"{one.high:g}: calibrate the robot again (lerobot-calibrate)"
+            )
+    return Servos(robot, path, found)
+
+
+def find_motors(folder: Path, robot: str, columns: Iterable[str]) -> tuple[Servos, list[str]]:
+    """Return the motors of the calibration file in or beside a data set, and warnings.
+
+    Files are searched in the data set, its folders `meta` and `calibration`, and then in the folder
+    that holds the data set. A leader's file is used only if there is no other.
+
+    Args:
+        folder: the data set.
+        robot: type of the robot.
+        columns: names of the recorded columns. A file must have a motor of one of them, or as many
+            motors as there are columns if these are only numbered.
+
+    Raises SceneError: there are several files, and none is clearly the robot's.
+    """
+    columns, warnings = [*columns], list[str]()
+    names = {name.removesuffix(".pos").removeprefix("main_") for name in columns} | {*columns}
+    is_numbered = all(name[-1:].isdigit() for name in columns)
+    inside = ("*.json", "meta/*.json", "calibration/**/*.json")
+    for place, patterns in ((folder, inside), (folder.resolve().parent, (inside[0], inside[2]))):
+        files = sorted({one for pattern in patterns for one in place.glob(pattern)})
+        found = [one for file in files if (one := read_motors(file, robot)) is not None]
+        own = [
+            one
+            for one in found
+            if names & {*one.motors} or (is_numbered and len(one.motors) == len(columns))
+        ]
+        warnings += [
+            f"{one.path}: its motors are not those of the data set: {', '.join(one.motors)}"
+            for one in found
+            if place == folder and one not in own
+        ]
+        follower = [one for one in own if "leader" not in str(one.path).lower()] or own
+        if len(follower) > 1:
+            listed = ", ".join(str(one.path) for one in follower)
+            raise SceneError(
+                f"{folder}: has several calibrations of its motors: {listed}; name the follower's: "
+                "--joint-map FILE"
+            )
+        if follower:
+            return follower[0], warnings
+    return Servos(robot), warnings
 
 
 class Column(NamedTuple):
@@ -57,14 +194,9 @@ class ServoJoint:
         """Return whether the column's or the joint's name ends with one of the names."""
         return self.column.removesuffix(".pos").endswith(names) or self.name.endswith(names)
 
-    @property
-    def middle(self) -> float:
-        """Middle of the joint's limits [rad or m]; 0 without limits."""
-        return 0.5 * (self.lower + self.upper) if math.isfinite(self.upper - self.lower) else 0.0
-
 
 def servo_encoding(
-    joints: Sequence[ServoJoint], servos: Servos | None, units: str | None, slack: float = 0.1
+    joints: Sequence[ServoJoint], servos: Servos | None, units: str | None, slack: float
 ) -> tuple[Encoding | None, list[str]]:
     """Return the encoding of columns that LeRobot recorded from servos, and warnings.
 
@@ -74,7 +206,7 @@ def servo_encoding(
         joints: joints with their columns and motors.
         servos: the robot's motors; None: LeRobot did not record the log.
         units: the encoding as the user says; None: it is inferred.
-        slack: tolerance of the joints' limits [rad].
+        slack: tolerance of the limits [rad].
 
     Raises SceneError: the readings seem to be normalised, and their ranges are not known.
     """
@@ -101,7 +233,15 @@ def servo_encoding(
     if encoding is None or not is_told[encoding]:
         return None, []
     if encoding == "normalised" and not units:
-        _require_ranges(bodies, known)
+        unknown = [joint.column for joint in bodies if range_in_steps(joint, known.turn) is None]
+        if unknown and not (known.is_so or known.is_dynamixel):
+            raise SceneError(
+                f"the readings of the joint log ({', '.join(unknown)}) seem to be normalised to "
+                "-100 ... 100, as in LeRobot, and their ranges are not known: put the robot's "
+                "calibration file into the data set or name it (--joint-map FILE), or give units: "
+                "rad, deg, or normalised for the joints' limits, or a joint map with the range of "
+                "each: JOINT: {column: COLUMN, from: [-100, 100], to: [LOWEST, HIGHEST]} in radians"
+            )
         if is_radians and why.startswith("but"):
             raise SceneError(
                 f"the readings of the joint log ({', '.join(one.column for one in bodies)}) could "
@@ -269,18 +409,23 @@ def servo_columns(
     return columns, warnings
 
 
-def _zero(joint: ServoJoint, length: float, turn: int, alike: float = 0.25) -> float:
-    """Return a joint's position [rad] in the middle of its motor's range.
+def _spans_limits(joint: ServoJoint, length: float, turn: int, alike: float = 0.25) -> bool:
+    """Return whether the range of a joint's motor is about as long as the joint's limits.
 
-    Args:
-        joint: the joint.
-        length: length of the range [steps].
-        turn: steps of a full turn.
-        alike: maximum difference of the range from the joint's limits [the limits' length]; beyond
-            it the range tells nothing of the limits, and the result is 0.
+    ``length``: of the range [steps]. ``turn``: steps of a full turn. ``alike``: maximum difference
+    [the limits' length].
     """
-    span, travel = joint.upper - joint.lower, 2.0 * math.pi * length / turn
-    return joint.middle if length < turn - 1 and abs(travel - span) <= alike * span else 0.0
+    span = joint.upper - joint.lower
+    return abs(2.0 * math.pi * length / turn - span) <= alike * span < math.inf
+
+
+def _zero(joint: ServoJoint, length: float, turn: int) -> float:
+    """Return a joint's position [rad] in the middle of its motor's range, of a ``length`` [steps].
+
+    It is 0 if the range tells nothing of the joint's limits.
+    """
+    told = length < turn - 1 and _spans_limits(joint, length, turn)
+    return 0.5 * (joint.lower + joint.upper) if told else 0.0
 
 
 def _between(joint: ServoJoint, low: float, high: float) -> Column | None:
@@ -350,17 +495,11 @@ def _so_degrees(joints: Sequence[ServoJoint], servos: Servos) -> dict[str, Colum
     return old_columns if excess[1] < excess[0] or (excess[1] == excess[0] and not is_new) else {}
 
 
-def _gripper_column(
-    joint: ServoJoint, servos: Servos, encoding: Encoding, alike: float = 0.25
-) -> Column | None:
+def _gripper_column(joint: ServoJoint, servos: Servos, encoding: Encoding) -> Column | None:
     """Return a gripper's map; None: its readings do not determine its position.
 
-    Args:
-        joint: the gripper's joint.
-        servos: the robot's motors.
-        encoding: of the other joints.
-        alike: maximum difference of the motor's range from the joint's limits [the limits' length];
-            beyond it a gear is between them, and the range's ends are the joint's limits.
+    If the motor's range is not about as long as the joint's limits, a gear is between them, and the
+    range's ends are the limits. ``encoding``: of the other joints.
     """
     motor, turn = joint.motor, servos.turn
     length = math.nan if motor is None else motor.high - motor.low
@@ -373,24 +512,10 @@ def _gripper_column(
         low, high = 0.0, 100.0
         if not (np.nanmin(joint.readings) >= -0.5 and np.nanmax(joint.readings) <= 100.5):
             return None
-    travel, span = 2.0 * math.pi * length / turn, joint.upper - joint.lower
-    if joint.is_angle and abs(travel - span) <= alike * span:
-        scale = travel / (high - low)
+    if joint.is_angle and _spans_limits(joint, length, turn):
+        scale = 2.0 * math.pi * length / turn / (high - low)
         return Column(joint.column, scale, joint.lower - scale * low)
     return _between(joint, low, high)
-
-
-def _require_ranges(joints: Sequence[ServoJoint], servos: Servos) -> None:
-    """Raise SceneError if a range of normalised readings is neither calibrated nor inferable."""
-    unknown = [joint.column for joint in joints if range_in_steps(joint, servos.turn) is None]
-    if unknown and not (servos.is_so or servos.is_dynamixel):
-        raise SceneError(
-            f"the readings of the joint log ({', '.join(unknown)}) seem to be normalised to -100 "
-            "... 100, as in LeRobot, and their ranges are not known: put the robot's calibration "
-            "file into the data set or name it (--joint-map FILE), or give units: rad, deg, or "
-            "normalised for the joints' limits, or a joint map with the range of each: JOINT: "
-            "{column: COLUMN, from: [-100, 100], to: [LOWEST, HIGHEST]} in radians"
-        )
 
 
 def is_gripper_name(words: Sequence[str]) -> bool:

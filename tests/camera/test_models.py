@@ -176,7 +176,7 @@ def test_cameras_on_a_circle_look_at_its_centre_and_the_face():
     with pytest.raises(CameraError, match="at least one camera"):
         circle_of_cameras(0, face_camera=False)
     with pytest.raises(CameraError, match="radius must be positive"):
-        circle_of_cameras(radius=0.0)
+        circle_of_cameras(1, radius=0.0)
 
 
 def test_principal_points_far_from_the_middle_are_warned_of():
@@ -184,15 +184,12 @@ def test_principal_points_far_from_the_middle_are_warned_of():
         camera = PinholeCamera("eye", width, height, 600.0, 600.0, center_x, center_y, np.eye(4))
         return "".join(intrinsics_warnings([camera]))
 
-    assert "pictures of about 1280 x 960: divide" in said(639.5, 479.5)
-    assert "pictures of about 325 x 237: divide" in said(162.0, 118.0)
-    assert "center_x and center_y seem to be exchanged" in said(238.0, 322.0)
-    # 1920 x 1080 pixels given for pictures of another shape.
-    assert "are the intrinsics those of these pictures?" in said(959.5, 539.5)
+    # Of pictures of twice the size, exchanged, and of 1920 x 1080 pixels.
+    for x, y in ((639.5, 479.5), (238.0, 322.0), (959.5, 539.5)):
+        assert f"pictures of {2 * x + 1:.0f} x {2 * y + 1:.0f}" in said(x, y)
     # Lenses are within a tenth of the pictures' size of the middle, in square pictures, too.
     rng = np.random.default_rng(5)
-    for width, height in ((640, 480), (320, 180), (224, 224), (480, 640), (1920, 1080)):
+    for size in ((640, 480), (320, 180), (224, 224), (480, 640), (1920, 1080)):
         for _ in range(50):
-            x, y = rng.uniform(0.4, 0.6, 2) * (width, height)
-            assert not said(x, y, width, height)
+            assert not said(*(rng.uniform(0.4, 0.6, 2) * size - 0.5), *size)
     assert not intrinsics_warnings([PARALLEL])

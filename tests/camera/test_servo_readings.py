@@ -7,8 +7,15 @@ import pytest
 
 from drake_pose.camera.episode import JointLog
 from drake_pose.camera.joint_map import map_joints, motors_of, read_joint_map
-from drake_pose.camera.motor_calibration import Servos, find_motors, read_motors
-from drake_pose.camera.servo_readings import Column, ServoJoint, correct_homing, dump_column
+from drake_pose.camera.servo_readings import (
+    Column,
+    ServoJoint,
+    Servos,
+    correct_homing,
+    dump_column,
+    find_motors,
+    read_motors,
+)
 from drake_pose.errors import SceneError
 
 BODY = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")

@@ -30,9 +30,8 @@ from drake_pose.camera.joint_map import (
     without_followers,
 )
 from drake_pose.camera.models import intrinsics_warnings
-from drake_pose.camera.motor_calibration import Servos, read_motors
 from drake_pose.camera.picture_files import VIDEOS, frame_key
-from drake_pose.camera.servo_readings import Column
+from drake_pose.camera.servo_readings import Column, Servos, read_motors
 from drake_pose.camera.sources import TIME_STAMPS
 from drake_pose.errors import (
     SceneError,

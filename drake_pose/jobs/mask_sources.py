@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from drake_pose.camera.picture_files import (
 )
 from drake_pose.errors import SceneError
 from drake_pose.jobs.estimate.measurements import frames_of
-from drake_pose.silhouette.mask_pictures import AnnotatedPicture, Annotations, read_coco
+from drake_pose.silhouette.coco import AnnotatedPicture, Annotations, read_coco
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, common_rate
 
 
@@ -114,10 +114,10 @@ class Source:
         """
         known = [] if self.cameras is None else list(self.cameras.cameras)
         listed = [(folder, coco, one) for folder, coco in self.annotated for one in coco.pictures]
-        places = {folder or PurePosixPath(one.file).parent for folder, _, one in listed}
+        places = {folder or one.file.parent for folder, _, one in listed}
         known_frames: set[tuple[str, str]] = set()
         for folder, coco, one in listed:
-            file = PurePosixPath(one.file)
+            file = one.file
             if known:
                 names = [*reversed(file.parent.parts), folder, *(known if len(known) == 1 else [])]
                 camera = next((name for name in names if name in known), None)

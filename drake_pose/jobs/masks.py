@@ -292,10 +292,11 @@ def _read_given(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
         source.check_size(camera, (entry.height, entry.width), where)
         try:
             mask = entry.draw(classes)
-        except ValueError as error:
-            raise MaskError(f"{where}: {error}") from error
-        warnings = coco.warnings if entry is coco.pictures[0] else ()
-        yield FoundMask(camera, frame, where, mask, warnings=warnings)
+        except (KeyError, TypeError, ValueError) as error:
+            raise MaskError(f"{where}: a segmentation cannot be drawn: {error}") from error
+        left_out = f"{coco.path}: {coco.boxes} annotations have a box, but no area: left out"
+        is_told = coco.boxes and entry is coco.pictures[0]
+        yield FoundMask(camera, frame, where, mask, warnings=(left_out,) if is_told else ())
     for camera, files in source.pictures.items():
         for frame, path in files.items():
             mask = read_binary_mask(path, MaskError, may_be_empty=True, lossy=True)

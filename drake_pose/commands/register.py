@@ -168,7 +168,6 @@ def _print_registration(result: SceneRegistration) -> None:
     """Print the camera poses with standard deviations, other estimates, and the worst frames."""
     from drake_pose.files.folder import REPORT
     from drake_pose.jobs.registration.result import PARAMETERS, parameter_rows
-    from drake_pose.jobs.registration.tracks import SCENE
     from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 
     console = output_console()
@@ -191,7 +190,7 @@ def _print_registration(result: SceneRegistration) -> None:
         )
     console.print(table)
     for name, one in result.summary["cameras"].items():
-        if "time_offset_scores" in one or one.get("evidence") == SCENE:
+        if "time_offset_scores" in one or "points" in one:
             console.print(escape(f"camera '{name}': {_say_clock(one)}"), soft_wrap=True)
     first = next(iter(result.summary["cameras"].values()))
     for key, title, of, what in PARAMETERS:
@@ -211,7 +210,7 @@ def _print_registration(result: SceneRegistration) -> None:
                 )
             )
     misfits = [(name, one) for name, own in result.registered.items() for one in own.frames]
-    if next(iter(result.summary["cameras"].values())).get("evidence") == SCENE:
+    if "points" in first:
         shown, which = worst_frames([-misfit.inlier_ratio for _, misfit in misfits], 8)
         frames = Table("camera", "frame", "points that fit", "", title=f"Standing scene{which}")
         shares: list[tuple[str, ...]] = [(percent(misfit.inlier_ratio),) for _, misfit in misfits]

@@ -182,14 +182,6 @@ class Backgrounds:
         best = largest(sums.visible + np.maximum(sums.covered, 0.0).sum(axis=2))
         return float(np.maximum(best - sums.uncovered, 0.0).sum())
 
-    def contour_terms(self, size: float, weight: float) -> tuple[float, float]:
-        """Return a length that is added to the outlines', and the weight of their mean edges.
-
-        The length limits the score of short outlines, whose edges are strong by chance. ``size``:
-        frames times their width [pixel]. ``weight``: beside the explained fraction.
-        """
-        return 0.3 * size, weight
-
     def changed_frames(self) -> Floats:
         """Return (H, W) the number of frames that differ from the most frequent background.
 
@@ -201,14 +193,6 @@ class Backgrounds:
             difference = cv2.blur(1.0 - likeness / np.float32(np.exp(MODEL.log_peak)), (3, 3))
             counts += np.where(difference > 0.5, difference, 0.0)
         return counts
-
-    def known(self, pictures: Sequence[Picture], covered: Mask, small: Mask) -> "KnownBackground":
-        """Return the background behind the body in images (H, W, 3) of the same f frames.
-
-        ``covered``, ``small``: (f, H, W) and (f, h, w) approximate silhouettes at that size, and at
-        the size of these images.
-        """
-        return KnownBackground.estimate(pictures, self.gains, self.shows_background(small), covered)
 
     def _likeness(self, picture: Floats, colours: Floats) -> Floats:
         """Return the likelihood ratios (H, W), see ``likeness``, under a background (H, W, 3)."""

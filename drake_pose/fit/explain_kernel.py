@@ -9,7 +9,6 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Floats, Mask
 from drake_pose.compiled import compiled
@@ -24,12 +23,6 @@ class PixelSums(NamedTuple):
     covered: Floats  # (H, W, f, 3) change of each log-likelihood if a frame is covered.
     uncovered: Floats  # (H, W) maximum of ``visible``.
     edges: Floats  # (2, f, H, W) strength of edges across u and v in each frame, minus its mean.
-    # (H, W, f) kind of each pixel in each frame, and counts: (k,) number of pixels of each kind.
-    # With k > 0, the gain is what the silhouettes tell about the kinds: that of the log likelihood
-    # if pixels in and outside of them have frequencies of their own. The first three are then not
-    # used.
-    kinds: NDArray[np.uint8] = np.zeros((1, 1, 1), np.uint8)
-    counts: Array = np.zeros(0)
 
 
 class Explained(IntEnum):
@@ -130,17 +123,6 @@ def _cover(
 
 
 @compiled
-def _plogp(counts: Array) -> float:
-    """Return the log-likelihood of counts (k,) at their own frequencies."""
-    total, found = 0.0, 0.0
-    for count in counts:
-        if count > 0.0:
-            total += count
-            found += count * np.log(count)
-    return found - total * np.log(total) if total > 0.0 else 0.0
-
-
-@compiled
 def _sum_up(
     frames: int,
     sums: PixelSums,
@@ -159,21 +141,13 @@ def _sum_up(
     words, ends, positions, one = scratch.words, scratch.ends, scratch.positions, np.uint64(1)
     zero, last, lowest = np.uint64(0), words.shape[1] - 1, words.shape[0] - 1
     every = (one << np.uint64(frames)) - one
-    inside = np.zeros(sums.counts.shape[0])
     for row in range(top, bottom):
         for column in range(ends[row, 0], ends[row, 1]):
             word = words[row, column]
             if word == zero:
                 continue
             covered = word & every
-            if covered != zero and inside.shape[0] > 0:
-                remaining = covered
-                while remaining != zero:
-                    bit = remaining & (~remaining + one)
-                    f = positions[(bit * _WINDOWS) >> np.uint64(58)]
-                    inside[sums.kinds[row, column, f]] += 1.0
-                    remaining ^= bit
-            elif covered != zero:
+            if covered != zero:
                 a, b, c = sums.visible[row, column]
                 remaining = covered
                 while remaining != zero:
@@ -208,9 +182,6 @@ def _sum_up(
                 totals[Explained.CONTOUR] += strength
                 totals[Explained.OUTLINE] += 1.0
                 remaining ^= bit
-    if inside.shape[0] > 0:
-        totals[Explained.AREA] = inside.sum()
-        totals[Explained.GAIN] = _plogp(inside) + _plogp(sums.counts - inside) - _plogp(sums.counts)
     for row in range(top, bottom):
         words[row, ends[row, 0] : ends[row, 1]] = zero
         ends[row, 0], ends[row, 1] = words.shape[1], 0

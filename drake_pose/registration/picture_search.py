@@ -162,8 +162,6 @@ class PictureSearch:
         body: the robot's surfaces.
         camera: its intrinsics; its pose is not used.
         frames: f pictures, the most dissimilar first.
-        riding: whether the body moves with the camera (``fit.riding``). The "world" is then the
-            root of the body's pose tree.
     """
 
     def __init__(
@@ -171,16 +169,13 @@ class PictureSearch:
         body: RegistrationBody,
         camera: PinholeCamera,
         frames: Sequence[PosedPicture],
-        riding: bool = False,
     ) -> None:
         self._body, self.camera, self.frames = body, camera, tuple(frames)
-        self._riding = riding
         coarse, *finer = (simplify_or_hull(body.coarse, count) for count in PICTURES.triangles)
         # Small parts are invisible at the coarsest level.
         least = 0.25 * max(node.ball[3] for node in coarse)
         coarse = tuple(node if node.ball[3] >= least else EMPTY_OUTLINE for node in coarse)
-        # A body that moves with the camera is near: its shape shows in small pictures, too.
-        self._outlines = (body.medium,) * 3 if riding else (coarse, *finer)
+        self._outlines = (coarse, *finer)
         self._X_WN = self.nodes_at(np.array([frame.values for frame in frames]))
         self._levels = dict[int, PyramidLevel]()
         self.joint_offsets = np.zeros(len(body.kinematics.names))
@@ -217,8 +212,7 @@ class PictureSearch:
         level = self._level(max(rounds[0][0], least_width))
         poses = level.starts(rotations)
         # A few frames, the most dissimilar, select starts for the scores in all frames.
-        first = ((2, 0.12), (4, 0.3)) if self._riding else ((4, 0.25),)
-        for frames, fraction in (*first, (len(self.frames), 1.0)):
+        for frames, fraction in ((4, 0.25), (len(self.frames), 1.0)):
             poses = level.best(poses, frames, fraction)
         after = (*(kept for _, kept, _, _ in rounds[1:]), rounds[-1][1])
         improved = list[list[Array]]()
@@ -266,14 +260,12 @@ class PictureSearch:
             other._levels = {}
         return other
 
-    def silhouettes(self, camera: PinholeCamera, shift: int = 0) -> Mask:
+    def silhouettes(self, camera: PinholeCamera) -> Mask:
         """Return the body's silhouettes (f, H, W) in all frames.
 
-        Args:
-            camera: at its pose, with pictures of H x W pixels.
-            shift: frame k gets the joint positions of frame k + shift, with wrap-around.
+        camera: at its pose, with pictures of H x W pixels.
         """
-        poses = camera.X_CW @ np.roll(self._X_WN, -shift, axis=0)
+        poses = camera.X_CW @ self._X_WN
         return np.array(map_ordered(lambda X: draw_mask(self._outlines[-1], X, camera), poses))
 
     def nodes_at(self, values: Array) -> Array:
@@ -289,15 +281,6 @@ class PictureSearch:
         other.__dict__.update(changes)
         other._levels = {width: level(known) for width, known in self._levels.items()}
         return other
-
-    def with_shifted_pictures(self) -> "PictureSearch":
-        """Return a search in the same pictures, shifted by half their size with wrap-around."""
-        height, width = self.camera.height // 2, self.camera.width // 2
-        frames = [
-            replace(frame, picture=np.roll(frame.picture, (height, width), axis=(0, 1)))
-            for frame in self.frames
-        ]
-        return PictureSearch(self._body, self.camera, frames, self._riding)
 
     def fit_offsets(
         self,
@@ -460,10 +443,9 @@ class PictureSearch:
         small = camera.resized(level.camera.width, level.camera.height)
         covered = self.silhouettes(camera)
         same = small.width == camera.width
+        showing = level.backgrounds.shows_background(covered if same else self.silhouettes(small))
         pictures = [frame.picture for frame in frames]
-        known = level.backgrounds.known(
-            pictures, covered, covered if same else self.silhouettes(small)
-        )
+        known = KnownBackground.estimate(pictures, level.backgrounds.gains, showing, covered)
         return known, covered
 
     def _segment(
@@ -501,7 +483,7 @@ class PictureSearch:
             count = PICTURES.search_frames if width < PICTURES.compare_width else len(self.frames)
             pictures = [frame.picture for frame in self.frames[:count]]
             self._levels[width] = PyramidLevel(
-                self._outlines[k], self.camera, pictures, self._X_WN[:count], width, self._riding,
+                self._outlines[k], self.camera, pictures, self._X_WN[:count], width,
             )  # fmt: skip
         return self._levels[width]
 

@@ -24,7 +24,6 @@ from drake_pose.fit.explain_kernel import (
     explain_poses,
     make_words,
 )
-from drake_pose.fit.riding import RidingPictures
 from drake_pose.registration.posed_frames import placed_points
 from drake_pose.registration.register import uniform_rotations
 from drake_pose.silhouette.outline import Outline, PackedOutlines, pack
@@ -237,7 +236,6 @@ class PyramidLevel:
         pictures: f pictures (H, W, 3).
         X_WN: (f, nodes, 4, 4) the nodes' poses.
         width: width of this level's pictures [pixel]; at most that of the given ones.
-        riding: whether the body rides along with the camera.
     """
 
     def __init__(
@@ -247,7 +245,6 @@ class PyramidLevel:
         pictures: Sequence[Picture],
         X_WN: Array,
         width: int,
-        riding: bool = False,
     ) -> None:
         width = min(width, camera.width)
         height = max(8, round(camera.height * width / camera.width))
@@ -257,20 +254,14 @@ class PyramidLevel:
         self._parameters = self.camera.kernel_parameters()
         points = np.array([placed_points(outlines, X) for X in X_WN])
         size = float(np.sqrt(((points - points.mean(axis=(0, 1))) ** 2).sum(axis=2).mean()))
-        self.backgrounds: Backgrounds | RidingPictures
-        if riding:
-            off = np.linalg.norm(points[:, None] - points, axis=3).max(axis=2)
-            alike = np.exp(-((off / (0.1 * size)) ** 2))
-            self.backgrounds = RidingPictures.estimate(np.array(small), alike)
-        else:
-            self.backgrounds = Backgrounds.estimate(np.array(small))
+        self.backgrounds = Backgrounds.estimate(np.array(small))
         moves = np.linalg.norm(np.ptp(points, axis=0), axis=1)
         counts = [len(outline.vertices) for outline in outlines]
         owners = np.repeat(np.arange(len(outlines)), counts)
         most = np.zeros(len(outlines))
         np.maximum.at(most, owners, moves)
         # A node is static if its points move by less than 0.06 of the body's size.
-        self._static = (most < 0.06 * size) & (not riding)
+        self._static = most < 0.06 * size
         moving = points[:, ~self._static[owners]]
         self._points = (moving if moving.size else points).reshape(-1, 3)
         self._middle = self._points.mean(axis=0)
@@ -340,12 +331,11 @@ class PyramidLevel:
         """Return the first `frames` pictures (None: all), prepared for scores."""
         X_WN = np.ascontiguousarray(self._X_WN[:frames, :, :3])
         possible = self.backgrounds.max_gain * len(X_WN) / len(self._X_WN)
-        outline, weight = self.backgrounds.contour_terms(
-            len(X_WN) * self.camera.width, PICTURES.contour_weight
-        )
+        # The added length limits the score of short outlines, whose edges are strong by chance.
+        outline = 0.3 * len(X_WN) * self.camera.width
         return ScoredPictures(
             self._packed, X_WN, self._static, self._parameters, self.backgrounds.sums,
-            self._middle, np.array([max(possible, 1e-9), outline, weight]),
+            self._middle, np.array([max(possible, 1e-9), outline, PICTURES.contour_weight]),
         )  # fmt: skip
 
     def best(self, X_CW: Sequence[Array], frames: int, fraction: float) -> list[Array]:
@@ -367,14 +357,11 @@ class PyramidLevel:
 
         They show the body where pictures change. Each rotation is combined with three depths, near
         that at which the body is as large as the changing part, and with two places in the picture:
-        the centre of the changes, and a random one. Where changes tell nothing
-        (``RidingPictures``), places and depths are random.
+        the centre of the changes, and a random one.
 
         rotations: number of rotations over the whole sphere, and of further ones near upright.
         """
         changes = self.backgrounds.changed_frames()
-        if changes is None:
-            return self._starts_around(18 * rotations)
         v, u = np.mgrid[: changes.shape[0], : changes.shape[1]]
         total = max(float(changes.sum()), 1e-9)
         middle = np.array([float((changes * axis).sum()) / total for axis in (u, v)])
@@ -398,21 +385,6 @@ class PyramidLevel:
                 X[:, :3, 3] = p_CM - R_CW @ self._middle
                 starts += list(X)
         return starts
-
-    def _starts_around(self, count: int) -> list[Array]:
-        """Return `count` random poses X_CW (4, 4) with the body's middle in or beside the picture.
-
-        The middle is 0.5 to 4 times the body's size away from the camera.
-        """
-        rng, size = np.random.default_rng(0), (self.camera.width, self.camera.height)
-        place = rng.uniform(-0.7, 1.7, (count, 2)) * size - self._parameters[3:5]
-        ray = np.column_stack([place / self._parameters[1:3], np.ones(count)])
-        away = self._size * np.exp(rng.uniform(np.log(0.5), np.log(4.0), count))
-        X = np.tile(np.eye(4), (count, 1, 1))
-        X[:, :3, :3] = uniform_rotations(count)[rng.permutation(count)]
-        p_CM = ray * (away / np.linalg.norm(ray, axis=1))[:, None]
-        X[:, :3, 3] = p_CM - X[:, :3, :3] @ self._middle
-        return list(X)
 
     def improve(
         self, X_CW: Sequence[Array], evaluations: int, turn: float

@@ -151,18 +151,17 @@ def _random_mount(rng: np.random.Generator, one: Gripper, width: int, height: in
 
 def simulate_wrist(
     data: Path, folder: Path, one: Gripper, seed: int, *, contrast: float = 0.6, things: int = 14,
-    held: bool = False, motion: str = "free", opening: str = "moves", late: float = 0.03,
-    drawn: Gripper | None = None, count: int = 60, away: bool = False, stands: bool = False,
+    held: bool = False, motion: str = "free", late: float = 0.03, count: int = 60,
+    away: bool = False, stands: bool = False,
 ) -> tuple[ArticulatedModel, SimulatedEpisode]:  # fmt: skip
     """Simulate an episode; its camera has the pose X_LC on the gripper's link.
 
     Args:
         data: folder of the models.
-        one: the arm and its gripper; drawn: those that are drawn in their place; None: the same.
+        one: the arm and its gripper.
         contrast: of the table's texture; 0.02: a faint grain. things: number of boxes on it.
         held: whether the hand holds a thing.
         motion: "free": all joints swing; "upright": the hand turns about the vertical only.
-        opening: "moves": the gripper opens and closes; "still": it does not.
         late: how late the pictures are [s]. count: of pictures, five a second.
         away: whether the camera looks away from the gripper.
         stands: whether the camera stands half a metre behind the place where it would begin.
@@ -189,37 +188,24 @@ def simulate_wrist(
         part = 0.5 + 0.5 * np.sin(closing[0] * times + closing[1])
         if held:
             part = 0.35 + 0.0 * part
-        elif opening == "still":
-            part = 0.8 + 0.0 * part
         for joint, (low, high) in one.fingers.items():
             q[:, model.position_index(joint)] = low + part * (high - low)
         return q
 
     times = np.arange(count) / 5.0
     log_times = np.arange(-1.0, times[-1] + 1.0, 1.0 / LOG_HZ)
-    shown, other = model, drawn or one
-    if drawn:
-        shown = load_model(data / other.file, check=False)
-    room = WristRoom(shown, other, folder, seed, held=held, contrast=contrast, things=things)
+    room = WristRoom(model, one, folder, seed, held=held, contrast=contrast, things=things)
     context, pictures, first = model.plant.CreateDefaultContext(), [], None
     for q in at(times + late):
         model.plant.SetPositions(context, q)
         X_WL = model.plant.GetBodyByName(one.link).EvalPoseInWorld(context).GetAsMatrix4()
-        q_shown = q
-        if drawn:
-            q_shown = shown.default_positions.copy()
-            for k, joint in enumerate(other.arm):
-                q_shown[shown.position_index(joint)] = q[arm[k % len(arm)]]
-            part = 0.5 * (1.0 + np.sin(q[arm[0]] * 9.0))
-            for joint, (low, high) in other.fingers.items():
-                q_shown[shown.position_index(joint)] = low + part * (high - low)
         placed = camera.with_pose(X_WL @ camera.X_WC)
         if stands:
             back = np.eye(4)
             back[2, 3] = -0.5
             first = first or placed.with_pose(placed.X_WC @ back)
             placed = first
-        picture = room.picture(q_shown, np.array([3.0, 3.0, 0.0]), placed)
+        picture = room.picture(q, np.array([3.0, 3.0, 0.0]), placed)
         noisy = picture + rng.normal(0.0, 3.0, picture.shape)
         pictures.append(np.clip(noisy, 0, 255).astype(np.uint8))
     return model, SimulatedEpisode(np.array(pictures), times, log_times, at(log_times), camera)

@@ -79,8 +79,6 @@ class RegistrationInputs:
         audited_frames: names of the frames to be audited.
         frames: frames that have been read, with the masks of searched and known cameras.
         visible_nodes: names of the tree's nodes that masks show; None: all.
-        riding_nodes: names of nodes that move with cameras on a link: the link, and what it carries
-            by logged joints.
         target: the calibration target of cameras on a link; at the world's origin in the tree until
             its pose is estimated. None: the masks show the robot.
         offset_joints, scaled_links: names of joints whose offsets are estimated, and of links whose
@@ -106,7 +104,6 @@ class RegistrationInputs:
     audited_frames: tuple[str, ...] = ()
     frames: tuple[MultiViewFrame, ...] = ()
     visible_nodes: tuple[str, ...] | None = None
-    riding_nodes: tuple[str, ...] = ()
     target: CalibrationTarget | None = None
     offset_joints: tuple[str, ...] = ()
     scaled_links: tuple[str, ...] = ()
@@ -329,12 +326,8 @@ def _read_episode(
             "is not known: give a joint map (--joint-map FILE), or hold those that do not move "
             "(--hold NAME=VALUE)"
         )
-    riding: tuple[str, ...] = ()
-    if scene_alone and settings.on is not None:
-        carried = {tree.nodes[0].name, *robot.carried_by(settings.on)} & {*mapped.posed}
-        riding = tuple(node.name for node in tree.nodes if node.name in carried)
     joint_names, link_names = _select_parameters(robot, kinematics, settings)
-    return replace(inputs, offset_joints=joint_names, scaled_links=link_names, riding_nodes=riding)
+    return replace(inputs, offset_joints=joint_names, scaled_links=link_names)
 
 
 def _recording(

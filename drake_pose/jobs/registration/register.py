@@ -78,7 +78,6 @@ from drake_pose.registration.standing_object import (
     find_target_frames,
     require_detections,
 )
-from drake_pose.registration.standing_scene.gripper import GripperSearch
 from drake_pose.registration.standing_scene.track_registration import (
     TrackRegistration,
     register_tracks,
@@ -298,15 +297,11 @@ class _Registration:
         base = inputs.tree.node_index((inputs.visible_nodes or ())[0])
         for camera in inputs.searched_cameras:
             name, start = camera.name, time.perf_counter()
-            recording, gripper = inputs.recordings[name], None
-            assumed = name in inputs.assumed_focal
+            recording, assumed = inputs.recordings[name], name in inputs.assumed_focal
             focal = self._settings.focal or assumed
-            if inputs.riding_nodes and not focal:
-                riding = RegistrationBody(inputs.tree, inputs.riding_nodes)
-                gripper = GripperSearch(riding, self.body, camera, recording)
             with self._refusing(name):
                 result = register_tracks(
-                    self.body, link, base, camera, recording, focal, inputs.offset_joints, gripper
+                    self.body, link, base, camera, recording, focal, inputs.offset_joints
                 )
                 self.tracks[name] = result
                 self.warnings += track_warnings(result, assumed)

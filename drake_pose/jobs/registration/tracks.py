@@ -31,15 +31,6 @@ from drake_pose.registration.register import RegistrationBody, evenly_spaced
 from drake_pose.registration.shared_fit import SHARED
 from drake_pose.registration.standing_scene.track_registration import TrackRegistration
 
-SCENE = "scene"
-"""The summary's `evidence` of a camera on a link that was registered from a standing scene."""
-
-GRIPPER = "gripper"
-"""The `evidence` of a camera that was registered from the gripper alone."""
-
-BOTH = "scene and gripper"
-"""The `evidence` of a camera that was registered from both."""
-
 
 def watch_cameras(inputs: RegistrationInputs) -> RegistrationInputs:
     """Return an episode's inputs with its cameras' motions, and warnings of drift and shake.
@@ -230,24 +221,14 @@ def picture_warnings(result: PictureRegistration | TrackRegistration, assumed: b
 
 def describe_tracks(result: TrackRegistration, kinematics: TreeKinematics) -> dict[str, Any]:
     """Return a camera's part of summary.json on its points, clock, focal length and offsets."""
-    view, seen = result.gripper, len(result.seen.uv) > 0
-    used = view is not None and not result.contradiction
     return {
-        "evidence": (BOTH if seen else GRIPPER) if used else SCENE,
-        "gripper": view
-        and {
-            "contours_that_fit": view.ratio,
-            "told": view.explained,
-            "told_by_chance": None if math.isnan(view.chance) else view.chance,
-            "contradicts": result.contradiction or None,
-        },
         "masks": "none",
         "mean_iou": None,
         "points": len(np.unique(result.seen.points)),
         "sightings": len(result.seen.uv),
-        "sightings_that_fit": float(result.inliers.mean()) if seen else None,
-        "explained": result.explained if seen else None,
-        "explained_by_chance": result.chance if seen else None,
+        "sightings_that_fit": float(result.inliers.mean()),
+        "explained": result.explained,
+        "explained_by_chance": result.chance,
         **describe_lens_and_clock(result),
         **describe_parameters(result.offsets, (), kinematics),
     }
@@ -265,18 +246,6 @@ def track_warnings(result: TrackRegistration, assumed: bool) -> list[str]:
             "better: estimate them, too (--zeros all). The camera's pose is the one that fits with "
             "them; the joint positions were left as they are"
         )
-    if result.contradiction:
-        texts.append(
-            f"camera '{name}': the gripper in its pictures places it {result.contradiction} from "
-            "where the scene does; the scene's pose was taken: is the gripper the model's, is it "
-            "mounted as there, and is its opening right?"
-        )
-    if result.gripper is not None and not len(result.seen.uv):
-        texts.append(
-            f"camera '{name}': its pose comes from the gripper in its pictures alone, as the scene "
-            "does not show enough: it is right only if the gripper is the model's, and if the "
-            "pictures are not mirrored, which a symmetric gripper does not show"
-        )
     loose = [offset.name for offset in result.offsets if not offset.determined]
     if loose:
         texts.append(
@@ -289,20 +258,13 @@ def track_warnings(result: TrackRegistration, assumed: bool) -> list[str]:
 def draw_tracks(folder: Path, result: TrackRegistration, most: int = 6) -> None:
     """Draw inlier points in blue and outliers in orange, in up to `most` pictures.
 
-    The gripper's contours are orange lines.
-
     folder: the result folder.
     """
     camera, frames = result.found.camera.name, result.found.frames
-    silhouettes = {} if result.gripper is None else result.gripper.silhouettes
     worst = sorted(range(len(frames)), key=lambda k: frames[k].inlier_ratio)
     for k in evenly_spaced(worst, most):
         name = frames[k].frame
         picture = result.pictures[name].copy()
-        if name in silhouettes:
-            shown = silhouettes[name].astype(np.uint8)
-            contours, _ = cv2.findContours(shown, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-            cv2.drawContours(picture, contours, -1, EXCESS_RGB, 1)
         rows = result.seen.frames == k
         for (u, v), fits in zip(result.seen.uv[rows], result.inliers[rows], strict=True):
             colour = (0, 114, 178) if fits else EXCESS_RGB

@@ -221,26 +221,6 @@ def pose_difference(X_LC: Array, other: Array) -> Array:
     return np.concatenate([turns.reshape(*X.shape[:-2], 3), X[..., :3, 3]], axis=-1)
 
 
-class PosePrior(NamedTuple):
-    """What is known of a pose X_LC (4, 4) before a fit.
-
-    covariance: (6, 6) of its errors, rotation vector [rad] and translation [m] along the camera's
-    axes at X_LC.
-    """
-
-    X_LC: Array
-    covariance: Array
-
-    def off(self, X_LC: Array) -> Array:
-        """Return the difference (6,) from the known pose to X_LC (4, 4), see `pose_difference`."""
-        return pose_difference(self.X_LC, X_LC)
-
-    def size(self, X_LC: Array) -> float:
-        """Return the root mean square difference to a pose X_LC (4, 4) [standard deviations]."""
-        off = self.off(X_LC)
-        return float(np.sqrt(off @ np.linalg.solve(self.covariance, off) / len(off)))
-
-
 class TrackProblem(NamedTuple):
     """What a bundle adjustment fits."""
 
@@ -252,7 +232,6 @@ class TrackProblem(NamedTuple):
     # (1 + k,) prior standard deviations of the logarithm of the focal length and of the constants;
     # 0: it is known and not fitted.
     prior_sds: Array
-    prior: PosePrior | None = None  # Of the camera's pose; None: nothing is known of it.
 
     def without(self, frames: Indices) -> "TrackProblem":
         """Return the problem without the frames of these indices.
@@ -307,8 +286,6 @@ def fit_tracks(
     unknown = np.concatenate([np.ones(6, np.bool_), free])
     known = np.concatenate([np.full(6, 1e-9), np.where(free, problem.prior_sds, 1.0) ** -2])
     information = np.diag(known)
-    if problem.prior is not None:
-        information[:6, :6] += np.linalg.inv(problem.prior.covariance)
     for scale in scales:
         r, A, B = _residuals(problem, fit)
         lengths = np.linalg.norm(r, axis=1)
@@ -318,8 +295,7 @@ def fit_tracks(
         G = _twists(problem, fit.X_LC, fit.constants)
         S, g, points_step = _without_points(problem.seen, r, A, B, w, len(fit.points))
         H = (G.T @ S @ G + information)[np.ix_(unknown, unknown)]
-        difference = np.zeros(6) if problem.prior is None else problem.prior.off(fit.X_LC)
-        errors = np.concatenate([difference, fit.constants])
+        errors = np.concatenate([np.zeros(6), fit.constants])
         step = np.zeros(6 + count)
         step[unknown] = -np.linalg.solve(H, (G.T @ g + information @ errors)[unknown])
         fit = fit._replace(
@@ -370,19 +346,6 @@ def intrinsics_effect(
         )
     fits = [fit_tracks(problem._replace(camera=other), fit) for other in wrong]
     differences = np.array([_moved(fit, other) for other in fits])
-    return np.asarray(differences.T @ differences)
-
-
-def prior_effect(problem: TrackProblem, fit: TrackFit) -> Array:
-    """Return the covariance (7 + k, 7 + k), see `TrackFit`, from errors of the pose's prior."""
-    if problem.prior is None:
-        return np.zeros((len(fit.covariance),) * 2)
-    variances, axes = np.linalg.eigh(problem.prior.covariance)
-    rows = []
-    for error in (axes * np.sqrt(variances.clip(min=0.0))).T:
-        wrong = problem.prior._replace(X_LC=problem.prior.X_LC @ motion(error))
-        rows.append(_moved(fit, fit_tracks(problem._replace(prior=wrong), fit)))
-    differences = np.array(rows)
     return np.asarray(differences.T @ differences)
 
 

@@ -50,10 +50,6 @@ class Sightings(NamedTuple):
     points: Indices
     uv: Array
 
-    def none(self) -> "Sightings":
-        """Return no sightings."""
-        return Sightings(self.frames[:0], self.points[:0], self.uv[:0])
-
 
 def match_pictures(pictures: Sequence[Picture]) -> tuple[Matches, Sightings]:
     """Match points between all pairs of RGB pictures (H, W, 3), and join the matches to tracks."""

@@ -16,7 +16,6 @@ from drake_pose.registration.hand_eye import rotation_spread
 from drake_pose.registration.joint_offsets import KinematicParameter
 from drake_pose.registration.recording import Recording, TimeOffset, choose_pictures
 from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
-from drake_pose.registration.standing_scene.gripper import GripperFit, GripperSearch
 from drake_pose.registration.standing_scene.hand_eye_tracks import (
     EpipolarSearch,
     TrackFit,
@@ -27,7 +26,6 @@ from drake_pose.registration.standing_scene.hand_eye_tracks import (
     intrinsics_effect,
     jackknife,
     poses_differ,
-    prior_effect,
     recorded_link_poses,
 )
 from drake_pose.registration.standing_scene.picture_matches import (
@@ -39,8 +37,6 @@ from drake_pose.registration.standing_scene.picture_matches import (
 
 class TrackRegistrationSettings(NamedTuple):
     """Settings of a registration from a standing scene; chosen as those of `TrackSettings`.
-
-    A "pose of the gripper" is the camera's pose on the link as found from the gripper alone.
 
     Args:
         pictures, moving: maximum numbers of slow and of fast pictures that are used.
@@ -55,13 +51,6 @@ class TrackRegistrationSettings(NamedTuple):
         least_motion: minimum standard deviation of the link's position [mm].
         determined: maximum standard deviation of a determined constant, over the prior's.
         max_sd: maximum standard deviation of a determined pose along any axis [rad and m].
-        agrees: maximum root mean square difference of the poses from scene and from gripper
-            [standard deviations].
-        near: rotation [rad] and distance [m] within which the scene refines a pose of the gripper.
-        deciding: minimum number of matches that decide between poses of the gripper.
-        apart: minimum explained fraction of the best of these poses, over that of the second.
-        most_explained: minimum explained fraction with which a scene improves a pose of the
-            gripper, if the scene does not determine a pose by itself.
         better: ratio of the residuals without and with joint offsets from which these are likely.
     """
 
@@ -79,11 +68,6 @@ class TrackRegistrationSettings(NamedTuple):
     least_motion: float = 5.0
     determined: float = 0.2
     max_sd: float = 0.04
-    agrees: float = 2.5
-    near: tuple[float, float] = (0.1, 0.05)
-    deciding: int = 30
-    apart: float = 1.3
-    most_explained: float = 0.5
     better: float = 1.5
 
 
@@ -103,16 +87,11 @@ class TrackRegistration:
     # Names of joints whose offsets explain the pictures much better, if no offsets were asked for;
     # the camera's covariance then includes their effect.
     likely: tuple[str, ...]
-    explained: float  # Fraction of matches that the pose explains; nan: the gripper alone gave it.
+    explained: float  # Fraction of matches that the pose explains.
     chance: float  # The largest such fraction of any pose with joint positions of other moments.
     seen: Sightings  # N sightings of points, by index of the frames of `found`.
     inliers: NDArray[np.bool_]  # (n,) which sightings are inliers.
     pictures: dict[str, Picture]  # (H, W, 3) by frame name.
-    # The pose from the gripper alone; None: it is not seen, or its contours do not fit.
-    gripper: GripperFit | None = None
-    # How far the gripper's pose is from the scene's, in words, if the difference is significant;
-    # the gripper is not used then. "": it is not.
-    contradiction: str = ""
 
 
 def register_tracks(
@@ -123,11 +102,8 @@ def register_tracks(
     recording: Recording,
     focal: bool = False,
     offset_joints: Sequence[str] = (),
-    gripper: GripperSearch | None = None,
 ) -> TrackRegistration:
     """Estimate the pose of a camera on a link from its pictures of an unknown scene.
-
-    The scene is fitted together with the gripper, if the camera sees it.
 
     Args:
         body: the robot, whose pose tree starts at the link.
@@ -137,7 +113,6 @@ def register_tracks(
         recording: the camera's pictures and the joint log.
         focal: whether the focal length is fitted.
         offset_joints: names of the joints whose offsets are fitted.
-        gripper: fits the gripper, which moves with the camera; None: its shape is not known.
 
     Raises RegistrationError: too little is matched, no pose explains it, or the link's motion does
         not determine the pose; the message says what would help.
@@ -153,38 +128,13 @@ def register_tracks(
     sds = np.concatenate([lens_sds, settings.joint_sd * asked])
     problem = TrackProblem(camera, link_poses, seen, sds)
     scene = _Scene(body, link, problem, matches, focal, timed)
-    view, why = None, ""
-    try:
-        _require_motion(camera, link, link_poses(np.zeros(1 + len(names))))
-        _require_matches(camera, matches, len(rows))
-        start = scene.search()
-        if start.explained < settings.least_gain * start.chance:
-            search, values = EpipolarSearch(camera, matches), recording.values_at(0.0)[rows]
-            _refuse_unexplained(camera, link, start, *explaining_link(body, base, values, search))
-        fitted = scene.fit(start, None)
-    except RegistrationError as error:
-        if gripper is None:
-            raise
-        view, start = _start_at_gripper(gripper, scene, error)
-        fitted = scene.fit(start, view) if start.matches else scene.without(view)
-        if start.matches and view.prior(fitted.covariance).size(fitted.fit.X_LC) > settings.agrees:
-            raise RegistrationError(
-                f"{str(error).removesuffix(' Nothing was written')} The gripper in its pictures "
-                "contradicts the scene. Nothing was written"
-            ) from error
-    else:
-        clock = float(fitted.fit.constants[1])
-        view = None if gripper is None else gripper.near(fitted.fit.X_LC, clock)
-        if view is not None:
-            prior = view.prior(fitted.covariance)
-            if prior.size(fitted.fit.X_LC) < settings.agrees:
-                fitted = scene.fit(start, view)
-            else:
-                difference = prior.off(fitted.fit.X_LC)
-                why = (
-                    f"{1e3 * np.linalg.norm(difference[3:]):.0f} mm and "
-                    f"{np.degrees(np.linalg.norm(difference[:3])):.1f} degrees"
-                )
+    _require_motion(camera, link, link_poses(np.zeros(1 + len(names))))
+    _require_matches(camera, matches, len(rows))
+    start = scene.search()
+    if start.explained < settings.least_gain * start.chance:
+        search, values = EpipolarSearch(camera, matches), recording.values_at(0.0)[rows]
+        _refuse_unexplained(camera, link, start, *explaining_link(body, base, values, search))
+    fitted = scene.fit(start)
     problem, fit, covariance = fitted.problem, fitted.fit, fitted.covariance
     scale = float(np.exp(fit.constants[0]))
     placed = replace(
@@ -192,11 +142,6 @@ def register_tracks(
     ).with_pose(fit.X_LC)
     J = np.kron(np.eye(2), fit.X_LC[:3, :3])
     misfits = _misfits([recording.names[k] for k in rows], seen, fit)
-    if view is not None and not start.matches:
-        misfits = tuple(
-            FrameMisfit(name, math.nan, math.nan, view.ratio, True) for name in view.silhouettes
-        )
-        pictures, seen = [recording.picture(name) for name in view.silhouettes], seen.none()
     found = RegisteredCamera(
         placed, J @ covariance[:6, :6] @ J.T, misfits, np.array(fitted.alike).reshape(-1, 4, 4)
     )
@@ -212,8 +157,6 @@ def register_tracks(
         seen,
         fit.inliers,
         dict(zip((misfit.frame for misfit in misfits), pictures, strict=True)),
-        view,
-        why,
     )
 
 
@@ -222,7 +165,7 @@ class _Start(NamedTuple):
 
     X_LC: poses (4, 4), best first. constants: (2 + m,) logarithm of the focal length's ratio, time
     offset [s] and joint offsets of the best pose. explained, chance: see ``TrackRegistration``.
-    matches: number of matches; 0: the scene does not help.
+    matches: number of matches.
     """
 
     X_LC: list[Array]
@@ -275,32 +218,14 @@ class _Scene(NamedTuple):
         constants[0] = math.log(scale)
         explained, X_LC, constants = self._timed(search, *candidates[0], constants)
         candidates = [(explained, X_LC), *candidates[1:]]
+        # Shifts give each picture the joint positions of another one.
+        count = int(self.problem.seen.frames.max()) + 1
         chance = max(
             search.search(np.roll(X_WL, shift, axis=0), settings.chance_rotations)[0][0]
-            for shift in self._shifts()
+            for shift in {max(1, round(part * count)) for part in (0.25, 0.5, 0.75)}
         )
         poses = [X for gain, X in candidates if gain > 0.7 * explained]
         return _Start(poses[:3], constants, explained, chance, len(self.matches.uv))
-
-    def compare(self, X_LC: Array, offset: float) -> _Start:
-        """Return a pose (4, 4) and about its time offset [s] as a start, and what they explain."""
-        search = EpipolarSearch(self.problem.camera, self.matches)
-        constants = np.zeros(len(self.problem.prior_sds))
-        constants[1] = offset
-        X_WL = self.problem.link_poses(constants[1:])
-        gain, X = search.refine(X_WL, X_LC)
-        explained, X, constants = self._timed(search, gain, X, constants)
-        if poses_differ(X, X_LC, turn=STANDING_SCENE.near[0], shift=STANDING_SCENE.near[1]):
-            explained = 0.0  # The refinement went to another pose.
-        chance = max(
-            search.refine(np.roll(X_WL, shift, axis=0), X_LC)[0] for shift in self._shifts()
-        )
-        return _Start([X_LC], constants, explained, chance, len(self.matches.uv))
-
-    def _shifts(self) -> set[int]:
-        """Return shifts, in pictures, that give each picture the joint positions of another one."""
-        n = int(self.problem.seen.frames.max()) + 1
-        return {max(1, round(part * n)) for part in (0.25, 0.5, 0.75)}
 
     def _timed(
         self, search: EpipolarSearch, explained: float, X_LC: Array, constants: Array
@@ -315,37 +240,23 @@ class _Scene(NamedTuple):
                 best = gain, X, at
         return best
 
-    def fit(self, start: _Start, view: GripperFit | None) -> _SceneFit:
-        """Fit from a start; view: the pose from the gripper, used as a prior; None: there is none.
+    def fit(self, start: _Start) -> _SceneFit:
+        """Fit from a start.
 
         Raises RegistrationError: the pose is not determined.
         """
-        problem = self.problem._replace(prior=None if view is None else view.prior())
-        asked = bool((problem.prior_sds[2:] > 0.0).any())
-        problem, fit = _fit_determined(problem, start.X_LC[0], start.constants)
+        asked = bool((self.problem.prior_sds[2:] > 0.0).any())
+        problem, fit = _fit_determined(self.problem, start.X_LC[0], start.constants)
         self._require(problem, fit, fit.covariance)
         likely: tuple[str, ...] = ()
         if not asked:
             likely, problem, fit = _with_likely_offsets(self.body, problem, fit)
         covariance = jackknife(problem, fit) + intrinsics_effect(problem, fit)
-        covariance += prior_effect(problem, fit)
         self._require(problem, fit, covariance, likely)
         others = [fit_tracks(problem, X, start.constants) for X in start.X_LC[1:]]
         as_good = (other.X_LC for other in others if other.sigma < 1.1 * fit.sigma)
         alike = [X_LC for X_LC in as_good if poses_differ(X_LC, fit.X_LC)]
         return _SceneFit(problem, fit, covariance, alike, likely)
-
-    def without(self, view: GripperFit) -> _SceneFit:
-        """Return the pose from the gripper alone, without the scene's points."""
-        count = len(self.problem.prior_sds)
-        constants, covariance = np.zeros(count), np.zeros((6 + count, 6 + count))
-        covariance[:6, :6], covariance[7, 7] = view.covariance, np.inf
-        if view.time_offset is not None:
-            constants[1], covariance[7, 7] = view.time_offset[0], view.time_offset[1] ** 2
-        points, lengths = np.zeros((0, 3)), np.zeros(0)
-        fit = TrackFit(view.X_LC, constants, points, math.nan, covariance, lengths)
-        problem = self.problem._replace(prior_sds=0.0 * self.problem.prior_sds)
-        return _SceneFit(problem, fit, covariance)
 
     def _require(
         self, problem: TrackProblem, fit: TrackFit, covariance: Array, likely: Sequence[str] = ()
@@ -353,46 +264,6 @@ class _Scene(NamedTuple):
         """Refuse a fit that is not determined, as `_require_determined` does."""
         X_WL = problem.link_poses(fit.constants[1:])
         _require_determined(problem.camera, self.link, X_WL, fit.X_LC, covariance, likely)
-
-
-def _start_at_gripper(
-    gripper: GripperSearch, scene: _Scene, error: RegistrationError
-) -> tuple[GripperFit, _Start]:
-    """Return the pose from the gripper, and a start at it; without matches if these do not help.
-
-    error: why the scene alone does not determine the pose.
-
-    Raises RegistrationError: the gripper does not determine it either.
-    """
-    views, why = gripper.find()
-    told = str(error).removesuffix(" Nothing was written")
-    if not views:
-        raise RegistrationError(
-            f"{told} Nor does the gripper in its pictures help, or it is not in view: {why}. "
-            "Nothing was written"
-        ) from error
-    count, starts = len(scene.matches.uv), list[_Start]()
-    if count >= STANDING_SCENE.deciding:
-        clocks = [0.0 if view.time_offset is None else view.time_offset[0] for view in views]
-        pairs = zip(views, clocks, strict=True)
-        starts = [scene.compare(view.X_LC, clock) for view, clock in pairs]
-    order = sorted(range(len(starts)), key=lambda k: -starts[k].explained)
-    best = starts[order[0]] if starts else None
-    helps = best is not None and best.explained > STANDING_SCENE.least_gain * best.chance
-    alone = _Start([], np.zeros(0), math.nan, math.nan, 0)
-    if len(views) > 1:
-        # A symmetric gripper looks the same from several sides; the scene does not.
-        apart = STANDING_SCENE.apart
-        if not helps or starts[order[0]].explained < apart * starts[order[1]].explained:
-            raise RegistrationError(
-                f"{told} The gripper in its pictures fits as well in {len(views)} poses of the "
-                "camera, as it looks the same from several sides, and the scene does not decide. "
-                "Nothing was written"
-            ) from error
-    if best is None or not helps:
-        return views[0], alone
-    enough = count >= STANDING_SCENE.least and best.explained > STANDING_SCENE.most_explained
-    return views[order[0]], best if enough else alone
 
 
 def _require_matches(camera: PinholeCamera, matches: Matches, count: int) -> None:
@@ -423,8 +294,8 @@ def _refuse_unexplained(
         f"best one explains {start.explained:.0%} of {start.matches} matched points, where "
         f"joint positions of other moments explain {start.chance:.0%}; twice as much is "
         f"needed. {hint}, does the scene stand still, are the joint positions those of these "
-        "pictures, are the pictures not mirrored, and is the focal length about right? Nothing "
-        "was written"
+        "pictures, are the pictures not mirrored, and is the focal length about right? If the "
+        "camera sees little but the gripper, give a --target. Nothing was written"
     )
 
 

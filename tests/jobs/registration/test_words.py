@@ -361,38 +361,23 @@ def tracked(**more: Any) -> Any:
     given = {
         "found": found, "time_offset": TimeOffset(0.05, 0.01, np.zeros((0, 2))),
         "focal_deviation": 0.0, "offsets": (), "likely": (), "explained": 0.7, "chance": 0.2,
-        "seen": seen, "inliers": np.array([True, True, False]), "gripper": None,
-        "contradiction": "",
+        "seen": seen, "inliers": np.array([True, True, False]),
         "pictures": {f"{k}": np.zeros((30, 40, 3), np.uint8) for k in range(3)},
     }  # fmt: skip
     return SimpleNamespace(**(given | more))
 
 
-GRIPPER_FIT = SimpleNamespace(ratio=0.8, explained=0.4, chance=np.nan, silhouettes={})
-
-
 def test_a_camera_on_a_link_is_summarised(body: RegistrationBody) -> None:
     kinematics = body.kinematics
     told = describe_tracks(tracked(), kinematics)
-    assert (told["evidence"], told["gripper"], told["points"], told["sightings"]) == (
-        "scene", None, 2, 3
-    )  # fmt: skip
+    assert (told["points"], told["sightings"]) == (2, 3)
     assert told["sightings_that_fit"] == pytest.approx(2 / 3)
     assert (told["explained"], told["explained_by_chance"]) == (0.7, 0.2)
     assert (told["time_offset_s"], told["time_offset_sd_s"]) == (0.05, 0.01)
     assert (told["focal_px"], told["focal_sd_px"]) == (288.0, None)
-    told = describe_tracks(tracked(gripper=GRIPPER_FIT, focal_deviation=0.01), kinematics)
-    assert told["evidence"] == "scene and gripper"
-    assert told["gripper"]["contradicts"] is told["gripper"]["told_by_chance"] is None
+    told = describe_tracks(tracked(focal_deviation=0.01, time_offset=None), kinematics)
     assert told["focal_sd_px"] == pytest.approx(2.88)
-    against = tracked(gripper=GRIPPER_FIT, contradiction="far")
-    told = describe_tracks(against, kinematics)
-    assert (told["evidence"], told["gripper"]["contradicts"]) == ("scene", "far")
-    nothing = Sightings(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
-    alone = tracked(gripper=GRIPPER_FIT, seen=nothing, inliers=np.zeros(0, bool), time_offset=None)
-    told = describe_tracks(alone, kinematics)
-    assert (told["evidence"], told["sightings_that_fit"]) == ("gripper", None)
-    assert told["explained"] is told["time_offset_s"] is None
+    assert told["time_offset_s"] is None
     unknown = tracked(time_offset=TimeOffset(0.05, np.inf, np.zeros((0, 2))))
     assert describe_tracks(unknown, kinematics)["time_offset_s"] is None
     # Warnings of what was estimated, or is not determined.
@@ -400,21 +385,15 @@ def test_a_camera_on_a_link_is_summarised(body: RegistrationBody) -> None:
     (text,) = track_warnings(tracked(focal_deviation=0.02), True)
     assert "estimated as 288 pixels (standard deviation 6)" in text
     assert "offsets of a explain" in track_warnings(tracked(likely=("a",)), False)[0]
-    assert "places it far from where the scene does" in track_warnings(against, False)[0]
-    assert "from the gripper in its pictures alone" in track_warnings(alone, False)[0]
     loose = undetermined("a", ())
     assert (
         "the offsets of a are not determined" in track_warnings(tracked(offsets=(loose,)), False)[0]
     )
     assert "do not determine its time offset" in track_warnings(unknown, False)[0]
-    assert len(track_warnings(tracked(gripper=GRIPPER_FIT), False)) == 0
 
 
-def test_points_and_contours_are_drawn_in_the_worst_pictures(tmp_path: Any) -> None:
-    shown = np.zeros((30, 40), bool)
-    shown[2:8, 25:35] = True
-    fit = SimpleNamespace(**{**vars(GRIPPER_FIT), "silhouettes": {"0": shown}})
-    draw_tracks(tmp_path, tracked(gripper=fit))
+def test_points_are_drawn_in_the_worst_pictures(tmp_path: Any) -> None:
+    draw_tracks(tmp_path, tracked())
     pictures = {
         path.stem: cv2.imread(str(path))[..., ::-1] for path in tmp_path.glob("overlay/left/*.png")
     }
@@ -425,8 +404,6 @@ def test_points_and_contours_are_drawn_in_the_worst_pictures(tmp_path: Any) -> N
         assert np.abs(ring.astype(int) - colour).max() < 60
         assert not pictures[name][uv[1], uv[0]].any()
     assert not pictures["2"].any()
-    assert tuple(pictures["0"][2, 30]) == tuple(orange)
-    assert not pictures["0"][5, 30].any()
     draw_tracks(tmp_path / "few", tracked(), most=1)
     assert [path.stem for path in (tmp_path / "few").glob("overlay/left/*.png")] == ["1"]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -34,8 +34,14 @@ from drake_pose.commands.common import (
     worst_frames,
 )
 from drake_pose.errors import SceneError
-from drake_pose.files.settings import CaptureSettings, EstimateSettings, changed, percent
-from drake_pose.jobs.live.settings import CaptureMethod, LiveSettings
+from drake_pose.files.settings import (
+    CaptureMethod,
+    CaptureSettings,
+    EstimateSettings,
+    LiveSettings,
+    changed,
+    percent,
+)
 
 if TYPE_CHECKING:
     from drake_pose.files.records import SceneEstimate
@@ -238,11 +244,10 @@ def capture(
     of_masks = bool(truth or resume or set(changed(settings)) - {"packages"})
     # Not SOURCES of camera.sources: importing that module would slow the start of every command.
     has_sources = (scene / "sources.yaml").is_file()
-    of_person = bool(live.shape or not live.fit_shape)
-    if method != "person" and (of_masks or of_person):
+    if method != "person" and (of_masks or not live.fit_shape):
         raise UsageError(
-            "--camera, --frame, --every, --truth, --no-track, --resume, --shape "
-            "and --no-fit-shape need --method person"
+            "--camera, --frame, --every, --truth, --no-track, --resume and --no-fit-shape need "
+            "--method person"
         )
     if method == "person" and live.faces is not None:
         raise UsageError("--face-camera and --faces need --method paper")
@@ -263,18 +268,17 @@ def capture(
             truth=truth, resume=resume, overlay=overlay, replay=replay, json=json,
         )  # fmt: skip
         return
-    from drake_pose.jobs.live.capture import capture_live
-    from drake_pose.jobs.live.scene import hush_opencv, load_live_scene
+    from drake_pose.jobs.live import capture_live, hush_opencv, load_live_scene
 
     hush_opencv()
     studio = load_live_scene(scene)
-    live = replace(live, replay=replay, packages=settings.packages)
     if method != "person" and any(one.live for one in studio.specifications.values()):
         say("drake-pose: stand upright in view of the cameras, both arms spread to the sides")
     with count_progress("frames", None) as advance:
         found, interrupted, unreported = capture_live(
-            studio, out, model, live, warn, lambda count, _: advance(count), method
-        )
+            studio, out, model, live, method, packages=settings.packages, replay=replay,
+            on_report=warn, on_frame=lambda count, _: advance(count),
+        )  # fmt: skip
     for text in unreported:
         warn(text)
     if interrupted:
@@ -311,7 +315,7 @@ def empty_room(folder: Path, /, *, pictures: Annotated[int, within(1)] = 30) -> 
         folder: Folder with cameras.yaml and sources.yaml.
         pictures: Number of pictures of each camera.
     """
-    from drake_pose.jobs.live.scene import hush_opencv, take_empty_room
+    from drake_pose.jobs.live import hush_opencv, take_empty_room
 
     hush_opencv()
     for camera, place in take_empty_room(folder, pictures).items():

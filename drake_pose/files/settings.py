@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_t
 
 from cyclopts import Parameter, Token
 
-from drake_pose.errors import SettingsError, for_caller, require_at_least
+from drake_pose.errors import SettingsError, for_caller, require_at_least, require_positive
 
 _Settings = TypeVar("_Settings", bound=type)
 Axis = Literal["x", "y", "z"]
@@ -30,8 +30,10 @@ GONE = {
     "masks --model": "take the masks of a segmentation network, or paint them",
     "undistort": "use cv2.undistort, as tutorials/commands.md shows",
     "walk": "use the system Walker in a diagram, as tutorials/people.md shows",
+    "capture --shape": "lengths and radii are fitted to the first frames of each capture",
     "capture --start": "a person is captured from masks of every frame",
     "--export rerun": "log what drake_pose.load_cameras reads by rerun's own package",
+    "capture --tolerance": "pictures half a period apart are of one time",
 }
 """What to use instead of commands, their options ("--name", "command --name") and values ("--name
 value") that are gone.
@@ -309,6 +311,37 @@ class CaptureSettings(SceneSettings):
     track: Annotated[bool, Parameter(negative="--no-track")] = True
     """Track the body through a sequence, and search only in the first frame and after a loss;
     --no-track: search in every frame."""
+
+
+CaptureMethod = Literal["person", "paper"]
+"""person: a fit to all silhouettes at once; paper: the stages of Date et al. as published."""
+
+
+@readable
+@dataclass(frozen=True, kw_only=True)
+class LiveSettings:
+    """Settings of a live capture.
+
+    Raises:
+        SettingsError: a time is not positive, or an option lacks the other one that it needs.
+    """
+
+    seconds: Annotated[float | None, within(0.01)] = None
+    """Stop after this time [s]. Live capture (sources.yaml) only."""
+    fit_shape: Annotated[bool, Parameter(negative="--no-fit-shape")] = True
+    """--fit-shape: fit link lengths and radius scales to the first frames. --no-fit-shape: keep the
+    model's. Live capture only."""
+    face_camera: Annotated[str | None, Parameter(metavar="NAME")] = None
+    """With --method paper: the camera before the face, for the direction of the head; needs
+    --faces."""
+    faces: Annotated[Path | None, Parameter(metavar="FOLDER")] = None
+    """With --method paper: folder with pictures of the person's face and directions.csv, which has
+    the columns picture, turn and nod [deg]."""
+
+    def __post_init__(self) -> None:
+        require_positive(seconds=self.seconds)
+        if (self.face_camera is None) != (self.faces is None):
+            raise SettingsError("--face-camera and --faces need each other")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -36,8 +36,8 @@ from drake_pose.person.pose_tracker import (
     TrackState,
     fit_shape,
     shape_values,
+    tracker_of_person,
 )
-from drake_pose.person.search import LENIENT
 from drake_pose.person.views import FrameViews, SilhouetteView, edge_spacing, see_silhouette
 from drake_pose.silhouette.outline import Outline
 
@@ -129,10 +129,10 @@ class _Capture:
         self, tree: PoseTree, cameras: Mapping[str, Camera], read: ReadFrame, is_sequence: bool
     ) -> None:
         self._cameras, self._read, self._is_sequence = cameras, read, is_sequence
-        self._bare, is_shape = ContourFit(tree, noise=NOISE), shape_values(tree)
-        self.tracker = PersonPoseTracker(self._bare, LENIENT, is_shape)
+        self.tracker = tracker_of_person(tree, None)
+        self._bare = self.tracker.fit
         # Whether the model has shape joints to be fitted.
-        self._has_shape = bool(is_shape.any())
+        self._has_shape = bool(shape_values(tree).any())
         self.alternatives: dict[int, tuple[tuple[Array, Array], ...]] = {}
         # Frames used for the shape are needed three times. By frame and camera: the region, packed
         # to bits along the rows, and its edge.
@@ -185,8 +185,7 @@ class _Capture:
         fit, observed = self._bare, [self._see(k) for k in frames]
         views = [(one.cameras, [view.edge for view in one.views]) for one in observed]
         shape = fit_shape(fit, views, np.array(poses))
-        shaped, plan = ContourFit(fit.kinematics, shape.outlines, NOISE), self.tracker.plan
-        return shape, PersonPoseTracker(shaped, LENIENT, shape_values(fit.tree), shape.values, plan)
+        return shape, tracker_of_person(fit.kinematics, shape, self.tracker.plan)
 
     def find_explanations(
         self, frame: int, start: PoseFit | None = None

@@ -19,8 +19,9 @@ import numpy as np
 
 from drake_pose.arrays import Array, Indices, Mask
 from drake_pose.body import PoseTree
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
-from drake_pose.errors import ModelError, UnknownNameError
+from drake_pose.errors import ModelError
 from drake_pose.fit.contour_fit import (
     Comparison,
     ContourFit,
@@ -319,18 +320,11 @@ NOISE = Noise(deviation=0.02, correlation=0.15)
 
 
 @dataclass(frozen=True, eq=False)
-class KnownShape:
-    """A person's lengths by shape joint [m], else the model's; radius scales by part, else 1."""
-
-    lengths: Mapping[str, float]
-    radius_scales: Mapping[str, float]
-
-
-@dataclass(frozen=True, eq=False)
 class PersonShape:
     """A person's fitted shape."""
 
-    known: KnownShape
+    lengths: Mapping[str, float]  # By shape joint [m].
+    radius_scales: Mapping[str, float]  # By part.
     values: Array  # (m,) values of the pose tree: fitted shape joints [m], others 0.
     covariance: Array  # (h, h) covariance of the shape joints [m^2].
     poses: Array  # (frames, m) values in the fitted frames [rad, m].
@@ -361,31 +355,17 @@ def shape_parts(tree: PoseTree) -> tuple[list[str], list[int]]:
     return parts, [parts.index(name) for name in names]
 
 
-def tracker_of_person(tree: PoseTree, shape: KnownShape | None) -> PersonPoseTracker:
-    """Return a tracker of a person of known shape; its lengths are held.
+def tracker_of_person(
+    tree: PoseTree | TreeKinematics, shape: PersonShape | None, plan: BodyPlan | None = None
+) -> PersonPoseTracker:
+    """Return a tracker of a person of known shape, whose lengths are held.
 
-    `shape` None: the model's own shape.
-
-    Raises ModelError: the model has no landmarks of trunk, arms and legs; UnknownNameError: the
-    shape names a length or a part that the model lacks.
+    ``shape``: None: the model's own. ``plan``: limbs of the tree, if they exist already. Raises
+    ModelError: the model has no landmarks of trunk, arms and legs.
     """
-    shape = shape or KnownShape({}, {})
-    fit, held = ContourFit(tree, noise=NOISE), shape_values(tree)
-    rest = fit.kinematics.flatten(tree.default_values())
-    names = list(fit.kinematics.names)
-    lengths = [name for name, wanted in zip(names, held, strict=True) if wanted]
-    for name, length in shape.lengths.items():
-        if name not in lengths:
-            raise UnknownNameError("length", name, lengths, str(tree.model.path))
-        rest[names.index(name)] = length
-    parts, groups = shape_parts(tree)
-    for part in shape.radius_scales:
-        if part not in parts:
-            raise UnknownNameError("part", part, parts, str(tree.model.path))
-    if shape.radius_scales:
-        scales = np.array([shape.radius_scales.get(part, 1.0) for part in parts])
-        fit = ContourFit(fit.kinematics, with_radius_scales(fit.outlines, scales[groups]), NOISE)
-    return PersonPoseTracker(fit, LENIENT, held, rest)
+    outlines, rest = (None, None) if shape is None else (shape.outlines, shape.values)
+    fit = ContourFit(tree, outlines, NOISE)
+    return PersonPoseTracker(fit, LENIENT, shape_values(fit.tree), rest, plan)
 
 
 def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
@@ -444,11 +424,14 @@ def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
         )
         total += (H[np.ix_(is_shape, is_shape)] - cross.T @ follow) / len(frames)
     covariance = np.linalg.inv(prior + total)
-    known = KnownShape(
+    return PersonShape(
         dict(zip(names, lengths.tolist(), strict=True)),
         dict(zip(parts, scales.tolist(), strict=True)),
+        values,
+        np.asarray(covariance),
+        poses,
+        shaped.outlines,
     )
-    return PersonShape(known, values, np.asarray(covariance), poses, shaped.outlines)
 
 
 def _sides_information(names: Sequence[str], scale_count: int) -> Array:

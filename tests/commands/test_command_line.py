@@ -112,6 +112,7 @@ def test_a_signal_during_parsing_is_reported_in_one_line(monkeypatch: pytest.Mon
         ("capture scene --out new --start=first.csv", "masks"),
         ("register scene --model arm.urdf --out out --export rerun", "load_cameras"),
         ("register scene --model arm.urdf --out out --export=rerun", "load_cameras"),
+        ("capture scene --out new --tolerance 0.1", "one time"),
     ],
 )
 def test_what_is_gone_names_what_to_use_instead(line: str, instead: str) -> None:

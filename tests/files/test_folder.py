@@ -15,7 +15,7 @@ from drake_pose.files.folder import claimed, read_summary, write_file, write_sum
 from drake_pose.files.records import FrameRecord, PoseTable, read_earlier_summary
 from drake_pose.files.writer import ResultWriter
 from drake_pose.jobs.batch import run_batch
-from drake_pose.jobs.live.capture import capture_live
+from drake_pose.jobs.live import capture_live
 from drake_pose.silhouette.pictures.scenes import load_scene
 
 NAMES = ("a", "b")

@@ -63,8 +63,8 @@ def follow_person(
     result.records.clear()
     result.begin()
     if captured.shape is not None:
-        known = captured.shape.known
-        result.more |= {"lengths_m": known.lengths, "radius_scales": known.radius_scales}
+        shape = captured.shape
+        result.more |= {"lengths_m": shape.lengths, "radius_scales": shape.radius_scales}
 
     def finished() -> Iterator[tuple[FrameRecord, Drawn]]:
         """Yield record and overlays of each frame, then add the warnings to the result."""

@@ -52,8 +52,8 @@ class TestShape:
         assert np.abs(off).max() < 0.02
         assert np.abs(off).mean() < 0.5 * np.mean(np.abs(list(LENGTHS.values())))
         for part, factor in factors.items():
-            assert shape.known.radius_scales[part] == pytest.approx(factor, abs=0.05), part
-        off = np.array([x - LENGTHS.get(name, 0.0) for name, x in shape.known.lengths.items()])
+            assert shape.radius_scales[part] == pytest.approx(factor, abs=0.05), part
+        off = np.array([x - LENGTHS.get(name, 0.0) for name, x in shape.lengths.items()])
         assert 0.05 < off @ np.linalg.solve(shape.covariance, off) / len(off) < 2.0
 
     def test_model_of_fixed_lengths_is_refused(self, person):

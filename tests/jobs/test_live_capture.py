@@ -4,12 +4,9 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_pose.body import bundled_model, load_model
-from drake_pose.errors import OutputError, SceneError, SettingsError, UnknownNameError
-from drake_pose.jobs.live.capture import capture_live
-from drake_pose.jobs.live.scene import load_live_scene, run_live, take_empty_room
-from drake_pose.jobs.live.settings import LiveSettings
-from drake_pose.person.pose_tracker import KnownShape, tracker_of_person
+from drake_pose.errors import OutputError, SceneError, SettingsError
+from drake_pose.files.settings import LiveSettings
+from drake_pose.jobs.live import capture_live, load_live_scene, run_live, take_empty_room
 from tests.cli import run_command
 from tests.jobs.live_scenes import RATE_HZ, absent, standing, write_studio
 from tests.jobs.scenes import read_rows as rows_of
@@ -36,8 +33,8 @@ def studio(tmp_path_factory, person):
 @pytest.fixture(scope="module")
 def captured(studio, person, tmp_path_factory):
     out, reports = tmp_path_factory.mktemp("results") / "out", []
-    settings, scene = LiveSettings(replay=False), load_live_scene(studio)
-    result = capture_live(scene, out, person.path, settings, on_report=reports.append)
+    scene = load_live_scene(studio)
+    result = capture_live(scene, out, person.path, replay=False, on_report=reports.append)
     return out, result, "\n".join(reports)
 
 
@@ -98,9 +95,9 @@ def test_ctrl_c_keeps_all_frames(studio, person, tmp_path):
         if count == 6:
             raise KeyboardInterrupt
 
-    settings = LiveSettings(replay=False, fit_shape=False)
+    scene, settings = load_live_scene(studio), LiveSettings(fit_shape=False)
     _, interrupted, _ = capture_live(
-        load_live_scene(studio), tmp_path / "out", person.path, settings, on_frame=interrupt
+        scene, tmp_path / "out", person.path, settings, replay=False, on_frame=interrupt
     )
     assert interrupted
     assert len(rows_of(tmp_path / "out" / "poses.csv")) == 6
@@ -132,43 +129,18 @@ def test_command_captures_and_refuses(studio, captured, person, tmp_path):
 
 
 @pytest.mark.slow
-def test_shape_is_fitted_to_a_video_and_reused_from_its_result(person, tmp_path):
+def test_shape_is_fitted_to_a_video(person, tmp_path):
     folder = tmp_path / "studio"
     folder.mkdir()
     poses = [standing(person, arm_deg=20.0 + 4.0 * k) for k in range(10)]
     write_studio(folder, person, poses, "videos", cameras=4)
-    scene, first, second = load_live_scene(folder), tmp_path / "first", tmp_path / "second"
-    found = capture_live(scene, first, None, LiveSettings(replay=False))[0].summary
+    found = capture_live(load_live_scene(folder), tmp_path / "out", replay=False)[0].summary
     assert found["found_count"] == 10
     assert found["mean_iou"] > 0.85
     assert len(found["lengths_m"]) > 5
-    again, _, _ = capture_live(scene, second, None, LiveSettings(shape=first, replay=False))
-    assert again.summary["radius_scales"] == pytest.approx(found["radius_scales"])
-    assert again.summary["mean_iou"] > 0.85
 
 
-def test_known_shape_is_used(person):
-    model = load_model(bundled_model("person").with_name("person_shape.urdf"), check=False)
-    tree = model.pose_tree()
-    shape = KnownShape({"left_thigh_stretch": 0.02}, {"trunk": 1.2})
-    tracker = tracker_of_person(tree, shape)
-    plain = tracker_of_person(tree, None)
-    names = [node.name for node in tree.nodes]
-    trunk = next(k for k, name in enumerate(names) if "trunk" in name)
-    wide, usual = (np.ptp(one.fit.outlines[trunk].vertices, axis=0) for one in (tracker, plain))
-    np.testing.assert_allclose(wide / usual, [1.2, 1.0, 1.2], rtol=1e-6)
-    q = tracker.positions(tracker.start(tracker.values(model.default_positions)).values)
-    assert q[model.position_index("left_thigh_stretch")] == 0.0
-    for wrong in (KnownShape({"nose": 0.1}, {}), KnownShape({}, {"nose": 1.1})):
-        with pytest.raises(UnknownNameError, match="nose"):
-            tracker_of_person(tree, wrong)
-
-
-def test_results_without_a_shape_and_wrong_settings_are_refused(captured, studio, tmp_path):
-    with pytest.raises(OutputError, match="lengths_m"):
-        capture_live(
-            load_live_scene(studio), tmp_path / "out", None, LiveSettings(shape=captured[0])
-        )
+def test_wrong_settings_and_folders_are_refused(tmp_path):
     with pytest.raises(SettingsError, match="positive"):
         LiveSettings(seconds=0.0)
     with pytest.raises(SceneError, match=r"sources\.yaml"):
@@ -191,8 +163,8 @@ def test_empty_room_is_taken_once(person, tmp_path):
 
 def test_a_slow_computer_skips_ahead(studio, monkeypatch):
     clock = {"now": 0.0}
-    monkeypatch.setattr("drake_pose.jobs.live.scene.time.monotonic", lambda: clock["now"])
-    sensors = load_live_scene(studio).open_sensors(None)
+    monkeypatch.setattr("drake_pose.jobs.live.time.monotonic", lambda: clock["now"])
+    sensors = load_live_scene(studio).open_sensors()
     builder = DiagramBuilder()
     builder.AddSystem(sensors)
     diagram = builder.Build()

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import SceneError, SettingsError
-from drake_pose.jobs.live.capture import capture_live
-from drake_pose.jobs.live.scene import load_live_scene
-from drake_pose.jobs.live.settings import LiveSettings
+from drake_pose.jobs.live import capture_live, load_live_scene
 from drake_pose.person.date.skeleton import registered_positions
 from tests.cli import run_command
 from tests.jobs.live_scenes import standing, write_studio
@@ -81,8 +79,6 @@ def test_inputs_unfit_for_the_paper_method_are_refused(tmp_path, person):
     scene, out = load_live_scene(tmp_path), tmp_path / "out"
     with pytest.raises(SceneError, match="'camera_0' delivers masks"):
         capture_live(scene, out, method="paper")
-    with pytest.raises(SettingsError, match="leave shape out"):
-        capture_live(scene, out, None, LiveSettings(shape=tmp_path), method="paper")
     words = ["capture", str(tmp_path), "--out", str(tmp_path / "out"), "--method", "paper"]
     for more in (["--no-track"], ["--face-camera", "camera_0"]):
         assert run_command([*words, *more]).exit_code == 2

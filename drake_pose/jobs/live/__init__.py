@@ -1,1 +1,0 @@
-"""Live capture of a person, frame by frame as pictures arrive."""

@@ -38,8 +38,7 @@ if TYPE_CHECKING:
     from drake_pose.registration.online_registration import OnlineRegistration
     from drake_pose.registration.register import RegistrationBody
     from drake_pose.search import MultiStartSearch, View
-    from drake_pose.silhouette.pictures.label_images import label_image_to_mask
-    from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+    from drake_pose.silhouette.pictures.label_renderer import LabelRenderer, label_image_to_mask
     from drake_pose.silhouette.pictures.scenes import load_scene
     from drake_pose.systems.bodies import RobotStateMessage
     from drake_pose.systems.cameras import MaskPlayer, SilhouetteCamera, cameras_from_drake
@@ -87,7 +86,7 @@ _HOMES = {
     "constant_velocity": "filtering.motion",
     "estimate_scene": "jobs.estimate.scene",
     "from_bounds": "filtering.inequalities",
-    "label_image_to_mask": "silhouette.pictures.label_images",
+    "label_image_to_mask": "silhouette.pictures.label_renderer",
     "load_cameras": "camera.camera_files",
     "load_model": "body.model",
     "load_scene": "silhouette.pictures.scenes",

@@ -20,7 +20,7 @@ from drake_pose.camera.picture_files import (
 )
 from drake_pose.errors import SceneError
 from drake_pose.jobs.estimate.measurements import frames_of
-from drake_pose.silhouette.coco import AnnotatedPicture, Annotations, read_coco
+from drake_pose.silhouette.pictures.masks import AnnotatedPicture, Annotations, read_coco
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, common_rate
 
 

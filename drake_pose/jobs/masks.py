@@ -2,7 +2,7 @@
 
 import math
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -44,9 +44,6 @@ from drake_pose.silhouette.segmentation import (
 MIN_AGREEMENT = 0.85
 """Minimum IoU of masks by two thresholds, below which they are doubtful."""
 _PARTIAL = "masks.part"
-
-Find = Callable[[str, Picture], tuple[Mask, float, tuple[str, ...]]]
-"""Called with a camera and its picture; returns mask, agreement (see FoundMask) and warnings."""
 
 
 class FoundMask(NamedTuple):
@@ -256,21 +253,54 @@ def find_masks(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
     background = settings.background
     if background is None and not settings.classes:
         # Without a segmentation method, a folder of background pictures implies one.
-        room = source.path / "background"
-        background = room if room.is_dir() else None
+        beside = source.path / "background"
+        background = beside if beside.is_dir() else None
     if background is None:
         yield from _read_given(source, settings)
         return
     if source.annotated:
         raise SceneError(f"{source.path}: has annotations; segmentation needs pictures")
-    find = _by_empty_room(source, background)
-    for camera in source.names:
-        for frame, where, picture in source.read(camera):
-            try:
-                mask, agreement, warnings = find(camera, picture)
-            except (SceneError, SettingsError) as error:
-                raise type(error)(f"{where}: {error}") from error
-            yield FoundMask(camera, frame, where, mask, picture, warnings, agreement)
+    # All backgrounds are read before the first mask is written.
+    rooms = {name: _background(source, name, background) for name in source.names}
+    for camera, (room, doubts) in rooms.items():
+        yield from _differing_regions(source, camera, room, doubts)
+
+
+def _differing_regions(
+    source: Source,
+    camera: str,
+    room: Background,
+    doubts: tuple[str, ...],
+    thresholds: Sequence[float] = (0.7, 1.4),
+    changed: float = 0.6,
+) -> Iterator[FoundMask]:
+    """Yield the region of each of a camera's pictures that differs from its background.
+
+    Args:
+        source: the source of the pictures.
+        camera: the camera's name.
+        room: its background.
+        doubts: warnings of the background, which are given once.
+        thresholds: factors of the background's noise for masks to compare with.
+        changed: fraction of a picture in the mask above which a changed light or camera is
+            suspected.
+    """
+    backgrounds = [room.with_noise(k) for k in (1.0, *thresholds)]
+    for frame, where, picture in source.read(camera):
+        if picture.shape != room.mean.shape:
+            height, width = room.mean.shape[:2]
+            raise SceneError(
+                f"{where}: differs in size from the background, {width} x {height} (width x height)"
+            )
+        mask, *again = (person_region(picture, one) for one in backgrounds)
+        if (part := mask.mean()) > changed:
+            doubts += (
+                f"{part:.0%} of it differ from the background; check whether the light has changed "
+                "or the camera has moved",
+            )
+        agreement = min(intersection_over_union(mask, one) for one in again)
+        yield FoundMask(camera, frame, where, mask, picture, doubts, agreement)
+        doubts = ()
 
 
 def _read_given(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
@@ -305,53 +335,6 @@ def _read_given(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
     for camera in (name for name in source.names if name not in source.pictures):
         for frame, where, picture in source.read(camera):
             yield FoundMask(camera, frame, where, threshold_mask(picture, where, MaskError))
-
-
-def _least_overlap(mask: Mask, others: Iterable[Mask]) -> float:
-    """Return the lowest IoU of a mask with others; nan if there are none."""
-    return min((intersection_over_union(mask, one) for one in others), default=math.nan)
-
-
-def _by_empty_room(
-    source: Source,
-    background: Path | str,
-    thresholds: Sequence[float] = (0.7, 1.4),
-    changed: float = 0.6,
-) -> Find:
-    """Return a `Find` that segments the region of a picture that differs from the background.
-
-    Args:
-        source: the source of the pictures.
-        background: picture, folder of pictures or "median", as in ``MaskSettings.background``.
-        thresholds: factors of the background's noise for masks to compare with.
-        changed: fraction of a picture in the mask above which a changed light or camera is
-            suspected.
-    """
-    doubts: dict[str, tuple[str, ...]] = {}
-    rooms: dict[str, list[Background]] = {}
-    for name in source.names:
-        room, doubts[name] = _background(source, name, background)
-        rooms[name] = [room.with_noise(k) for k in (1.0, *thresholds)]
-
-    def find(camera: str, picture: Picture) -> tuple[Mask, float, tuple[str, ...]]:
-        """Return mask (H, W), agreement and warnings of a camera's picture (H, W, 3)."""
-        room = rooms[camera][0]
-        if picture.shape != room.mean.shape:
-            height, width = room.mean.shape[:2]
-            raise SceneError(
-                f"differs in size from the background, {width} x {height} (width x height)"
-            )
-        mask, *again = (person_region(picture, one) for one in rooms[camera])
-        # Warnings of a background are given once.
-        warnings = doubts.pop(camera, ())
-        if mask.mean() > changed:
-            warnings += (
-                f"{mask.mean():.0%} of it differ from the background; check whether the light has "
-                "changed or the camera has moved",
-            )
-        return mask, _least_overlap(mask, again), warnings
-
-    return find
 
 
 def _background(

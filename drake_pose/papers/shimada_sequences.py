@@ -54,7 +54,7 @@ from drake_pose.input_files import read_csv
 from drake_pose.jobs.estimate.inputs import EstimateInputs, read_inputs
 from drake_pose.papers.tables import Advance, Count, figure_table, uncounted
 from drake_pose.search import View
-from drake_pose.silhouette.pictures.label_images import label_image_to_mask
+from drake_pose.silhouette.pictures.label_renderer import label_image_to_mask
 from drake_pose.systems.truncated_ekf import (
     HandSensor,
     TruncatedEkf,

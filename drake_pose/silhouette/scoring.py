@@ -98,22 +98,20 @@ def draw_labels(
     labels: Sequence[int] | np.ndarray,
     X_CN: np.ndarray,
     camera: Camera,
-    empty: int = 0,
 ) -> np.ndarray:
-    """Return the label (H, W) int16 of the nearest surface in each pixel.
+    """Return the label (H, W) int16 of the nearest surface in each pixel; 0 where there is none.
 
     Args:
         outlines: the surfaces, one per node, each in its node's frame N.
         X_CN: (nodes, 4, 4) poses of the nodes in the camera.
         camera: the camera whose image is drawn.
-        labels: (nodes,) non-negative labels of the surfaces.
-        empty: label of pixels without a surface, different from all labels.
+        labels: (nodes,) positive labels of the surfaces.
     """
     packed, poses = _check_body(outlines, np.asarray(X_CN)[None])
     image = np.empty((camera.height, camera.width), dtype=np.int16)
     numbers = np.asarray(labels, dtype=np.int16)
     closed = np.array([outline.is_closed for outline in outlines], dtype=np.bool_)
-    paint_labels(packed, numbers, closed, poses[0], camera.kernel_parameters(), empty, image)
+    paint_labels(packed, numbers, closed, poses[0], camera.kernel_parameters(), 0, image)
     return image
 
 

@@ -26,7 +26,7 @@ from drake_pose.camera.drake import camera_from_drake, camera_to_drake
 from drake_pose.camera.models import Camera, PinholeCamera, camera_tuple
 from drake_pose.errors import CameraError, ModelError, UnknownNameError
 from drake_pose.silhouette.outline import outline_from_mesh, pack
-from drake_pose.silhouette.pictures.label_images import (
+from drake_pose.silhouette.pictures.label_renderer import (
     EMPTY,
     label_image_to_mask,
     mask_to_label_image,

@@ -37,7 +37,7 @@ from drake_pose.registration.online_registration import (
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import RegisteredCamera
 from drake_pose.search import PoseEstimate, PoseSearch
-from drake_pose.silhouette.pictures.label_images import label_image_to_mask
+from drake_pose.silhouette.pictures.label_renderer import label_image_to_mask
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.bodies import add_meshcat_skin, add_posed_plant, add_skin
 from drake_pose.systems.cameras import MaskPlayer, add_sensors

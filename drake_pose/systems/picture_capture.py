@@ -17,7 +17,7 @@ from drake_pose.camera.models import Camera
 from drake_pose.camera.sources import Clock, FrameSource, TimedPicture
 from drake_pose.camera.synchroniser import CameraChange, Synchroniser
 from drake_pose.errors import CameraError, SettingsError, UnknownNameError
-from drake_pose.silhouette.pictures.label_images import fill_label_image, label_image_to_mask
+from drake_pose.silhouette.pictures.label_renderer import fill_label_image, label_image_to_mask
 from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ
 from drake_pose.silhouette.segmentation import Background, person_region
 from drake_pose.systems.cameras import colour_image_to_picture, fill_colour_image

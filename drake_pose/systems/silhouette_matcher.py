@@ -15,7 +15,7 @@ from drake_pose.camera.models import Camera, camera_tuple
 from drake_pose.errors import SettingsError, require_at_least
 from drake_pose.filtering.contour_tracker import MatchAndTrack, TrackerState, TrackingSettings
 from drake_pose.search import TRACKED, PoseEstimate, PoseSearch, View
-from drake_pose.silhouette.pictures.label_images import label_image_to_mask
+from drake_pose.silhouette.pictures.label_renderer import label_image_to_mask
 from drake_pose.systems.bodies import body_poses
 from drake_pose.systems.cameras import ColourPorts
 from drake_pose.systems.ports import (

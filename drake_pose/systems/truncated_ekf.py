@@ -25,7 +25,7 @@ from drake_pose.filtering.hand_silhouette import HandMeasurement, HandSilhouette
 from drake_pose.filtering.motion import FunctionMotion, MotionModel
 from drake_pose.filtering.state import Belief, StateLayout, make_belief
 from drake_pose.filtering.truncated_filter import FilterState, Hypothesis, TruncatedFilter
-from drake_pose.silhouette.pictures.label_images import label_image_to_mask
+from drake_pose.silhouette.pictures.label_renderer import label_image_to_mask
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.cameras import MaskPlayer
 from drake_pose.systems.diagrams import add_simulated_cameras

@@ -11,7 +11,7 @@ from pycocotools import mask as coco
 
 from drake_pose.camera.picture_files import read_binary_mask, read_picture, threshold_mask
 from drake_pose.errors import MaskError, SceneError
-from drake_pose.silhouette.coco import draw_area, read_coco
+from drake_pose.silhouette.pictures.masks import draw_area, read_coco
 
 HEIGHT, WIDTH = 40, 60
 

@@ -183,9 +183,6 @@ def test_invisible_body_is_refused():
         require_visible([CUBE], at(0, 50, 3)[None], PARALLEL)
 
 
-EMPTY = 32766
-
-
 def require_nearest(meshes, X_CN, camera):
     """Compare labels 1, 2, ... with ray casting.
 
@@ -193,10 +190,10 @@ def require_nearest(meshes, X_CN, camera):
     """
     labels = range(1, 1 + len(meshes))
     outlines = [outline_from_mesh(mesh) for mesh in meshes]
-    image = draw_labels(outlines, labels, X_CN, camera, EMPTY)
+    image = draw_labels(outlines, labels, X_CN, camera)
     depths = np.array([brute_force_depth(m, X, camera) for m, X in zip(meshes, X_CN, strict=True)])
     is_covered = np.isfinite(depths).any(axis=0)
-    np.testing.assert_array_equal(image != EMPTY, is_covered)
+    np.testing.assert_array_equal(image != 0, is_covered)
     own = np.take_along_axis(depths, np.where(is_covered, image - 1, 0)[None], axis=0)[0]
     # The kernel's depths are 32-bit floats: either surface may win where depths are equal.
     assert (own[is_covered] <= depths.min(axis=0)[is_covered] * (1.0 + 1e-5)).all()
@@ -254,7 +251,7 @@ def test_surfaces_of_one_label_are_united():
 
 
 def test_no_surfaces_give_an_empty_label_image():
-    assert (draw_labels([], [], np.empty((0, 4, 4)), CAMERAS[0], EMPTY) == EMPTY).all()
+    assert (draw_labels([], [], np.empty((0, 4, 4)), CAMERAS[0]) == 0).all()
 
 
 def directed_edges(triangles):

@@ -18,7 +18,7 @@ from drake_pose.person.date.features import (
 )
 from drake_pose.person.date.pose import estimate_pose
 from drake_pose.person.date.skeleton import LIMBS
-from drake_pose.silhouette.pictures.label_images import mask_to_label_image
+from drake_pose.silhouette.pictures.label_renderer import mask_to_label_image
 from drake_pose.silhouette.segmentation import learn_background, person_region
 from drake_pose.systems.cameras import (
     build_camera_rig,

@@ -7,7 +7,7 @@ from drake_pose.camera.models import circle_of_cameras
 from drake_pose.camera.sources import FrameSource, SourceSpecification, TimedPicture
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.person.views import edge_spacing, see_silhouette
-from drake_pose.silhouette.pictures.label_images import label_image_to_mask, mask_to_label_image
+from drake_pose.silhouette.pictures.label_renderer import label_image_to_mask, mask_to_label_image
 from drake_pose.silhouette.segmentation import learn_background, person_region
 from drake_pose.systems.cameras import build_camera_rig
 from drake_pose.systems.person import SilhouetteSensor

@@ -24,8 +24,12 @@ from drake_pose.body import ModelSkin, bundled_model, load_model
 from drake_pose.camera.drake import camera_to_drake
 from drake_pose.camera.models import ParallelCamera, PinholeCamera, look_at
 from drake_pose.errors import ModelError
-from drake_pose.silhouette.pictures.label_images import EMPTY, label_data
-from drake_pose.silhouette.pictures.label_renderer import DeformableSkin, LabelRenderer
+from drake_pose.silhouette.pictures.label_renderer import (
+    EMPTY,
+    DeformableSkin,
+    LabelRenderer,
+    label_data,
+)
 from drake_pose.systems.cameras import SilhouetteCamera
 from tests.benchmarks.silhouette_camera import arm_model, measure_camera
 

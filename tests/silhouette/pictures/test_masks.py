@@ -13,7 +13,7 @@ from pydrake.systems.sensors import ImageLabel16I
 
 from drake_pose.camera.picture_files import read_picture
 from drake_pose.errors import MaskError
-from drake_pose.silhouette.pictures.label_images import label_image_to_mask, mask_to_label_image
+from drake_pose.silhouette.pictures.label_renderer import label_image_to_mask, mask_to_label_image
 from drake_pose.silhouette.pictures.masks import (
     compare_masks,
     read_mask,

@@ -13,7 +13,7 @@ from drake_pose.body import ArticulatedModel, load_model
 from drake_pose.errors import MaskError, SettingsError
 from drake_pose.registration.online_registration import OnlineRegistration, pose_difference
 from drake_pose.registration.register import RegistrationBody
-from drake_pose.silhouette.pictures.label_images import mask_to_label_image
+from drake_pose.silhouette.pictures.label_renderer import mask_to_label_image
 from drake_pose.systems.diagrams import (
     REGISTRATION,
     CameraRegistration,

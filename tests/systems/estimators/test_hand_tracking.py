@@ -6,7 +6,7 @@ from drake_pose.filtering.hand_silhouette import HandSilhouette
 from drake_pose.filtering.state import Belief
 from drake_pose.papers.shimada import experiment_filter
 from drake_pose.papers.shimada_sequences import true_states
-from drake_pose.silhouette.pictures.label_images import mask_to_label_image
+from drake_pose.silhouette.pictures.label_renderer import mask_to_label_image
 from drake_pose.systems.truncated_ekf import HandSensor
 from tests.systems.bench import Bench
 

@@ -16,8 +16,7 @@ from drake_pose.search import (
     PaperSearch,
     PaperSearchSettings,
 )
-from drake_pose.silhouette.pictures.label_images import mask_to_label_image
-from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer, mask_to_label_image
 from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scenes import load_scene
 from drake_pose.systems.cameras import MaskPlayer

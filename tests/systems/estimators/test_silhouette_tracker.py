@@ -8,12 +8,12 @@ from pydrake.trajectories import PiecewisePolynomial
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.filtering.contour_tracker import TrackingSettings
 from drake_pose.search import PaperSearch, PaperSearchSettings
-from drake_pose.silhouette.pictures.label_images import (
+from drake_pose.silhouette.pictures.label_renderer import (
     EMPTY,
+    LabelRenderer,
     label_image_to_mask,
     mask_to_label_image,
 )
-from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.systems.cameras import SilhouetteCamera, picture_to_colour_image
 from drake_pose.systems.diagrams import build_simulated_matching
 from drake_pose.systems.silhouette_matcher import TRACK, SilhouetteTracker

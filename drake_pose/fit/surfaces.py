@@ -252,7 +252,6 @@ def _sample_surface(outline: Outline, count: int = 300) -> Array:
 def load_or_make(
     made_of: tuple[bytes, ...],
     make: Callable[[], Outline],
-    least_time: float = 0.004,
     most_files: int = 500,
 ) -> Outline:
     """Return a surface from its file, or make and store it.
@@ -261,8 +260,6 @@ def load_or_make(
         made_of: everything the surface depends on, including versions of the code that makes it;
             its digest is the file's name.
         make: makes the surface; it is called if there is no valid file.
-        least_time: minimum time [s] of making a surface for it to be stored; reading a file takes
-            about a millisecond.
         most_files: maximum number of files (60 kB for 2500 triangles); the least recently used ones
             are removed.
     """
@@ -275,17 +272,15 @@ def load_or_make(
     path = kernels / "surfaces" / f"{digest.hexdigest()}.surface"
     outline = _read(path)
     if outline is None:
-        start = time.perf_counter()
         outline = make()
-        if time.perf_counter() - start >= least_time:
-            with suppress(OSError):  # The disk is full or the folder is not writable.
-                _write(path, outline)
-                ages = sorted(
-                    (one.stat().st_mtime, one) for one in path.parent.iterdir() if one.is_file()
-                )
-                for _, one in ages[: max(0, len(ages) - most_files)]:
-                    with suppress(OSError):
-                        one.unlink()
+        with suppress(OSError):  # The disk is full or the folder is not writable.
+            _write(path, outline)
+            ages = sorted(
+                (one.stat().st_mtime, one) for one in path.parent.iterdir() if one.is_file()
+            )
+            for _, one in ages[: max(0, len(ages) - most_files)]:
+                with suppress(OSError):
+                    one.unlink()
     return outline
 
 

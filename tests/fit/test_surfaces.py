@@ -18,7 +18,6 @@ from drake_pose.fit.surfaces import (
     simplify_rigid_parts,
     simplify_surfaces,
     surface_distance,
-    with_radius_scales,
 )
 from drake_pose.silhouette.outline import TreeSurfaces, outline_from_mesh
 from drake_pose.workers import map_ordered
@@ -107,17 +106,6 @@ def test_surface_distance_matches_brute_force():
     assert surface_distance(one, one) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_surfaces_are_simplified_once_per_shape_and_count():
-    once, again = (simplify_surfaces(Rigid(ball_and_tube(40)))[0] for _ in range(2))
-    given = ball_and_tube(40)
-    wider = outline_from_mesh(TriangleMesh(1.1 * given.vertices, given.triangles))
-    (other,) = simplify_surfaces(Rigid(wider))
-    (coarser,) = simplify_surfaces(Rigid(given), VERY_FEW)
-    assert again is once
-    np.testing.assert_allclose(np.ptp(other.vertices, axis=0), np.ptp(wider.vertices, axis=0), 0.02)
-    assert len(coarser.triangles) < len(once.triangles)
-
-
 def test_simplification_is_thread_safe(monkeypatch):
     balls = [
         outline_from_mesh(TriangleMesh(ball.vertices, ball.faces))
@@ -161,8 +149,7 @@ def same(one, other):
     )
 
 
-def test_stored_surfaces_are_exact(folder, monkeypatch):
-    monkeypatch.setattr(surfaces.load_or_make, "__defaults__", (0.0, 500))
+def test_stored_surfaces_are_exact(folder):
     given = ball_and_tube(40)
     _simplify_cached.cache_clear()
     made = simplify_surfaces(Rigid(given), FEW)[0]
@@ -179,13 +166,13 @@ def test_stored_surfaces_are_exact(folder, monkeypatch):
 )
 def test_a_damaged_file_is_replaced(folder, damage):
     make = Maker()
-    load_or_make((b"key",), make, 0.0)
+    load_or_make((b"key",), make)
     (file,) = folder.iterdir()
     whole = file.read_bytes()
     file.write_bytes(damage(whole))
-    assert same(load_or_make((b"key",), make, 0.0), make.outline)
+    assert same(load_or_make((b"key",), make), make.outline)
     assert make.count == 2
-    assert same(load_or_make((b"key",), make, 0.0), make.outline)
+    assert same(load_or_make((b"key",), make), make.outline)
     assert make.count == 2
     assert file.read_bytes() == whole
 
@@ -194,11 +181,11 @@ def test_key_parts_are_distinguished_and_oldest_files_removed(folder):
     makers = [Maker(1.0 + k) for k in range(4)]
     keys = [(b"ab", b"c"), (b"a", b"bc"), (b"abc",), (b"abc", b"")]
     for key, make in zip(keys, makers, strict=True):
-        assert same(load_or_make(key, make, 0.0, 3), make.outline)
+        assert same(load_or_make(key, make, 3), make.outline)
     assert len(list(folder.iterdir())) == 3
-    load_or_make(keys[-1], makers[-1], 0.0)
+    load_or_make(keys[-1], makers[-1])
     assert makers[-1].count == 1
-    load_or_make(keys[0], makers[0], 0.0)
+    load_or_make(keys[0], makers[0])
     assert makers[0].count == 2
 
 
@@ -207,11 +194,7 @@ def test_without_a_writable_folder_surfaces_are_made(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     for folder in (None, tmp_path / "file", tmp_path / "none"):
         monkeypatch.setattr(surfaces, "kernel_folder", lambda folder=folder: folder)
-        assert load_or_make((b"key",), make, 0.0) is make.outline
-    quick = Maker()
-    monkeypatch.setattr(surfaces, "kernel_folder", lambda: tmp_path)
-    assert load_or_make((b"quick",), quick, 60.0) is quick.outline
-    assert not (tmp_path / "surfaces").exists()
+        assert load_or_make((b"key",), make) is make.outline
 
 
 def ball(level, radius=1.0):
@@ -257,15 +240,6 @@ def test_surfaces_that_cannot_be_simplified_become_hulls():
     (again,) = simplify_outlines([simple], 40)
     assert 30 <= len(again.triangles) <= 48
     assert simplify_outlines([small])[0] is small
-
-
-def test_radius_scales_widen_surfaces_about_their_long_axis():
-    given = [outline_from_mesh(ball(1)), outline_from_mesh(ball(1, 0.5))]
-    for one, wide, k in zip(
-        given, with_radius_scales(given, np.array([2.0, 0.5])), (2.0, 0.5), strict=True
-    ):
-        np.testing.assert_allclose(wide.vertices, one.vertices * [k, 1.0, k])
-        np.testing.assert_array_equal(wide.triangles, one.triangles)
 
 
 def test_only_rigid_parts_of_a_skin_are_simplified(person):

@@ -8,9 +8,6 @@ from drake_pose.errors import SettingsError
 from drake_pose.silhouette.pictures.masks import intersection_over_union
 from drake_pose.silhouette.segmentation import (
     Background,
-    _components,
-    _filled,
-    _strength,
     background_of_recording,
     background_support,
     find_regions,
@@ -110,46 +107,6 @@ def test_moving_object_is_not_in_the_median_background():
     np.testing.assert_allclose(support[differs], hidden[differs], atol=1e-6)
     with pytest.raises(SettingsError, match="three or more"):
         background_of_recording(pictures[:2])
-
-
-def test_components_are_filled_and_neither_tiny_nor_huge():
-    """At most the area is limited after filling, at least before."""
-    above = np.zeros((100, 100), bool)
-    above[10:40, 10:40] = True
-    above[20:30, 20:30] = False
-    above[60:65, 60:66] = True
-    above[80:85, 80:86] = True
-    above[82, 82] = False
-    (ring, spot), expected = _components(above), np.zeros((100, 100), bool)
-    expected[10:40, 10:40] = True
-    np.testing.assert_array_equal(ring, expected)
-    assert np.count_nonzero(spot) == 30
-    frame = np.ones((100, 100), bool)
-    frame[8:92, 8:92] = False
-    assert [*_components(frame)] == []
-    (thinner,) = _components(frame, (0.003, 1.0))
-    assert thinner.all()
-    # What a region and the border enclose is a hole if it is small.
-    cut = np.zeros((50, 60), bool)
-    cut[5:45, :40] = True
-    for rows, fills in ((6, True), (9, False)):
-        bay = cut.copy()
-        bay[20 : 20 + rows, :20] = False
-        assert _filled(bay)[20 : 20 + rows, :20].all() == fills
-
-
-def test_strength_is_a_quantile_of_the_change_along_the_outline():
-    mask = np.zeros((30, 40), bool)
-    mask[10:20, 10:30] = True
-    change = np.zeros((30, 40), np.float32)
-    change[10:20, 10:30] = 100.0
-    change[11:19, 11:29] = 1e4
-    for columns in (0, 10, 12, 16):
-        change[10, 10 : 10 + columns] = 20.0
-        edge = np.sort(np.r_[np.full(columns, 20.0), np.full(56 - columns, 100.0)])
-        expected = np.quantile(edge, 0.25) * np.sqrt(200.0)
-        assert _strength(mask, change) == pytest.approx(expected)
-    assert _strength(np.ones((5, 5), bool), np.ones((5, 5), np.float32)) == 0.0
 
 
 @pytest.mark.parametrize("width", [480, 960])

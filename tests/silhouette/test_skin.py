@@ -16,7 +16,7 @@ from drake_pose.silhouette.outline import (
     TreeSurfaces,
     outline_from_mesh,
 )
-from drake_pose.silhouette.pictures.label_renderer import LabelRenderer, _apexes
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.scoring import draw_mask, prefix_sums, score_bodies, subtract_body
 from tests.body.models import load_limb
 from tests.silhouette.agreement import MAX_DIFFERENCE, measure_agreement
@@ -170,19 +170,3 @@ def test_bands_of_wrong_shape_are_refused():
             score_bodies([bending], X_CN, camera, prefixes, bands)
     with pytest.raises(ValueError, match="finite"):
         score_bodies([bending], X_CN, camera, prefixes, [np.full((1, 4, 3), np.nan)])
-
-
-def test_tetrahedra_reach_just_inside_their_triangles():
-    """By a twentieth of the root of twice the area, against the outward normal."""
-    rng = np.random.default_rng(3)
-    vertices, triangles = rng.normal(size=(9, 3)), np.arange(9).reshape(3, 3)
-    for depth in (0.05, 0.2):
-        given = {} if depth == 0.05 else {"depth": depth}
-        for (a, b, c), apex in zip(
-            vertices[triangles], _apexes(vertices, triangles, **given), strict=True
-        ):
-            normal = np.cross(b - a, c - a)
-            expected = -depth * np.sqrt(np.linalg.norm(normal)) * normal / np.linalg.norm(normal)
-            np.testing.assert_allclose(apex - (a + b + c) / 3.0, expected)
-    flat = np.zeros((3, 3))
-    np.testing.assert_array_equal(_apexes(flat, np.arange(3)[None]), np.zeros((1, 3)))

@@ -250,10 +250,6 @@ def test_surfaces_of_one_label_are_united():
     assert set(np.unique(labels)) == {0, 5}
 
 
-def test_no_surfaces_give_an_empty_label_image():
-    assert (draw_labels([], [], np.empty((0, 4, 4)), CAMERAS[0]) == 0).all()
-
-
 def directed_edges(triangles):
     """Every use of an edge: from, to, triangle, sorted."""
     return sorted(

@@ -19,11 +19,11 @@ from drake_pose.silhouette.pictures.scenes import Scene, load_scene
 
 def read_scene(
     path: Path,
-    wanted: Sequence[str] = (),
-    frames: Sequence[str] = (),
-    cameras: Mapping[str, Camera] | None = None,
+    wanted: Sequence[str],
+    frames: Sequence[str],
+    cameras: Mapping[str, Camera] | None,
+    every: int,
     sequence: bool = False,
-    every: int = 1,
 ) -> tuple[Scene, tuple[str, ...]]:
     """Return a checked scene of the wanted cameras, and the names of its frames.
 
@@ -34,8 +34,8 @@ def read_scene(
         wanted: names of cameras; empty: all that have files.
         frames: names of frames, or ranges ``FIRST:LAST``; empty: all.
         cameras: cameras by name that replace those of the folder; None: the folder's.
-        sequence: whether the scene is a sequence if its scene.yaml does not say.
         every: every n-th frame is kept, the first wanted one included.
+        sequence: whether the scene is a sequence if its scene.yaml does not say.
 
     Raises DrakePoseError, which names the file, camera or frame that is invalid or missing.
     """
@@ -193,11 +193,10 @@ def _repeated_files(scene: Scene) -> set[tuple[str, str]]:
     return set(found)
 
 
-def _check_gaps(frames: Sequence[str], max_gaps: int = 6) -> list[str]:
+def _check_gaps(frames: Sequence[str]) -> list[str]:
     """Return one warning about numbers missing between consecutively numbered frames, or none.
 
-    Numbers are missing where a step between frames is larger than the median step. ``max_gaps``:
-    largest number of gaps that are listed.
+    Numbers are missing where a step between frames is larger than the median step.
     """
     keys = [natural_key(frame) for frame in frames]
     if len(keys) < 3 or any(key[:-2] != keys[0][:-2] or key[-1][0] for key in keys):
@@ -207,12 +206,10 @@ def _check_gaps(frames: Sequence[str], max_gaps: int = 6) -> list[str]:
     wide = np.flatnonzero(steps > usual_step) if usual_step > 0 else np.empty(0, dtype=int)
     if not len(wide):
         return []
-    texts = [f"between {frames[k]} and {frames[k + 1]}" for k in wide[:max_gaps]]
-    rest = f" and at {len(wide) - max_gaps} more places" if len(wide) > max_gaps else ""
     missing = int((steps[wide] // usual_step - 1).sum())
     return [
-        f"{missing} frames dropped by all cameras {', '.join(texts)}{rest}; the times of all later "
-        "frames do not include them"
+        f"{missing} frames dropped by all cameras, the first between {frames[wide[0]]} and "
+        f"{frames[wide[0] + 1]}; the times of all later frames do not include them"
     ]
 
 

@@ -8,7 +8,7 @@ search (``MultiStartSearch``) returns continuous values, and ``RootPlacementSear
 position or the camera's scale.
 """
 
-from drake_pose.search.beam_search import BeamSearch
+from drake_pose.search.beam_search import BeamSearch, BeamSearchSettings
 from drake_pose.search.estimates import (
     TRACKED,
     UNEXPLAINED,
@@ -20,7 +20,7 @@ from drake_pose.search.estimates import (
     joint_estimates,
     mimic_joints,
 )
-from drake_pose.search.kameda import PaperSearch
+from drake_pose.search.kameda import PaperSearch, PaperSearchSettings
 from drake_pose.search.multi_start import MultiStartSearch
 from drake_pose.search.pose_modes import (
     ExaminationSettings,
@@ -36,5 +36,4 @@ from drake_pose.search.root_placement import (
 )
 from drake_pose.search.root_places import scale_camera, slide_root
 from drake_pose.search.sampled_body import PoseSearch, SampledTree, Scoring
-from drake_pose.search.settings import BeamSearchSettings, ExactSearchSettings, PaperSearchSettings
-from drake_pose.search.views_fit import ViewsFit, covariance_pose_set
+from drake_pose.search.views_fit import RobustSettings, ViewsFit, covariance_pose_set

@@ -13,18 +13,86 @@ import copy
 import itertools
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from drake_pose.body import PoseTree
+from drake_pose.errors import SettingsError, require_at_least
 from drake_pose.search.branch_and_bound import PosesWithin, branch_and_bound
 from drake_pose.search.estimates import PoseEstimate, View, require_views
-from drake_pose.search.partial_poses import PartialPoses, PoseStore, SilhouetteBits, coarsen
+from drake_pose.search.partial_poses import (
+    BoundLimits,
+    PartialPoses,
+    PoseStore,
+    SilhouetteBits,
+    coarsen,
+)
 from drake_pose.search.pose_modes import ExaminationSettings, examine, renderer_tolerance
-from drake_pose.search.sampled_body import SampledBody, Scoring
-from drake_pose.search.settings import BeamSearchSettings, BoundLimits, Stage
+from drake_pose.search.sampled_body import GridSettings, SampledBody, Scoring
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One pass of the beam search over all nodes.
+
+    Args:
+        hypotheses: beam width: number of hypotheses kept after each node.
+        outside_fraction: greatest area of a node outside the silhouette, as a fraction of the
+            node's mean projected area, both summed over the views; infinite: no limit.
+        outside_weight: cost of a pixel outside the silhouette, relative to the gain of a newly
+            covered pixel.
+        limb_by_limb: True: place one limb after another; False: place the ends of all limbs last.
+    """
+
+    hypotheses: int
+    outside_fraction: float = 0.0
+    outside_weight: int = 1
+    limb_by_limb: bool = False
+
+    def __post_init__(self) -> None:
+        require_at_least(1, hypotheses=self.hypotheses, outside_weight=self.outside_weight)
+        require_at_least(0, outside_fraction=self.outside_fraction)
+
+
+EXACT_STAGES = (Stage(20), Stage(160))
+"""Stages for a model that fits the object exactly. If no pose fits exactly, they end early; if they
+find none, a branch and bound enumerates all poses within the tolerance."""
+
+TOLERANT_STAGES = (Stage(80, 0.3, 5), Stage(300, 1.0, 2))
+"""Stages for a model that fits the object only approximately."""
+
+
+@dataclass(frozen=True)
+class BeamSearchSettings(GridSettings):
+    """Parameters of the beam search.
+
+    Args:
+        tolerance: a pose with J up to this counts as exact [pixel]; None: the difference between
+            two renderers (``renderer_tolerance``).
+        stages: the passes, run one after another until J is within the tolerance. Where
+            ``outside_fraction`` is 0 the tolerance limits the area outside; after these stages a
+            branch and bound enumerates all poses within the tolerance.
+        research_hypotheses: beam width when limbs of the best pose are searched again; 0: limbs are
+            not searched again.
+        time_limit: time after which the best pose found is returned [s]; None: no limit.
+
+    Raises:
+        SettingsError: if a value is out of its range.
+    """
+
+    tolerance: float | None = None
+    stages: tuple[Stage, ...] = EXACT_STAGES + TOLERANT_STAGES
+    research_hypotheses: int = 30
+    time_limit: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.stages:
+            raise SettingsError("stages must hold at least one stage")
+        hypotheses = self.research_hypotheses
+        require_at_least(0, research_hypotheses=hypotheses, time_limit=self.time_limit)
 
 
 def grow(

@@ -15,6 +15,7 @@ import numpy as np
 from drake_pose.search.estimates import View
 from drake_pose.search.pair_kernel import NO_CHILDREN, prune_pairs, unite
 from drake_pose.search.partial_poses import (
+    BoundLimits,
     LimitReached,
     PartialPoses,
     PoseStore,
@@ -23,7 +24,6 @@ from drake_pose.search.partial_poses import (
     expand_groups,
 )
 from drake_pose.search.sampled_body import SampledBody
-from drake_pose.search.settings import BoundLimits
 
 
 @dataclass(frozen=True)

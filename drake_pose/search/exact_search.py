@@ -6,23 +6,58 @@ masks, or a model that does not fit the object, ``multi_start`` uses the robust 
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtri
 
 from drake_pose.body import PoseTree
-from drake_pose.search.beam_search import BeamSearch
+from drake_pose.search.beam_search import BeamSearch, Stage
 from drake_pose.search.estimates import PoseSet
-from drake_pose.search.parts import NeighbourhoodSearch, PartSearch
-from drake_pose.search.refinement import RefinementBody, RefinementProblem, descend
-from drake_pose.search.settings import (
+from drake_pose.search.parts import NeighbourhoodSearch, NeighbourhoodSettings, PartSearch
+from drake_pose.search.refinement import (
     COARSE_PASSES,
     FINE_PASSES,
     LAST_PASSES,
-    ExactSearchSettings,
+    RefinementBody,
+    RefinementProblem,
+    descend,
 )
-from drake_pose.search.views_fit import FittedPose, describe_modes
+from drake_pose.search.views_fit import FittedPose, RobustSettings, describe_modes
+
+
+@dataclass(frozen=True)
+class ExactSearchSettings:
+    """Parameters of the search in exact masks; limits of J are fractions of the border length.
+
+    The beam searches use grids of 20 degrees (index 0) and 15 degrees (index 1). Each runs only if
+    those before it found no good pose: a pose missed on one grid or in one order of nodes is often
+    found on another.
+    """
+
+    stages: tuple[tuple[int, Stage], ...] = (
+        (0, Stage(60, 0.3, 5)),
+        (1, Stage(60, 1.0, 2)),
+        (1, Stage(60, 1.0, 2, limb_by_limb=True)),
+        (1, Stage(60, 0.3, 5, limb_by_limb=True)),
+    )
+    # Masks may be exact if at least this fraction of their border pixels coincides with the border
+    # of a fitted pose. Bodies drawn by Drake have .54 to .99 (``tests/silhouettes``), real arms and
+    # people .1 to .51.
+    coinciding: float = 0.53
+    # The search gives up if J after the coarse passes exceeds the larger of these two: the second
+    # is a fraction of the square root of the mean silhouette area [pixel].
+    hopeless: float = 1.5
+    hopeless_fraction: float = 0.017
+    exact: float = 0.18  # A pose with a smaller J is the answer.
+    plausible: float = 0.5  # Above this J the pose of the robust fit is the answer.
+    # Two grids agree if the ratio of their Js is smaller: the model itself does not fit.
+    agreement: float = 1.1
+    same: float = 0.1  # Poses are equal if no value differs by more [rad or m].
+    # Ratio of the actual standard deviation to that of statistically independent distances.
+    noise_factor: float = 1.4
+    misfit: float = 0.025  # Above this J no value is determined: another pose may be right.
 
 
 class ExactPose(NamedTuple):
@@ -110,7 +145,7 @@ class ExactSearch:
         """Refine ``start`` (m + 4,), and place parts anew until ``deadline`` (perf_counter)."""
         fine, _, steps = descend(problem, start, self.body.freedom(), FINE_PASSES)
         neighbourhood = NeighbourhoodSearch(problem, self._parts)
-        good = self._settings.noise * problem.border_length
+        good = NeighbourhoodSettings.noise * problem.border_length
         parameters, J = neighbourhood.improve(fine, good, deadline)
         return ExactPose(parameters, J, float(problem.J(start)), steps, neighbourhood)
 
@@ -139,8 +174,8 @@ class ExactSearch:
         ``reached``: from ``find`` or ``refine``. ``tree``: with its root where the body is.
         """
         settings, others = self._settings, []
-        for _ in range(settings.replacements):
-            limit = reached.J + settings.noise * problem.border_length
+        while True:
+            limit = reached.J + NeighbourhoodSettings.noise * problem.border_length
             others = reached.neighbourhood.others(reached.parameters, limit, settings.same)
             if not others or problem.J(others[0]) >= reached.J:
                 break
@@ -188,7 +223,7 @@ def find_intervals(
     information = equations.H[0] / variance + np.diag(12.0 / spans**2)
     covariance = np.zeros((count, count))
     covariance[np.ix_(free.columns, free.columns)] = np.linalg.inv(information)
-    margins = float(ndtri(0.5 + 0.5 * settings.confidence)) * np.sqrt(np.diag(covariance))
+    margins = float(ndtri(0.5 + 0.5 * RobustSettings().confidence)) * np.sqrt(np.diag(covariance))
     fits = problem.J(parameters) <= settings.misfit * problem.border_length
     near = np.maximum(margins, settings.same)
     groups = [[parameters]]
@@ -213,5 +248,5 @@ def find_intervals(
             ends = np.full(count, -np.inf), np.full(count, np.inf)
         modes.append(FittedPose(poses[0], 0.0, *ends, len(poses)))
         Js.append(float(problem.J(first)))
-    tolerance = settings.noise * problem.border_length
+    tolerance = NeighbourhoodSettings.noise * problem.border_length
     return describe_modes(kinematics, tree or body.tree, modes, Js, tolerance, fits)

@@ -14,9 +14,34 @@ from typing import Any
 import numpy as np
 
 from drake_pose.body import PoseTree
+from drake_pose.errors import require_at_least
 from drake_pose.search.estimates import PoseEstimate, View, require_views
-from drake_pose.search.sampled_body import Regions, SampledTree, Scoring
-from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.search.sampled_body import GridSettings, Regions, SampledTree, Scoring
+
+
+@dataclass(frozen=True)
+class PaperSearchSettings(GridSettings):
+    """Parameters of Kameda's search (sections 5.1, 5.2 and 6.1 of the paper).
+
+    Args:
+        outside_limit: the threshold r of (4) [pixel]: greatest area of a segment outside the
+            silhouette, in each view. None: start with 12.6 % of the mean projected area of a
+            segment (200 pixels for the paper's body) and double until a pose is found.
+        candidate_limit: K, the number of candidates kept for each node.
+        run_limit: greatest number of runs of step 3; the best pose found until then is returned.
+
+    Raises:
+        SettingsError: if a value is out of its range.
+    """
+
+    outside_limit: float | None = None
+    candidate_limit: int = 5
+    run_limit: int = 10_000
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_at_least(0, outside_limit=self.outside_limit)
+        require_at_least(1, candidate_limit=self.candidate_limit, run_limit=self.run_limit)
 
 
 @dataclass(frozen=True)

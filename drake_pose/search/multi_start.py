@@ -17,7 +17,7 @@ import itertools
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -26,26 +26,65 @@ import numpy as np
 from drake_pose.body import PoseTree, bundled_model, load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import ParallelCamera
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import simplify_outlines, simplify_surfaces
-from drake_pose.search.beam_search import BeamSearch
+from drake_pose.search.beam_search import TOLERANT_STAGES, BeamSearch, BeamSearchSettings
 from drake_pose.search.coarse_search import CoarsePoses, CoarseSearch
 from drake_pose.search.estimates import PoseEstimate, View, require_views
-from drake_pose.search.exact_search import ExactPose, ExactSearch
+from drake_pose.search.exact_search import ExactPose, ExactSearch, ExactSearchSettings
 from drake_pose.search.partial_poses import coarsen
 from drake_pose.search.refinement import RefinementProblem
 from drake_pose.search.sampled_body import SampledBody
 from drake_pose.search.self_motions import counter_turns, flips
-from drake_pose.search.settings import (
-    COARSE_STAGES,
-    MEDIUM_STAGES,
-    TOLERANT_STAGES,
-    BeamSearchSettings,
-    ExactSearchSettings,
-    MultiStartSettings,
-)
 from drake_pose.search.views_fit import FittedPose, RobustModes, ViewsFit, distinct, refine_best
 from drake_pose.silhouette.outline import Outline
 from drake_pose.workers import map_ordered
+
+COARSE_STAGES = (AnnealingStage(0.1, 0.04, 3), AnnealingStage(0.05, 0.04, 3))
+MEDIUM_STAGES = (AnnealingStage(0.05, 0.026, 4), AnnealingStage(0.025, 0.026, 4))
+
+
+@dataclass(frozen=True)
+class MultiStartSettings:
+    """Parameters of the search in damaged masks.
+
+    Lengths are fractions of the size: the square root of the silhouettes' mean area.
+    In several views the cost of a wrong pose is higher from the first stage on, so starts are
+    dropped early. In a single view the last stage may decide.
+    """
+
+    interval: float = math.radians(15.0)  # Sampling interval of angles in the coarse search [rad].
+    final: tuple[AnnealingStage, ...] = (AnnealingStage(0.0125, 0.0125, 6),)
+    starts: int = 40  # Number of coarse poses that are fitted.
+    finalists: int = 4  # Number of poses that are fitted to the end.
+    # Stages, and the number of poses kept after them: in one view, and in several.
+    passes: tuple[tuple[tuple[tuple[AnnealingStage, ...], int], ...], ...] = (
+        ((COARSE_STAGES, 12), (MEDIUM_STAGES, 12)),
+        (
+            (COARSE_STAGES[:1], 20),
+            (COARSE_STAGES[1:], 12),
+            (MEDIUM_STAGES[:1], 6),
+            (MEDIUM_STAGES[1:], 6),
+        ),
+    )
+    # Stages of alternative poses in several views, and the number kept after them.
+    alternative_passes: tuple[tuple[tuple[AnnealingStage, ...], int], ...] = (
+        (MEDIUM_STAGES[:1], 4),
+        (MEDIUM_STAGES[1:], 4),
+    )
+    # Coarse poses differ if some node's image is at least this far away.
+    separation: float = 0.13
+    rounds: int = 2  # Rounds of the search for alternative poses,
+    explored: int = 3  # number of poses around which alternatives are searched in a round,
+    alternatives: int = 6  # and number of alternatives of each pose that are fitted,
+    flipped: int = 3  # besides this number of flipped poses.
+    # In several views a round ends if no alternative costs less than this fraction of the best.
+    improvement: float = 0.98
+    # Radius of a disc as thick as a limb, in one and in several views.
+    limb_radii: tuple[float, float] = (0.03, 0.04)
+    beam_starts: int = 10  # If a wrong region holds such a disc: number of poses of a beam search,
+    beam_views: int = 2  # number of views that it uses,
+    beam_pixels: int = 3000  # and area of their silhouettes [pixel].
 
 
 class MultiStartSearch:

@@ -6,6 +6,7 @@ the silhouettes, and the poses of the nodes with children still to be placed. Pa
 equal in these are merged; they are recognised by hashes (``pair_kernel``).
 """
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from drake_pose.camera.models import ParallelCamera
+from drake_pose.errors import SettingsError, require_at_least
 from drake_pose.search.estimates import View
 from drake_pose.search.pair_kernel import (
     ReachablePixels,
@@ -24,7 +26,6 @@ from drake_pose.search.pair_kernel import (
     unite_poses,
 )
 from drake_pose.search.sampled_body import SampledBody
-from drake_pose.search.settings import BoundLimits
 from drake_pose.silhouette.bit_kernel import (
     WORD,
     BitView,
@@ -33,6 +34,37 @@ from drake_pose.silhouette.bit_kernel import (
     make_bit_view,
     prune_by_balls,
 )
+
+
+@dataclass(frozen=True)
+class BoundLimits:
+    """Limits of a branch and bound.
+
+    Raises:
+        SettingsError: if a value is out of its range.
+    """
+
+    states: int = 20_000  # Greatest number of partial poses kept after each node.
+    # Greatest number of pairs of a partial pose and a pose of the next node that are evaluated for
+    # one node.
+    pairs: int = 1_000_000
+    poses: int = 1_000_000  # Number of drawn poses of nodes after which the search stops.
+    # The search stops before the drawn poses and the areas that they reach take more than this, and
+    # it keeps fewer partial poses if all would take more than a quarter of this [byte]. Temporary
+    # arrays take about as much again.
+    memory: int = 400_000_000
+    time_limit: float | None = None  # Time after which the search stops [s]; None: no limit.
+
+    def __post_init__(self) -> None:
+        sizes = {"states": self.states, "pairs": self.pairs, "poses": self.poses}
+        require_at_least(1, **sizes, memory=self.memory)
+        if self.time_limit is not None and not 0.0 <= self.time_limit < math.inf:
+            raise SettingsError(f"time_limit must be 0 s or more, not {self.time_limit}")
+
+    @property
+    def deadline(self) -> float:
+        """The time.perf_counter() at which a search that starts now must stop [s]."""
+        return math.inf if self.time_limit is None else time.perf_counter() + self.time_limit
 
 
 class LimitReached(Exception):

@@ -22,8 +22,13 @@ import numpy as np
 from drake_pose.body import PoseTree
 from drake_pose.fit.surfaces import simplify_rigid_parts
 from drake_pose.search.estimates import View
-from drake_pose.search.refinement import Freedom, RefinementBody, RefinementProblem, descend
-from drake_pose.search.settings import ExactSearchSettings, NeighbourhoodSettings
+from drake_pose.search.refinement import (
+    Freedom,
+    Pass,
+    RefinementBody,
+    RefinementProblem,
+    descend,
+)
 from drake_pose.silhouette.outline import pack
 from drake_pose.silhouette.scoring import prefix_sums
 from drake_pose.silhouette.span_kernel import score
@@ -31,6 +36,27 @@ from drake_pose.silhouette.span_kernel import score
 # For a coarse view: X_CW (4, 4), the camera's kernel parameters (8,), and prefix sums (2, H, W + 1)
 # of the silhouette and of the area outside it, both without the pixels that other nodes cover.
 _Region = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
+class NeighbourhoodSettings:
+    """Parameters of the search around a pose; excesses of J are fractions of the border length."""
+
+    placed: tuple[Pass, ...] = (Pass(4, 4, 30.0, 100.0),)  # First passes of a part placed anew.
+    # First passes of a mirrored part of the body.
+    mirrored: tuple[Pass, ...] = (Pass(8, 4, 30.0, 100.0), Pass(6, 3, 6.0, 30.0))
+    second: tuple[Pass, ...] = (Pass(5, 3, 6.0, 30.0),)  # Passes after the first ones.
+    fine: tuple[Pass, ...] = (Pass(6, 2, 2.0, 5.0),)  # Passes to the optimum of the part alone.
+    final: tuple[Pass, ...] = (Pass(6, 1, 1.0, 0.5, slack=0.4),)  # Passes of alternative poses.
+    whole: tuple[Pass, ...] = (Pass(3, 3, 6.0, 50.0), Pass(3, 2, 2.0, 5.0))  # All parts move.
+    refined: int = 2  # Number of placements that get the second passes.
+    noise: float = 0.03  # Pixel noise: poses whose J exceeds another's by less are as good.
+    first_excess: float = 0.15  # Greatest excess over the current J after the first passes.
+    whole_excess: float = 0.01  # Poses up to this excess are refined with all parts moving.
+    least_decrease: float = 0.003  # A smaller decrease of J is no improvement.
+    same_error: float = 0.1  # Errors of a part are equal if they differ by a smaller fraction.
+    least_error: float = 0.001  # Parts with less error are not placed anew [fraction of the area].
+    rounds: int = 2  # Number of tries of each part; doubled where all parts must be tried.
 
 
 @dataclass(frozen=True)
@@ -519,7 +545,7 @@ class NeighbourhoodSearch:
         starts = [self.search.mirror(parameters, part, view) for view in problem.views]
         if erring and not part.exchanged:
             starts += self.search.propose(problem, parameters, part)
-        rough, near = [], J + ExactSearchSettings.noise * length
+        rough, near = [], J + settings.noise * length
         for start in starts:
             if part.exchanged:
                 refined, cost, _ = descend(problem, start, freedom, settings.mirrored)

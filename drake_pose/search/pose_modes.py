@@ -21,9 +21,8 @@ from scipy.spatial import cKDTree
 from drake_pose.errors import SettingsError, require_at_least
 from drake_pose.search.branch_and_bound import PartialPoseGraph, PosesWithin, branch_and_bound
 from drake_pose.search.estimates import JointEstimate, PoseEstimate, PoseMode, PoseSet, View
-from drake_pose.search.partial_poses import expand_groups
+from drake_pose.search.partial_poses import BoundLimits, expand_groups
 from drake_pose.search.sampled_body import SampledBody, SampledTree
-from drake_pose.search.settings import BoundLimits
 
 
 def grid_steps(grid: np.ndarray) -> np.ndarray:

@@ -24,12 +24,20 @@ import numpy as np
 from drake_pose.body import PoseTree
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import SettingsError
-from drake_pose.search.beam_search import BeamSearch, grow
+from drake_pose.search.beam_search import BeamSearch, BeamSearchSettings, Stage, grow
 from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.partial_poses import PoseStore, SilhouetteBits, coarsen
 from drake_pose.search.parts import NeighbourhoodSearch, PartSearch
-from drake_pose.search.refinement import Pass, RefinementBody, RefinementProblem, descend
+from drake_pose.search.refinement import (
+    COARSE_PASSES,
+    FINE_PASSES,
+    Pass,
+    RefinementBody,
+    RefinementProblem,
+    descend,
+)
 from drake_pose.search.root_places import (
+    RootPlacementSettings,
     RootPlaces,
     find_root_places,
     in_camera,
@@ -38,13 +46,6 @@ from drake_pose.search.root_places import (
     slide_root,
 )
 from drake_pose.search.sampled_body import SampledBody
-from drake_pose.search.settings import (
-    COARSE_PASSES,
-    FINE_PASSES,
-    BeamSearchSettings,
-    RootPlacementSettings,
-    Stage,
-)
 from drake_pose.workers import map_ordered
 
 

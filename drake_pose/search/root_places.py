@@ -23,8 +23,29 @@ from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import View
 from drake_pose.search.sampled_body import SampledBody
-from drake_pose.search.settings import RootPlacementSettings
 from drake_pose.silhouette.scoring import score_bodies
+
+
+class RootPlacementSettings(NamedTuple):
+    """Parameters of the search for the root's position."""
+
+    positions_across: int = 12  # Positions tried across the silhouette.
+    scale_ratio: float = 1.12  # Ratio of neighbouring scales or depths.
+    # Factor by which a body cut off by the image border may be larger than its silhouette.
+    cut_off: float = 1.5
+    # Greatest area outside the silhouette [fraction of a node's mean projected area]. It is large
+    # because the root may be half a grid step off.
+    outside_fraction: float = 0.6
+    outside_weight: int = 2  # Cost of a pixel outside, relative to the gain of one newly covered.
+    hypotheses: int = 500  # Beam width, shared among the scales or depths.
+    quota: float = 0.05  # Greatest fraction of the hypotheses with the same root position.
+    starts: int = 24  # Number of poses refined by the coarse passes.
+    finalists: int = 3  # Number of root positions searched again, and of poses refined to the end.
+    coarse_pixels: int = 1500  # Area of a silhouette in the coarse images [pixel].
+    root_factor: int = 2  # Beam width after the root, as a multiple of the beam width.
+    root_spare: int = 2  # Rotations tried at each position, as a multiple of its quota.
+    spare: int = 8  # Hypotheses made before the quota is applied, as a multiple of the beam width.
+    good_E_total: float = 0.004  # The search ends at a pose with a smaller E_total.
 
 
 class RootPlaces(NamedTuple):

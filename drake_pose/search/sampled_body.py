@@ -5,7 +5,9 @@ views, and ``SampledBody`` adds bounding and inscribed balls by which nodes are 
 """
 
 import copy
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Protocol
 
@@ -13,9 +15,9 @@ import numpy as np
 
 from drake_pose.body import PoseTree, require_tree
 from drake_pose.camera.models import Camera, ParallelCamera
+from drake_pose.errors import require_positive
 from drake_pose.fit.surfaces import collapse_edges
 from drake_pose.search.estimates import PoseEstimate, View
-from drake_pose.search.settings import BeamSearchSettings, GridSettings
 from drake_pose.silhouette.contour_points import CelledOutline, divide_outline
 from drake_pose.silhouette.outline import Outline, TreeSurfaces
 from drake_pose.silhouette.scoring import (
@@ -29,6 +31,25 @@ from drake_pose.silhouette.scoring import (
 # For each view: (H, W) uint8 mask of the part of the silhouette that no placed node covers, and
 # (2, H, W + 1) row-wise prefix sums of the silhouette and of that part.
 Regions = list[tuple[np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True)
+class GridSettings:
+    """Sampling intervals of a pose tree's values.
+
+    Args:
+        interval: sampling interval of every angle [rad]; the paper's is 20 degrees.
+        length_interval: sampling interval of every prismatic position [m].
+
+    Raises:
+        SettingsError: if a value is out of its range.
+    """
+
+    interval: float = math.radians(20.0)
+    length_interval: float = 0.05
+
+    def __post_init__(self) -> None:
+        require_positive(interval=self.interval, length_interval=self.length_interval)
 
 
 class SampledTree:
@@ -277,7 +298,7 @@ class SampledBody:
             the node and its descendants at all samples [m].
     """
 
-    def __init__(self, tree: PoseTree, settings: BeamSearchSettings) -> None:
+    def __init__(self, tree: PoseTree, settings: GridSettings) -> None:
         self.sampled = SampledTree(tree, settings)
         # The mean projected area of a convex surface is a quarter of its area (Cauchy). The length
         # of each plane's normal is twice the area of its triangle.

@@ -42,9 +42,34 @@ from drake_pose.search.estimates import (
     joint_estimates,
 )
 from drake_pose.search.self_motions import Flip, flips
-from drake_pose.search.settings import ExactSearchSettings, RobustSettings
 from drake_pose.silhouette.outline import Outline
 from drake_pose.workers import map_ordered
+
+
+class RobustSettings(NamedTuple):
+    """Parameters of the intervals and modes computed from damaged masks."""
+
+    # Stage at which costs of poses are compared.
+    comparison: AnnealingStage = AnnealingStage(0.0125, 0.026, 2)
+    measure: AnnealingStage = AnnealingStage(0.025, 0.0125)  # Stage at which errors are measured.
+    # Difference of costs that is significant [standard deviations].
+    significance: float = 1.96
+    confidence: float = 0.95  # Probability that an interval contains the true value.
+    modes: int = 8  # Greatest number of modes.
+    # Values whose interval by covariance is wider on a side are moved step by step [rad, m].
+    moved: tuple[float, float] = (math.radians(3.0), 0.01)
+    longest_steps: tuple[float, float] = (0.5, 0.1)  # Longest step of a moved value [rad, m].
+    step_factor: float = 1.6  # Ratio of successive steps.
+    camera_freedom: int = 6  # Degrees of freedom of a camera's error.
+
+    @staticmethod
+    def widest(is_angle: np.ndarray) -> np.ndarray:
+        """Return (m,) the greatest width of a determined value's interval [rad or m].
+
+        It is 10 degrees, or 2 cm, on each side. ``is_angle``: (m,) bool whether each of the pose
+        tree's m values is an angle.
+        """
+        return 2.0 * np.where(is_angle, math.radians(10.0), 0.02)
 
 
 class FittedPose(NamedTuple):
@@ -252,7 +277,7 @@ def describe_modes(
 
 def interval_widths(covariance: np.ndarray, degrees_of_freedom: int) -> np.ndarray:
     """Return half the widths (m,) of intervals by a covariance (m, m), with Student's quantile."""
-    one_sided = 0.5 + 0.5 * ExactSearchSettings.confidence
+    one_sided = 0.5 + 0.5 * RobustSettings().confidence
     return np.asarray(stdtrit(degrees_of_freedom, one_sided) * np.sqrt(np.diag(covariance)))
 
 

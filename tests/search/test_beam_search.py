@@ -18,7 +18,7 @@ from drake_pose.search import (
     renderer_tolerance,
     samples_at,
 )
-from drake_pose.search.settings import Stage
+from drake_pose.search.beam_search import Stage
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.search.bodies import box_link, front_camera, joint, load_body, swinging_chain
 from tests.search.grid_problems import show_pose

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drake_pose.search.branch_and_bound import branch_and_bound
-from drake_pose.search.settings import BoundLimits
+from drake_pose.search.partial_poses import BoundLimits
 from tests.search.bodies import box_link, joint, load_body
 from tests.search.grid_problems import ProblemMaker
 

@@ -11,8 +11,6 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import MaskError
 from drake_pose.search import (
-    BeamSearch,
-    ExaminationSettings,
     JointEstimate,
     MultiStartSearch,
     PoseEstimate,
@@ -181,15 +179,3 @@ def test_angles_are_returned_in_the_turn_around_the_default(model, truth):
     assert swing.holds(math.radians(truth[0]))
     assert swing.holds(math.radians(truth[0] + 720.0))
     assert not swing.holds(math.radians(truth[0] + 90.0))
-
-
-def test_directions_on_both_sides_of_half_a_turn_are_one_mode(model):
-    """The pose is on the grid at 180 degrees, with neighbours at 160 and -160 degrees."""
-    search = BeamSearch(model.pose_tree(), None, ExaminationSettings(tolerance=400.0))
-    result = search.match(views_of(model, np.radians([180.0, 0.0])))
-    np.testing.assert_allclose(np.degrees(np.abs(result.q)), [180.0, 0.0], atol=1e-6)
-    first = result.pose_set.modes[0].joints[0]
-    # The interval is continuous across half a turn, with the answer at its centre.
-    ends = np.degrees(np.array([first.low, first.high]) - result.q[0])
-    np.testing.assert_allclose(ends, [-20.0, 20.0], atol=1e-6)
-    assert result.pose_set.mode_count == 1

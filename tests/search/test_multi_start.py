@@ -5,7 +5,6 @@ import pytest
 
 from drake_pose.errors import SettingsError
 from drake_pose.search import BeamSearch, MultiStartSearch, PaperSearch, View
-from drake_pose.search.multi_start import without_specks
 from drake_pose.search.refinement import RefinementProblem
 from drake_pose.silhouette.outline import TreeSurfaces
 from drake_pose.silhouette.scoring import draw_mask
@@ -229,26 +228,3 @@ def test_salt_noise_does_not_spoil_the_pose(tree, search, pose):
 def test_no_view_is_refused(chain, make):
     with pytest.raises(SettingsError, match="at least one view"):
         make(chain.tree).match([])
-
-
-def shape():
-    rows, columns = np.mgrid[:120, :150]
-    mask = np.hypot(rows - 60, columns - 70) < 35
-    mask[58:62, 20:140] = True
-    return mask
-
-
-def test_only_masks_with_many_specks_are_filtered():
-    mask = shape()
-    mask[5, 5] = True
-    assert without_specks(mask) is mask
-    specks = np.zeros((50, 60), dtype=bool)
-    specks[10, 10] = specks[30, 40] = True
-    np.testing.assert_array_equal(without_specks(specks), specks)
-    generator = np.random.default_rng(1)
-    for salt, pepper in ((0.1, 0.0), (0.1, 0.1)):
-        chance = generator.random((120, 150))
-        noisy = (shape() | (chance < salt)) & (chance < 1.0 - pepper)
-        cleaned = without_specks(noisy)
-        assert (cleaned ^ shape()).sum() < 0.05 * shape().sum()
-        assert (noisy ^ shape()).sum() > 0.2 * shape().sum()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from drake_pose.search import View, renderer_tolerance, samples_at
+from drake_pose.search.partial_poses import BoundLimits
 from drake_pose.search.pose_modes import (
     cluster_samples,
     contour_length,
@@ -13,7 +14,6 @@ from drake_pose.search.pose_modes import (
     find_modes,
     grid_steps,
 )
-from drake_pose.search.settings import BoundLimits
 from tests.search.arms import is_held
 from tests.search.bodies import box_link, forked_body, joint, load_body, swinging_chain
 from tests.search.grid_problems import ProblemMaker

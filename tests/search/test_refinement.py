@@ -10,8 +10,15 @@ from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.search import View
 from drake_pose.search.exact_search import find_intervals
 from drake_pose.search.parts import NeighbourhoodSearch, PartSearch, find_parts, find_reflections
-from drake_pose.search.refinement import Pass, RefinementBody, RefinementProblem, descend
-from drake_pose.search.settings import COARSE_PASSES, FINE_PASSES, LAST_PASSES
+from drake_pose.search.refinement import (
+    COARSE_PASSES,
+    FINE_PASSES,
+    LAST_PASSES,
+    Pass,
+    RefinementBody,
+    RefinementProblem,
+    descend,
+)
 from drake_pose.silhouette.outline import TreeSurfaces
 from drake_pose.silhouette.scoring import draw_mask
 from tests.search.bodies import forked_body

@@ -15,13 +15,11 @@ from drake_pose.fit.covariance import (
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import simplify_surfaces
 from drake_pose.search import ViewsFit, views_fit
-from drake_pose.search.self_motions import Flip, counter_turns, flips
-from drake_pose.search.settings import RobustSettings
-from drake_pose.search.views_fit import FittedPose, RobustModes, distinct
+from drake_pose.search.self_motions import Flip, flips
+from drake_pose.search.views_fit import FittedPose, RobustModes, RobustSettings, distinct
 from drake_pose.silhouette.outline import TreeSurfaces
 from tests.body.models import joint, link, urdf, write
 from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_view, is_held, split
-from tests.search.bodies import swinging_chain
 
 TRUTH = np.array([0.6, 0.7, -0.7, 0.9, 0.3])
 FINE = tuple(AnnealingStage(scale, 0.0125, 8) for scale in (0.025, 0.0125))
@@ -89,17 +87,6 @@ def test_a_turn_about_an_axis_of_symmetry_is_not_determined(tmp_path):
     assert (spin.low, spin.high) == (-2.0, 2.5)
 
 
-def test_without_time_intervals_follow_from_the_covariance(kinematics):
-    views = damaged_views(kinematics.tree, TRUTH, 1)
-    fit = ViewsFit(kinematics, simplify_surfaces(TreeSurfaces(kinematics.tree)), views)
-    pose = fit.refine(TRUTH, FINE)
-    before = fit.evaluations
-    answer = RobustModes(fit, lambda: False).find([pose], lambda _: 0.0)
-    assert answer.mode_count == 1
-    assert fit.evaluations - before < 5
-    assert all(one.low < one.high for one in answer.joints)
-
-
 def test_refinement_respects_limits_and_held_values(kinematics):
     views = [draw_view(kinematics.tree, TRUTH, camera) for camera in arm_cameras()]
     fit = ViewsFit(kinematics, simplify_surfaces(TreeSurfaces(kinematics.tree)), views)
@@ -158,29 +145,6 @@ def test_flips_outside_the_limits_are_left_out(kinematics):
     # The turret's limits are +-150 degrees, so 10 cannot become 190 degrees.
     values = np.radians([10.0, 40.0, -30.0, 50.0, 20.0])
     assert flips(kinematics, values) == []
-
-
-def test_counter_turns_keep_the_pose_of_later_links(kinematics):
-    # With the shoulder upright, turret and roll have the same axis.
-    values = np.array([0.6, 0.0, -0.5, 0.9, 0.3])
-    found = counter_turns(kinematics, values, np.radians(30.0))
-    turned = [one for one in found if one[0] != values[0] and one[2] != values[2]]
-    assert turned
-    before = poses(kinematics, values)
-    for one in turned:
-        np.testing.assert_allclose(poses(kinematics, one)[-1], before[-1], atol=1e-9)
-    assert all(((one >= kinematics.lower) & (one <= kinematics.upper)).all() for one in found)
-
-
-def test_a_planar_chain_has_counter_turns_but_no_flips(tmp_path):
-    kinematics = TreeKinematics(swinging_chain(tmp_path, 3).pose_tree())
-    values = np.array([0.3, -0.4, 0.5])
-    assert flips(kinematics, values) == []
-    for one in counter_turns(kinematics, values, 0.5):
-        changed = np.flatnonzero(one != values)
-        assert len(changed) == 2
-        # With parallel axes the two changes cancel, except for full turns.
-        assert (one - values).sum() == pytest.approx(0.0, abs=1e-9)
 
 
 class Valley:
@@ -276,16 +240,6 @@ def test_wide_intervals_end_where_the_cost_grows_significantly(kinematics, monke
     stuck = Valley(kinematics, along, 0.2, 1.8)
     RobustModes(stuck, lambda: False).find([FittedPose(TRUTH)], lambda _: 3.0)
     assert not stuck.started
-
-
-def test_a_wide_valley_ends_at_the_limits(kinematics):
-    valley = Valley(kinematics, [1.0, 0.0, 0.0, 0.0, 0.0], 0.5, 1e3)
-    (mode,) = RobustModes(valley, lambda: True).find([FittedPose(TRUTH)], lambda _: 3.0).modes
-    lower, upper = kinematics.local_limits(TRUTH)
-    assert (mode.joints[0].low, mode.joints[0].high) == (lower[0], upper[0])
-    assert not mode.joints[0].determined
-    steps = np.abs(np.diff([TRUTH[0] - TRUTH[0], *(abs(one[0]) for one in valley.started[:4])]))
-    assert steps.max() <= 0.5 + 1e-9
 
 
 def test_poses_as_good_are_modes_or_widen_one(kinematics, monkeypatch):

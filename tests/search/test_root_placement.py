@@ -16,7 +16,6 @@ from drake_pose.search import (
 )
 from drake_pose.search.root_placement import choose_root_samples
 from drake_pose.search.root_places import (
-    _pixel_sizes,
     find_root_places,
     in_camera,
     root_steps,
@@ -323,27 +322,6 @@ def test_candidates_in_space_are_seen_by_all_cameras(sampled):
     # Two cameras side by side do not tell the depth: the larger silhouette gives layers.
     near = [View(replace(EYE, name=name), views[0].mask) for name in "ab"]
     assert len(find_root_places(sampled, near, False, None)) > 1
-
-
-def test_sizes_follow_from_areas_of_random_poses(sampled):
-    """The silhouette is between the least and the largest 3 % of parallel projections."""
-    flat, areas = replace(front_camera(200), pixels_per_metre=90.0), []
-    for seed in range(60):
-        X_WN = random_pose(sampled, seed, np.zeros(3))
-        areas.append(draw_mask(sampled.sampled.outlines, flat.X_CW @ X_WN, flat).sum() / 90.0**2)
-    mask = np.zeros((200, 200), bool)
-    mask[40:90, 60:150] = True
-    sizes = _pixel_sizes(sampled, View(flat, mask))
-    low, middle, high = np.quantile(areas, [0.03, 0.5, 0.97])
-    assert sizes[0] == pytest.approx(np.sqrt(mask.sum() / middle), rel=0.04)
-    assert np.sqrt(mask.sum() / high) / 1.2 < sizes.min() < 1.04 * np.sqrt(mask.sum() / high)
-    assert 0.96 * np.sqrt(mask.sum() / low) < sizes.max() < 1.2 * np.sqrt(mask.sum() / low)
-    # A silhouette that touches the border may be of a body that is half as large again.
-    at_border = np.roll(mask, -40, axis=0)
-    cut = _pixel_sizes(sampled, View(flat, at_border))
-    assert cut.min() == sizes.min()
-    assert cut.max() / sizes.max() == pytest.approx(1.5, rel=0.13)
-    assert cut.max() > sizes.max()
 
 
 def test_a_slid_root_is_seen_at_the_same_place_by_a_scaled_camera():

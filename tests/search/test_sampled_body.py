@@ -17,8 +17,8 @@ from drake_pose.search import BeamSearchSettings
 from drake_pose.search.multi_start import without_specks
 from drake_pose.search.pose_modes import estimate_joints
 from drake_pose.search.root_placement import place_body
-from drake_pose.search.sampled_body import SampledBody, _ball_around, _fixed_points
-from drake_pose.search.self_motions import counter_turns, flips
+from drake_pose.search.sampled_body import SampledBody
+from drake_pose.search.self_motions import counter_turns
 from drake_pose.silhouette.scoring import draw_mask
 from tests.body.models import joint, link, urdf, write
 
@@ -26,44 +26,6 @@ from tests.body.models import joint, link, urdf, write
 @pytest.fixture(scope="module")
 def sampled(body) -> SampledBody:
     return SampledBody(body.pose_tree(), BeamSearchSettings(interval=0.5))
-
-
-def test_a_ball_contains_all_balls_and_is_hardly_larger_than_needed() -> None:
-    rng = np.random.default_rng(2)
-    for count in (1, 2, 9):
-        centers, radii = rng.normal(size=(count, 3)), rng.uniform(0.0, 0.5, count)
-        ball = _ball_around(centers, radii)
-        assert (np.linalg.norm(centers - ball[:3], axis=1) + radii).max() == pytest.approx(ball[3])
-        # No centre nearby needs a much smaller radius.
-        others = ball[:3] + 0.1 * rng.normal(size=(400, 3))
-        needed = np.linalg.norm(centers[None] - others[:, None], axis=2) + radii
-        assert needed.max(axis=1).min() > 0.96 * ball[3]
-
-
-def test_fixed_points_lie_on_a_joints_axis_within_its_ball() -> None:
-    """61 of them over the ball's diameter; a ball joint has one, a slide none."""
-    rng = np.random.default_rng(3)
-    axis = np.array([2.0, -1.0, 2.0]) / 3.0
-    centre = rng.normal(size=3)
-    turns = Rotation.from_rotvec(np.outer([0.0, 0.4, -0.9], axis)).as_matrix()
-    offset = Rotation.random(random_state=4).as_matrix()
-    X = np.tile(np.eye(4), (3, 1, 1))
-    X[:, :3, :3] = offset @ turns
-    X[:, :3, 3] = np.array([1.0, 2.0, 3.0]) - (offset @ turns) @ centre
-    ball = np.array([0.3, 0.1, -0.2, 0.7])
-    found = _fixed_points(X, ball)
-    assert found.shape == (61, 3)
-    np.testing.assert_allclose(np.cross(found - centre, axis), 0.0, atol=1e-9)
-    for one in X:
-        placed = found @ one[:3, :3].T + one[:3, 3]
-        np.testing.assert_allclose(placed, found @ X[0, :3, :3].T + X[0, :3, 3], atol=1e-9)
-    along = (found - ball[:3]) @ axis
-    assert sorted((along.min(), along.max())) == pytest.approx([-0.7, 0.7])
-    X[:, :3, :3] = Rotation.random(3, random_state=5).as_matrix()
-    X[:, :3, 3] = np.array([1.0, 2.0, 3.0]) - X[:, :3, :3] @ centre
-    np.testing.assert_allclose(_fixed_points(X, ball), centre[None], atol=1e-9)
-    X[1, :3, 3] += 0.1
-    assert _fixed_points(X, ball).shape == (0, 3)
 
 
 def test_reach_balls_contain_a_node_and_all_below_it_at_all_samples(sampled) -> None:
@@ -205,21 +167,6 @@ def test_counter_turns_are_all_multiples_of_parallel_pairs(tmp_path) -> None:
     # Nothing is left within narrow limits.
     narrow = chain_of(tmp_path, "0 1 0", "0 1 0", limits='lower="-0.2" upper="0.2"')
     assert counter_turns(narrow, np.zeros(2), 0.5) == []
-
-
-def test_flips_leave_later_links_where_they_were(tmp_path) -> None:
-    """With the middle joint perpendicular to both."""
-    kinematics = chain_of(tmp_path, "0 0 1", "0 1 0", "0 0 1", "1 0 0")
-    values = np.array([0.4, 0.9, -0.3, 0.2])
-    found = flips(kinematics, values)
-    assert any(np.allclose(one.values[1], -0.9) for one in found)
-    before = kinematics.poses(values)
-    for one in found:
-        np.testing.assert_allclose(kinematics.poses(one.values)[3], before[3], atol=2e-3)
-        np.testing.assert_array_equal(one.changed, np.abs(one.values - values) > 1e-9)
-        assert not one.mirrored[~one.changed].any()
-    # Axes that are not perpendicular have none.
-    assert flips(chain_of(tmp_path, "0 0 1", "0 1 1", "0 0 1"), np.array([0.4, 0.9, -0.3])) == []
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,7 @@ from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.kernel import assemble_normal_equations, compare_contours
 from drake_pose.fit.surfaces import simplify_surfaces
 from drake_pose.search import MultiStartSearch, ViewsFit
-from drake_pose.search.multi_start import small_match
-from drake_pose.search.settings import MEDIUM_STAGES
+from drake_pose.search.multi_start import MEDIUM_STAGES, small_match
 from drake_pose.silhouette.outline import TreeSurfaces, pack
 
 

@@ -173,22 +173,6 @@ def test_rates_decay_with_memory_and_change_by_their_kinds_acceleration(body):
     np.testing.assert_allclose(belief.mean[len(moving) :], math.exp(-1.0))
 
 
-def test_smaller_accelerations_give_smaller_initial_rate_deviations(body):
-    tree = body.pose_tree("trunk", root_position=np.zeros(3))
-    observation = ContourObservation(tree, [CAMERA], root_moves=True)
-    calm, wild = (
-        ContourTracker(observation, PERIOD, TrackingSettings(angle_acceleration=a)).start_belief(
-            np.zeros(len(observation.layout))
-        )
-        for a in (1.0, 10.0)
-    )
-    count = len(observation.layout.moving)
-    ratio = wild.deviations() / calm.deviations()
-    turns = [name.endswith("turn") for name in observation.layout.moving]
-    np.testing.assert_allclose(ratio[:count], 1.0)
-    np.testing.assert_allclose(ratio[count:], np.where(turns, 10.0, 1.0))
-
-
 @pytest.mark.parametrize(("fraction", "asked"), [(0.04, 1), (0.6, 2)])
 def test_the_search_is_used_if_much_of_the_silhouette_is_unexplained(body, fraction, asked):
     """Another object appears, far from the body's contour."""

@@ -17,9 +17,7 @@ from drake_pose.filtering.contour_tracker import (
     TrackingSettings,
 )
 from drake_pose.filtering.sequence_fit import (
-    SEQUENCE,
     FittedSequence,
-    TrackedStart,
     find_start,
     fit_sequence,
     pose_set,
@@ -181,11 +179,6 @@ def observation(body):
     free = RootRotation.free()
     tree = body.pose_tree("trunk", root_position=np.zeros(3), root_rotation=free)
     return ContourObservation(tree, [front_camera(200, shift=0.2)], True, True, prior_weight=0.03)
-
-
-def test_a_starts_cost_is_its_mean_error_with_the_prior():
-    start = TrackedStart((np.zeros(2),) * 2, None, (0.02, 0.04), (4.0, 8.0))
-    assert start.cost == pytest.approx(0.03 + 6.0 * SEQUENCE.prior_weight)
 
 
 def test_a_tilt_rotates_only_the_root(observation):

@@ -152,12 +152,11 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         return mapping
 
 
-class _TaggedLoader(_UniqueKeyLoader):
-    """Loader that stores the tag of a mapping under ``_tag``, as pydrake.common.yaml does."""
+def _construct_tagged(loader: _UniqueKeyLoader, suffix: str, node: yaml.Node) -> Any:
+    """Return a node with a tag ``!suffix``, the key ``_tag`` of a mapping; others lose it.
 
-
-def _construct_tagged(loader: _TaggedLoader, suffix: str, node: yaml.Node) -> Any:
-    """Return a node with a tag ``!suffix``, the key ``_tag`` of a mapping; others lose it."""
+    pydrake.common.yaml does the same.
+    """
     if isinstance(node, yaml.MappingNode):
         return {"_tag": f"!{suffix}", **loader.construct_mapping(node, deep=True)}
     if isinstance(node, yaml.SequenceNode):
@@ -165,22 +164,17 @@ def _construct_tagged(loader: _TaggedLoader, suffix: str, node: yaml.Node) -> An
     return loader.construct_scalar(node)
 
 
-_TaggedLoader.add_multi_constructor("!", _construct_tagged)
+_UniqueKeyLoader.add_multi_constructor("!", _construct_tagged)
 
 
-def read_yaml(
-    path: Path, error_type: type[DrakePoseError], *, tags: bool = False, largest: int = 1 << 20
-) -> Any:
+def read_yaml(path: Path, error_type: type[DrakePoseError], largest: int = 1 << 20) -> Any:
     """Return the content of a YAML file as plain values.
 
-    The file's size is limited. Aliases stay references, so a small file cannot exhaust the memory
-    unless the caller walks through every copy.
+    Local tags of mappings, as Drake's files have them, are stored under the key ``_tag``. Aliases
+    stay references, so a small file cannot exhaust the memory unless the caller walks through every
+    copy.
 
-    Args:
-        error_type: class of the exceptions.
-        tags: store local tags of mappings, as Drake's files have them, under the key ``_tag``;
-            else such a file is refused.
-        largest: maximum size of the file [byte].
+    ``largest``: maximum size of the file [byte].
 
     Raises error_type: the file is unreadable, too large or invalid. The message names the file.
     """
@@ -192,7 +186,7 @@ def read_yaml(
         raise error_type(f"{path}: larger than the maximum of {largest} bytes")
     try:
         # The loader derives from yaml.SafeLoader.
-        return yaml.load(data, Loader=_TaggedLoader if tags else _UniqueKeyLoader)
+        return yaml.load(data, Loader=_UniqueKeyLoader)
     except (yaml.YAMLError, ValueError, TypeError) as error:
         raise error_type(f"{path}: not a YAML file: {' '.join(str(error).split())}") from error
     except RecursionError:

@@ -50,42 +50,34 @@ def describe_model(
         tree = model.pose_tree()
     except DrakePoseError as error:
         return ModelReport(path, "", (), (), (str(error),))
-    return ModelReport(
-        path=path,
-        name=model.name,
-        nodes=tuple(_describe_node(tree, index) for index in range(len(tree.nodes))),
-        warnings=model_warnings(model, tree),
-        errors=(),
-    )
-
-
-def _describe_node(tree: PoseTree, index: int) -> dict[str, Any]:
-    """Return the dictionary of the node of index ``index`` for ``ModelReport.nodes``."""
-    model, node = tree.model, tree.nodes[index]
-    followers = {coupling.follower for coupling in tree.placements[index].follows}
-    follows = {
-        follower: f"{multiplier:g} {model.position_names[leader]} {offset:+g}"
-        for follower, leader, multiplier, offset in tree.followers
-        if follower in followers
-    }
-    joints = []
-    for position in (*node.positions, *follows):
-        scale = 180.0 / math.pi if model.position_kinds[position] == "angle" else 1.0
-        joint = {
-            "name": model.position_names[position],
-            "kind": model.position_kinds[position],
-            "lower": float(model.lower[position] * scale),
-            "upper": float(model.upper[position] * scale),
-            "follows": follows.get(position, ""),
+    nodes = []
+    for node, placement in zip(tree.nodes, tree.placements, strict=True):
+        followers = {coupling.follower for coupling in placement.follows}
+        follows = {
+            follower: f"{multiplier:g} {model.position_names[leader]} {offset:+g}"
+            for follower, leader, multiplier, offset in tree.followers
+            if follower in followers
         }
-        joints.append(joint)
-    return {
-        "name": node.name,
-        "parent": tree.nodes[node.parent].name if node.parent >= 0 else "world",
-        "joints": joints,
-        "triangles": len(node.mesh.triangles),
-        "watertight": is_watertight(node.mesh),
-    }
+        joints = []
+        for position in (*node.positions, *follows):
+            scale = 180.0 / math.pi if model.position_kinds[position] == "angle" else 1.0
+            joint = {
+                "name": model.position_names[position],
+                "kind": model.position_kinds[position],
+                "lower": float(model.lower[position] * scale),
+                "upper": float(model.upper[position] * scale),
+                "follows": follows.get(position, ""),
+            }
+            joints.append(joint)
+        described = {
+            "name": node.name,
+            "parent": tree.nodes[node.parent].name if node.parent >= 0 else "world",
+            "joints": joints,
+            "triangles": len(node.mesh.triangles),
+            "watertight": is_watertight(node.mesh),
+        }
+        nodes.append(described)
+    return ModelReport(path, model.name, tuple(nodes), model_warnings(model, tree), ())
 
 
 def model_warnings(
@@ -142,12 +134,10 @@ def model_warnings(
     return tuple(summarise_warnings(warnings + _symmetry_warnings(model)))
 
 
-def _size_warnings(
-    model: ArticulatedModel, tree: PoseTree, smallest: float = 0.02, largest: float = 20.0
-) -> list[str]:
+def _size_warnings(model: ArticulatedModel, tree: PoseTree, largest: float = 50.0) -> list[str]:
     """Return warnings about implausible sizes and about joints with a single possible value.
 
-    ``smallest``, ``largest``: plausible extents of the body in its default pose [m].
+    ``largest``: plausible extent of the body in its default pose [m]; the smallest is 1 / largest.
     """
     poses = tree.node_poses(tree.default_values())
     corners = [
@@ -157,7 +147,7 @@ def _size_warnings(
     ]
     size = float(np.ptp(np.concatenate(corners), axis=0).max()) if corners else 1.0
     warnings = []
-    if not smallest <= size <= largest:
+    if not 1.0 / largest <= size <= largest:
         warnings.append(
             f"the body is {size:.3g} m long from end to end; check that its lengths and the scale "
             "of its meshes are in metres"

@@ -128,7 +128,20 @@ def _choose_root(
     own root has a default position; other roots need one. ``root``, ``rotation``: the user's, if
     any.
     """
-    floating = _floating_tops(graph)
+    # The group of the first node behind each floating joint that moves geometry.
+    floating = []
+    for edge in (edge for edge in graph.edges if edge.joint_map is None):
+        if edge.inner != 0:
+            raise ModelError(
+                f"link '{graph.groups[edge.outer].name}' floats relative to "
+                f"'{graph.groups[edge.inner].name}'; only the world may carry a floating joint"
+            )
+        branches = _branches(graph, edge.outer)
+        if any(graph.has_geometry(branch.group) for branch in branches):
+            # A group without geometry is a node only if it has several children.
+            children = [branch.group for branch in branches if branch.parent == 0]
+            only_carries = not graph.has_geometry(edge.outer) and len(children) == 1
+            floating.append(children[0] if only_carries else edge.outer)
     if len(floating) > 1:
         names = [graph.groups[group].name for group in floating]
         raise ModelError(
@@ -147,28 +160,6 @@ def _choose_root(
             raise SettingsError(f"root_rotation needs a root: name one of {', '.join(names)}")
         return tops[0], True
     return asked, tops == [asked]
-
-
-def _floating_tops(graph: LinkGraph) -> list[int]:
-    """Return the index of the first node's group behind each floating joint that moves geometry.
-
-    Raises ModelError: a link floats relative to another one than the world.
-    """
-    tops = []
-    for edge in graph.edges:
-        if edge.joint_map is None:
-            if edge.inner != 0:
-                raise ModelError(
-                    f"link '{graph.groups[edge.outer].name}' floats relative to "
-                    f"'{graph.groups[edge.inner].name}'; only the world may carry a floating joint"
-                )
-            branches = _branches(graph, edge.outer)
-            if any(graph.has_geometry(branch.group) for branch in branches):
-                # A group without geometry is a node only if it has several children.
-                children = [branch.group for branch in branches if branch.parent == 0]
-                only_carries = not graph.has_geometry(edge.outer) and len(children) == 1
-                tops.append(children[0] if only_carries else edge.outer)
-    return tops
 
 
 def _branches(graph: LinkGraph, start: int) -> list[Branch]:

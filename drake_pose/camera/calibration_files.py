@@ -80,7 +80,7 @@ def read_camera_content(
             return tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
             raise CameraError(f"{path}: not a TOML file: {error}") from error
-    return read_yaml(path, CameraError, tags=True)
+    return read_yaml(path, CameraError)
 
 
 def calibrated_cameras(

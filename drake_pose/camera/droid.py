@@ -152,9 +152,7 @@ def _zed_cameras(
     return cameras
 
 
-def recorded_pose(
-    rows: Any, name: str, warnings: list[str], moved: float = 0.005, turned: float = 0.005
-) -> Array | None:
+def recorded_pose(rows: Any, name: str, warnings: list[str], moved: float = 0.005) -> Array | None:
     """Return the pose X_WC (4, 4) of a still camera, W being the robot's base, as DROID records it.
 
     DROID's rows are the position [m], and the angles of rotations about the fixed axes x, y and z
@@ -165,8 +163,8 @@ def recorded_pose(
             with a warning.
         name: the camera's name, for messages.
         warnings: list to which warnings are appended.
-        moved, turned: range of a row's positions [m] and angles [rad] above which a warning says
-            that the camera moved.
+        moved: range of positions [m] or angles [rad] above which a warning says that the camera
+            moved.
     """
     values = np.asarray(rows, dtype=np.float64)
     values = values.reshape(-1, 6) if values.shape[-1:] == (6,) and values.size else values
@@ -179,7 +177,7 @@ def recorded_pose(
     # Angles near half a turn change their sign from row to row.
     values = np.column_stack([values[:, :3], np.unwrap(values[:, 3:], axis=0)])
     spread = np.ptp(values, axis=0)
-    if spread[:3].max() > moved or spread[3:].max() > turned:
+    if spread.max() > moved:
         warnings.append(
             f"camera '{name}': its recorded extrinsics vary by {1e3 * spread[:3].max():.0f} mm and "
             f"{np.degrees(spread[3:].max()):.1f} degrees; their median is used"

@@ -86,12 +86,10 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
             name = camera_name(key)
             names.append(key if name in names else name)
             try:
-                camera = _read_camera(data, number, key, table, file, warnings)
+                camera = _read_camera(data, number, key, table, file, stamps, kept, warnings)
             except SceneError as error:
                 warnings.append(f"camera '{names[-1]}' is left out: {error}")
                 continue
-            if not len(camera.times):
-                camera = _of_rows(camera, stamps, kept)
             fields = {**features[key], **(features[key].get("info") or {})}
             camera = replace(camera, name=names[-1])
             cameras.append(with_fields(camera, fields, str(path / INFO)))
@@ -366,13 +364,21 @@ def _read_joints(
 
 
 def _read_camera(
-    data: _DataSet, number: int, key: str, table: Any, file: Path, warnings: list[str]
+    data: _DataSet,
+    number: int,
+    key: str,
+    table: Any,
+    file: Path,
+    stamps: Array,
+    kept: Indices,
+    warnings: list[str],
 ) -> EpisodeCamera:
-    """Return a camera of an episode: of a video with its times, or of images without times (0,).
+    """Return a camera of an episode: of a video with its times, or of images with the rows' times.
 
     ``number``: of the episode. ``key``: the camera's feature. ``table``: the episode's
-    (pyarrow.Table), of a ``file`` for messages. ``warnings``: appended to. Raises SceneError: the
-    camera's images are missing or damaged.
+    (pyarrow.Table), of a ``file`` for messages. ``stamps``, ``kept``: (k,) times [s] and indices of
+    the rows to use. ``warnings``: appended to. Raises SceneError: the camera's images are missing
+    or damaged.
     """
     feature = data.info["features"][key]
     if feature.get("dtype") == "video":
@@ -383,13 +389,12 @@ def _read_camera(
             raise SceneError(f"{video} is missing")
     column = table[key] if key in table.column_names else None
     stored = StoredPictures(data.path, file, key, column, shape_of(feature), number)
-    height, width = stored.read(0).shape[:2]
-    return EpisodeCamera(key, width, height, np.empty(0), None, None, stored.read)
 
+    def recorded(k: int) -> Picture:
+        return stored.read(int(kept[k]))
 
-def _of_rows(camera: EpisodeCamera, stamps: Array, kept: Indices) -> EpisodeCamera:
-    """Return a camera of stored images that has the rows ``kept`` (k,), at their times (k,) [s]."""
-    return replace(camera, times=stamps, read_recorded=lambda k: camera.read_recorded(int(kept[k])))
+    height, width = recorded(0).shape[:2]
+    return EpisodeCamera(key, width, height, stamps, None, None, recorded)
 
 
 def _video_camera(

@@ -139,17 +139,14 @@ def find_states(features: Features) -> list[str]:
     if joints:
         hand = [key for key in numeric if re.search(r"gripper|finger", key.lower())]
         joints = [key for key in numeric if key in {*joints, *hand} and key not in plain]
-    if plain and not (joints and _is_cartesian(plain[0], features[plain[0]])):
-        return plain
-    return joints if plain else grouped or joints
-
-
-def _is_cartesian(key: str, feature: Mapping[str, Any]) -> bool:
-    """Return whether a feature's names are coordinates of a pose, or it has no names of its own."""
-    words = "|".join(("[xyzw]", "[rq][xyzw]", "roll", "pitch", "yaw", "gripper", "pad", "state"))
-    names = feature_names(key, {**feature, "shape": shape_of(feature) or [1]})
-    found = [re.fullmatch(rf"(?:.*[_. ])?(?:{words})(?:_?\d+)?", one.lower()) for one in names]
-    return all(found) or names[0] == "joint_0"
+    if plain and joints:
+        # The state is Cartesian if its names are coordinates of a pose, or none of its own.
+        feature = features[plain[0]]
+        names = feature_names(plain[0], {**feature, "shape": shape_of(feature) or [1]})
+        words = r"(?:.*[_. ])?(?:[xyzw]|[rq][xyzw]|roll|pitch|yaw|gripper|pad|state)(?:_?\d+)?"
+        if names[0] == "joint_0" or all(re.fullmatch(words, one.lower()) for one in names):
+            return joints
+    return plain or grouped or joints
 
 
 def describe(features: Features) -> str:

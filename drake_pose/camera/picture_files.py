@@ -304,22 +304,16 @@ class VideoPictures:
         self.time = 0.0
         if not self._capture.isOpened():
             raise SceneError(f"{path}: not a video that OpenCV can read")
-        self._missing = self._missing_pictures()
         codec = int(self._capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little")
         self._timed = TimedVideo(path) if codec.upper() == b"AV01" else None
-
-    def _missing_pictures(self) -> int:
-        """Return how many images OpenCV counts before the first one of a file that starts late.
-
-        OpenCV counts the images of Matroska and WebM from their duration.
-        """
-        if self._path.suffix.lower() not in (".mkv", ".webm") or not hasattr(cv2, "CAP_PROP_PTS"):
-            return 0
-        self._capture.grab()
-        missing = int(self._capture.get(cv2.CAP_PROP_PTS))
-        self._capture.release()
-        self._capture = cv2.VideoCapture(str(self._path))
-        return max(0, missing)
+        # OpenCV counts the images of Matroska and WebM from their duration: those before the first
+        # one of a file that starts late are missing.
+        self._missing = 0
+        if path.suffix.lower() in (".mkv", ".webm") and hasattr(cv2, "CAP_PROP_PTS"):
+            self._capture.grab()
+            self._missing = max(0, int(self._capture.get(cv2.CAP_PROP_PTS)))
+            self._capture.release()
+            self._capture = cv2.VideoCapture(str(path))
 
     @property
     def count(self) -> int:

@@ -67,7 +67,18 @@ def recorded_poses(
     if _is_transform(content):
         return _transforms([content], path)
     if (alone := _pose_of(content, f"{path}")) is not None:
-        return _named(content, alone, path)
+        # The words of easy_handeye.
+        more = content.get("parameters")
+        words = content | (more if isinstance(more, dict) else {})
+        on_hand = words.get("eye_on_hand") is True or words.get("calibration_type") == "eye_in_hand"
+        link = str(words.get("robot_effector_frame", "")) if on_hand else ""
+        if on_hand and not link:
+            raise CameraError(
+                f"{path}: is of a camera on the hand, but has no robot_effector_frame: add the "
+                "name of the link that carries it"
+            )
+        name = str(words.get("tracking_base_frame") or words.get("camera_name") or path.stem)
+        return {name: _optical(name, alone._replace(link=link))}
     found = _poses_by_name(content, path)
     if found:
         return found
@@ -118,7 +129,7 @@ def read_launch(text: str) -> list[dict[str, Any]] | None:
     """
     if "static_transform_publisher" not in text:
         return None
-    words = list[list[str]]()
+    words, found, quaternion = list[list[str]](), list[dict[str, Any]](), ("qx", "qy", "qz", "qw")
     if text.lstrip().startswith("<"):
         try:
             root = ElementTree.fromstring(text)
@@ -130,9 +141,27 @@ def read_launch(text: str) -> list[dict[str, Any]] | None:
     else:
         for block in text.split("static_transform_publisher")[1:]:
             own = re.search(r"arguments\s*=\s*\[(.*?)\]", block, re.DOTALL)
-            found = re.findall(r"[\"']([^\"']*)[\"']|([-+.\deE]+)", own[1]) if own else []
-            words.append([quoted or number for quoted, number in found])
-    return [one for one in map(_published, words) if one is not None]
+            pairs = re.findall(r"[\"']([^\"']*)[\"']|([-+.\deE]+)", own[1]) if own else []
+            words.append([quoted or number for quoted, number in pairs])
+    for given in words:
+        named = {k.lstrip("-"): v for k, v in zip(given[::2], given[1::2], strict=False)}
+        try:
+            if "frame-id" in named:
+                ends = named["frame-id"], named["child-frame-id"]
+            else:
+                is_number = re.fullmatch(r"[-+]?[\d.]+(e[-+]?\d+)?", given[6], re.IGNORECASE)
+                keys = [*"xyz", *(quaternion if is_number else ("yaw", "pitch", "roll"))]
+                named = dict(zip(keys, given, strict=False))
+                ends = given[len(keys)], given[len(keys) + 1]
+            turn = {key: float(named[key]) for key in quaternion if key in named}
+            rpy = [float(named.get(key, 0.0)) for key in ("roll", "pitch", "yaw")]
+            place = {key: float(named.get(key, 0.0)) for key in "xyz"}
+        except (ValueError, LookupError):
+            continue
+        moved = {"translation": place, **({"rotation": turn} if turn else {"rpy": rpy})}
+        frames = {"header": {"frame_id": ends[0]}, "child_frame_id": ends[1]}
+        found.append({**frames, "transform": moved})
+    return found
 
 
 def read_lines(text: str, episode_ids: Collection[str]) -> list[dict[str, Any]]:
@@ -143,36 +172,6 @@ def read_lines(text: str, episode_ids: Collection[str]) -> list[dict[str, Any]]:
     lines = [line for line in text.splitlines() if line.strip()]
     own = [line for line in lines if any(f'"{one}"' in line for one in episode_ids)]
     return [json.loads(line) for line in own or lines]
-
-
-def _published(words: Sequence[str]) -> dict[str, Any] | None:
-    """Return the transform of the arguments of a static_transform_publisher; None: not one."""
-    named = {k.lstrip("-"): v for k, v in zip(words[::2], words[1::2], strict=False)}
-    try:
-        if "frame-id" in named:
-            turn = {key: float(named[key]) for key in ("qx", "qy", "qz", "qw") if key in named}
-            x, y, z = (float(named.get(key, 0.0)) for key in "xyz")
-            ends = named["frame-id"], named["child-frame-id"]
-            rpy = [float(named.get(key, 0.0)) for key in ("roll", "pitch", "yaw")]
-        else:
-            count = 7 if _is_number(words[6]) else 6
-            x, y, z, *rest = map(float, words[:count])
-            turn = dict(zip(("qx", "qy", "qz", "qw"), rest, strict=True)) if count == 7 else {}
-            rpy, ends = rest[::-1], (words[count], words[count + 1])
-    except (ValueError, LookupError):
-        return None
-    rotation = {"rpy": rpy} if not turn else {"rotation": turn}
-    moved = {"translation": {"x": x, "y": y, "z": z}, **rotation}
-    return {"header": {"frame_id": ends[0]}, "child_frame_id": ends[1], "transform": moved}
-
-
-def _is_number(word: str) -> bool:
-    """Return whether a word is a number."""
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _is_transform(entry: Any) -> bool:
@@ -210,25 +209,6 @@ def _transforms(entries: Sequence[Any], path: Path) -> dict[str, RecordedPose]:
             name, RecordedPose(X, parent if re.search(hand, parent, re.IGNORECASE) else "", assumed)
         )
     return found
-
-
-def _named(content: Mapping[Any, Any], one: RecordedPose, path: Path) -> dict[str, RecordedPose]:
-    """Return the pose of a file with a single one, with the camera's frame and link if it says so.
-
-    These are the words of easy_handeye: ``eye_on_hand`` or ``calibration_type``,
-    ``tracking_base_frame`` (the camera's) and ``robot_effector_frame``.
-    """
-    words, more = dict(content), content.get("parameters")
-    words |= more if isinstance(more, dict) else {}
-    on_hand = words.get("eye_on_hand") is True or words.get("calibration_type") == "eye_in_hand"
-    link = str(words.get("robot_effector_frame", "")) if on_hand else ""
-    if on_hand and not link:
-        raise CameraError(
-            f"{path}: is of a camera on the hand, but has no robot_effector_frame: add the name "
-            "of the link that carries it"
-        )
-    name = str(words.get("tracking_base_frame") or words.get("camera_name") or path.stem)
-    return {name: _optical(name, one._replace(link=link))}
 
 
 def _optical(frame: str, one: RecordedPose) -> RecordedPose:
@@ -286,7 +266,7 @@ def _numbers(value: Any, keys: Sequence[str] = ()) -> Array | None:
 
 def finite_numbers(value: Any) -> Array | None:
     """Return the finite numbers (n,), by rows, of an array or of small nested lists; or None."""
-    if not isinstance(value, list | tuple | np.ndarray) or not _is_small(value):
+    if not isinstance(value, list | tuple | np.ndarray) or not _is_small(value, 3):
         return None
     try:
         found = np.asarray(value, dtype=np.float64).ravel()
@@ -295,15 +275,15 @@ def finite_numbers(value: Any) -> Array | None:
     return found if np.isfinite(found).all() else None
 
 
-def _is_small(value: Any, depth: int = 3, count: int = 100) -> bool:
+def _is_small(value: Any, depth: int) -> bool:
     """Return whether nested lists have few levels and entries; aliases of YAML may hold billions.
 
-    ``value``: the lists; anything else is small. ``depth``: maximum number of levels. ``count``:
-    maximum length of a list: several times a pose's 16 numbers.
+    ``value``: the lists; anything else is small. ``depth``: maximum number of levels. A list may
+    have several times as many entries as a pose.
     """
     if not isinstance(value, list | tuple):
         return True
-    return depth > 0 and len(value) <= count and all(_is_small(k, depth - 1, count) for k in value)
+    return depth > 0 and len(value) <= 100 and all(_is_small(one, depth - 1) for one in value)
 
 
 def _pose_of(value: Any, where: str) -> RecordedPose | None:
@@ -321,10 +301,7 @@ def _pose_of(value: Any, where: str) -> RecordedPose | None:
         inner = None if is_inverse is None else _pose_of(one, where)
         if inner is None:
             continue
-        X = inverse_pose(inner.X) if is_inverse else inner.X.copy()
-        if key.endswith("gl"):
-            X[:3, 1:3] *= -1.0
-        return RecordedPose(X, "", inner.assumed)
+        return inner._replace(X=inverse_pose(inner.X)) if is_inverse else inner
     return None
 
 
@@ -336,7 +313,7 @@ def _is_inverse(key: str) -> bool | None:
     """
     base, camera, end = "(world|base|robot)", "cam(era)?", "(transform|matrix|pose)?$"
     inverse = f"cw|w2c|{base}(to|2){camera}|{camera}t?{base}|viewmatrix|extrinsiccv"
-    pose = f"wc|c2w|{camera}(to|2){base}(gl)?|{base}t?{camera}|({camera})?(pose|extrinsics?)"
+    pose = f"wc|c2w|{camera}(to|2){base}|{base}t?{camera}|({camera})?(pose|extrinsics?)"
     if re.match(f"^[txh]?({inverse}){end}", key):
         return True
     plain = "transform|transformation|matrix|calibration"

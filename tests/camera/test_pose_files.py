@@ -116,7 +116,6 @@ def load(path, content, intrinsics, recording=None):
         ("matrix.yaml", {"left": {"T_cam_base": inverse_pose(X).tolist()}}),
         ("matrix.yaml", {"left": {"world_to_camera": inverse_pose(X).tolist()}}),
         ("matrix.yaml", {"T_base_camera": X.round(3).tolist()}),
-        ("gl.yaml", {"left": {"cam2world_gl": (X * [1, -1, -1, 1]).tolist()}}),
         (
             "parts.yaml",
             {"left": {"position": SIX[:3], "quat_wxyz": [QUATERNION[3], *QUATERNION[:3]]}},

@@ -263,17 +263,6 @@ def test_error_of_too_many_samples_names_the_node():
         product_grid([range(1000)] * 3, "head")
 
 
-def test_even_rotations_cover_so3_without_gaps():
-    interval = np.radians(30.0)
-    grid = Rotation.from_rotvec(even_rotations(interval))
-    np.testing.assert_allclose(grid[0].magnitude(), 0.0, atol=1e-12)
-    probes = Rotation.random(300, random_state=1)
-    nearest = [(grid * probe.inv()).magnitude().min() for probe in probes]
-    assert max(nearest) < 0.95 * interval
-    distances = [np.sort((grid * one.inv()).magnitude())[1] for one in grid[::25]]
-    assert min(distances) > 0.3 * interval
-
-
 def test_limited_rotation_applies_axes_in_order():
     rotation = RootRotation.limited([("y", -180, 180), ("z", -10, 10)])
     values = np.array([[0.5, 0.1]])

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import yaml
 
-from drake_pose.camera.camera_files import load_camera_file, load_cameras
+from drake_pose.camera.camera_files import load_camera_file
 from drake_pose.errors import CameraError
 
 SIZE = (640, 480)
@@ -121,15 +121,6 @@ def test_fisheye_undistortion_matches_opencv(tmp_path):
         assert np.percentile(difference, 99) <= 1
 
 
-def test_the_first_camera_of_a_chain_is_the_world(tmp_path):
-    found = load(tmp_path, kalibr())
-    assert found.unplaced == ()
-    np.testing.assert_array_equal(found.cameras["cam0"].X_WC, np.eye(4))
-    X_01 = found.cameras["cam1"].X_WC
-    np.testing.assert_allclose(X_01[:3, :3], R.T, atol=1e-12)
-    np.testing.assert_allclose(X_01[:3, 3], -R.T @ T, atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("text", "messages"),
     [
@@ -161,15 +152,6 @@ def test_unusable_files_are_named_with_the_supported_formats(tmp_path, text, mes
         load(tmp_path, text)
     for word in ["any.txt", *messages]:
         assert word in str(caught.value)
-
-
-def test_distortion_is_refused_unless_allowed(tmp_path):
-    path = tmp_path / "calibration.toml"
-    path.write_text(toml())
-    with pytest.raises(CameraError, match=r"'left' has distortion.*cv2.undistort"):
-        load_cameras(path)
-    path.write_text(toml(distortions=np.zeros(5)))
-    assert list(load_cameras(path)) == ["left"]
 
 
 def test_lens_straightens_pictures_as_opencv_does(tmp_path):

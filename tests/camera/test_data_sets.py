@@ -97,31 +97,6 @@ def test_episodes_have_their_own_images_and_rows(tmp_path, write):
         open_episode(tmp_path)
 
 
-def test_incomplete_and_damaged_data_sets(tmp_path):
-    write_v21(tmp_path, names=None)
-    for n in (0, 1):
-        (tmp_path / f"data/chunk-000//episode_{n:06d}.parquet").unlink()
-    with pytest.raises(UnknownNameError, match="has no episode '1'; it has: 2"):
-        open_episode(tmp_path, episode=1)
-    assert open_episode(tmp_path).joints.names == ("joint_0", "joint_1", "joint_2")
-    video = write_video(tmp_path / f"videos/chunk-001/{TOP}/episode_000002.mp4", range(7))
-    assert "camera 'top': has 7 pictures for 9 rows" in open_episode(tmp_path).warnings[0]
-    video.unlink()
-    assert "camera 'top' is left out" in open_episode(tmp_path).warnings[0]
-    table, info = tmp_path / "data/chunk-001//episode_000002.parquet", tmp_path / "meta/info.json"
-    table.write_bytes(table.read_bytes()[:-40])
-    with pytest.raises(SceneError, match="a file of it is damaged"):
-        open_episode(tmp_path)
-    table.unlink()
-    with pytest.raises(SceneError, match="of 3 these are present: none"):
-        open_episode(tmp_path)
-    info.write_text(info.read_text().replace("v2.1", "v1.6"))
-    with pytest.raises(
-        SceneError, match=r"version v1\.6, but only 2\.0, 2\.1 and 3\.0 are supported"
-    ):
-        open_episode(tmp_path)
-
-
 def test_a_real_data_set_is_read(shared_data):
     folder = shared_data / "humanoid_head_camera"
     for n, count in ((10, 290), (20, 297)):

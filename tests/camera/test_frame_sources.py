@@ -17,7 +17,7 @@ from drake_pose.camera.sources import (
     load_sources,
     open_source,
 )
-from drake_pose.errors import SceneError, SettingsError
+from drake_pose.errors import SceneError
 
 WIDTH, HEIGHT = 32, 24
 
@@ -320,16 +320,3 @@ class TestSourcesFile:
         for name, reason in (("camera_0", "empty-room"), ("camera_1", "7 x 5")):
             with pytest.raises(SceneError, match=reason):
                 load_background_pictures(found[name])
-
-
-@pytest.mark.parametrize(
-    ("more", "reason"),
-    [
-        ({"kind": "film"}, "kind"),
-        ({"rate_hz": 0.0}, "rate_hz"),
-        ({"width": 0}, "invalid picture size"),
-    ],
-)
-def test_invalid_specifications_are_refused(more, reason):
-    with pytest.raises(SettingsError, match=reason):
-        specify("x", **more)

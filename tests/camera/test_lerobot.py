@@ -202,6 +202,7 @@ def test_other_stamps(tmp_path):
         ([[t] for t in TIMES], ""),
         ([t + 3.7 for t in TIMES], "the rows' times begin at 3.7 s"),
         (np.float32(1.7e9 + TIMES), "'timestamp' stands still"),
+        (np.full(COUNT, np.nan), "'timestamp' stands still or is no number"),
         (None, "'timestamp' is missing: the times are frame_index divided by 10 Hz"),
     ):
         write_set(tmp_path, columns={"timestamp": stamps})
@@ -230,6 +231,9 @@ def entries(*names):
         ({"observation.state": ["a", "b"], "observation.joint_position": ["c", "d"]}, ("a", "b")),
         ({"observation.state": ["x", "y"], "observation.joint_position": ["c", "d"]}, ("c", "d")),
         ({"state": ["state"], "observation.states.joint_state": ["c", "d"]}, ("c", "d")),
+        ({"state": ["x", "y"]}, ("x", "y")),
+        ({"state": ["a", "b"], "observation.state": ["c", "d"]}, ("c", "d")),
+        ({"observation.state.a": ["a", "b"], "qpos": ["c", "d"]}, ("a", "b")),
         (
             {"observation.state.joint_position": ["c", "d"], "observation.state.velocity": None},
             ("c", "d"),

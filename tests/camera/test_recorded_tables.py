@@ -6,8 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drake_pose.camera.droid import recorded_pose
-from drake_pose.camera.lerobot_tables import find_states, is_picture, row_times
-from drake_pose.errors import SceneError
+from drake_pose.camera.lerobot_tables import is_picture, row_times
 
 TIMES = 3.0 + 0.1 * np.arange(9)
 
@@ -19,85 +18,12 @@ def times_of(column, rate: float | None = 10.0, **others) -> tuple[np.ndarray, l
     return row_times(table, rate, "file.parquet", warnings), warnings
 
 
-@pytest.mark.parametrize(
-    ("unit", "name"), [(1.0, ""), (1e3, "ms"), (1e6, "microseconds"), (1e9, "ns")]
-)
-def test_the_rate_tells_the_unit_of_times(unit, name) -> None:
-    for stretch in (1.0, 1.1, 0.9):
-        found, warnings = times_of(stretch * unit * TIMES)
-        np.testing.assert_allclose(found, stretch * TIMES)
-        assert len(warnings) == bool(name)
-        assert all(f"taken to be in {name}: it grows by" in text for text in warnings)
-    # Without a rate they are seconds.
-    found, warnings = times_of(unit * TIMES, None)
-    np.testing.assert_allclose(found, unit * TIMES)
-    assert warnings == []
-
-
-def test_rows_that_are_counted_are_divided_by_the_rate() -> None:
-    found, (text,) = times_of(np.arange(5.0, 14.0))
-    np.testing.assert_allclose(found, np.arange(5.0, 14.0) / 10.0)
-    assert "'timestamp' counts rows and is divided by 10 Hz" in text
-    # At 1 Hz a row is a second.
-    found, warnings = times_of(np.arange(5.0, 14.0), 1.0)
-    np.testing.assert_array_equal(found, np.arange(5.0, 14.0))
-    assert warnings == []
-
-
 @pytest.mark.parametrize("stretch", [0.5, 0.75, 1.3, 2.0])
 def test_times_at_another_rate_are_used_and_told(stretch) -> None:
     found, (text,) = times_of(stretch * TIMES)
     np.testing.assert_allclose(found, stretch * TIMES)
     assert f"the rows' times are {0.1 * stretch:.4g} s apart, but at 10 Hz" in text
     assert "would be 0.1 s" in text
-
-
-@pytest.mark.parametrize("column", [None, np.full(9, 7.0), np.full(9, np.nan)])
-def test_missing_times_follow_from_the_rate(column) -> None:
-    found, (text,) = times_of(column)
-    np.testing.assert_allclose(found, np.arange(9) / 10.0)
-    assert ("is missing" if column is None else "stands still or is no number") in text
-    assert "the row numbers divided by 10 Hz" in text
-    found, (text,) = times_of(column, frame_index=np.arange(4, 13))
-    np.testing.assert_allclose(found, np.arange(4, 13) / 10.0)
-    assert "frame_index divided by 10 Hz" in text
-    with pytest.raises(SceneError, match=r"has no fps; it has: .*other"):
-        times_of(column, None)
-
-
-def feature(*names: str, dtype: str = "float32", shape: tuple[int, ...] | None = None) -> dict:
-    return {"dtype": dtype, "shape": list(shape or (len(names),)), "names": list(names) or None}
-
-
-JOINTS = feature("pan", "lift", "elbow")
-POSE = feature("x", "y", "z", "roll", "pitch", "yaw", "gripper")
-
-
-@pytest.mark.parametrize(
-    ("features", "found"),
-    [
-        ({"observation.state": JOINTS, "action": JOINTS}, ["observation.state"]),
-        ({"state": JOINTS, "observation.image": feature(shape=(3, 4, 3))}, ["state"]),
-        ({"state": JOINTS, "observation.state": JOINTS}, ["observation.state"]),
-        ({"observation.state.a": JOINTS, "observation.state.b": JOINTS},
-         ["observation.state.a", "observation.state.b"]),
-        ({"state/a": JOINTS, "state/b": JOINTS}, ["state/a", "state/b"]),
-        ({"observation.joint_positions": JOINTS}, ["observation.joint_positions"]),
-        ({"observation.state": POSE, "observation.joint_positions": JOINTS,
-          "observation.gripper": feature("g")},
-         ["observation.joint_positions", "observation.gripper"]),
-        ({"observation.state": JOINTS, "observation.joint_positions": JOINTS},
-         ["observation.state"]),
-        ({"observation.state": POSE}, ["observation.state"]),
-        ({"observation.joint_velocities": JOINTS, "target_joints": JOINTS}, []),
-        ({"observation.state.a": JOINTS, "qpos": JOINTS}, ["observation.state.a"]),
-        ({"qpos": feature("a", dtype="string")}, []),
-        ({"qpos": feature("a", dtype="int64")}, ["qpos"]),
-        ({}, []),
-    ],
-)  # fmt: skip
-def test_measured_joint_positions_are_found(features, found) -> None:
-    assert find_states(features) == found
 
 
 @pytest.mark.parametrize(

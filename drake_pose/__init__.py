@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from drake_pose.body.model_files import bundled_model
     from drake_pose.body.root import RootRotation
     from drake_pose.camera.camera_files import load_cameras, save_cameras
-    from drake_pose.camera.drake import camera_to_drake
+    from drake_pose.camera.exchange import camera_to_drake
     from drake_pose.camera.models import PinholeCamera, look_at
     from drake_pose.errors import DrakePoseError
     from drake_pose.files.overlay import paint_agreement
@@ -81,7 +81,7 @@ _HOMES = {
     "Walker": "systems.walk",
     "audit_scene": "jobs.registration.audit",
     "bundled_model": "body.model_files",
-    "camera_to_drake": "camera.drake",
+    "camera_to_drake": "camera.exchange",
     "cameras_from_drake": "systems.cameras",
     "constant_velocity": "filtering.motion",
     "estimate_scene": "jobs.estimate.scene",

@@ -30,7 +30,7 @@ NOT_IMPORTED = {("camera", "body"), ("filtering", "registration"), ("person", "r
 WITH_SYSTEMS = {"systems", "files", "jobs", "papers", "commands"}
 # These files may import three plain value types of pydrake.systems.sensors: ImageLabel16I,
 # CameraInfo and CameraConfig.
-VALUE_TYPES = {"camera/drake.py", "silhouette/pictures/label_renderer.py"}
+VALUE_TYPES = {"camera/exchange.py", "silhouette/pictures/label_renderer.py"}
 
 # Modules that all subpackages may import.
 COMMON_MODULES = {

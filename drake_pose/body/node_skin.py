@@ -143,7 +143,6 @@ class ModelSkin:
 
     def __init__(self, model: ParsedModel) -> None:
         self.bands: tuple[SkinBand, ...] = model.skin
-        self._model = model
         self._kinematics = PlantKinematics(model)
         graph = build_link_graph(model, None)
         self._parts: list[tuple[int, tuple[int, ...], NodeSkin]] = []

@@ -162,7 +162,7 @@ def load_camera_file(
     configs = None if calibrated else _find_configs(content, path)
     if configs is not None:
         # Import Drake only if needed, because it loads slowly.
-        from drake_pose.camera.drake import read_configs
+        from drake_pose.camera.exchange import read_configs
 
         read = read_configs(configs, path)
         return CameraFile({_check_name(name, path): read[name] for name in read}, ())

@@ -22,7 +22,7 @@ from pydrake.trajectories import Trajectory
 
 from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body import ParsedModel, captured_warnings, labelled_meshes
-from drake_pose.camera.drake import camera_from_drake, camera_to_drake
+from drake_pose.camera.exchange import camera_from_drake, camera_to_drake
 from drake_pose.camera.models import Camera, PinholeCamera, camera_tuple
 from drake_pose.errors import CameraError, ModelError, UnknownNameError
 from drake_pose.silhouette.outline import outline_from_mesh, pack

@@ -13,7 +13,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import RgbdSensor
 
 from drake_pose.body import ParsedModel, bundled_model, load_model
-from drake_pose.camera.drake import camera_to_drake
+from drake_pose.camera.exchange import camera_to_drake
 from drake_pose.camera.models import PinholeCamera, look_at
 from drake_pose.silhouette.pictures.label_renderer import EMPTY, label_data
 from drake_pose.systems.cameras import SilhouetteCamera

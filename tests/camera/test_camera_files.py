@@ -14,8 +14,14 @@ from pydrake.math import RigidTransform
 from pydrake.systems.sensors import CameraConfig
 
 from drake_pose.camera.camera_files import load_cameras, save_cameras
-from drake_pose.camera.drake import camera_from_drake, camera_to_config, dump_scenario
-from drake_pose.camera.exports import mujoco_cameras, ros_camera_info, ros_transforms
+from drake_pose.camera.exchange import (
+    camera_from_drake,
+    camera_to_config,
+    dump_scenario,
+    mujoco_cameras,
+    ros_camera_info,
+    ros_transforms,
+)
 from drake_pose.camera.models import ParallelCamera, PinholeCamera, circle_of_cameras
 from drake_pose.errors import CameraError
 

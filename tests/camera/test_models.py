@@ -9,7 +9,7 @@ from pydrake.geometry import ClippingRange, RenderCameraCore
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.sensors import CameraInfo
 
-from drake_pose.camera.drake import camera_from_drake, camera_to_drake
+from drake_pose.camera.exchange import camera_from_drake, camera_to_drake
 from drake_pose.camera.models import (
     FACE_CAMERA,
     ParallelCamera,

@@ -8,7 +8,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from drake_pose.camera.camera_files import intrinsics_of, load_camera_file, load_cameras
-from drake_pose.camera.exports import ros_camera_info, ros_transforms
+from drake_pose.camera.exchange import ros_camera_info, ros_transforms
 from drake_pose.camera.models import PinholeCamera, inverse_pose
 from drake_pose.errors import CameraError
 

@@ -5,7 +5,7 @@ import pyarrow as pa
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.camera.droid import recorded_pose
+from drake_pose.camera.episode_files import recorded_pose
 from drake_pose.camera.lerobot_tables import is_picture, row_times
 
 TIMES = 3.0 + 0.1 * np.arange(9)

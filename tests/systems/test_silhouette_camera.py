@@ -21,7 +21,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import RgbdSensor
 
 from drake_pose.body import ModelSkin, bundled_model, load_model
-from drake_pose.camera.drake import camera_to_drake
+from drake_pose.camera.exchange import camera_to_drake
 from drake_pose.camera.models import ParallelCamera, PinholeCamera, look_at
 from drake_pose.errors import ModelError
 from drake_pose.silhouette.pictures.label_renderer import (

@@ -13,7 +13,7 @@ from pydrake.geometry import LightParameter, MakeRenderEngineVtk, RenderEngineVt
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_pose.body import ArticulatedModel, bundled_model, load_model
-from drake_pose.camera.drake import camera_to_drake
+from drake_pose.camera.exchange import camera_to_drake
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.files.overlay import paint_agreement
 from drake_pose.jobs.demo import run_demo

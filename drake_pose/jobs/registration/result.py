@@ -13,8 +13,12 @@ from drake_pose.arrays import Array, Picture
 from drake_pose.body import TARGET_POSITIONS, PoseTree
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import dump_cameras
-from drake_pose.camera.drake import dump_scenario
-from drake_pose.camera.exports import mujoco_cameras, ros_camera_info, ros_transforms
+from drake_pose.camera.exchange import (
+    dump_scenario,
+    mujoco_cameras,
+    ros_camera_info,
+    ros_transforms,
+)
 from drake_pose.camera.models import Camera
 from drake_pose.errors import listed
 from drake_pose.files.folder import OVERLAY, REPORT, without_nan, write_file, write_summary

@@ -32,7 +32,7 @@ from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.sensors import ImageLabel16I
 
 from drake_pose.body import ModelSkin, TriangleMesh, link_names
-from drake_pose.camera.drake import camera_to_drake
+from drake_pose.camera.exchange import camera_to_drake
 from drake_pose.camera.models import Camera, ParallelCamera
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from rich.text import Text
 from drake_pose.commands.batch import batch
 from drake_pose.commands.common import UsageError, say
 from drake_pose.commands.estimate import capture, demo, empty_room, estimate
-from drake_pose.commands.papers import date, kameda, reproduce_all, shimada
+from drake_pose.commands.papers import date, kameda, shimada
 from drake_pose.commands.prepare import check, masks
 from drake_pose.commands.register import audit, register
 from drake_pose.errors import DrakePoseError, SettingsError, options_in_messages
@@ -50,8 +50,7 @@ def _program(name: str, help: str, *commands: Callable[..., None]) -> App:
     Args:
         name: the program's name.
         help: its help text, before the list of commands.
-        commands: functions; a command has its function's name, without ``reproduce_`` and with
-            hyphens for underscores.
+        commands: functions; a command has its function's name, with hyphens for underscores.
     """
 
     def show_default(value: object) -> str | None:
@@ -75,7 +74,7 @@ def _program(name: str, help: str, *commands: Callable[..., None]) -> App:
     )
     for command in commands:
         about, _, _ = (command.__doc__ or "").partition("    Args:\n")
-        name = command.__name__.removeprefix("reproduce_").replace("_", "-")
+        name = command.__name__.replace("_", "-")
         program.command(command, name=name, help=_unfold(about))
     return program
 
@@ -96,7 +95,7 @@ app.command(
     _program(
         "reproduce",
         "Run a paper's experiment and show its published results beside ours.",
-        *(kameda, shimada, date, reproduce_all),
+        *(kameda, shimada, date),
     )
 )
 

@@ -1,4 +1,4 @@
-"""The commands `drake-pose reproduce kameda`, `shimada`, `date` and `all`."""
+"""The commands `drake-pose reproduce kameda`, `shimada` and `date`."""
 
 from __future__ import annotations
 
@@ -8,20 +8,15 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from cyclopts import Parameter
-
 from drake_pose.commands.common import (
     SPREAD,
     Json,
-    Out,
     Pictures,
-    Resume,
     Seed,
     UsageError,
     count_progress,
     output_console,
     print_json,
-    say,
     warn,
     within,
 )
@@ -30,7 +25,6 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from drake_pose.papers.tables import Count
-    from drake_pose.search import PoseSearch
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,19 +33,11 @@ class KamedaOptions:
 
     seed: Annotated[int | None, within(0)] = None
     """Seed of the random poses. Default: 0."""
-    seeds: Annotated[int | None, within(1)] = None
-    """Number of seeds; with several the spread of the results is shown. Default: 1."""
     method: Literal["paper", "beam"] | None = None
     """paper: the published search alone; beam: compare it with beam search. Default: paper."""
     angles: Literal["grid", "continuous"] | None = None
     """grid: true angles and samples are multiples of 20 degrees, as in the paper; continuous: true
     angles are arbitrary, and poses are refined between the samples. Default: grid."""
-    outside_limit: Annotated[float | None, within(0.0), Parameter(metavar="R")] = None
-    """The paper's r: area of a segment that may lie outside the mask [pixel]. Default: 200."""
-    candidates: Annotated[int | None, within(1), Parameter(metavar="K")] = None
-    """The paper's K: number of candidates kept for each segment. Default: 5."""
-    interval: Annotated[float | None, within(1.0, 90.0)] = None
-    """Sampling interval [deg]. Default: 20."""
     views: Annotated[int | None, within(1)] = None
     """With --angles continuous: number of cameras. Default: 1."""
     out: Pictures = None
@@ -89,7 +75,7 @@ def kameda(
     """
     one = options or KamedaOptions()
     is_continuous = one.angles == "continuous"
-    first, seeds = one.seed or 0, one.seeds or 1
+    first = one.seed or 0
     if experiment != "A":
         one.refuse("--experiment A", "out")
     elif is_continuous:
@@ -99,7 +85,7 @@ def kameda(
     warnings: list[str] = []
     with _experiment(one.out) as count:
         from drake_pose.papers import kameda as poses
-        from drake_pose.papers.kameda_pictures import save_pictures
+        from drake_pose.papers.pictures import save_poses
         from drake_pose.search import MultiStartSearch
 
         if experiment != "A":
@@ -112,24 +98,18 @@ def kameda(
             result = poses.run_experiment(search, images, first, count, one.views or 1)
             figures, table = poses.continuous_figures(result), poses.continuous_table(result)
         else:
-            limit = 200.0 if one.outside_limit is None else one.outside_limit
-            interval = one.interval or 20.0
             # For the comparison the published search runs on as many images as in the paper.
             is_beam = one.method == "beam"
             few = min(images, int(poses.PAPER["images"])) if is_beam else images
-            paper = poses.experiment_search(limit, one.candidates or 5, interval)
-            searches: list[tuple[PoseSearch, int]] = [(paper, few)]
+            runs = [poses.run_experiment(poses.experiment_search(), few, first, count)]
             if is_beam:
-                searches.append((poses.beam_experiment_search(interval), images))
-            runs = [
-                [poses.run_experiment(search, number, first + k, count) for k in range(seeds)]
-                for search, number in searches
-            ]
-            figures, table = poses.grid_figures(*runs[-1]), poses.grid_table(runs)
+                beam = poses.beam_experiment_search()
+                runs.append(poses.run_experiment(beam, images, first, count))
+            figures, table = poses.grid_figures(runs[-1]), poses.grid_table(runs)
             if is_beam:
-                figures["paper_method"] = poses.grid_figures(*runs[0])
+                figures["paper_method"] = poses.grid_figures(runs[0])
             if one.out is not None:
-                save_pictures(runs[-1][0], one.out)
+                save_poses(runs[-1], one.out)
     _show(figures, [table], json, warnings)
 
 
@@ -140,12 +120,9 @@ class ShimadaOptions:
     runs: Annotated[int | None, within(1)] = None
     """Number of sequences for each of r_13 = 35 and 40. Default: 50, with --pictures 10."""
     seed: Seed = 0
-    truncation: Literal["sequential", "joint", "clip", "none", "all"] | None = None
-    """Truncation of the belief by the inequalities; sequential is the published one, all compares
-    all of them. Default: joint, with --hypotheses sequential."""
-    observed: Literal["lines", "lines_wrist", "full"] | None = None
-    """Measurements. lines: axes of segments, fingertips and the palm's contour, as in the paper;
-    lines_wrist: also the wrist's position; full: all points. Default: lines."""
+    truncation: Literal["sequential", "joint", "clip", "none"] | None = None
+    """Truncation of the belief by the inequalities; sequential is the published one. Default:
+    joint, with --hypotheses sequential."""
     iterations: Annotated[int | None, within(1)] = None
     """Maximum number of linearisations in an update; the published filter has 1. Default: 20, with
     --hypotheses 1."""
@@ -154,13 +131,6 @@ class ShimadaOptions:
     hypotheses are created, and what rejects the wrong ones."""
     pictures: bool = False
     """Measure silhouettes drawn by Drake's renderer instead of noisy numbers."""
-    sequence: tuple[Path, ...] = ()
-    """With --pictures: use recorded silhouettes instead, of a right hand cut off at the wrist, in
-    one view of unknown scale (a scene with sequence: true); repeat for several."""
-    noise: float = 1.0
-    """Factor of the measurement noise; the filter knows it."""
-    acceleration: float = 1.0
-    """Factor of the accelerations that the filter expects."""
     out: Pictures = None
 
 
@@ -176,57 +146,32 @@ def shimada(
 
         drake-pose reproduce shimada --runs 20 --out results/shimada
         drake-pose reproduce shimada --pictures --out results/figure_17
-        drake-pose reproduce shimada --pictures --sequence SCENE --out results/figure_17_hand
     """
     one = options or ShimadaOptions()
-    is_all = one.truncation == "all"
-    if is_all and (one.hypotheses or one.out is not None):
-        raise UsageError("--truncation all excludes --hypotheses and --out")
-    if one.pictures and (one.hypotheses or one.observed or one.noise != 1.0):
-        raise UsageError("--pictures excludes --hypotheses, --observed and --noise")
-    if one.hypotheses and (one.noise, one.acceleration) != (1.0, 1.0):
-        raise UsageError("--hypotheses excludes --noise and --acceleration")
-    if one.sequence and (not one.pictures or one.runs or is_all):
-        raise UsageError("--sequence needs --pictures and excludes --runs and --truncation all")
-    figures: Mapping[str, Any]
+    if one.pictures and one.hypotheses:
+        raise UsageError("--pictures excludes --hypotheses")
+    truncation, iterations = one.truncation, one.iterations
+    warnings = []
     with _experiment(one.out) as count:
-        from drake_pose.filtering.truncated_filter import TRUNCATIONS
-        from drake_pose.papers import shimada, shimada_pictures, shimada_sequences
+        from drake_pose.papers import pictures, shimada
+        from drake_pose.papers.shimada_sequences import experiment_settings
 
-        if one.sequence:
-            settings = shimada.experiment_settings(one.truncation or "joint", one.iterations)
-            hands = []
-            for folder in one.sequence:
-                hand = shimada_sequences.run_sequence(folder, settings, one.acceleration, count)
-                hands.append(hand)
-                if one.out is not None:
-                    shimada_pictures.save_sequence(hand, one.out)
-            figures = {hand.name: hand.as_json() for hand in hands}
-            table = shimada_sequences.sequence_table(hands)
-            warnings = [hand.warning() for hand in hands]
-        elif one.hypotheses:
-            truncation, observed = one.truncation or "sequential", one.observed or "lines"
+        if one.hypotheses:
+            settings = experiment_settings(truncation or "sequential", iterations or 1)
             hypotheses = shimada.run_hypotheses_experiment(
-                one.runs or 50, one.seed, truncation, observed, count, one.iterations or 1
+                one.runs or 50, one.seed, settings, count
             )
-            figures, table, warnings = hypotheses.as_json(), hypotheses.table(), []
-            if one.out is not None and not shimada_pictures.save_hypotheses(hypotheses, one.out):
+            figures, table = hypotheses.as_json(), hypotheses.table()
+            if one.out is not None and not pictures.save_hypotheses(hypotheses, one.out):
                 warnings = ["no wrong hypothesis was rejected by an inequality: nothing to draw"]
         else:
-            names = TRUNCATIONS if is_all else (one.truncation or "joint",)
+            settings = experiment_settings(truncation or "joint", iterations or 20)
+            observed = shimada.PICTURES if one.pictures else "lines"
             runs = one.runs or (10 if one.pictures else 50)
-            measured = shimada.PICTURES if one.pictures else one.observed or "lines"
-            filtered = (count, one.iterations, one.noise, one.acceleration)
-            results = [
-                shimada.run_experiment(runs, one.seed, name, measured, *filtered) for name in names
-            ]
+            result = shimada.run_experiment(runs, one.seed, settings, observed, count)
+            figures, table = result.as_json(), shimada.result_table(result)
             if one.out is not None:
-                shimada_pictures.save_pictures(results[0], one.out)
-            every: dict[str, Any] = {
-                name: result.as_json() for name, result in zip(names, results, strict=True)
-            }
-            figures = every if is_all else every[names[0]]
-            table, warnings = shimada.result_table(*results), []
+                pictures.save_hands(result, one.out)
     _show(figures, [table], json, warnings)
 
 
@@ -259,46 +204,30 @@ def date(
     """
     with _experiment(out) as count:
         from drake_pose.papers import date as people
+        from drake_pose.papers.pictures import save_captures, save_walk
 
         if walk:
             figures, pictures = people.run_walk_through(cameras, seed, count)
             if out is not None:
-                people.save_walk(pictures, out)
+                save_walk(pictures, out)
             _show(figures, [people.walk_table(figures)], json)
             return
         result = people.run_experiment(cameras, frames, seed, method, count)
         if out is not None:
-            people.save_pictures(result, out)
+            save_captures(result, out)
     _show(result.as_json(), [*result.tables(), result.costs()], json)
 
 
-def reproduce_all(*, out: Out, short: bool = False, resume: Resume = False) -> None:
-    """Run the experiments of the three papers and write one page about them, report.html.
-
-    Finished experiments are kept: after Ctrl-C, --resume continues with the others.
-
-        drake-pose reproduce all --out results/papers
-
-    Args:
-        short: Use only a few images and runs, to see whether it works.
-    """
-    with _experiment(out, resume) as count:
-        from drake_pose.papers.all_experiments import reproduce_all as run
-
-        page = run(out, short, count, lambda text: say(f"drake-pose: {text}"))
-    say(f"drake-pose: wrote {page}")
-
-
 @contextmanager
-def _experiment(out: Path | None, resume: bool = False) -> Iterator[Count]:
+def _experiment(out: Path | None) -> Iterator[Count]:
     """Lock the folder for results, unless it is None; yields a function that starts a progress bar.
 
     That function gets a label and the number of all items, removes the bar before, and returns a
-    function to be called with the number of finished items. ``resume``: as in `claimed`.
+    function to be called with the number of finished items.
     """
     from drake_pose.files.folder import claimed
 
-    with ExitStack() as bars, nullcontext() if out is None else claimed(out, resume):
+    with ExitStack() as bars, nullcontext() if out is None else claimed(out):
 
         def count(what: str, total: int) -> Callable[[int], None]:
             bars.close()

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -13,24 +13,15 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 from pydrake.systems.sensors import ImageRgba8U
 
-from drake_pose.arrays import Array, Picture
+from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.camera.models import FACE_CAMERA, PinholeCamera, circle_of_cameras
 from drake_pose.errors import SettingsError
 from drake_pose.fit.contour_fit import ContourFit
-from drake_pose.person.date.features import (
-    FACE_SIZE,
-    Features,
-    PersonView,
-    SkinColour,
-    cut_face,
-    nearest_template,
-    see_person,
-)
 from drake_pose.person.date.skeleton import LIMBS, Skeleton, load_skeleton
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.silhouette.segmentation import Background, learn_background
-from drake_pose.systems.cameras import CameraRig, build_camera_rig, colour_image_to_picture
+from drake_pose.systems.cameras import CameraRig, build_camera_rig
 from drake_pose.systems.date import (
     CaptureSetup,
     PaperPoseEstimator,
@@ -112,16 +103,10 @@ class Studio:
             self.model, self.cameras, FACE_CAMERA, q, pictures, self.backgrounds
         )
 
-    def shown_at(self, q: Array, camera: str) -> Picture:
-        """Return the named camera's picture (H, W, 3) of a person at q (nq,), without noise."""
+    def mask_at(self, q: Array, camera: str) -> Mask:
+        """Return the named camera's silhouette (H, W) of a person at q (nq,)."""
         self.rig.set_positions(self.context, q)
-        return self.rig.picture(self.context, camera)
-
-    def face_at(self, q: Array) -> Picture | None:
-        """Return the face (130, 80, 3) of a person at q (nq,) in the face camera, as `cut_face`."""
-        picture = self.shown_at(q, FACE_CAMERA)
-        mask = self.rig.mask(self.context, FACE_CAMERA)
-        return cut_face(picture, see_person(picture, mask, SkinColour()).blobs)
+        return self.rig.mask(self.context, camera)
 
 
 def noisy(picture: Picture, generator: np.random.Generator, deviation: float = 3.0) -> Picture:
@@ -212,63 +197,18 @@ class PaperTrack(_StagedRun):
         port = self._capture.diagram.GetOutputPort("limb_points")
         return np.array(port.Eval(self.context)).reshape(len(LIMBS), 3, 3)[:, 1]
 
-    def seen(self) -> tuple[dict[str, PersonView], Features, tuple[Picture, ...]]:
-        """Return views by camera, features, and faces of the last frame.
-
-        The faces (130, 80, 3) are the input's and its nearest template; () if there was none.
-        """
-        setup, diagram, context = self._capture.estimator.setup, self._capture.diagram, self.context
-        views = {
-            name: diagram.GetOutputPort(f"person_view_{name}").Eval(context)
-            for name in setup.cameras
-        }
-        finder = diagram.GetSubsystemByName("features")
-        found = finder.GetOutputPort("found").Eval(finder.GetMyContextFromRoot(context))
-        if setup.face_camera is None or setup.faces is None:
-            return views, found, ()
-        name, templates = setup.face_camera.name, setup.faces
-        picture = colour_image_to_picture(diagram.GetInputPort(f"color_image_{name}").Eval(context))
-        face = cut_face(picture, diagram.GetOutputPort(f"person_view_{name}").Eval(context).blobs)
-        if face is None:
-            return views, found, ()
-        nearest, outside = nearest_template(face, templates)
-        if outside > setup.farthest_face:
-            return views, found, ()
-        flat = templates.mean + templates.coordinates[nearest] @ templates.basis
-        template = np.clip(flat, 0, 255).astype(np.uint8).reshape(*FACE_SIZE[::-1], 3)
-        return views, found, (face, template)
-
-    def perturbed(self, q: Array, generator: np.random.Generator) -> "PaperTrack":
-        """Return a track at q (nq,) turned around, features exchanged; `generator` is not used."""
-        estimator = self._capture.estimator
-        skeleton = estimator.setup.skeleton
-        wrong = np.array(q)
-        wrong[skeleton.head_angles[0]] += np.pi
-        wrong = skeleton.clip(wrong)
-        track = PaperTrack(self._capture)
-        context = estimator.GetMyMutableContextFromRoot(track.context)
-        estimator.set_person(context, wrong, skeleton.features(wrong)[[3, 4, 0, 2, 1]])
-        return track
-
 
 class SilhouetteTrack(_StagedRun):
-    """Track of all silhouettes at once, which can share another track's silhouettes.
+    """Track of all silhouettes at once.
 
     Args:
         capture: diagram of the silhouettes and the tracker.
         tracker: fits the person.
-        shared: a track of the same diagram that processes each frame before this one; None: the
-            silhouettes are found from the images.
     """
 
-    def __init__(
-        self,
-        capture: StagedDiagram[PersonTracker],
-        tracker: PersonPoseTracker,
-        shared: "SilhouetteTrack | None" = None,
-    ) -> None:
+    def __init__(self, capture: StagedDiagram[PersonTracker], tracker: PersonPoseTracker) -> None:
         super().__init__(capture)
-        self._capture, self._tracker, self._shared = capture, tracker, shared
+        self._capture, self._tracker = capture, tracker
 
     @staticmethod
     def build(studio: Studio) -> "SilhouetteTrack":
@@ -283,37 +223,9 @@ class SilhouetteTrack(_StagedRun):
         Raises SettingsError: fewer than two cameras saw the person in the first frame.
         """
         self._begin_frame()
-        if self._shared is None:
-            self._fix(images)
-            self._finish_frame(self._capture.stages)
-        else:
-            # A fixed input takes precedence over the port's connection in the diagram.
-            person = self._capture.estimator
-            own = person.GetMyMutableContextFromRoot(self.context)
-            other = person.GetMyContextFromRoot(self._shared.context)
-            for name in images:
-                port = person.GetInputPort(f"silhouette_{name}")
-                port.FixValue(own, AbstractValue.Make(port.Eval(other)))
-            self._finish_frame(())
+        self._fix(images)
+        self._finish_frame(self._capture.stages)
         return self._tracker.positions(self._state().values)
-
-    def perturbed(self, q: Array, generator: np.random.Generator) -> "SilhouetteTrack":
-        """Return a track from a perturbation of this one's state, whose silhouettes it shares.
-
-        Each frame must be processed by this track first. `generator` draws angles between their
-        limits, and a horizontal direction in which the person is half a metre away. `q` is not
-        used.
-        """
-        fit, state = self._tracker.fit, self._state()
-        values, angles = state.values.copy(), fit.kinematics.is_angle
-        lower = np.where(np.isinf(fit.lower), -np.pi, fit.lower)
-        upper = np.where(np.isinf(fit.upper), np.pi, fit.upper)
-        values[angles] = generator.uniform(lower, upper)[angles]
-        direction = generator.uniform(0.0, 2.0 * np.pi)
-        values[:2] += 0.5 * np.array([np.cos(direction), np.sin(direction)])
-        track = SilhouetteTrack(self._capture, self._tracker, self)
-        track._set_state(replace(state, values=values, step=np.zeros(len(values))))
-        return track
 
     def place(self, q: Array) -> None:
         """Set the person's positions to q (nq,)."""

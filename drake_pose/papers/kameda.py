@@ -24,7 +24,6 @@ from drake_pose.papers.tables import (
     Count,
     Figures,
     figure_table,
-    spread_over_seeds,
     uncounted,
 )
 from drake_pose.search import (
@@ -140,28 +139,14 @@ def experiment_camera(angle: float = 0.0) -> ParallelCamera:
     return ParallelCamera(name, 700, 700, 226.0, 349.5, 260.0, turn @ X_WC)
 
 
-def experiment_search(
-    outside_limit: float = 200.0, candidate_limit: int = 5, interval_deg: float = 20.0
-) -> PaperSearch:
-    """Return the paper's search of its female body (section 5).
-
-    Args:
-        outside_limit: r: a segment may leave the silhouette by this area [pixel].
-        candidate_limit: K: number of a segment's candidates that are kept.
-        interval_deg: sampling interval of the angles [deg].
-    """
-    settings = PaperSearchSettings(
-        interval=math.radians(interval_deg),
-        outside_limit=outside_limit,
-        candidate_limit=candidate_limit,
-    )
-    return PaperSearch(experiment_tree(), settings)
+def experiment_search() -> PaperSearch:
+    """Return the paper's search of its female body (section 5), with its threshold r [pixel]."""
+    return PaperSearch(experiment_tree(), PaperSearchSettings(outside_limit=200.0))
 
 
-def beam_experiment_search(interval_deg: float = 20.0) -> BeamSearch:
-    """Return the beam search of the same body at an interval [deg]; it needs no threshold r."""
-    settings = BeamSearchSettings(interval=math.radians(interval_deg))
-    return BeamSearch(experiment_tree(), settings)
+def beam_experiment_search() -> BeamSearch:
+    """Return the beam search of the same body and samples; it needs no threshold r."""
+    return BeamSearch(experiment_tree(), BeamSearchSettings())
 
 
 def experiment_tree() -> PoseTree:
@@ -195,7 +180,7 @@ def draw_values(
 
 
 def run_experiment(
-    search: PoseSearch, images: int = 219, seed: int = 0, count: Count = uncounted, views: int = 1
+    search: PoseSearch, images: int, seed: int, count: Count = uncounted, views: int = 1
 ) -> RandomPoses:
     """Draw random poses and search them in their silhouettes.
 
@@ -296,22 +281,11 @@ def causes_of_wrong_angles(
     return Causes(hidden, bool((images[0] != images[1]).sum() >= unseen))
 
 
-def grid_figures(*runs: RandomPoses) -> dict[str, Any]:
-    """Return the figures of experiment A, by the keys of ``PAPER`` and others.
+def grid_figures(result: RandomPoses) -> dict[str, Any]:
+    """Return the figures of a run of experiment A, by the keys of ``PAPER`` and others.
 
-    Several runs must differ in the seed only; the result then has the first run's figures, and
-    under "spread" mean, minimum and maximum of each over all runs. E_total is over the silhouettes
-    for which a pose was found; ``not_found`` counts the others.
+    E_total is over the silhouettes for which a pose was found; ``not_found`` counts the others.
     """
-    every = [_grid_figures(run) for run in runs]
-    if len(runs) == 1:
-        return every[0]
-    no_outcome = ("images", "seed", "total_seconds", "tolerance")
-    return {**every[0], "spread": spread_over_seeds(every, no_outcome)}
-
-
-def _grid_figures(result: RandomPoses) -> dict[str, Any]:
-    """Return the figures of one run, as `grid_figures`."""
     trials = result.trials
     found = [trial.result for trial in trials]
     E_total = [one.E_total for one in found if one.found]
@@ -360,8 +334,8 @@ def _grid_figures(result: RandomPoses) -> dict[str, Any]:
     }
 
 
-def grid_table(columns: Sequence[Sequence[RandomPoses]]) -> Table:
-    """Tabulate the paper's printed figures beside those of searches, each with a run per seed."""
+def grid_table(results: Sequence[RandomPoses]) -> Table:
+    """Tabulate the paper's printed figures beside those of runs with different searches."""
     rows = {
         "images": ("silhouettes", "{}"),
         "tolerance": ("  equal within [pixel]", "{:.0f}"),
@@ -388,15 +362,13 @@ def grid_table(columns: Sequence[Sequence[RandomPoses]]) -> Table:
         "free_joints": ("silhouettes with an undetermined joint", "{}"),
         "examination_median_seconds": ("seconds for proof and set, median", "{:.3f}"),
     }
-    shown: dict[str, Any] = {"paper": PAPER}
-    for runs in columns:
-        figures = [_grid_figures(run) for run in runs]
-        if figures[0]["method"] == "beam":
-            # Runs of the beam search are other steps than the paper's, and not comparable.
-            own = rows.keys() - {
-                "improved", "mean_runs", "mean_runs_without_worst_seven", "min_runs"
-            }  # fmt: skip
-            shown["beam search"] = [{key: one[key] for key in own} for one in figures]
+    # Runs of the beam search are other steps than the paper's, and not comparable.
+    own = {"improved", "mean_runs", "mean_runs_without_worst_seven", "min_runs"}
+    shown: dict[str, Figures] = {"paper": PAPER}
+    for result in results:
+        figures = grid_figures(result)
+        if figures["method"] == "beam":
+            shown["beam search"] = {key: one for key, one in figures.items() if key not in own}
         else:
             shown["the paper's method"] = figures
     return figure_table("Kameda, experiment A: one silhouette of a female body", rows, shown)

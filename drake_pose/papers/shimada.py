@@ -19,7 +19,7 @@ from scipy.special import chdtri
 from drake_pose.arrays import Array
 from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.errors import SettingsError, require_at_least, require_choice, require_positive
+from drake_pose.errors import SettingsError, require_at_least, require_choice
 from drake_pose.filtering.hand import (
     FLEXIONS,
     HAND_STATE,
@@ -36,7 +36,6 @@ from drake_pose.filtering.truncated_filter import FilterSettings, FilterState, T
 from drake_pose.filtering.update import make_measurement, update
 from drake_pose.papers.shimada_sequences import (
     ACCELERATIONS,
-    FRAMES,
     OBSERVED,
     HandTrack,
     SyntheticSequence,
@@ -77,8 +76,6 @@ class HandsResult:
     seed: int
     settings: FilterSettings
     observed: str
-    noise: float = 1.0
-    acceleration: float = 1.0
 
     def as_json(self) -> dict[str, object]:
         """Return the figures of each case over its runs, and the settings."""
@@ -89,13 +86,11 @@ class HandsResult:
             "truncation": self.settings.truncation,
             "iterations": self.settings.iterations,
             "observed": self.observed,
-            "noise": self.noise,
-            "acceleration": self.acceleration,
         }
 
 
-def result_table(*results: HandsResult) -> Table:
-    """Tabulate the figures of both cases, for one result or for one of each truncation."""
+def result_table(result: HandsResult) -> Table:
+    """Tabulate the figures of both cases."""
     rows = {
         "length_error_mean": ("length error, mean [pixel]", "{:.2f}"),
         "length_error_p95": ("  95th percentile", "{:.2f}"),
@@ -113,31 +108,22 @@ def result_table(*results: HandsResult) -> Table:
         "rejected_by_an_inequality": ("  rejected by an inequality", "{}"),
         "lost": ("lost", "{}"),
     }
-    first = results[0]
-    one = len(results) == 1
-    which = f"{first.settings.truncation} truncation" if one else "all truncations"
-    more = f", linearisations: {first.settings.iterations} at most" if one else ""
+    settings = result.settings
     return figure_table(
-        f"Shimada, synthetic hand: {which}, {first.observed} observation{more}",
+        f"Shimada, synthetic hand: {settings.truncation} truncation, {result.observed} "
+        f"observation, linearisations: {settings.iterations} at most",
         rows,
-        {
-            key if one else f"{result.settings.truncation}\n{key}": _figures(case)
-            for result in results
-            for key, case in result.trials.items()
-        },
+        {key: _figures(case) for key, case in result.trials.items()},
         "figure (at t = 55 unless stated)",
     )
 
 
 def run_experiment(
-    runs: int = 50,
-    seed: int = 0,
-    truncation: str = "joint",
+    runs: int,
+    seed: int,
+    settings: FilterSettings,
     observed: str = "lines",
     count: Count = uncounted,
-    iterations: int | None = None,
-    noise: float = 1.0,
-    acceleration: float = 1.0,
 ) -> HandsResult:
     """Run the experiment of section 6 for r_13 = 35 and r_13 = 40.
 
@@ -147,22 +133,16 @@ def run_experiment(
     Args:
         runs: number of runs of each case.
         seed: of the motions, the noise and the first guesses.
-        truncation: "joint", "sequential" (the paper's), "clip" or "none".
-        observed: "lines": axes, tips and the palm's outline, as in the paper; "lines_wrist": the
-            wrist's position, too; "full": all; or PICTURES.
+        settings: of the filter, as of ``experiment_settings``.
+        observed: "lines": axes, tips and the palm's outline, as in the paper; "full": all; or
+            PICTURES.
         count: reports progress.
-        iterations: largest number of linearisations per update; 1 in the paper; None: the default.
-        noise: factor on the noise, known to the filter.
-        acceleration: factor on the accelerations that the filter expects.
 
     Raises SettingsError: an argument is not one of these.
     """
     require_at_least(1, runs=runs)
     require_choice("observed", observed, (*OBSERVED, PICTURES))
-    if observed == PICTURES and noise != 1.0:
-        raise SettingsError("noise does not apply to pictures: leave it at 1")
-    settings = experiment_settings(truncation, iterations)
-    hand_filter, observation = experiment_filter(settings, noise, acceleration)
+    hand_filter, observation = experiment_filter(settings)
     seen = "lines" if observed == PICTURES else observed
     follow = _filter_pictures if observed == PICTURES else _filter_sequence
 
@@ -172,7 +152,7 @@ def run_experiment(
 
     # The first call loads compiled code, which must not count as an update's time.
     filtered(0, 35.0)
-    advance = count(f"sequences, {truncation} truncation", runs * len(CASES))
+    advance = count(f"sequences, {settings.truncation} truncation", runs * len(CASES))
     trials = {}
     for place, (key, r_13) in enumerate(CASES.items()):
         case = []
@@ -180,31 +160,21 @@ def run_experiment(
             case.append(filtered(run, r_13))
             advance(place * runs + run + 1)
         trials[key] = tuple(case)
-    return HandsResult(trials, seed, settings, observed, noise, acceleration)
+    return HandsResult(trials, seed, settings, observed)
 
 
 def experiment_filter(
-    settings: FilterSettings | None = None, noise: float = 1.0, acceleration: float = 1.0
+    settings: FilterSettings | None = None,
 ) -> tuple[TruncatedFilter, HandObservation]:
     """Return the experiment's filter and its observation model.
 
-    The filter's inequalities are table 1's, read from the bundled hand.
-
-    ``settings``: None: ``experiment_settings("joint")``. ``noise``, ``acceleration``: factors as of
-    ``run_experiment``. Raises SettingsError: a factor is not positive.
+    The filter's inequalities are table 1's, read from the bundled hand. ``settings``: None: those
+    of ``experiment_settings``.
     """
-    require_positive(noise=noise, acceleration=acceleration)
+    settings = settings or experiment_settings()
     rows = model_inequalities(_hand()).restricted_to(HAND_STATE.names)
-    usual = HandObservation(pixels_per_metre=PIXELS_PER_METRE)
-    observation = replace(
-        usual,
-        point_deviation=noise * usual.point_deviation,
-        angle_deviation=noise * usual.angle_deviation,
-        distance_deviation=noise * usual.distance_deviation,
-    )
-    U = acceleration**2 * HAND_STATE.process_noise(ACCELERATIONS)
-    motion = LinearMotion(HAND_STATE.transition(), U, None)
-    settings = settings or experiment_settings("joint")
+    observation = HandObservation(pixels_per_metre=PIXELS_PER_METRE)
+    motion = LinearMotion(HAND_STATE.transition(), HAND_STATE.process_noise(ACCELERATIONS), None)
     return TruncatedFilter(HAND_STATE, observation, rows, motion, settings), observation
 
 
@@ -267,7 +237,7 @@ def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
     silhouette = HandSilhouette(hand_filter, width, height, center)
     parts = build_hand_estimation(model, camera, silhouette, sequence.guess, positions, period)
     # Keep three frames for the pictures.
-    track = follow_pictures(parts, period, FRAMES, (7, 23, 39))
+    track = follow_pictures(parts, period, (7, 23, 39))
     return FilteredHand(sequence, track, np.full(len(HAND_STATE), math.nan))
 
 
@@ -375,17 +345,17 @@ class HypothesesResult:
     inequalities: Inequalities  # Of the filter.
     settings: Mapping[str, object]  # Arguments of the experiment by name.
 
-    def example(self, lived: int = 2) -> tuple[HypothesisHistory, HypothesisHistory] | None:
+    def example(self) -> tuple[HypothesisHistory, HypothesisHistory] | None:
         """Return a wrong hypothesis that an inequality rejected, and its survivor (figure 9).
 
-        Of those that lived `lived` frames or more, one that the paper's inequality rejected is
+        Of those that lived longer than a frame, one that the paper's inequality rejected is
         preferred, then the largest weight. Its survivor is the one nearest to the truth. None:
         there is no such hypothesis.
         """
         rejected = [
             one
             for one in self.histories
-            if one.reason == "constraint" and one.wrong and one.lived >= lived
+            if one.reason == "constraint" and one.wrong and one.lived > 1
         ]
         rejected.sort(key=lambda one: (one.row.startswith(COUPLED), one.weights[-2]), reverse=True)
         for removed in rejected:
@@ -440,42 +410,33 @@ class HypothesesResult:
         }
         figures = self.as_json()
         title = (
-            f"Shimada, figure 9: {figures['truncation']} truncation, {figures['observed']} "
-            f"observation, {figures['iterations']} linearisations at most"
+            f"Shimada, figure 9: {figures['truncation']} truncation, lines observation, "
+            f"{figures['iterations']} linearisations at most"
         )
         heading = f"hypotheses in {figures['runs']} sequences"
         return figure_table(title, rows, {"ours": figures}, heading)
 
 
 def run_hypotheses_experiment(
-    runs: int = 50,
-    seed: int = 0,
-    truncation: str = "sequential",
-    observed: str = "lines",
-    count: Count = uncounted,
-    iterations: int = 1,
+    runs: int, seed: int, settings: FilterSettings, count: Count = uncounted
 ) -> HypothesesResult:
     """Follow every hypothesis while fingers bend through the image plane, as in figure 9.
 
     In figure 9 the depth of a third segment is ambiguous in frame 18, and the wrong hypothesis is
     rejected in frame 20. The motion is that of ``run_experiment``, with the fingers pointing out of
-    the image plane. Weights, which the paper does not have, reject nothing here.
-
-    Arguments and errors are those of ``run_experiment``; `observed` must not be PICTURES.
+    the image plane, and lines are observed. Weights, which the paper does not have, reject nothing
+    here. Arguments and errors are those of ``run_experiment``.
     """
     require_at_least(1, runs=runs)
-    require_choice("observed", observed, OBSERVED)
     # A hypothesis ends only by an inequality, by being equal to another, or as one of more than 8.
-    settings = replace(
-        experiment_settings(truncation, iterations), hypothesis_cap=8, smallest_weight=0.0
-    )
+    settings = replace(settings, hypothesis_cap=8, smallest_weight=0.0)
     hand_filter, observation = experiment_filter(settings)
     advance = count("sequences", runs)
     histories: list[HypothesisHistory] = []
     sequences, final_errors = [], []
     for run in range(runs):
         generator = np.random.default_rng([seed, run])
-        sequence = make_sequence(35.0, observed, observation, generator, OBLIQUENESS)
+        sequence = make_sequence(35.0, "lines", observation, generator, OBLIQUENESS)
         state, states = hand_filter.start(sequence.guess), []
         for t, y in enumerate(sequence.measurements):
             state = hand_filter.update(hand_filter.predict(state) if t else state, y)
@@ -484,7 +445,7 @@ def run_hypotheses_experiment(
         sequences.append(sequence)
         final_errors.append(angle_error(state.best.mean, sequence.states[-1]))
         advance(run + 1)
-    made = {"runs": runs, "seed": seed, "observed": observed}
+    made = {"runs": runs, "seed": seed, "observed": "lines"}
     made |= {"truncation": settings.truncation, "iterations": settings.iterations}
     return HypothesesResult(
         tuple(histories), tuple(sequences), np.array(final_errors), hand_filter.inequalities, made

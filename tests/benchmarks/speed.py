@@ -10,22 +10,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import trimesh
-from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from drake_pose.body import TriangleMesh, bundled_model, load_model
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.papers.date_capture import SilhouetteTrack, Studio, one_core
-from drake_pose.papers.kameda import (
-    experiment_camera,
-    experiment_search,
-    grid_table,
-    run_experiment,
-)
+from drake_pose.papers.kameda import experiment_camera
 from drake_pose.person.date.walking import FEWEST_FRAMES, MOTIONS, make_motion
 from drake_pose.registration.picture_registration import register_pictures
 from drake_pose.registration.recording import Recording
@@ -163,26 +156,17 @@ def measure_pictures(size: tuple[int, int] = (640, 480), frames: int = 30) -> tu
 
 
 def record_person(folder: Path, frames: int, cameras: int) -> None:
-    """Write a person's motion as masks in folder/masks, and as JPEG pictures in folder/pictures.
-
-    The pictures have masks in the first frame.
-    """
+    """Write a person's motion as a scene of masks in a new folder."""
     studio = Studio.build(cameras, (640, 480), np.random.default_rng([5, 1]))
-    for kind in ("masks", "pictures"):
-        (folder / kind).mkdir()
-        save_cameras(folder / kind / "cameras.yaml", studio.cameras)
-        (folder / kind / "scene.yaml").write_text("sequence: true")
+    folder.mkdir()
+    save_cameras(folder / "cameras.yaml", studio.cameras)
+    (folder / "scene.yaml").write_text("sequence: true")
     motion = make_motion(studio.skeleton, 4 * FEWEST_FRAMES, 5)
     for k, q in enumerate(motion.q[:frames]):
         for name, picture in studio.pictures(q).items():
-            mask = person_region(picture, studio.backgrounds[name])
-            for kind in ("masks", "pictures") if k == 0 else ("masks",):
-                path = folder / kind / "masks" / name / f"{k:04d}.png"
-                path.parent.mkdir(parents=True, exist_ok=True)
-                write_mask(path, mask)
-            path = folder / "pictures" / "images" / name / f"{k:04d}.jpg"
+            path = folder / "masks" / name / f"{k:04d}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(path), picture[..., ::-1])
+            write_mask(path, person_region(picture, studio.backgrounds[name]))
 
 
 def measure_capture(scene: Path, overlay: bool, frames: int) -> tuple[float, float]:
@@ -245,18 +229,16 @@ def _picture_rows() -> Iterator[tuple[str, ...]]:
 
 def _capture_rows(frames: int = 60, cameras: int = 9) -> Iterator[tuple[str, ...]]:
     with tempfile.TemporaryDirectory() as folder:
-        record_person(Path(folder), 2 * frames, cameras)
-        for kind in ("masks", "pictures"):
-            for overlay in (False, True):
-                whole, further = measure_capture(Path(folder) / kind, overlay, frames)
-                name = "JPEG pictures" if kind == "pictures" else kind
-                name = f"{name}, overlays" if overlay else name
-                numbers = 1e3 * whole / frames, 1e3 * further
-                yield name, *(f"{one:.0f}" for one in numbers), f"{whole - frames * further:.1f} s"
+        record_person(Path(folder) / "scene", 2 * frames, cameras)
+        for overlay in (False, True):
+            whole, further = measure_capture(Path(folder) / "scene", overlay, frames)
+            name = "masks, overlays" if overlay else "masks"
+            numbers = 1e3 * whole / frames, 1e3 * further
+            yield name, *(f"{one:.0f}" for one in numbers), f"{whole - frames * further:.1f} s"
 
 
 def main() -> None:
-    """Print times of the kernel and the papers' methods, and the agreement with Drake."""
+    """Print times of the kernel, of registration and capture, and the agreement with Drake."""
     headings: tuple[str, ...] = ("triangles", "kernel, a candidate", "Drake label image", "ratio")
     print_table("One segment, 700 x 700 pixels, one core", headings, _kernel_rows())
     title = "XOR of the kernel's masks and Drake's, 200 random poses"
@@ -270,14 +252,6 @@ def main() -> None:
     title = "Capture of 60 recorded frames, nine views, 640 x 480: CPU time of the process"
     headings = ("recorded", "milliseconds a frame", "a further frame", "start, search and report")
     print_table(title, headings, _capture_rows())
-    start = time.process_time()
-    result = run_experiment(experiment_search())
-    seconds = time.process_time() - start
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    Console().print(
-        grid_table([[result]]),
-        f"experiment A: {seconds:.1f} s CPU on one core; peak memory {memory:.0f} MiB",
-    )
 
 
 if __name__ == "__main__":

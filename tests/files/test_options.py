@@ -126,7 +126,7 @@ def test_single_names_and_lists_become_tuples_and_json_is_plain():
     assert {*changed(one)} == {
         "cameras", "frames", "packages", "workers", "start", "root_rotation", "time_limit"
     }  # fmt: skip
-    assert {*one.search_settings} == {"root_rotation", "time_limit"}
+    assert {*one.search_settings} == {"start", "root_rotation", "time_limit"}
     assert changed(EstimateSettings()) == ()
 
 

@@ -217,45 +217,6 @@ def test_summaries_are_written_rarely_if_that_takes_long(monkeypatch, took, wait
     assert next_summary(100.0 - took) == pytest.approx(100.0 + wait)
 
 
-def test_surroundings_are_cut_with_a_margin():
-    """Eight pixels and 12 % of the larger side; the picture is enlarged by a whole number."""
-    shown = np.zeros((300, 400), bool)
-    shown[100:151, 200:221] = True
-    rows, columns = overlay._surroundings(shown)
-    assert (rows.start, rows.stop) == (100 - 14, 151 + 14)
-    assert (columns.start, columns.stop) == (200 - 14, 221 + 14)
-    shown[2, 3] = True
-    rows, columns = overlay._surroundings(shown)
-    assert (rows.start, columns.start) == (0, 0)
-    for size, factor in (
-        ((60, 140), 8),
-        ((61, 140), 7),
-        ((60, 141), 7),
-        ((481, 10), 1),
-        ((10, 10), 8),
-    ):
-        assert overlay._enlarged(np.ones(size, np.uint8)).shape == (
-            size[0] * factor,
-            size[1] * factor,
-        )
-
-
-def test_borders_are_pixels_before_another_segment():
-    """To the right or below, both within the body."""
-    rng = np.random.default_rng(3)
-    body, segments = rng.random((12, 15)) < 0.8, rng.integers(0, 3, (12, 15))
-    picture = np.zeros((12, 15), np.uint8)
-    overlay._draw_borders(picture, body, segments, 9)
-    for v, u in np.ndindex(12, 15):
-        beside = [(v, u + 1), (v + 1, u)]
-        differs = any(
-            a < 12 and b < 15 and body[a, b] and segments[a, b] != segments[v, u] for a, b in beside
-        )
-        assert picture[v, u] == 9 * (body[v, u] and differs)
-    overlay._draw_borders(picture, body, None, 5)
-    assert not (picture == 5).any()
-
-
 def test_frames_are_told_as_they_are_finished():
     """Before the first one, and after each: how many of those asked for are done."""
     told, done = [], {"0": record(), "9": record()}

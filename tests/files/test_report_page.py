@@ -360,21 +360,6 @@ def test_replay_of_many_triangles_is_small_and_accurate(tmp_path):
     np.testing.assert_allclose(np.linalg.norm(points / [1, 2, 1], axis=1), 0.1, atol=0.003)
 
 
-def test_numbers_of_a_page_are_rounded_and_unknown_ones_dashes():
-    _range, _limits_text, _ends = (
-        getattr(report_page, k) for k in ("_range", "_limits_text", "_ends")
-    )
-    assert _range((1.234, 5.678), 1) == "1.2 to 5.7"
-    assert _range((1.24, 1.16), 1) == "1.2"
-    assert _range((-0.001, -0.001), 1) == "0.0"
-    assert _range((-np.inf, 3.0), 2) == "none to 3.00"
-    assert _range((np.nan, np.nan), 1) == "–"
-    assert _limits_text((-90.04, np.inf)) == "-90 to none"
-    assert _limits_text((0.26, 1.0)) == "0.3 to 1"
-    assert _ends(np.array([3.0, np.nan]), np.array([-1.0, np.inf])) == (-1.0, 3.0)
-    assert np.isnan(_ends(np.array([np.nan]))).all()
-
-
 @pytest.mark.parametrize(
     ("limits", "estimate", "interval", "bars"),
     [
@@ -429,22 +414,6 @@ def test_the_answer_counts_frames_and_joints(records, answer):
     assert report_page.estimate_answer(*found_by({"mean_E_total": 0.1}, *records)) == answer
 
 
-@pytest.mark.parametrize(
-    ("method", "images", "stopped", "text"),
-    [
-        ("beam", {}, ("end", "end"), "searched by beam search and contour fits"),
-        ("beam", {}, ("end", "tracked"), "tracked in 1 frames, 1 searched by beam search and "
-         "contour fits"),
-        ("beam", {}, ("tracked", "tracked"), "tracked in 2 frames"),
-        ("person", {}, ("end", "end"), "one person, fitted to all silhouettes at once"),
-        ("beam", {"x": 1}, ("tracked", "tracked"), "tracked by colour in 2 frames"),
-    ],
-)  # fmt: skip
-def test_the_method_is_told_with_counts(method, images, stopped, text):
-    _, estimate = found_by({"method": method}, *(told(stopped_by=one) for one in stopped))
-    assert report_page._describe_method(SimpleNamespace(images=images), estimate) == text
-
-
 def test_pictures_are_of_the_worst_the_middle_and_the_best_frame(tmp_path):
     """Of each frame those with the lowest IoU, six in all; the pictures are made smaller."""
     records, cameras = {}, {f"c{k}": camera(f"c{k}") for k in range(4)}
@@ -492,50 +461,3 @@ def test_pictures_count_as_used_where_they_were_compared():
     nothing = report_page._camera_row(estimate, "d", states)
     assert nothing["mean"] is nothing["lowest"] is nothing["worst"] is None
     assert nothing["warnings"] == [2]
-
-
-def test_axes_of_plots_are_in_the_figure_and_frames_are_labelled():
-    """About six names, of at most twenty letters; the axis spans all frames."""
-    for height, left in ((1.5, 0.09), (3.0, 0.2)):
-        figure, axes = report_page.new_plot(height, left)
-        box = axes.get_position()
-        assert (box.x0, box.x1) == pytest.approx((left, 0.985))
-        # The same space below and above for labels, whatever the height [inch].
-        assert height * box.y0 == pytest.approx(0.3)
-        assert height * (1.0 - box.y1) == pytest.approx(0.08)
-        assert figure.get_size_inches() == pytest.approx((6.4, height))
-    for count, step in ((5, 1), (6, 1), (7, 2), (40, 7)):
-        _, axes = report_page.new_plot()
-        names = [f"{k:04d}" + "x" * 30 for k in range(count)]
-        report_page._mark_frames(axes, names)
-        assert axes.get_xticks().tolist() == [*range(0, count, step)]
-        labels = [one.get_text() for one in axes.get_xticklabels()]
-        assert labels == [name[:20] for name in names[::step]]
-        assert axes.get_xlim() == (-0.5, count - 0.5)
-    _, axes = report_page.new_plot()
-    report_page._mark_frames(axes, [])
-    assert axes.get_xlim() == (-0.5, 0.5)
-
-
-def test_axes_have_a_margin_and_a_legend_for_several_curves():
-    names = ["a", "b", "c"]
-    values = np.array([1.0, 2.0, 3.0])
-    (axes,) = plot_curves(names, [("one", values)], joined=True).axes
-    assert axes.get_ylim() == pytest.approx((1.0 - 0.16, 3.0 + 0.16))
-    assert axes.get_legend() is None
-    (axes,) = plot_curves(names, [("one", values), ("two", values)], joined=True).axes
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["one", "two"]
-    (axes,) = plot_curves(names, [("one", np.full(3, 5.0))], joined=True).axes
-    assert axes.get_ylim() == pytest.approx((5.0 - 0.008, 5.0 + 0.008))
-    (axes,) = plot_curves(names, [("one", np.full(3, np.nan))], joined=True).axes
-    assert axes.get_ylim() == pytest.approx((-0.08, 1.08))
-    # Limits within 30 % of the curves' span are near.
-    for limits, ends in (((0.41, 3.61), (0.41, 3.0)), ((0.39, 3.59), (1.0, 3.59))):
-        (axes,) = plot_curves(names, [("one", values)], joined=True, limits=limits).axes
-        margin = 0.08 * (ends[1] - ends[0])
-        assert axes.get_ylim() == pytest.approx((ends[0] - margin, ends[1] + margin))
-    wide, own = (
-        plot_curves(names, [("measured", values), ("one", values)], joined=False).axes[0].lines
-    )
-    assert (wide.get_markersize(), own.get_markersize(), own.get_linestyle()) == (16, 8, "None")
-    assert wide.get_linewidth() > own.get_linewidth()

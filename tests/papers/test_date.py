@@ -5,17 +5,16 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import SettingsError
+from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
 from drake_pose.papers.date import (
     active_frames,
     draw_walk,
-    perturbed_frames,
     run_experiment,
     run_walk_through,
-    save_pictures,
-    save_walk,
     walk_by,
 )
 from drake_pose.papers.date_capture import PERIOD
+from drake_pose.papers.pictures import save_captures, save_walk
 from drake_pose.person.date.features import SkinColour, skin_blobs
 from drake_pose.person.date.walking import (
     COMMANDS,
@@ -48,9 +47,6 @@ class TestMotion:
         short, whole = (make_motion(skeleton, frames, 3) for frames in (50, 120))
         np.testing.assert_array_equal(short.q, whole.q[:50])
         assert short.names == whole.names[:50]
-        assert REGISTERED not in perturbed_frames(short).values()
-        assert max(perturbed_frames(short)) < 40
-        assert list(perturbed_frames(whole).values()) == [*MOTIONS, REGISTERED]
 
     def test_too_few_frames(self, skeleton):
         with pytest.raises(SettingsError, match="40 frames"):
@@ -69,18 +65,17 @@ def test_fit_to_all_silhouettes_is_more_accurate_and_pictures_are_saved(tmp_path
     assert figures["elbows"]["paper_mm"] < 0.7 * figures["elbows"]["ik_only_mm"]
     assert figures["elbows"]["silhouette_mm"] < 0.5 * figures["elbows"]["paper_mm"]
     assert set(figures["as_found"]) == set(MOTIONS)
-    assert figures["frames_to_recover"] <= 15
     assert figures["fps"] == pytest.approx(1e3 / figures["ms_per_frame"]["all"])
     assert set(figures["motions"]) == set(MOTIONS)
-    names = {file.name for file in save_pictures(result, tmp_path / "new")}
-    motions = {f"figure_{n}_{name}.png" for n in ("02", "03", "07") for name in MOTIONS}
-    assert names == {*motions, "figure_04.png", "errors.png"}
-    walk = cv2.imread(str(tmp_path / "new" / "figure_07_walk.png"))
-    # The input and three estimates, each a person before the same background.
-    parts = np.split(walk, 4, axis=1)
-    for part in parts:
-        assert (np.abs(part.astype(int) - part[0, 0]).max(axis=2) > 30).mean() > 0.01
-    assert np.abs(parts[0].astype(int) - parts[3]).mean() < 3.0
+    # The captured silhouette covers the person in the picture.
+    for sample in result.samples.values():
+        limbs, body = sample.captured["silhouette"]
+        assert np.linalg.norm(limbs - sample.limbs, axis=-1).max() < 5.0
+        assert 0.01 < body.mean() < 0.3
+    save_captures(result, tmp_path)
+    drawn = cv2.imread(str(tmp_path / "figure_07.png"))[..., ::-1]
+    for colour in (MISSING_RGB, EXCESS_RGB):
+        assert (drawn == colour).all(axis=-1).sum() > 1000
 
 
 class TestWalkThrough:
@@ -111,13 +106,14 @@ class TestWalkThrough:
     @pytest.mark.slow
     def test_captured_turns_last_as_long_as_the_true_ones(self, tmp_path):
         """Only turns are compared: five small pictures do not always separate the feet."""
-        figures, pictures = run_walk_through(5, size=(320, 240))
+        figures, pictures = run_walk_through(5, 0, size=(320, 240))
         assert figures["same_command"] > 0.7
         for name in COMMANDS[:2]:
             one = figures["commands"][name]
             assert one["captured_s"] == pytest.approx(one["true_s"], abs=0.1)
         assert figures["heading_error_deg"] < 5.0
-        assert save_walk(pictures, tmp_path).name == "figure_08.png"
+        save_walk(pictures, tmp_path)
+        assert cv2.imread(str(tmp_path / "figure_08.png")).shape[0] > 4 * 240
 
 
 @pytest.mark.parametrize(
@@ -125,4 +121,4 @@ class TestWalkThrough:
 )
 def test_arguments_are_checked(bad, word):
     with pytest.raises(SettingsError, match=word):
-        run_experiment(**bad)
+        run_experiment(**{"cameras": 4, "frames": 40, "seed": 0} | bad)

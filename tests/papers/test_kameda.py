@@ -4,11 +4,13 @@ import json
 import math
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from drake_pose.commands.main import app
 from drake_pose.errors import SettingsError
+from drake_pose.files.overlay import MISSING_RGB
 from drake_pose.papers.kameda import (
     beam_experiment_search,
     causes_of_wrong_angles,
@@ -21,10 +23,9 @@ from drake_pose.papers.kameda import (
     grid_figures,
     run_experiment,
 )
-from drake_pose.papers.kameda_pictures import chest_ranks, ratio_within, save_pictures
+from drake_pose.papers.pictures import save_poses
 from drake_pose.search import MultiStartSearch, PoseEstimate
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.silhouette.scoring import draw_mask
 from tests.cli import CliRunner
 
 
@@ -110,18 +111,19 @@ def test_beam_search_matches_every_silhouette_and_its_set_has_the_true_pose(beam
         assert all(joint.holds(value) for joint, value in zip(joints, values, strict=True))
 
 
-def test_pictures_are_written(result, beam_result, tmp_path):
-    """For the paper's search and the beam search."""
-    files = save_pictures(replace(result, trials=result.trials[:1]), tmp_path / "paper")
-    assert all(file.stat().st_size > 5000 for file in files)
-    names = {file.name for file in files}
-    assert {"figure_11_runs_of_step_3.png", "figure_12_chest_candidates.png"} < names
-    assert ("figure_12_not_matched.png" in names) == (not result.trials[0].exact)
-    several = [one for one in beam_result.trials if one.result.pose_set.mode_count > 1][:1]
-    few = replace(beam_result, trials=(*beam_result.trials[:1], *several))
-    names = {file.name for file in save_pictures(few, tmp_path / "beam")}
-    assert "figure_11_milliseconds.png" in names
-    assert ("modes_1.png" in names) == bool(several)
+def test_pictures_show_the_outcomes(result, beam_result, tmp_path):
+    save_poses(beam_result, tmp_path / "beam")
+    names = {file.stem for file in (tmp_path / "beam").iterdir()}
+    assert "figure_12_not_matched" not in names
+    right = [trial.pose_equal for trial in beam_result.trials]
+    assert ("figure_07_pose_right" in names) == any(right)
+    save_poses(result, tmp_path / "paper")
+    missed = sum(trial.result.found and not trial.exact for trial in result.trials)
+    picture = cv2.imread(str(tmp_path / "paper" / "figure_12_not_matched.png"))
+    # Each pose differs from its silhouette: blue of the silhouette only, orange of the body only.
+    assert missed > 0
+    for row in np.array_split(picture, min(missed, 4)):
+        assert (row[..., ::-1] == MISSING_RGB).all(axis=-1).sum() > 200
 
 
 def at(search, **degrees):
@@ -145,34 +147,6 @@ def test_hand_before_the_belly_is_hidden_from_behind(search):
     assert causes_of_wrong_angles(search.sampled, camera, true, true) == (False, False)
 
 
-def test_chest_rank_matches_areas_counted_in_masks(search, result):
-    ranks, lengths = chest_ranks(replace(result, trials=result.trials[:1]))
-    trial, nodes = result.trials[0], [node.name for node in search.tree.nodes]
-    head, chest = nodes.index("head"), nodes.index("chest")
-
-    def masks(values):
-        X_CN = result.cameras[0].X_CW @ search.tree.node_poses(values)
-        outlines = search.sampled.surfaces.at(values)
-        return [draw_mask([outlines[i]], X_CN[[i]], result.cameras[0]) for i in (head, chest)], (
-            draw_mask(outlines, X_CN, result.cameras[0])
-        )
-
-    (true_head, true_chest), silhouette = masks(trial.true_values)
-    covered = []
-    for values in search.sampled.values[chest]:
-        posed = list(trial.true_values)
-        posed[chest] = values
-        (_, mask), _ = masks(posed)
-        if (mask & ~silhouette).sum() <= search.settings.outside_limit:
-            covered.append(int((mask & silhouette & ~true_head).sum()))
-    own = int((true_chest & silhouette & ~true_head).sum())
-    assert lengths[0] == pytest.approx(len(covered), abs=1)
-    better = sum(one > own + 3 for one in covered)
-    worse = sum(one < own - 3 for one in covered)
-    assert 1 + better <= ranks[0] <= len(covered) - worse
-    assert (ratio_within(ranks, ranks[0] - 1), ratio_within(ranks, ranks[0])) == (0.0, 1.0)
-
-
 def test_cameras_are_spread_over_180_degrees():
     before, after = run_experiment(experiment_search(), 1, 7, views=2).cameras
     assert before.X_WC[:3, 2] @ after.X_WC[:3, 2] == pytest.approx(0.0)
@@ -180,7 +154,7 @@ def test_cameras_are_spread_over_180_degrees():
     np.testing.assert_allclose(origins[0], origins[1])
     for bad in ({"views": 0}, {"images": 0}):
         with pytest.raises(SettingsError, match=next(iter(bad))):
-            run_experiment(experiment_search(), **bad)
+            run_experiment(experiment_search(), **{"images": 1, "seed": 0} | bad)
 
 
 @pytest.mark.slow
@@ -236,11 +210,9 @@ def test_both_methods_find_the_hand(tmp_path):
     [
         (("--experiment", "D"), ("--experiment", "A", "B", "C")),
         (("--experiment", "B", "--seed", "1"), ("--seed", "--experiment A")),
-        (("--experiment", "C", "--outside-limit", "9"), ("--outside-limit", "--experiment A")),
         (("--views", "1"), ("continuous",)),
         (("--views", "0", "--angles", "continuous"), ("views",)),
         (("--angles", "continuous", "--method", "paper"), ("grid",)),
-        (("--angles", "continuous", "--outside-limit", "200"), ("grid",)),
         (("--angles", "odd"), ("--angles", "grid", "continuous")),
     ],
 )
@@ -249,13 +221,3 @@ def test_incompatible_options_are_refused(options, words):
     assert refused.exit_code == 2
     for word in words:
         assert word in refused.stderr
-
-
-def test_runs_of_several_seeds_show_the_spread():
-    made = reproduce("--images", "1", "--seeds", "2", "--method", "beam", "--json")
-    assert made.exit_code == 0, made.output
-    beam = json.loads(made.stdout)
-    for one, method in ((beam, "beam"), (beam["paper_method"], "paper")):
-        assert one["method"] == method
-        assert one["spread"]["mean_runs"]["min"] <= one["mean_runs"]
-        assert not {"seed", "images", "total_seconds"} & set(one["spread"])

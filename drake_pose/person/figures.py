@@ -48,14 +48,13 @@ class Person:
 
 
 def find_figures(
-    mask: Mask, *, speck: float = 0.05, least_pixels: float = 16.0, least_fraction: float = 2e-4
+    mask: Mask, *, speck: float = 0.05, least_fraction: float = 2e-4
 ) -> tuple[Figure, ...]:
     """Return the figures of a mask (H, W), the largest first, without specks.
 
     Args:
         speck: figures below this fraction of the largest one's area are specks.
-        least_pixels, least_fraction: a figure's area must exceed `least_pixels` [pixel^2] and
-            `least_fraction` of the picture's area.
+        least_fraction: a figure's area must exceed this fraction of the picture's area.
     """
     small, step = _coarse(mask)
     left, top, width, height = cv2.boundingRect(small)
@@ -74,8 +73,8 @@ def find_figures(
         for middle, box in zip(middles[1:], boxes[1:], strict=True)
     ]
     found.sort(key=lambda one: -one.area)
-    least = max(least_pixels, least_fraction * mask.size)
-    return tuple(one for one in found if one.area > max(least, speck * found[0].area))
+    least = max(least_fraction * mask.size, speck * found[0].area)
+    return tuple(one for one in found if one.area > least)
 
 
 def cut_figures(mask: Mask, unwanted: Sequence[Figure]) -> Mask:
@@ -250,8 +249,6 @@ def sort_figures(
     figures: Mapping[str, Sequence[Figure]],
     persons: Sequence[Person],
     person: Person | None,
-    *,
-    far: float = 0.7,
     large: float = 0.25,
 ) -> dict[str, tuple[tuple[Figure, ...], bool]]:
     """Find the figures of other persons, and where they merge with the followed person.
@@ -264,8 +261,8 @@ def sort_figures(
         figures: of each mask by camera, in the order of the persons' camera indices.
         persons: all persons found in the frame.
         person: the followed one, without figures where hidden; None: absent.
-        far, large: a figure is a stranger's if the ray is farther from the followed person [m] and
-            it is larger than this fraction of the followed person's figure.
+        large: a figure is a stranger's if its ray is too far from the followed person for any part
+            of a body, and it is larger than this fraction of the followed person's figure.
 
     Returns:
         By camera: the figures of others, all figures where the person is absent; and whether the
@@ -300,7 +297,7 @@ def sort_figures(
                 or ray_distances(camera, figure.middle, positions).min(initial=np.inf) < off
                 or (
                     k in person.figures
-                    and off >= far
+                    and off >= 2.0 * _MAX_RAY_DISTANCE
                     and figure.area > large * own[person.figures[k]].area
                 )
             ):
@@ -393,23 +390,21 @@ def follow_one(
     return found
 
 
-def find_tracks(
-    frames: Sequence[Sequence[Person]], step: float = 0.4, more: float = 0.1
-) -> list[dict[int, Person]]:
+def find_tracks(frames: Sequence[Sequence[Person]], step: float = 0.4) -> list[dict[int, Person]]:
     """Link persons from frame to frame, nearest ones first.
 
     ``frames``: persons found in each frame. ``step``: largest movement of a person's middle from
-    one frame to the next [m]. ``more``: added to `step` for each frame in which the person is
-    hidden [m]. Returns the track of each person: positions and figures by index of the frame.
+    one frame in which the person is seen to the next [m]. Returns the track of each person:
+    positions and figures by index of the frame.
     """
     tracks: list[dict[int, Person]] = []
     for k, persons in enumerate(frames):
         pairs = []
         for t, track in enumerate(tracks):
-            last = max(track)
+            last = track[max(track)].position
             for p, person in enumerate(persons):
-                distance = float(np.linalg.norm(person.position - track[last].position))
-                if distance < step + more * (k - last - 1):
+                distance = float(np.linalg.norm(person.position - last))
+                if distance < step:
                     pairs.append((distance, t, p))
         free_tracks, free = set(range(len(tracks))), set(range(len(persons)))
         for _, t, p in sorted(pairs):
@@ -456,7 +451,6 @@ class PersonRecording:
         cameras: by name.
         read: returns the masks of a frame; each of `count` frames is read once here.
         is_sequence: whether frames follow each other; if not, the largest person in each is taken.
-        measured: least number of frames in which the height is measured.
     """
 
     def __init__(
@@ -465,7 +459,6 @@ class PersonRecording:
         read: ReadFrame,
         count: int,
         is_sequence: bool,
-        measured: int = 20,
     ) -> None:
         self._read, self._count = read, count
         self._left_out: dict[str, int] = {}
@@ -481,7 +474,7 @@ class PersonRecording:
                 covering.append(
                     width > 0.98 * cameras[name].width and height > 0.98 * cameras[name].height
                 )
-            if frame % max(1, count // measured) == 0 and len(seen) >= 2:
+            if len(seen) >= 2:
                 used = [cameras[name] for name in seen]
                 position = triangulate(used, [figure.middle for figure in seen.values()])
                 for camera, figure in zip(used, seen.values(), strict=True):

@@ -59,49 +59,6 @@ def colour_image_to_picture(image: ImageRgba8U) -> Picture:
     return np.asarray(cv2.cvtColor(image.data, cv2.COLOR_RGBA2RGB))
 
 
-class ColourPorts:
-    """Input ports for the colour images of some of a system's cameras.
-
-    Args:
-        system: the system that gets the ports.
-        cameras: all cameras of the system.
-        wanted: names of the cameras that get a port.
-        port: maps a camera to its port's name.
-
-    Attributes:
-        cameras: names of the cameras that have a port, in the order of all cameras.
-
-    Raises:
-        UnknownNameError: a name in ``wanted`` is no camera's.
-    """
-
-    def __init__(
-        self,
-        system: PortedSystem,
-        cameras: Sequence[Camera],
-        wanted: Collection[str],
-        port: Callable[[Camera], str],
-    ) -> None:
-        known = {camera.name: camera for camera in cameras}
-        for name in wanted:
-            if name not in known:
-                raise UnknownNameError("camera", name, known, "color_cameras")
-        self.cameras = tuple(name for name in known if name in wanted)
-        self._given = system.add_camera_inputs(
-            {name: port(known[name]) for name in self.cameras},
-            lambda name: ImageRgba8U(known[name].width, known[name].height),
-        )
-
-    def pictures(self, context: Context) -> dict[str, Picture]:
-        """Return the available pictures (H, W, 4) by name of the camera.
-
-        ``context`` is the system's. The pictures are views of the images' writable data, as
-        compiled kernels require, and are valid until the context changes.
-        """
-        images = self._given(context).items()
-        return {name: image.mutable_data for name, image in images if image.size()}
-
-
 DEFAULT_FRAME_RATE_HZ = 1.0
 """Frame rate of a scene that has none, such as stills [Hz]."""
 

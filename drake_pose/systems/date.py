@@ -305,7 +305,7 @@ class FaceDirectionFinder(PortedSystem):
         farthest: largest distance of a face from the eigenspace [grey levels].
     """
 
-    def __init__(self, camera: Camera, templates: FaceTemplates, farthest: float = 30.0) -> None:
+    def __init__(self, camera: Camera, templates: FaceTemplates, farthest: float) -> None:
         super().__init__()
         self.add_input("color_image", ImageRgba8U(camera.width, camera.height))
         self.add_input("person_view", None)
@@ -350,7 +350,7 @@ class PoseRecogniser(PortedSystem):
         skeleton: Skeleton,
         registered: RegisteredPose,
         cameras: Sequence[Camera],
-        threshold: float = 0.93,
+        threshold: float,
     ) -> None:
         super().__init__()
         seen_by = _add_views(self, cameras)

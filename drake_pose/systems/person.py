@@ -362,9 +362,13 @@ def build_silhouette_capture(
     not positive.
     """
     builder = DiagramBuilder()
-    person, sensors = add_person_tracker(
-        builder, tracker, cameras, backgrounds, period, edge_points, source, with_deviations
-    )
+    sensors = add_silhouette_sensors(builder, source, cameras, backgrounds, edge_points)
+    person = PersonTracker(tracker, list(cameras.values()), period, with_deviations)
+    builder.AddNamedSystem("person_tracker", person)
+    for name, sensor in sensors.items():
+        builder.Connect(sensor.silhouette, person.GetInputPort(f"silhouette_{name}"))
+    if source is not None and source.HasOutputPort("time"):
+        builder.Connect(source.GetOutputPort("time"), person.GetInputPort("time"))
     if meshcat is not None:
         positions = person.GetOutputPort("last_positions")
         add_avatar(builder, tracker.fit.tree.model, positions, meshcat, "avatar", period)
@@ -376,28 +380,3 @@ def build_silhouette_capture(
         "edge": tuple(sensor.silhouette for sensor in sensors.values()),
     }
     return StagedDiagram(builder.Build(), stages, person)
-
-
-def add_person_tracker(
-    builder: DiagramBuilder,
-    tracker: PersonPoseTracker,
-    cameras: Mapping[str, Camera],
-    backgrounds: Mapping[str, Background],
-    period: float,
-    edge_points: float = EDGE_POINTS,
-    source: System | None = None,
-    with_deviations: bool = False,
-) -> tuple[PersonTracker, dict[str, SilhouetteSensor]]:
-    """Add a PersonTracker, its sensors and their source to a diagram.
-
-    The arguments are those of ``build_silhouette_capture``. Returns the tracker, and the sensors by
-    name of the camera.
-    """
-    sensors = add_silhouette_sensors(builder, source, cameras, backgrounds, edge_points)
-    person = PersonTracker(tracker, list(cameras.values()), period, with_deviations)
-    builder.AddNamedSystem("person_tracker", person)
-    for name, sensor in sensors.items():
-        builder.Connect(sensor.silhouette, person.GetInputPort(f"silhouette_{name}"))
-    if source is not None and source.HasOutputPort("time"):
-        builder.Connect(source.GetOutputPort("time"), person.GetInputPort("time"))
-    return person, sensors

@@ -44,9 +44,10 @@ class PictureCapture(PortedSystem):
 
     A periodic update reads the sources; output ports show the last synchronised frames. Recorded
     sources follow the simulation's time: all frames are shown, and the simulation terminates after
-    the last. If ``live``, sources follow the computer's clock: the newest frames are shown, after
-    waiting for all cameras to open. External devices cannot be part of a Context, so that a
-    PictureCapture works in one simulator only.
+    the last. If a source is live, all follow the computer's clock: the newest frames are shown,
+    after waiting for all cameras to open. Pictures half a period apart are of one time, those of
+    live cameras, which are not triggered together, 0.9 periods apart. External devices cannot be
+    part of a Context, so that a PictureCapture works in one simulator only.
 
     Output ports:
         color_image_<camera> (ImageRgba8U): without pixels if the camera has no picture in these
@@ -59,13 +60,11 @@ class PictureCapture(PortedSystem):
         sources: opened sources of pictures, by name of the camera.
         cameras: cameras by name, which give the sizes of the images.
         period: time between two updates [s]; None: that of the fastest source.
-        live: whether the pictures come by the computer's clock; None: whether a source is live.
-        tolerance: largest difference of time stamps in synchronised frames [s]; None: half a
-            period, or 0.9 periods for live cameras, which are not triggered together.
         clock: returns the computer's time [s]; that of the live sources.
         opening_timeout: longest time to wait for the first pictures of live cameras [s].
 
     Attributes:
+        live: whether the pictures come by the computer's clock.
         frames: the synchronised frames shown; None before the first ones.
         skipped: number of synchronised frames that were skipped for newer ones.
 
@@ -80,8 +79,6 @@ class PictureCapture(PortedSystem):
         cameras: Mapping[str, Camera],
         period: float | None = None,
         *,
-        live: bool | None = None,
-        tolerance: float | None = None,
         clock: Clock = time.monotonic,
         opening_timeout: float = 8.0,
     ) -> None:
@@ -90,19 +87,15 @@ class PictureCapture(PortedSystem):
             if name not in cameras:
                 raise UnknownNameError("camera", name, cameras, "the calibration")
         self._sources = dict(sources)
-        devices = any(one.specification.live for one in sources.values())
-        self.live = devices if live is None else live
-        if devices and not self.live:
-            raise SettingsError("live cameras cannot be captured by the simulation's time")
+        self.live = any(one.specification.live for one in sources.values())
         if period is None:
             rates = [rate for one in sources.values() if (rate := one.rate_hz) is not None]
             period = 1.0 / max(rates, default=USUAL_RATE_HZ)
         self.period = period
         require_period("capture", self.period)
-        if tolerance is None:
-            tolerance = (0.9 if devices else 0.5) * self.period
+        tolerance = (0.9 if self.live else 0.5) * self.period
         self._synchroniser: Synchroniser[TimedPicture] = Synchroniser(
-            self._sources, tolerance, timeout=max(4.0 * self.period, tolerance)
+            self._sources, tolerance, timeout=4.0 * self.period
         )
         self._clock, self._opening_timeout = clock, opening_timeout
         self._since: float | None = None

@@ -8,16 +8,15 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
-from pydrake.systems.sensors import ImageLabel16I
+from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
 from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera, camera_tuple
-from drake_pose.errors import SettingsError, require_at_least
+from drake_pose.errors import SettingsError, UnknownNameError, require_at_least
 from drake_pose.filtering.contour_tracker import MatchAndTrack, TrackerState, TrackingSettings
 from drake_pose.search import TRACKED, PoseEstimate, PoseSearch, View
 from drake_pose.silhouette.pictures.label_renderer import label_image_to_mask
 from drake_pose.systems.bodies import body_poses
-from drake_pose.systems.cameras import ColourPorts
 from drake_pose.systems.ports import (
     BeliefSystem,
     ImmutableValue,
@@ -301,8 +300,17 @@ class SilhouetteTracker(SilhouetteMatcher):
         )
         self.add_input("measured_positions", nq)
         self.add_input("first_positions", nq)
-        self._colours = ColourPorts(
-            self, cameras, color_cameras, lambda one: camera_port("color_image", one, cameras)
+        known = {camera.name: camera for camera in cameras}
+        for name in color_cameras:
+            if name not in known:
+                raise UnknownNameError("camera", name, known, "color_cameras")
+        self._colours = self.add_camera_inputs(
+            {
+                one.name: camera_port("color_image", one, cameras)
+                for one in cameras
+                if one.name in color_cameras
+            },
+            lambda name: ImageRgba8U(known[name].width, known[name].height),
         )
         self.add_belief_output("position_deviations", nq, self._deviations)
         self.add_belief_output("estimated_state", model.plant.num_multibody_states(), self._state)
@@ -312,7 +320,12 @@ class SilhouetteTracker(SilhouetteMatcher):
         self, context: Context, memory: _Memory, views: Sequence[View]
     ) -> tuple[PoseEstimate | None, _Memory]:
         """Return the tracked or searched pose, None before any evidence, and the next memory."""
-        pictures = self._colours.pictures(context)
+        # Views of the images' writable data, as compiled kernels require.
+        pictures = {
+            name: image.mutable_data
+            for name, image in self._colours(context).items()
+            if image.size()
+        }
         last, root_position = memory.tracker_state, self.eval_input(context, "root_position")
         if not views and not pictures and last.track is None:
             return None, memory

@@ -301,7 +301,7 @@ class TestPreparation:
             for one in (setup.skeleton, studio.skeleton)
         ]
         assert off[0] < 0.25 * off[1]
-        recogniser = PoseRecogniser(setup.skeleton, setup.registered, list(ring.values()))
+        recogniser = PoseRecogniser(setup.skeleton, setup.registered, list(ring.values()), 0.93)
         found = evaluated(recogniser, "recognised_positions", **views)
         np.testing.assert_allclose(found[:3], q[:3], atol=0.03)
 

@@ -192,8 +192,7 @@ def check_units(
     model: ParsedModel,
     names: Sequence[str],
     known: Mapping[int | str, np.ndarray],
-    slack_angle: float = 0.1,
-    slack_fraction: float = 0.1,
+    slack: float = 0.1,
     millimetres_from: float = 20.0,
     largest: float = 1e6,
 ) -> tuple[str, ...]:
@@ -204,8 +203,8 @@ def check_units(
         model: the model with the limits.
         names: names of the positions.
         known: (len(names),) values by frame [rad or m].
-        slack_angle: tolerance of an angle beyond its limits [rad].
-        slack_fraction: tolerance of a length beyond its limits, as a fraction of its range.
+        slack: tolerance beyond the limits, of an angle [rad], of a length as a fraction of its
+            range.
         millimetres_from: multiple of its limits beyond which a length may be in millimetres; an
             angle may be in degrees if it is more than a full turn beyond its limits.
         largest: largest absolute value of any position [rad or m].
@@ -227,24 +226,22 @@ def check_units(
             continue
         values = np.array([row[k] for row in known.values()])
         what, unit, other, scale = "length", "m", "metres", 1e-3
-        slack, most = (
-            slack_fraction * (upper - lower),
-            millimetres_from * max(abs(lower), abs(upper)),
-        )
+        allowed = slack * (upper - lower)
+        most = millimetres_from * max(abs(lower), abs(upper))
         if is_angle := model.position_kinds[place] == "angle":
             what, unit, other, scale = "angle", "rad", "radians", math.pi / 180.0
-            slack = slack_angle
-            most = max(abs(lower), abs(upper)) + 2.0 * math.pi + slack
+            allowed = slack
+            most = max(abs(lower), abs(upper)) + 2.0 * math.pi + allowed
         off = np.maximum(lower - values, values - upper)
         worst = int(np.argmax(off))
-        if off[worst] <= slack:
+        if off[worst] <= allowed:
             continue
         text = (
             f"{path}: column '{name}', frame {list(known)[worst]}: {values[worst]:g} {unit} "
             f"lies outside the joint's limits, {lower:.4g} to {upper:.4g} {unit}"
         )
         scaled = scale * values
-        inside = (lower - slack <= scaled) & (scaled <= upper + slack)
+        inside = (lower - allowed <= scaled) & (scaled <= upper + allowed)
         if np.abs(values).max() > most and inside.all():
             wrong = "degrees" if unit == "rad" else "millimetres"
             raise SceneError(
@@ -253,7 +250,7 @@ def check_units(
             )
         why = "; check the column's joint, its offset, sign and unit"
         turn = math.copysign(2.0 * math.pi, values[worst])
-        if is_angle and lower - slack <= values[worst] - turn <= upper + slack:
+        if is_angle and lower - allowed <= values[worst] - turn <= upper + allowed:
             why = (
                 f"; a full turn off, {values[worst] - turn:.4g} rad, it would not; check whether "
                 "the encoder counts a turn too many, or whether the angles are in degrees"

@@ -21,7 +21,6 @@ from drake_pose.errors import SceneError, SettingsError
 from drake_pose.input_files import read_csv
 from drake_pose.person.date.skeleton import Skeleton, registered_positions
 from drake_pose.person.views import meeting_points, triangulate
-from drake_pose.silhouette.segmentation import learn_background, person_region
 
 FACE_SIZE = (80, 130)
 """Width and height to which a face is scaled, 80 x 130 in section 3.2.2 [pixel]."""
@@ -270,7 +269,7 @@ def recognise(
     registered: RegisteredPose,
     cameras: Sequence[Camera],
     contours: Sequence[Contour | None],
-    threshold: float = 0.9,
+    threshold: float,
 ) -> tuple[Array, float] | None:
     """Recognise the registered pose in all cameras' contours (5).
 
@@ -414,21 +413,18 @@ def find_face(
     return np.full(2, np.nan)
 
 
-def learn_recorded_faces(folder: Path, skin: SkinColour | None = None) -> FaceTemplates:
+def learn_recorded_faces(folder: Path) -> FaceTemplates:
     """Return the eigenspace of faces that a camera recorded.
 
     `directions.csv` in the folder has the header `picture,turn,nod`: the name of a picture beside
     it (.png or .jpg), and where the face looks relative to the camera [deg]: turn to the person's
-    left, nod downwards. The largest skin-coloured blob of a whole picture is the face. Where other
-    things have the colour of skin, a subfolder `empty` must hold pictures without the person.
-
-    `skin` is the range of skin colours; None: the default.
+    left, nod downwards. The largest skin-coloured blob of a picture is the face.
 
     Raises:
         SceneError: a file, line or picture is wrong; the message names it.
         SettingsError: there are fewer than three pictures.
     """
-    path, background, empty = folder / "directions.csv", None, folder / "empty"
+    path = folder / "directions.csv"
     header, rows = read_csv(path, SceneError)
     if header != ["picture", "turn", "nod"]:
         raise SceneError(f"{path}: the first line must be picture,turn,nod")
@@ -450,29 +446,15 @@ def learn_recorded_faces(folder: Path, skin: SkinColour | None = None) -> FaceTe
         if name in table:
             raise SceneError(f"{where}: '{name}' has a line already")
         table[name] = turn, nod
-    if empty.is_dir():
-        files = sorted(path for path in empty.iterdir() if path.suffix.lower() in SUFFIXES)
-        if not files:
-            raise SceneError(f"{empty}: holds no picture; remove the folder, or fill it")
-        pictures = [read_picture(file, SceneError) for file in files]
-        for file, picture in zip(files, pictures, strict=True):
-            if picture.shape != pictures[0].shape:
-                raise SceneError(f"{file}: is not as large as {files[0].name}")
-        background = learn_background(pictures)
     faces = []
     for name in table:
         picture = read_picture(folder / name, SceneError)
         region = np.ones(picture.shape[:2], dtype=np.bool_)
-        if background is not None:
-            if background.mean.shape != picture.shape:
-                raise SceneError(f"{folder / name}: is not as large as the pictures in 'empty'")
-            region = person_region(picture, background)
-        face = cut_face(picture, skin_blobs(picture, region, skin or SkinColour()))
+        face = cut_face(picture, skin_blobs(picture, region, SkinColour()))
         if face is None:
             raise SceneError(
                 f"{folder / name}: no face: nothing in it has the colour of skin, or the largest "
-                "patch touches the picture's edge; take the picture out of directions.csv, or name "
-                "another skin colour"
+                "patch touches the picture's edge; take the picture out of directions.csv"
             )
         faces.append(face)
     return learn_faces(faces, np.radians(list(table.values())).reshape(-1, 2))

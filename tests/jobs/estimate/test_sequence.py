@@ -7,14 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drake_pose.body import load_model
 from drake_pose.files.records import FrameRecord
 from drake_pose.files.settings import EstimateSettings
-from drake_pose.jobs.estimate.body_fit import _StartedSearch
 from drake_pose.jobs.estimate.inputs import EstimateInputs, read_inputs
 from drake_pose.jobs.estimate.measurements import MeasuredPositions
 from drake_pose.jobs.estimate.scene import check_track, compare_cameras, estimate_scene
-from drake_pose.search import TRACKED, RootPlacementSearch
+from drake_pose.search import TRACKED
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.jobs.scenes import URDF, TinyScene, camera, edit_camera, write_scene
 from tests.search.arms import crane
@@ -77,16 +75,6 @@ def test_without_track_every_frame_is_searched(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found[0], found[1])
 
 
-def test_tracking_settings_follow_the_scene(tiny_scene: TinyScene) -> None:
-    model, scene = load_model(tiny_scene.model), load_scene(tiny_scene.folder)
-    for search in (None, RootPlacementSearch.__new__(RootPlacementSearch)):
-        assert EstimateInputs(scene, model, scene.frames, False, search, None).tracking() is None
-        tracking = EstimateInputs(scene, model, scene.frames, True, search, None).tracking()
-        assert tracking is not None
-        assert tracking.root_moves is (search is not None)
-        assert not tracking.scale_unknown
-
-
 def test_joint_errors_are_modulo_full_turns(tiny_scene: TinyScene, tmp_path: Path) -> None:
     """As for a UR5 with limits of 360 degrees: 331.5 degrees measured, -28.5 estimated."""
     model, scene = crane(tmp_path), load_scene(tiny_scene.folder)
@@ -95,15 +83,6 @@ def test_joint_errors_are_modulo_full_turns(tiny_scene: TinyScene, tmp_path: Pat
     errors = inputs.joint_errors("0000", np.radians([177.0, -28.0]))
     assert errors == pytest.approx({"swing": -1.0, "luff": 0.5})
     assert inputs.joint_errors("0001", np.zeros(2)) == {}
-
-
-def test_a_track_continues_from_known_poses_and_searches_after_a_loss() -> None:
-    search, known = _StartedSearch.__new__(_StartedSearch), object()
-    search.first = known
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(RootPlacementSearch, "match", lambda *_: "searched")
-        assert search.match([]) is known
-        assert search.match([]) == "searched"
 
 
 ANGLES = ((20.0, -40.0), (-40.0, -80.0))

@@ -297,14 +297,12 @@ class TestOthers:
         found = sort_figures({"0": camera}, {"0": (figure,)}, [me, hidden], me)
         assert found == {"0": ((), side is None)}
 
-    @pytest.mark.parametrize(("gap", "far"), [(1, 0.39), (1, 0.41), (3, 0.59), (3, 0.61)])
-    def test_track_may_move_farther_while_hidden(self, gap: int, far: float) -> None:
-        """0.4 m from frame to frame, and 0.1 m more for each frame without the person."""
+    @pytest.mark.parametrize(("gap", "far"), [(1, 0.39), (1, 0.41), (3, 0.39), (3, 0.41)])
+    def test_track_continues_within_a_step_also_after_a_gap(self, gap: int, far: float) -> None:
         first, then = (Person(np.array([x, 0.0, 1.0]), {}, 100.0) for x in (0.0, far))
         tracks = find_tracks([[], [first], *[[]] * (gap - 1), [then]])
-        same = far < 0.4 + 0.1 * (gap - 1)
-        expected = [{1: first, gap + 1: then}] if same else [{1: first}, {gap + 1: then}]
-        assert tracks == expected
+        alone = [{1: first}, {gap + 1: then}]
+        assert tracks == ([{1: first, gap + 1: then}] if far < 0.4 else alone)
 
     def test_followed_person_is_seen_longest_and_may_return(self) -> None:
         def person(x: float, area: float = 100.0) -> Person:
@@ -333,14 +331,11 @@ class TestOthers:
 
     @pytest.mark.parametrize(("side", "counts"), [(10, True), (7, False)])
     def test_specks_are_no_figures(self, side: int, counts: bool) -> None:
-        """The limit is 2e-4 of the picture, here 61 pixels, and 16 pixels at least."""
+        """The limit is 2e-4 of the picture, here 61 pixels."""
         mask = np.zeros((239, 1285), dtype=bool)
         mask[50 : 50 + side, 60 : 60 + side] = True
         found = find_figures(mask)
         assert [one.area for one in found] == [float(side**2)] * counts
-        small = np.zeros((60, 80), dtype=bool)
-        small[10:15, 10:15] = True
-        assert len(find_figures(small)) == 1
 
     def test_separate_person_stands_apart_and_is_large(self) -> None:
         def person(x: float, area: float, z: float = 1.0) -> Person:

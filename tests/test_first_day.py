@@ -116,7 +116,7 @@ def test_a_models_repr_is_one_line(model):
         ("name those: --camera NAME", "name those: cameras=NAME"),
         ("(--joints FILE): --hold elbow=VALUE", "(joints=FILE): hold={'elbow': VALUE}"),
         ("in the zeros (--zeros all)?", "in the zeros (zeros='all')?"),
-        ("leave --no-track out (--keep-out)", "leave track=False out (keep_out)"),
+        ("leave --no-track out (--joint-map)", "leave track=False out (joint_map)"),
         ("(drake-pose masks --largest) or --out", "(drake-pose masks --largest) or out"),
     ],
 )
@@ -149,8 +149,6 @@ def test_errors_of_python_calls_name_arguments():
     with pytest.raises(DrakePoseError, match=r"joints") as refused:
         audit_scene(scene, bundled_model("man"))
     assert "--" not in str(refused.value)
-    with pytest.raises(SettingsError, match="keep_out is for suggest"):
-        RegistrationSettings(keep_out=(((0.0,) * 3, (1.0,) * 3),))
 
 
 def test_an_error_carries_what_was_assumed_before():

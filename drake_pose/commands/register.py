@@ -201,14 +201,6 @@ def _print_registration(result: SceneRegistration) -> None:
             console.print(parameters)
     if "target" in first:
         console.print(_say_target(first["target"]))
-    for name, one in result.summary["cameras"].items():
-        if one["suggestion"]:
-            values = ", ".join(f"{k}={v:.3f}" for k, v in one["suggestion"]["positions"].items())
-            console.print(
-                escape(
-                    f"camera '{name}': a picture at {values} would show which of its poses is right"
-                )
-            )
     misfits = [(name, one) for name, own in result.registered.items() for one in own.frames]
     if "points" in first:
         shown, which = worst_frames([-misfit.inlier_ratio for _, misfit in misfits], 8)

@@ -31,6 +31,8 @@ GONE = {
     "undistort": "use cv2.undistort, as tutorials/commands.md shows",
     "walk": "use the system Walker in a diagram, as tutorials/people.md shows",
     "capture --shape": "lengths and radii are fitted to the first frames of each capture",
+    "--suggest": "the warning of several poses names the joint that tells them apart best",
+    "--keep-out": "the warning of several poses names the joint that tells them apart best",
     "capture --start": "a person is captured from masks of every frame",
     "reproduce all": "run reproduce kameda, shimada and date; tutorials/figures.md has the results",
     "reproduce --seeds": "run the command with several --seed",
@@ -153,19 +155,6 @@ def parse_numbers(text: str, count: int) -> tuple[float, ...]:
     if len(parts) != count:
         raise SettingsError(f"'{text}' must be {count} numbers separated by commas")
     return tuple(map(parse_number, parts))
-
-
-def parse_boxes(texts: Iterable[str]) -> tuple[tuple[Corner, Corner], ...]:
-    """Return the lower and upper corner [m] of each box ``X,Y,Z:X,Y,Z`` given by two corners."""
-    boxes = []
-    for text in texts:
-        corners = text.split(":")
-        if [len(corner.split(",")) for corner in corners] != [3, 3]:
-            raise SettingsError(f"'{text}' must have the form X,Y,Z:X,Y,Z")
-        (ax, ay, az), (bx, by, bz) = (parse_numbers(corner, 3) for corner in corners)
-        low = (min(ax, bx), min(ay, by), min(az, bz))
-        boxes.append((low, (max(ax, bx), max(ay, by), max(az, bz))))
-    return tuple(boxes)
 
 
 def parse_root_position(text: str) -> Corner | tuple[Path, str] | Literal["unknown"]:

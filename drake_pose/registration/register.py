@@ -11,7 +11,6 @@ import copy
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from itertools import combinations
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -30,11 +29,10 @@ from drake_pose.registration.posed_frames import (
     LAST_SPACING,
     PosedFrame,
     PosedFrames,
-    placed_points,
 )
 from drake_pose.registration.shared_fit import SharedFit, SharedValues, fit_pose
 from drake_pose.silhouette.outline import EMPTY_OUTLINE, Outline, TreeSurfaces
-from drake_pose.silhouette.scoring import draw_mask, score_bodies
+from drake_pose.silhouette.scoring import score_bodies
 from drake_pose.workers import map_ordered
 
 
@@ -79,9 +77,6 @@ class CameraSearchSettings(NamedTuple):
 SEARCH = CameraSearchSettings()
 
 T = TypeVar("T")
-Corner = tuple[float, float, float]
-Box = tuple[Corner, Corner]
-"""Minimum and maximum corner of a box along the world's axes [m]."""
 
 
 class RegistrationBody:
@@ -369,58 +364,6 @@ def fit_to_inliers(fit: SharedFit, most: int = 5, settled: float = 1e-4) -> Shar
         if k > 0 and np.array_equal(inliers, used) and moved < settled:
             break
     return found
-
-
-def suggest_pose(
-    body: RegistrationBody,
-    camera: PinholeCamera,
-    X_WC: Sequence[Array],
-    keep_out: Sequence[Box] = (),
-    *,
-    tried: int = 300,
-    seed: int = 0,
-    width: int = 160,
-) -> tuple[Array, float] | None:
-    """Suggest joint positions at which ambiguous camera poses become distinguishable.
-
-    Random positions within the joint limits are tried (one full turn for a joint without limits).
-
-    Args:
-        body: the robot's surfaces.
-        camera: its pose is not used.
-        X_WC: two or more poses (4, 4) of the camera to distinguish.
-        keep_out: boxes that no point of the body's coarse surfaces may enter.
-        tried: number of random positions.
-        seed: of the random numbers.
-        width: approximate width of the pictures in which silhouettes are compared [pixel].
-
-    Returns the pose tree's values (m,) [rad or m], and the area in which the two most similar
-    silhouettes differ, over their mean area. None: no position is visible from all camera poses and
-    free of the boxes.
-    """
-    generator, kinematics = np.random.default_rng(seed), body.kinematics
-    lower = np.where(np.isfinite(kinematics.lower), kinematics.lower, -np.pi)
-    upper = np.where(np.isfinite(kinematics.upper), kinematics.upper, np.pi)
-    scale = min(1.0, width / camera.width)
-    size = (max(1, round(scale * camera.width)), max(1, round(scale * camera.height)))
-    cameras = [camera.with_pose(one).resized(*size) for one in X_WC]
-    best: tuple[Array, float] | None = None
-    for _ in range(tried):
-        values = generator.uniform(lower, upper)
-        X_WN = kinematics.poses(values)
-        points = placed_points(body.coarse, X_WN)
-        if any(np.all((points >= low) & (points <= high), axis=1).any() for low, high in keep_out):
-            continue
-        masks = [draw_mask(body.coarse, one.X_CW @ X_WN, one) for one in cameras]
-        if not all(mask.any() for mask in masks):
-            continue
-        difference = min(
-            2.0 * np.count_nonzero(a != b) / (np.count_nonzero(a) + np.count_nonzero(b))
-            for a, b in combinations(masks, 2)
-        )
-        if best is None or difference > best[1]:
-            best = values, float(difference)
-    return best
 
 
 def keep_distinct(items: Iterable[T], differ: Callable[[T, T], bool]) -> list[T]:

@@ -9,7 +9,6 @@ from drake_pose.files.settings import (
     MaskSettings,
     changed,
     parse_assignments,
-    parse_boxes,
     parse_packages,
     parse_root_position,
     parse_root_rotation,
@@ -37,7 +36,6 @@ def test_option_texts_are_parsed():
     assert parse_root_rotation("free") == "free"
     limits = parse_root_rotation("y=-180:180, x=-10:10")
     assert list(limits.items()) == [("y", (-180.0, 180.0)), ("x", (-10.0, 10.0))]
-    assert parse_boxes(["1,2,9:4,-5,6"]) == (((1.0, -5.0, 6.0), (4.0, 2.0, 9.0)),)
 
 
 BAD = {

@@ -10,7 +10,7 @@ import pytest
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.jobs.registration.diagnosis import likely_offset_warnings
+from drake_pose.jobs.registration.words import likely_offset_warnings
 from drake_pose.registration.joint_offsets import (
     _kept,
     _unknown_rotations,

@@ -1,20 +1,16 @@
-"""Laws of what a registration compares: poses, overlaps, and positions that tell poses apart."""
+"""Laws of what a registration compares: poses and overlaps."""
 
 import cv2
 import numpy as np
-import pytest
 
-from drake_pose.registration.posed_frames import PosedFrames, placed_points
+from drake_pose.registration.posed_frames import PosedFrames
 from drake_pose.registration.register import (
-    RegistrationBody,
     distinct_poses,
     frame_misfits,
     keep_distinct,
     overlap_areas,
-    suggest_pose,
 )
 from drake_pose.silhouette.scoring import draw_mask
-from tests.registration.arm_pictures import MIDDLE, PLACE, looking_at
 
 
 def test_poses_are_distinct_if_points_are_apart_in_pictures(posed: PosedFrames) -> None:
@@ -58,29 +54,3 @@ def test_overlaps_count_pixels_of_scaled_pictures(posed: PosedFrames) -> None:
     assert (first.frame, first.inlier_ratio, first.is_inlier) == (posed.frames[0].name, 0.9, True)
     assert not second.is_inlier
     assert first.E_total < 0.05 < 0.9 < first.iou
-
-
-def test_suggested_positions_tell_poses_apart_outside_of_boxes(body: RegistrationBody) -> None:
-    """They are the best of many random ones, in which all cameras see the body."""
-    camera = looking_at(PLACE, MIDDLE, 0.1)
-    X_WC = [camera.X_WC, looking_at(PLACE + np.array([0.0, 0.1, 0.0]), MIDDLE, 0.12).X_WC]
-    found = suggest_pose(body, camera, X_WC, tried=12, width=160)
-    assert found is not None
-    small = [camera.with_pose(X).resized(160, 120) for X in X_WC]
-
-    def difference(values: np.ndarray) -> float:
-        a, b = (draw_mask(body.coarse, c.X_CW @ body.kinematics.poses(values), c) for c in small)
-        return 2.0 * np.count_nonzero(a ^ b) / (a.sum() + b.sum())
-
-    assert found[1] == pytest.approx(difference(found[0]))
-    rng = np.random.default_rng(0)
-    drawn = [rng.uniform(body.kinematics.lower, body.kinematics.upper) for _ in range(12)]
-    assert found[1] == pytest.approx(max(map(difference, drawn)))
-    box = (np.full(3, -9.0), np.full(3, 9.0))
-    assert suggest_pose(body, camera, X_WC, [box], tried=3) is None
-    low = np.array([-9.0, -9.0, 0.55])
-    free = suggest_pose(body, camera, X_WC, [(low, np.full(3, 9.0))], tried=40)
-    assert free is not None
-    assert placed_points(body.coarse, body.kinematics.poses(free[0]))[:, 2].max() < 0.55
-    away = looking_at(PLACE, 2.0 * PLACE, 0.0).X_WC
-    assert suggest_pose(body, camera, [camera.X_WC, away], tried=3) is None

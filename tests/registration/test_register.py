@@ -10,11 +10,9 @@ from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import (
     CameraSearch,
     RegistrationBody,
-    suggest_pose,
     uniform_rotations,
 )
-from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from tests.registration.arm_pictures import MIDDLE, errors, looking_at, see
+from tests.registration.arm_pictures import errors, looking_at, see
 
 PLACES = {
     "beside": (np.array([1.6, 0.4, 0.5]), 0.1),
@@ -74,36 +72,3 @@ class TestUniformRotations:
         nearest = np.arccos(np.clip(0.5 * (trace_parts.max(axis=1) - 1.0), -1.0, 1.0))
         # Balls of this radius about all rotations would cover them about twice.
         assert np.degrees(nearest.max()) < 16.0
-
-
-BEHIND = ((-2.0, -2.0, -1.0), (-0.2, 2.0, 2.0))
-
-
-class TestSuggestPose:
-    def test_suggests_positions_that_distinguish_two_cameras(
-        self, model: ArticulatedModel, body: RegistrationBody
-    ) -> None:
-        """From front and back the arm's zero pose looks the same, except for its boxes."""
-        places = [np.array([1.8, 0.0, 0.4]), np.array([-1.8, 0.0, 0.4])]
-        cameras = [looking_at(place, MIDDLE, 0.0) for place in places]
-        poses = [camera.X_WC for camera in cameras]
-        found = suggest_pose(body, cameras[0], poses, [BEHIND], seed=1)
-        assert found is not None
-        values, told = found
-        kinematics = body.kinematics
-        assert np.all((values >= kinematics.lower) & (values <= kinematics.upper))
-        X_WN = kinematics.poses(values)
-        for outline, X in zip(body.full, X_WN, strict=True):
-            # The tested points lie on the coarse surfaces.
-            assert (outline.vertices @ X[0, :3] + X[0, 3]).min() > BEHIND[1][0] - 0.02
-        q, X_WB = body.tree.positions_from(kinematics.split(values))
-        masks = [LabelRenderer(model, camera).mask(q, X_WB) for camera in cameras]
-        area = np.mean([np.count_nonzero(mask) for mask in masks])
-        difference = np.count_nonzero(masks[0] != masks[1]) / area
-        assert abs(difference - told) < 0.1
-        assert difference > 0.5
-
-    def test_no_free_positions_give_no_suggestion(self, body: RegistrationBody) -> None:
-        camera = looking_at(np.array([1.8, 0.0, 0.4]), MIDDLE, 0.0)
-        everywhere = ((-9.0, -9.0, -9.0), (9.0, 9.0, 9.0))
-        assert suggest_pose(body, camera, [camera.X_WC] * 2, [everywhere], tried=5) is None

@@ -23,11 +23,7 @@ from drake_pose.files.records import mask_digests, user_units
 from drake_pose.files.settings import percent
 from drake_pose.jobs.estimate.measurements import left_out_warnings
 from drake_pose.jobs.registration.audit_page import write_audit_page
-from drake_pose.jobs.registration.diagnosis import (
-    compare_camera,
-    compare_clock,
-    lost_frames_warning,
-)
+from drake_pose.jobs.registration.diagnosis import compare_camera, compare_clock
 from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs, still_joints
 from drake_pose.jobs.registration.large_errors import SceneComparison
 from drake_pose.jobs.registration.result import (
@@ -47,6 +43,7 @@ from drake_pose.jobs.registration.tracks import (
 from drake_pose.jobs.registration.words import (
     describe_common_finding,
     describe_frame_finding,
+    lost_frames_warning,
     shift_unit,
 )
 from drake_pose.registration.diagnosis import DIAGNOSIS

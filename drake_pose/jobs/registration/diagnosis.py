@@ -1,9 +1,9 @@
 """Check registered cameras, clocks and frames, and word what is wrong with them."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations, pairwise
+from itertools import pairwise
 
 import numpy as np
 from scipy.special import chdtrc
@@ -15,10 +15,9 @@ from drake_pose.files.records import BADLY_EXPLAINED
 from drake_pose.files.settings import percent
 from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.jobs.registration.readings import likeliest_reading
-from drake_pose.jobs.registration.words import describe_reading
 from drake_pose.registration.diagnosis import DIAGNOSIS
-from drake_pose.registration.findings import Finding
-from drake_pose.registration.joint_offsets import JointCalibration, calibrate_joints
+from drake_pose.registration.findings import Diagnosis, Finding
+from drake_pose.registration.joint_offsets import calibrate_joints
 from drake_pose.registration.online_registration import pose_difference, squared_distance
 from drake_pose.registration.picture_acceptance import PictureRegistration
 from drake_pose.registration.posed_frames import (
@@ -29,20 +28,17 @@ from drake_pose.registration.posed_frames import (
 )
 from drake_pose.registration.recording import Recording
 from drake_pose.registration.register import (
-    LAST_SPACING,
     SEARCH,
     CameraSearch,
     E_total,
     RegisteredCamera,
     RegistrationBody,
-    TargetPose,
     evenly_spaced,
     frame_misfits,
     overlap_areas,
 )
-from drake_pose.registration.shared_fit import SHARED, SharedFit
+from drake_pose.registration.shared_fit import SharedFit
 from drake_pose.registration.standing_object import TargetSearch
-from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.scoring import require_visible
 
 Search = CameraSearch | TargetSearch
@@ -57,7 +53,7 @@ def explain_misfit(found: RegisteredCamera, min_inlier_ratio: float = 0.65) -> s
     masks, another robot's masks or exchanged frames have 0.6 at most.
     """
     inliers = [frame for frame in found.frames if frame.is_inlier]
-    left = _left(found)
+    left = left_over(found)
     ratio = float(np.mean(np.sort([frame.inlier_ratio for frame in found.frames])[-2:]))
     if len(found.frames) > 1 and len(inliers) < 2:
         return (
@@ -72,7 +68,7 @@ def explain_misfit(found: RegisteredCamera, min_inlier_ratio: float = 0.65) -> s
     )
 
 
-def _left(found: RegisteredCamera) -> float:
+def left_over(found: RegisteredCamera) -> float:
     """Return the median E_total of the inlier frames."""
     return float(np.median([frame.E_total for frame in found.frames if frame.is_inlier]))
 
@@ -100,7 +96,7 @@ def require_explained(
             other = search.register(camera, changed)
         except RegistrationError:
             continue
-        if explain_misfit(other) is None and _left(other) < much_better * _left(found):
+        if explain_misfit(other) is None and left_over(other) < much_better * left_over(found):
             better.append(text)
     advice = (
         "are these masks of this robot or object, are the joint positions those of these frames, "
@@ -365,56 +361,6 @@ def _picture_shift(
     return float(np.sqrt(np.fmin(squares, most**2).mean()))
 
 
-def likely_offset_warnings(
-    body: RegistrationBody, found: RegisteredCamera, frames: Sequence[PosedFrame]
-) -> list[str]:
-    """Return a warning of the likeliest joint offset that would explain all frames' residuals.
-
-    The list is empty if no offset is likely.
-
-    ``body``: the robot's surfaces. ``found``: the registered camera. ``frames``: the camera's
-    frames; at most 24 inlier frames are used.
-    """
-    names = {frame.frame for frame in found.frames if frame.is_inlier}
-    sample = evenly_spaced([frame for frame in frames if frame.name in names], 24)
-    if not sample:
-        return []
-    posed = PosedFrames(body.kinematics, body.full, found.camera, sample, LAST_SPACING)
-    fit = SharedFit([posed], [found.camera.X_CW])
-    all_frames = np.ones(len(sample), bool)
-    likely = fit.likely_offsets(
-        fit.fit(SHARED.stages_with_constants[-1:], fit.start, all_frames), all_frames
-    )
-    turns = dict(zip(body.kinematics.names, body.kinematics.is_angle, strict=True))
-    for name, estimate in likely.items():
-        unit, factor = ("deg", math.degrees(1.0)) if turns[name] else ("mm", 1e3)
-        reading = describe_reading(factor * estimate[0], factor * estimate[1], unit)
-        return [
-            f"camera '{found.camera.name}': its frames are explained better if joint '{name}' "
-            f"{reading}; while joint offsets are unknown, the camera's error may exceed its "
-            "standard deviation: estimate them with --zeros all"
-        ]
-    return []
-
-
-def lost_frames_warning(
-    camera: str, lost: Sequence[str], names: Sequence[str], what: str = "robot"
-) -> str:
-    """Return a warning of pictures without the robot where it should be.
-
-    Args:
-        camera: its name.
-        lost: names of the pictures without the robot.
-        names: names of all pictures, in order.
-        what: what is not visible.
-    """
-    return (
-        f"camera '{camera}': the {what} is not visible where it should be in frames "
-        f"{frame_ranges(lost, names)}: is something in front of it, or do the joint positions "
-        "belong to other pictures?"
-    )
-
-
 def last_before_change(wrong: Sequence[bool], least: int = 2) -> int | None:
     """Return the index of the last frame before frames change from inliers to outliers, or back.
 
@@ -428,157 +374,47 @@ def last_before_change(wrong: Sequence[bool], least: int = 2) -> int | None:
     return int(turns[0])
 
 
-def outlier_warnings(found: RegisteredCamera, from_pictures: bool = False) -> list[str]:
-    """Return warnings of a camera's outlier frames, and of alternative poses.
+def changed_after(found: Diagnosis, cameras: Collection[str], least: int) -> tuple[list[int], str]:
+    """Return the outlier frames on one side of a change, and the last frame before the change.
 
-    from_pictures: whether the camera was registered from pictures.
+    Args:
+        found: the diagnosis.
+        cameras: names; only frames with masks of exactly these cameras are used.
+        least: minimum number of frames on each side of a change.
 
-    Raises RegistrationError: half of the masks or more are outliers. In pictures this is a warning:
-        the frames of the fit agree, and the others may be dark or blurred.
+    Returns:
+        the outliers' indices in ``found.frames``, and the last frame's name. ([], ""): no change.
     """
-    name, frames = found.camera.name, [frame.frame for frame in found.frames]
-    wrong, texts, moved = found.outliers, [], ""
-    last = last_before_change([frame in wrong for frame in frames])
-    if last is not None:
-        moved = f" Were camera or base moved after frame '{frames[last]}'?"
-    if wrong:
-        right = len(frames) - len(wrong)
-        text = (
-            f"camera '{name}': {len(wrong)} of {len(frames)} frames are outliers and did not "
-            f"count: {frame_ranges(wrong, frames)}; are their joint positions those of the "
-            f"pictures?{moved}"
-        )
-        if 2 * right <= len(frames):
-            supporting = frame_ranges([frame for frame in frames if frame not in wrong], frames)
-            if not from_pictures:
-                raise RegistrationError(
-                    f"camera '{name}': half of the frames or more are outliers, {len(wrong)} of "
-                    f"{len(frames)}: {frame_ranges(wrong, frames)}.{moved} Either these are wrong, "
-                    f"or the others, {supporting}, agree by chance: is this the robot's model, "
-                    "with covers and tools, and are the joint positions those of the pictures and "
-                    "in the model's zeros (--zeros all)? If the others are right, give a scene of "
-                    "them alone. Nothing was written"
-                )
-            text += (
-                f" FEWER THAN HALF OF THE FRAMES AGREE, {right} of {len(frames)}: {supporting}; "
-                "the pose rests on these alone and may be wrong: correct the others, or add frames"
-            )
-        texts.append(text)
-    if len(found.alternatives):
-        texts.append(
-            f"camera '{name}': {len(found.alternatives)} other poses fit equally well; see "
-            "registration.yaml and the overlays, and add frames with other joint positions"
-        )
-    return texts
+    rows = [k for k, frame in enumerate(found.frames) if {*frame.given_ratios} == {*cameras}]
+    wrong = [found.frames[k].finding is not None for k in rows]
+    last = last_before_change(wrong, least)
+    if last is None:
+        return [], ""
+    return [rows[k] for k in np.flatnonzero(wrong)], found.frames[rows[last]].frame
 
 
-def parameter_warnings(found: JointCalibration) -> list[str]:
-    """Return warnings of joint offsets and link scales that are uncertain.
+def base_motion(
+    given: Mapping[str, Camera], placed: Mapping[str, RegisteredCamera], sds: float = 4.0
+) -> Finding | None:
+    """Return the base's motion that explains the motions of all cameras; None: none does.
 
-    If no parameter is significant, this is the only warning. Otherwise there is a warning for each
-    parameter that only static parts separate from a camera's pose, and for each that is not
-    determined.
+    One camera alone does not tell a motion of the base from its own. The finding's shift is that
+    of the world's origin; its pixels and p-value are 0.
+
+    ``given``: cameras at their given poses, by name. ``placed``: registered cameras, by name; each
+    is in `given`. ``sds``: maximum difference between the cameras' motions [standard deviations],
+    to which 0.25 degrees and 3 mm are added.
     """
-    requested = [(f"joint '{offset.name}': its offset", offset) for offset in found.offsets]
-    requested += [(f"link '{scale.name}': its length", scale) for scale in found.link_scales]
-    if requested and not any(parameter.significant for _, parameter in requested):
-        return [
-            "none of the requested joint offsets and link lengths is significant beside other "
-            "errors (of each other, focal length, principal point, masks): no corrected URDF is "
-            "written"
-        ]
-    with_cameras = [
-        f"{what} is good to {np.degrees(one.deviation):.2g} degrees only, and turns the camera "
-        f"about the robot (correlated with {', '.join(one.gauge)}): edges of static parts separate "
-        "the two. Check in the overlays whether the base fits, or give a camera with its pose"
-        for what, one in requested
-        if one.determined and one.gauge
-    ]
-    return with_cameras + [
-        f"{what} is not determined by these silhouettes and was not changed"
-        + (
-            f" (correlated with {', '.join(parameter.gauge)}: their values hold if it is 0)"
-            if parameter.gauge
-            else ""
-        )
-        + "; add frames with other joint positions, or a view of a part that does not move with it"
-        for what, parameter in requested
-        if not parameter.determined
-    ]
-
-
-def target_warnings(pose: TargetPose) -> list[str]:
-    """Return warnings of symmetries of the calibration target."""
-    texts = []
-    if len(pose.symmetry_axes):
-        axes = "; ".join(", ".join(f"{x:.3f}" for x in axis) for axis in pose.symmetry_axes)
-        texts.append(
-            f"the target is round about an axis ({axes} in its frame), so its rotation about it is "
-            "not determined; the camera's pose does not depend on it"
-        )
-    if len(pose.alternatives):
-        texts.append(
-            f"the target looks the same in {len(pose.alternatives)} other poses, see its modes in "
-            "summary.json; the camera's pose does not depend on it"
-        )
-    return texts
-
-
-def common_outlier_warnings(
-    registered: Iterable[RegisteredCamera], *, from_pictures: bool = False, worse: float = 2.0
-) -> list[str]:
-    """Return warnings that compare several cameras' inliers.
-
-    They name frames that are outliers in all cameras, or in one camera but not in another. If the
-    cameras were registered from masks, they name pairs of cameras that have common frames, but no
-    common inlier frame.
-
-    worse: E_total of an inlier frame, over its camera's median and a percent more, from which the
-    frame does not support its joint positions against another camera.
-    """
-    is_inlier: dict[str, dict[str, bool]] = {}
-    sets, frames_of = dict[str, list[str]](), dict[str, set[str]]()
-    doubted = set[str]()
-    for found in registered:
-        usual = worse * _left(found) + 0.01
-        for misfit in found.frames:
-            is_inlier.setdefault(misfit.frame, {})[found.camera.name] = misfit.is_inlier
-            if misfit.is_inlier and misfit.E_total > usual:
-                doubted.add(misfit.frame)
-        sets[found.camera.name] = [frame.frame for frame in found.frames if frame.is_inlier]
-        frames_of[found.camera.name] = {frame.frame for frame in found.frames}
-    frames, masks = list(is_inlier), dict[str, list[str]]()
-    positions = [k for k, own in is_inlier.items() if len(own) > 1 and not any(own.values())]
-    for frame, inliers in is_inlier.items():
-        for name, right in inliers.items() if any(inliers.values()) else ():
-            if not right:
-                masks.setdefault(name, []).append(frame)
-    why = "something hides the robot there" if from_pictures else "their masks are not"
-    texts = [
-        f"cameras '{a}' and '{b}' rest on no common frame: '{a}' on {frame_ranges(own, frames)}, "
-        f"'{b}' on {frame_ranges(other, frames)}: if cameras or base were moved in between, their "
-        "poses do not belong together"
-        for (a, own), (b, other) in combinations(sets.items(), 2)
-        if frames_of[a] & frames_of[b] and not {*own} & {*other} and not from_pictures
-    ]
-    if positions:
-        texts.append(
-            f"frames {frame_ranges(positions, frames)} are outliers in all cameras that see them: "
-            "their joint positions are not those of the pictures; correct them, or leave these "
-            "frames out"
-        )
-    for name, wrong in masks.items():
-        unsure = [frame for frame in wrong if frame in doubted]
-        sure = [frame for frame in wrong if frame not in doubted]
-        if sure:
-            texts.append(
-                f"frames {frame_ranges(sure, frames)} are outliers in camera '{name}', but not in "
-                f"another one that sees them: their joint positions are right, {why}"
-            )
-        if unsure:
-            texts.append(
-                f"frames {frame_ranges(unsure, frames)} are outliers in camera '{name}', and fit "
-                "worse than others in another one that sees them: check their joint positions, "
-                "then their pictures"
-            )
-    return texts
+    motions = [given[name].X_WC @ camera.camera.X_CW for name, camera in placed.items()]
+    rotation_sd = max((camera.rotation_sd for camera in placed.values()), default=0.0)
+    shift_sd = max((camera.translation_sd for camera in placed.values()), default=0.0)
+    differences = [pose_difference(motion, motions[0]) for motion in motions[1:]]
+    most = sds * rotation_sd + np.radians(0.25), sds * shift_sd + 0.003
+    if not differences or any(
+        np.linalg.norm(difference[:3]) > most[0] or np.linalg.norm(difference[3:]) > most[1]
+        for difference in differences
+    ):
+        return None
+    motion = pose_difference(motions[0], np.eye(4))
+    size = float(np.linalg.norm(motion[:3])), float(np.linalg.norm(motion[3:]))
+    return Finding("base", "base", *size, rotation_sd, shift_sd, 0.0, 0.0)

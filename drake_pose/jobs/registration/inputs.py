@@ -309,12 +309,11 @@ def _read_episode(
     if not isinstance(settings, RegistrationSettings):
         return inputs
     scene_alone = settings.on is not None and target is None
-    for name in ("suggest", *(("lengths",) if scene_alone else ())):
-        if getattr(settings, name):
-            raise SettingsError(
-                f"--{name} needs masks, but {path} has pictures: make masks of them "
-                "(drake-pose masks), or leave it out"
-            )
+    if scene_alone and settings.lengths:
+        raise SettingsError(
+            f"--lengths needs masks, but {path} has pictures: make masks of them "
+            "(drake-pose masks), or leave it out"
+        )
     if scene_alone and settings.zeros and len(chosen) > 1:
         raise SettingsError(
             f"--zeros with --on takes one camera, but {path} has {', '.join(known)}: name the one "
@@ -385,7 +384,7 @@ def _read_masks(
         table = read_measured_positions(joints, robot.position_names)
     if joints is None or (table is not None and table.is_estimate):
         # Estimated positions would absorb these parameters.
-        for name in ("zeros", "lengths", "focal", "on", "suggest"):
+        for name in ("zeros", "lengths", "focal", "on"):
             if getattr(settings, name):
                 raise SettingsError(
                     f"--{name} needs measured joint positions (--joints FILE): estimated ones "

@@ -10,12 +10,13 @@ from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError, MaskError, RegistrationError
 from drake_pose.files.settings import percent
 from drake_pose.jobs.registration.diagnosis import (
+    base_motion,
+    changed_after,
     compare_camera,
     explain_misfit,
     require_seen_by,
 )
 from drake_pose.jobs.registration.inputs import RegistrationInputs
-from drake_pose.jobs.registration.moves import base_motion, changed_after
 from drake_pose.jobs.registration.readings import (
     focal_correction,
     joint_exchanges,

@@ -18,19 +18,12 @@ from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.registration.diagnosis import (
     Search,
     check_focal_length,
-    common_outlier_warnings,
     known_camera_warnings,
-    likely_offset_warnings,
-    lost_frames_warning,
-    outlier_warnings,
-    parameter_warnings,
     require_determined,
     require_explained,
-    target_warnings,
 )
 from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs, still_joints
 from drake_pose.jobs.registration.lerobot_files import lerobot_files, require_data_set
-from drake_pose.jobs.registration.odd_links import odd_link_warnings
 from drake_pose.jobs.registration.positions import (
     corrected_urdf,
     joint_shifts,
@@ -42,7 +35,6 @@ from drake_pose.jobs.registration.result import (
     describe_camera,
     describe_parameters,
     describe_run,
-    suggest_picture,
     write_result,
 )
 from drake_pose.jobs.registration.settings import RegistrationSettings
@@ -55,6 +47,16 @@ from drake_pose.jobs.registration.tracks import (
     say_refused,
     track_warnings,
     watch_cameras,
+)
+from drake_pose.jobs.registration.words import (
+    common_outlier_warnings,
+    likely_offset_warnings,
+    lost_frames_warning,
+    mode_warnings,
+    odd_link_warnings,
+    outlier_warnings,
+    parameter_warnings,
+    target_warnings,
 )
 from drake_pose.person.pose_tracker import shape_parts, shape_values
 from drake_pose.registration.bundle import adjust_bundle
@@ -199,8 +201,7 @@ class _Registration:
     Attributes:
         inputs, body: the inputs and the robot's surfaces; updated after each step.
         warnings: for the user.
-        registered, seconds, suggestions: by camera the result, the duration [s], and an entry on
-            joint positions that would distinguish alternative poses (None: no entry).
+        registered, seconds: by camera the result, and the duration [s].
         parameters: the summary's part on joint offsets and link scales.
         pictures: registrations from pictures, by camera; empty for masks, and for a target.
         target_pictures: by camera and frame, pictures in which the target was found.
@@ -219,7 +220,6 @@ class _Registration:
         self.warnings = list(inputs.warnings)
         self.registered = dict[str, RegisteredCamera]()
         self.seconds = dict[str, float]()
-        self.suggestions = dict[str, dict[str, Any] | None]()
         self.parameters: dict[str, Any] = {"zeros": {}, "lengths": {}}
         self.pictures = dict[str, PictureRegistration]()
         self.target_pictures = dict[str, dict[str, Picture]]()
@@ -333,11 +333,8 @@ class _Registration:
 
     def _note(self, found: RegisteredCamera, start: float) -> None:
         """Store a registered camera; start: when its search began, by time.perf_counter()."""
-        name, settings = found.camera.name, self._settings
-        self.registered[name], self.suggestions[name] = found, None
-        if settings.suggest and len(found.alternatives):
-            self.suggestions[name], texts = suggest_picture(self.body, found, settings.keep_out)
-            self.warnings += texts
+        name = found.camera.name
+        self.registered[name] = found
         self.seconds[name] = time.perf_counter() - start
         if self._on_camera is not None:
             self._on_camera(len(self.registered))
@@ -449,6 +446,7 @@ class _Registration:
                 if inputs.target is not None:
                     require_determined(found)
                 self.warnings += outlier_warnings(found, from_pictures)
+                self.warnings += mode_warnings(body, found, inputs.of(name))
         if joint and len(self.refused) > before:
             raise list(self.refused.values())[before]
         self._require_registered()
@@ -458,10 +456,9 @@ class _Registration:
 
     def describe(self, more: float) -> dict[str, dict[str, Any]]:
         """Return each camera's part of summary.json; more: added to each camera's duration [s]."""
-        on, suggestions = self._settings.on, self.suggestions
         return {
             name: self.parameters
-            | describe_camera(camera, self.seconds[name] + more, suggestions[name], on)
+            | describe_camera(camera, self.seconds[name] + more, self._settings.on)
             | (
                 describe_tracks(self.tracks[name], self.body.kinematics)
                 if name in self.tracks

@@ -33,11 +33,8 @@ from drake_pose.jobs.registration.words import describe_reading
 from drake_pose.registration.joint_offsets import KinematicParameter
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import (
-    Box,
     RegisteredCamera,
-    RegistrationBody,
     TargetPose,
-    suggest_pose,
 )
 from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.pictures.masks import encode_mask
@@ -51,7 +48,6 @@ if TYPE_CHECKING:
 def describe_camera(
     found: RegisteredCamera,
     seconds: float,
-    suggestion: dict[str, Any] | None = None,
     link: str | None = None,
 ) -> dict[str, Any]:
     """Return a camera's part of summary.json; lengths in m unless `_mm`, angles in `_deg`.
@@ -59,7 +55,6 @@ def describe_camera(
     Args:
         found: the camera.
         seconds: duration of the search [s].
-        suggestion: entry on joint positions that would distinguish alternative poses; None: none.
         link: the link that carries the camera, in whose frame its pose is; None: the world.
     """
     pose, target_pose, X = "X_WC" if link is None else "X_LC", found.target, found.camera.X_WC
@@ -79,7 +74,6 @@ def describe_camera(
         **describe_pose(pose, X, found),
         "modes": [{pose: one.tolist()} for one in (X, *found.alternatives)],
         "mean_iou": float(np.mean([frame.iou for frame in found.frames])),
-        "suggestion": suggestion,
         **({"target": target} if target else {}),
         "seconds": seconds,
         "outliers": list(found.outliers),
@@ -102,25 +96,6 @@ def describe_pose(name: str, X: Array, found: RegisteredCamera | TargetPose) -> 
         "translation_sd_mm": 1e3 * found.translation_sd,
         "rotation_sd_deg": float(np.degrees(found.rotation_sd)),
     }
-
-
-def suggest_picture(
-    body: RegistrationBody, found: RegisteredCamera, keep_out: Sequence[Box]
-) -> tuple[dict[str, Any] | None, list[str]]:
-    """Return joint positions that distinguish a camera's poses, and a warning if none are found.
-
-    The entries are ``positions`` by joint [rad or m] and ``difference``, see `suggest_pose`.
-    """
-    poses = [found.camera.X_WC, *found.alternatives]
-    suggested = suggest_pose(body, found.camera, poses, keep_out)
-    if suggested is None:
-        return None, [
-            f"camera '{found.camera.name}': no random joint positions are visible from all its "
-            "poses and free of collisions: no picture is suggested; is --keep-out too large?"
-        ]
-    values = zip(body.kinematics.names, suggested[0].tolist(), strict=True)
-    positions = {k: one for k, one in values if k not in TARGET_POSITIONS}
-    return {"positions": positions, "difference": suggested[1]}, []
 
 
 def describe_parameters(

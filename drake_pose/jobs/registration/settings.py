@@ -2,18 +2,15 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Literal, get_args
 
 from cyclopts import Parameter
 
-from drake_pose.errors import SettingsError, for_caller
+from drake_pose.errors import SettingsError
 from drake_pose.files.settings import (
-    Corner,
     EpisodeSettings,
     Names,
     Positions,
-    from_text,
-    parse_boxes,
     readable,
 )
 
@@ -63,14 +60,6 @@ class RegistrationSettings(AuditSettings):
     the significant scales is written."""
     focal: bool = False
     """Estimate the cameras' focal lengths, too."""
-    suggest: bool = False
-    """If several poses of a camera fit equally well, suggest joint positions that distinguish
-    these poses. For masks."""
-    keep_out: Annotated[
-        tuple[tuple[Corner, Corner], ...], from_text(parse_boxes, "X,Y,Z:X,Y,Z", repeated=True)
-    ] = ()
-    """With --suggest: corners of a box in the world that the robot must not enter [m]; repeat for
-    several."""
     exports: Annotated[tuple[Export, ...], Parameter("--export")] = ()
     """Export the cameras for this program, too; repeat for several. ros: camera_info and static
     transforms; mujoco: <camera> elements; drake: CameraConfigs; lerobot, for a LeRobot data set: a
@@ -82,12 +71,3 @@ class RegistrationSettings(AuditSettings):
         for name in self.exports:
             if name not in (known := get_args(Export)):
                 raise SettingsError(f"there is no export '{name}'; there is: {', '.join(known)}")
-        if self.keep_out and not self.suggest:
-            raise SettingsError(
-                for_caller("--keep-out is for --suggest; give both, or leave it out")
-            )
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the settings as plain JSON values."""
-        boxes = [{"low": low, "high": high} for low, high in self.keep_out]
-        return super().as_json() | {"keep_out": boxes}

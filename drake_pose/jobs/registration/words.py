@@ -1,12 +1,28 @@
-"""Errors found by a registration or an audit, in words."""
+"""Errors and doubts of a registration or an audit, in words."""
 
 import math
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
+from itertools import combinations, product
 
 import numpy as np
+from pydrake.multibody.tree import BodyIndex
 
+from drake_pose.errors import RegistrationError
 from drake_pose.files.settings import percent
+from drake_pose.jobs.registration.diagnosis import last_before_change, left_over
 from drake_pose.registration.findings import Finding, FrameDiagnosis
+from drake_pose.registration.joint_offsets import JointCalibration
+from drake_pose.registration.posed_frames import LAST_SPACING, PosedFrame, PosedFrames
+from drake_pose.registration.register import (
+    RegisteredCamera,
+    RegistrationBody,
+    TargetPose,
+    evenly_spaced,
+)
+from drake_pose.registration.shared_fit import SHARED, SharedFit
+from drake_pose.silhouette.pictures.scene_checks import frame_ranges
+from drake_pose.silhouette.scoring import draw_mask
 
 
 def shift_unit(kind: str) -> tuple[str, float]:
@@ -134,3 +150,312 @@ def describe_drift(camera: str, drift: float, deviation: float) -> str:
         f"{100.0 * deviation:.2f} percent {word} than its pictures': is the pictures' rate "
         "correct, and were none dropped?"
     )
+
+
+def lost_frames_warning(
+    camera: str, lost: Sequence[str], names: Sequence[str], what: str = "robot"
+) -> str:
+    """Return a warning of pictures without the robot where it should be.
+
+    Args:
+        camera: its name.
+        lost: names of the pictures without the robot.
+        names: names of all pictures, in order.
+        what: what is not visible.
+    """
+    return (
+        f"camera '{camera}': the {what} is not visible where it should be in frames "
+        f"{frame_ranges(lost, names)}: is something in front of it, or do the joint positions "
+        "belong to other pictures?"
+    )
+
+
+def likely_offset_warnings(
+    body: RegistrationBody, found: RegisteredCamera, frames: Sequence[PosedFrame]
+) -> list[str]:
+    """Return a warning of the likeliest joint offset that would explain all frames' residuals.
+
+    The list is empty if no offset is likely.
+
+    ``body``: the robot's surfaces. ``found``: the registered camera. ``frames``: the camera's
+    frames; at most 24 inlier frames are used.
+    """
+    names = {frame.frame for frame in found.frames if frame.is_inlier}
+    sample = evenly_spaced([frame for frame in frames if frame.name in names], 24)
+    if not sample:
+        return []
+    posed = PosedFrames(body.kinematics, body.full, found.camera, sample, LAST_SPACING)
+    fit = SharedFit([posed], [found.camera.X_CW])
+    all_frames = np.ones(len(sample), bool)
+    likely = fit.likely_offsets(
+        fit.fit(SHARED.stages_with_constants[-1:], fit.start, all_frames), all_frames
+    )
+    turns = dict(zip(body.kinematics.names, body.kinematics.is_angle, strict=True))
+    for name, estimate in likely.items():
+        unit, factor = ("deg", math.degrees(1.0)) if turns[name] else ("mm", 1e3)
+        reading = describe_reading(factor * estimate[0], factor * estimate[1], unit)
+        return [
+            f"camera '{found.camera.name}': its frames are explained better if joint '{name}' "
+            f"{reading}; while joint offsets are unknown, the camera's error may exceed its "
+            "standard deviation: estimate them with --zeros all"
+        ]
+    return []
+
+
+def odd_link_warnings(
+    body: RegistrationBody,
+    found: RegisteredCamera,
+    frames: Sequence[PosedFrame],
+    without: Collection[str] = (),
+    *,
+    max_ratio: float = 0.75,
+    min_fraction: float = 0.04,
+    min_elsewhere: float = 0.5,
+    most: int = 24,
+) -> list[str]:
+    """Return a warning of each link whose contour hardly fits while those of other links do.
+
+    Args:
+        body: the robot's surfaces.
+        found: the registered camera.
+        frames: its frames; at most `most` inlier frames are used.
+        without: names of links that were left out; links welded to their parents are not judged.
+        max_ratio: maximum fitting fraction of a named link's contour, over the links' median. In
+            masks by Drake's renderer links as modelled have 0.93 or more, a link with another
+            gripper 0.61 at most, with a box of its own size 0.64 at most.
+        min_fraction: minimum length of a judged link's contour [length of all contours].
+        min_elsewhere: minimum fitting fraction of the other links' contours. Where these do not fit
+            either, as with masks that are too wide everywhere, no link is odd.
+        most: maximum number of frames.
+    """
+    names = {frame.frame for frame in found.frames if frame.is_inlier}
+    sample = evenly_spaced([frame for frame in frames if frame.name in names], most)
+    if not sample:
+        return []
+    posed = PosedFrames(body.kinematics, body.full, found.camera, sample, LAST_SPACING)
+    fit = SharedFit([posed], [found.camera.X_CW])
+    lengths, fitting = fit.matched_lengths(fit.start).T
+    ratios = fitting / np.maximum(lengths, 1e-9)
+    shown = lengths >= min_fraction * max(float(lengths.sum()), 1e-9)
+    is_odd = shown & (ratios < max_ratio * np.median(ratios[shown]))
+    if not is_odd.any():
+        return []
+    others = shown & ~is_odd
+    ratio = float(fitting[others].sum() / lengths[others].sum())
+    if ratio < min_elsewhere:
+        return []
+    elsewhere = percent(ratio)
+    texts, model = [], body.tree.model
+    joints = [model.plant.get_joint(index) for index in model.plant.GetJointIndices()]
+    cut = [joint.parent_body() for joint in joints if joint.child_body().name() in without]
+    for k in np.flatnonzero(is_odd):
+        node = body.tree.nodes[k].name
+        # The gripper is welded to the last link, as a rule.
+        group = model.plant.GetBodiesWeldedTo(
+            model.plant.get_body(BodyIndex(model.link_index(node)))
+        )
+        if any(body.index() == other.index() for body in group for other in cut):
+            continue
+        fixed = [model.link_names[int(body.index())] for body in group]
+        welded = [name for name in fixed if name in model.link_meshes]
+        outermost = min(welded, key=lambda name: len(model.carried_by(name)), default=node)
+        more = "" if outermost == node else f" (with {outermost})"
+        texts.append(
+            f"camera '{found.camera.name}': {percent(float(ratios[k]))} of the contour of link "
+            f"'{node}'{more} fits, elsewhere {elsewhere}: is another gripper or tool mounted, a "
+            "camera or a cable, is a joint before it misread (drake-pose audit tells), or are the "
+            f"pictures distorted? --without {outermost} leaves it out, with what it carries"
+        )
+    return texts
+
+
+def outlier_warnings(found: RegisteredCamera, from_pictures: bool = False) -> list[str]:
+    """Return warnings of a camera's outlier frames.
+
+    from_pictures: whether the camera was registered from pictures.
+
+    Raises RegistrationError: half of the masks or more are outliers. In pictures this is a warning:
+        the frames of the fit agree, and the others may be dark or blurred.
+    """
+    name, frames = found.camera.name, [frame.frame for frame in found.frames]
+    wrong, texts, moved = found.outliers, [], ""
+    last = last_before_change([frame in wrong for frame in frames])
+    if last is not None:
+        moved = f" Were camera or base moved after frame '{frames[last]}'?"
+    if wrong:
+        right = len(frames) - len(wrong)
+        text = (
+            f"camera '{name}': {len(wrong)} of {len(frames)} frames are outliers and did not "
+            f"count: {frame_ranges(wrong, frames)}; are their joint positions those of the "
+            f"pictures?{moved}"
+        )
+        if 2 * right <= len(frames):
+            supporting = frame_ranges([frame for frame in frames if frame not in wrong], frames)
+            if not from_pictures:
+                raise RegistrationError(
+                    f"camera '{name}': half of the frames or more are outliers, {len(wrong)} of "
+                    f"{len(frames)}: {frame_ranges(wrong, frames)}.{moved} Either these are wrong, "
+                    f"or the others, {supporting}, agree by chance: is this the robot's model, "
+                    "with covers and tools, and are the joint positions those of the pictures and "
+                    "in the model's zeros (--zeros all)? If the others are right, give a scene of "
+                    "them alone. Nothing was written"
+                )
+            text += (
+                f" FEWER THAN HALF OF THE FRAMES AGREE, {right} of {len(frames)}: {supporting}; "
+                "the pose rests on these alone and may be wrong: correct the others, or add frames"
+            )
+        texts.append(text)
+    return texts
+
+
+def mode_warnings(
+    body: RegistrationBody, found: RegisteredCamera, frames: Sequence[PosedFrame]
+) -> list[str]:
+    """Return a warning of other poses that fit a camera equally well; empty: there are none.
+
+    It names the joint that tells them apart best, if it alone is moved from the first frame to an
+    end of its range, or by up to half a turn: there the silhouettes at the two most similar poses
+    differ most.
+
+    frames: of the camera; empty: no joint is named.
+    """
+    camera, kinematics = found.camera, body.kinematics
+    if not len(found.alternatives):
+        return []
+    advice, best = "add frames with other joint positions", 0.0
+    cameras = [camera.with_pose(X) for X in (camera.X_WC, *found.alternatives)]
+    ends = np.clip([kinematics.lower, kinematics.upper], -np.pi, np.pi)
+    for end, k in product(ends, range(len(kinematics.names))) if frames else ():
+        values = frames[0].values.copy()
+        values[k] = end[k]
+        X_WN = kinematics.poses(values)
+        masks = [draw_mask(body.coarse, one.X_CW @ X_WN, one) for one in cameras]
+        if not all(mask.any() for mask in masks):
+            continue
+        difference = min(
+            2.0 * np.count_nonzero(a != b) / (np.count_nonzero(a) + np.count_nonzero(b))
+            for a, b in combinations(masks, 2)
+        )
+        if difference > best:
+            turns, best = kinematics.is_angle[k], difference
+            to = f"{math.degrees(end[k]):.0f} degrees" if turns else f"{end[k]:.3f} m"
+            advice = (
+                f"add frames in which joint '{kinematics.names[k]}' moves: at {to}, and else as in "
+                f"frame '{frames[0].name}', their silhouettes differ by {percent(best)}"
+            )
+    return [
+        f"camera '{camera.name}': {len(found.alternatives)} other poses fit equally well (modes in "
+        f"summary.json); {advice}"
+    ]
+
+
+def parameter_warnings(found: JointCalibration) -> list[str]:
+    """Return warnings of joint offsets and link scales that are uncertain.
+
+    If no parameter is significant, this is the only warning. Otherwise there is a warning for each
+    parameter that only static parts separate from a camera's pose, and for each that is not
+    determined.
+    """
+    requested = [(f"joint '{offset.name}': its offset", offset) for offset in found.offsets]
+    requested += [(f"link '{scale.name}': its length", scale) for scale in found.link_scales]
+    if requested and not any(parameter.significant for _, parameter in requested):
+        return [
+            "none of the requested joint offsets and link lengths is significant beside other "
+            "errors (of each other, focal length, principal point, masks): no corrected URDF is "
+            "written"
+        ]
+    with_cameras = [
+        f"{what} is good to {np.degrees(one.deviation):.2g} degrees only, and turns the camera "
+        f"about the robot (correlated with {', '.join(one.gauge)}): edges of static parts separate "
+        "the two. Check in the overlays whether the base fits, or give a camera with its pose"
+        for what, one in requested
+        if one.determined and one.gauge
+    ]
+    return with_cameras + [
+        f"{what} is not determined by these silhouettes and was not changed"
+        + (
+            f" (correlated with {', '.join(parameter.gauge)}: their values hold if it is 0)"
+            if parameter.gauge
+            else ""
+        )
+        + "; add frames with other joint positions, or a view of a part that does not move with it"
+        for what, parameter in requested
+        if not parameter.determined
+    ]
+
+
+def target_warnings(pose: TargetPose) -> list[str]:
+    """Return warnings of symmetries of the calibration target."""
+    texts = []
+    if len(pose.symmetry_axes):
+        axes = "; ".join(", ".join(f"{x:.3f}" for x in axis) for axis in pose.symmetry_axes)
+        texts.append(
+            f"the target is round about an axis ({axes} in its frame), so its rotation about it is "
+            "not determined; the camera's pose does not depend on it"
+        )
+    if len(pose.alternatives):
+        texts.append(
+            f"the target looks the same in {len(pose.alternatives)} other poses, see its modes in "
+            "summary.json; the camera's pose does not depend on it"
+        )
+    return texts
+
+
+def common_outlier_warnings(
+    registered: Iterable[RegisteredCamera], *, from_pictures: bool = False, worse: float = 2.0
+) -> list[str]:
+    """Return warnings that compare several cameras' inliers.
+
+    They name frames that are outliers in all cameras, or in one camera but not in another. If the
+    cameras were registered from masks, they name pairs of cameras that have common frames, but no
+    common inlier frame.
+
+    worse: E_total of an inlier frame, over its camera's median and a percent more, from which the
+    frame does not support its joint positions against another camera.
+    """
+    is_inlier: dict[str, dict[str, bool]] = {}
+    sets, frames_of = dict[str, list[str]](), dict[str, set[str]]()
+    doubted = set[str]()
+    for found in registered:
+        usual = worse * left_over(found) + 0.01
+        for misfit in found.frames:
+            is_inlier.setdefault(misfit.frame, {})[found.camera.name] = misfit.is_inlier
+            if misfit.is_inlier and misfit.E_total > usual:
+                doubted.add(misfit.frame)
+        sets[found.camera.name] = [frame.frame for frame in found.frames if frame.is_inlier]
+        frames_of[found.camera.name] = {frame.frame for frame in found.frames}
+    frames, masks = list(is_inlier), dict[str, list[str]]()
+    positions = [k for k, own in is_inlier.items() if len(own) > 1 and not any(own.values())]
+    for frame, inliers in is_inlier.items():
+        for name, right in inliers.items() if any(inliers.values()) else ():
+            if not right:
+                masks.setdefault(name, []).append(frame)
+    why = "something hides the robot there" if from_pictures else "their masks are not"
+    texts = [
+        f"cameras '{a}' and '{b}' rest on no common frame: '{a}' on {frame_ranges(own, frames)}, "
+        f"'{b}' on {frame_ranges(other, frames)}: if cameras or base were moved in between, their "
+        "poses do not belong together"
+        for (a, own), (b, other) in combinations(sets.items(), 2)
+        if frames_of[a] & frames_of[b] and not {*own} & {*other} and not from_pictures
+    ]
+    if positions:
+        texts.append(
+            f"frames {frame_ranges(positions, frames)} are outliers in all cameras that see them: "
+            "their joint positions are not those of the pictures; correct them, or leave these "
+            "frames out"
+        )
+    for name, wrong in masks.items():
+        unsure = [frame for frame in wrong if frame in doubted]
+        sure = [frame for frame in wrong if frame not in doubted]
+        if sure:
+            texts.append(
+                f"frames {frame_ranges(sure, frames)} are outliers in camera '{name}', but not in "
+                f"another one that sees them: their joint positions are right, {why}"
+            )
+        if unsure:
+            texts.append(
+                f"frames {frame_ranges(unsure, frames)} are outliers in camera '{name}', and fit "
+                "worse than others in another one that sees them: check their joint positions, "
+                "then their pictures"
+            )
+    return texts

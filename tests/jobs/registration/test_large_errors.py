@@ -15,7 +15,8 @@ from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import Camera
 from drake_pose.errors import MaskError
 from drake_pose.jobs.registration.audit import SceneAudit, audit_scene
-from drake_pose.jobs.registration.diagnosis import common_outlier_warnings, last_before_change
+from drake_pose.jobs.registration.diagnosis import last_before_change
+from drake_pose.jobs.registration.words import common_outlier_warnings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import read_mask, write_mask
 from tests.jobs.registration.arm_scenes import JOINTS, ArmScene, write_arm_scene

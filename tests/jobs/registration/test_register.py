@@ -14,10 +14,10 @@ import yaml
 from drake_pose.body import load_model
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
-from drake_pose.jobs.registration.diagnosis import common_outlier_warnings
 from drake_pose.jobs.registration.positions import joint_shifts
 from drake_pose.jobs.registration.register import register_scene
 from drake_pose.jobs.registration.settings import RegistrationSettings
+from drake_pose.jobs.registration.words import common_outlier_warnings
 from drake_pose.registration.register import CameraSearch, FrameMisfit, RegisteredCamera
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.cli import Result, assert_refused, run_command, run_json, run_to_end
@@ -221,13 +221,16 @@ def test_too_few_frames_are_refused_before_the_search(
     assert not out.exists()
 
 
-def test_missing_suggestion_is_warned_of(tiny_scene: TinyScene, tmp_path: Path, out: Path) -> None:
-    """A planar arm looks the same from two places, and the box leaves no free pose."""
+def test_several_poses_are_warned_of_with_the_joint_to_move(
+    tiny_scene: TinyScene, tmp_path: Path, out: Path
+) -> None:
+    """A planar arm looks the same from two places."""
     joints = write_truth(tiny_scene, tmp_path / "joints.csv")
     arm = ArmScene(tiny_scene.folder, tiny_scene.model, joints, {})
     words = [*arm.register(out), "--no-overlay", "--camera", "front"]
-    words += ["--keep-out", "-9,-9,-9:9,9,9"]
-    assert_refused(run_command(words), "--keep-out is for --suggest", status=2)
-    found = run_to_end(*words, "--suggest", "--json")
+    for gone in ("--suggest", "--keep-out"):
+        assert_refused(run_command([*words, gone]), "the warning of several poses names", status=2)
+    found = run_to_end(*words, "--json")
     assert len(json.loads(found.stdout)["modes"]) > 1
-    assert "no picture is suggested; is --keep-out too large?" in found.stderr
+    assert "other poses fit equally well" in found.stderr
+    assert "add frames in which joint" in found.stderr

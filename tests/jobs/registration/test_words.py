@@ -1,5 +1,6 @@
 """What reports of registrations and audits say, against sentences and sizes worked out by hand."""
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -16,9 +17,6 @@ from drake_pose.jobs.registration.diagnosis import (
     compare_camera,
     compare_clock,
     explain_misfit,
-    lost_frames_warning,
-    outlier_warnings,
-    parameter_warnings,
     require_determined,
 )
 from drake_pose.jobs.registration.large_errors import SceneComparison, _add_remaining
@@ -34,6 +32,10 @@ from drake_pose.jobs.registration.words import (
     describe_error,
     describe_frame_finding,
     describe_reading,
+    lost_frames_warning,
+    mode_warnings,
+    outlier_warnings,
+    parameter_warnings,
 )
 from drake_pose.registration.findings import Finding, FrameDiagnosis
 from drake_pose.registration.joint_offsets import KinematicParameter, undetermined
@@ -47,7 +49,9 @@ from drake_pose.registration.register import (
 )
 from drake_pose.registration.standing_scene.picture_matches import Sightings
 from drake_pose.silhouette.outline import outline_from_mesh
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.scoring import draw_mask
+from tests.registration.arm_pictures import looking_at
 from tests.search.arms import arm_cameras, arm_urdf
 
 DEGREE = np.radians(1.0)
@@ -184,9 +188,6 @@ def test_outliers_are_named_and_refused_where_they_are_many() -> None:
         outlier_warnings(half)
     (text,) = outlier_warnings(half, from_pictures=True)
     assert "FEWER THAN HALF OF THE FRAMES AGREE, 2 of 4: 0-1;" in text
-    alike = registered(0.9, 0.9, alternatives=np.zeros((2, 4, 4)))
-    (text,) = outlier_warnings(alike)
-    assert "2 other poses fit equally well" in text
     lost = lost_frames_warning("c", ["1", "2", "4"], [*"01234"], "gripper")
     assert lost.startswith(
         "camera 'c': the gripper is not visible where it should be in frames 1-2, 4:"
@@ -415,7 +416,7 @@ def test_a_camera_is_summarised_with_deviations_and_misfits() -> None:
     C = np.zeros((6, 6))
     C[:3, :3], C[3:, 3:] = DEGREE**2 * np.diag([1.0, 4.0, 9.0]), 1e-6 * np.diag([4.0, 4.0, 16.0])
     one = replace(one, covariance=C)
-    told = describe_camera(one, 2.5, {"positions": {}})
+    told = describe_camera(one, 2.5)
     np.testing.assert_allclose(told["X_WC"], one.camera.X_WC)
     assert told["translation_sd_mm"] == pytest.approx(np.sqrt(24.0 / 3.0))
     assert told["rotation_sd_deg"] == pytest.approx(np.sqrt(14.0 / 3.0))
@@ -453,6 +454,33 @@ def test_parameters_are_summarised_in_their_units() -> None:
     assert told["lengths"]["arm"]["value_percent"] == pytest.approx(1.0)
     assert told["lengths"]["leg"]["high_percent"] is told["lengths"]["leg"]["value_percent"] is None
     assert not told["lengths"]["leg"]["determined"]
+
+
+def test_several_poses_name_the_joint_that_tells_them_apart_best(body: RegistrationBody) -> None:
+    """From front and back the arm's zero pose looks the same, except for its boxes."""
+    front, back = (
+        looking_at(np.array([x, 0.0, 0.4]), np.array([0.0, 0.0, 0.4]), 0.0) for x in (1.8, -1.8)
+    )
+    kinematics, model = body.kinematics, body.tree.model
+    frame = PosedFrame("7", np.zeros(len(kinematics.names)), np.ones((480, 640), bool))
+    found = RegisteredCamera(front, np.eye(6), (), np.array([back.X_WC]))
+    sizes = {}
+    for k, name in enumerate(kinematics.names):
+        for end in (kinematics.lower[k], kinematics.upper[k]):
+            values = frame.values.copy()
+            values[k] = np.clip(end, -np.pi, np.pi)
+            q, X_WB = body.tree.positions_from(kinematics.split(values))
+            a, b = (LabelRenderer(model, camera).mask(q, X_WB) for camera in (front, back))
+            sizes[name, f"{np.degrees(values[k]):.0f}"] = 2.0 * (a ^ b).sum() / (a.sum() + b.sum())
+    (name, degrees), size = max(sizes.items(), key=lambda item: item[1])
+    (text,) = mode_warnings(body, found, [frame])
+    said = (
+        rf"'eye': 1 other poses .* joint '{name}' moves: at {degrees} degrees, .* '7', .* by (.*) %"
+    )
+    assert float(re.search(said, text).group(1)) == pytest.approx(100.0 * size, abs=2.0)
+    assert size > 0.3
+    assert mode_warnings(body, found, [])[0].endswith("; add frames with other joint positions")
+    assert mode_warnings(body, replace(found, alternatives=np.zeros((0, 4, 4))), [frame]) == []
 
 
 def test_bodies_are_drawn_with_the_index_of_the_shown_node(body: RegistrationBody) -> None:

@@ -20,8 +20,7 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
 from drake_pose.fit.base_edges import BASE
 from drake_pose.fit.parameters import POSE_NAMES, carried_joints, link_scale_name
-from drake_pose.registration.offset_search import joints_like_cameras
-from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
+from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, joints_like_cameras
 from drake_pose.registration.register import RegisteredCamera, RegistrationBody
 from drake_pose.registration.shared_fit import SHARED, SharedFit, SharedValues
 

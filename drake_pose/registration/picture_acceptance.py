@@ -17,7 +17,6 @@ from drake_pose.fit.background import estimate_gain
 from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.fit.problem import TIME_OFFSET
 from drake_pose.fit.surfaces import simplify_or_hull
-from drake_pose.registration.offset_search import joints_like_cameras
 from drake_pose.registration.picture_search import (
     PictureFit,
     PictureSearch,
@@ -25,7 +24,7 @@ from drake_pose.registration.picture_search import (
     RoughPose,
     segment_picture,
 )
-from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
+from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, joints_like_cameras
 from drake_pose.registration.pyramid_level import PICTURES
 from drake_pose.registration.recording import NO_CLOCK, Recording, TimeOffset, posed_pictures
 from drake_pose.registration.register import (

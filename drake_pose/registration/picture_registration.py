@@ -20,7 +20,6 @@ from drake_pose.errors import RegistrationError
 from drake_pose.fit.base_edges import BASE, joint_rotation, locate_base
 from drake_pose.fit.covariance import vuong_statistic
 from drake_pose.fit.problem import TIME_OFFSET
-from drake_pose.registration.offset_search import joints_like_cameras
 from drake_pose.registration.picture_acceptance import (
     ACCEPTANCE,
     PictureRegistration,
@@ -42,6 +41,7 @@ from drake_pose.registration.picture_search import (
     ratio_margin,
     rotation_between,
 )
+from drake_pose.registration.posed_frames import joints_like_cameras
 from drake_pose.registration.pyramid_level import PICTURES
 from drake_pose.registration.recording import (
     NO_CLOCK,

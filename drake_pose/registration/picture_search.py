@@ -28,9 +28,8 @@ from drake_pose.fit.background import (
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.fit.surfaces import simplify_or_hull
-from drake_pose.registration.offset_search import joints_like_cameras, search_offsets
-from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
-from drake_pose.registration.pyramid_level import PICTURES, PyramidLevel, evidence
+from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, joints_like_cameras
+from drake_pose.registration.pyramid_level import PICTURES, PyramidLevel, evidence, search_offsets
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.registration.shared_fit import SharedFit, SharedValues
 from drake_pose.silhouette.outline import EMPTY_OUTLINE, Outline

@@ -245,3 +245,27 @@ def middle_of(kinematics: TreeKinematics, frames: Sequence[MultiViewFrame]) -> A
     """Return the mean position (3,) of the nodes' origins in all frames, in the world [m]."""
     places = [kinematics.poses(frame.values)[:, :3, 3].mean(axis=0) for frame in frames]
     return np.asarray(np.mean(places, axis=0))
+
+
+def joints_like_cameras(kinematics: TreeKinematics, values: Array, shown: Mask) -> tuple[str, ...]:
+    """Return names of joints whose offset looks like a rotation of the camera about the robot.
+
+    Such a joint, usually the first, moves all parts that move at all, about an axis that is fixed
+    in the world. Only static parts then separate its offset from the camera's pose.
+
+    ``kinematics``: of the body's pose tree. ``values``: (f, m) values in f frames [rad or m].
+    ``shown``: (nodes,) which nodes are visible.
+    """
+    motions = [kinematics.motions(one) for one in values]
+    count = len(kinematics.names)
+    twists = np.array([one.twists[:count] for one in motions])
+    still = np.ptp(twists, axis=0).max(axis=1) < 1e-6
+    moves = motions[0].moves[shown][:, :count]
+    # Nodes that no value moves between the frames are static.
+    changing = np.ptp(values, axis=0) > 1e-3
+    moving = moves[:, changing].any(axis=1)
+    return tuple(
+        name
+        for k, name in enumerate(kinematics.names)
+        if still[k] and moving.any() and moves[moving, k].all()
+    )

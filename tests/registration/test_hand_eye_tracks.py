@@ -10,14 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.registration.standing_scene.hand_eye_tracks import (
+from drake_pose.registration.hand_eye import (
     EpipolarSearch,
     TrackProblem,
     fit_tracks,
     gauge_constants,
     jackknife,
 )
-from drake_pose.registration.standing_scene.picture_matches import (
+from drake_pose.registration.picture_matches import (
     Matches,
     Sightings,
     match_pictures,

@@ -20,7 +20,6 @@ from drake_pose.fit.evidence import Observation
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import BodyParameters
 from drake_pose.fit.problem import parameter_names
-from drake_pose.registration.bundle import adjust_bundle
 from drake_pose.registration.hand_eye import hand_eye_starts, rotation_spread
 from drake_pose.registration.joint_offsets import (
     describe_constants,
@@ -28,7 +27,7 @@ from drake_pose.registration.joint_offsets import (
     widen_to_cost_curvature,
 )
 from drake_pose.registration.online_registration import pose_difference
-from drake_pose.registration.per_frame_fit import PerFrameFit
+from drake_pose.registration.per_frame_fit import PerFrameFit, adjust_bundle
 from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrame, PosedFrames
 from drake_pose.registration.register import (
     CameraSearch,
@@ -500,7 +499,7 @@ def test_bundle_adjustment_corrects_camera_and_positions(body: RegistrationBody)
     given = [cameras[0], cameras[1].with_pose(X_WC)]
     nothing = np.zeros(len(kinematics.names), bool)
     (camera,), (covariance,), values, radius_scales = adjust_bundle(
-        kinematics, body.medium, given, ("b",), frames, nothing, covariance_frames=1
+        kinematics, body.medium, given, ("b",), frames, nothing
     )
     shift, turn = errors(camera.X_WC, cameras[1].X_WC)
     assert shift < 0.012

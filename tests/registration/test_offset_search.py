@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from drake_pose.fit.base_edges import BASE, draw_normals, joint_rotation, locate_base
-from drake_pose.registration.offset_search import joints_like_cameras
 from drake_pose.registration.picture_registration import register_pictures
 from drake_pose.registration.picture_search import PictureSearch, PosedPicture
+from drake_pose.registration.posed_frames import joints_like_cameras
 from tests.benchmarks.rooms import Room
 from tests.registration.arm_pictures import errors, looking_at
 

@@ -59,8 +59,8 @@ from drake_pose.jobs.registration.words import (
     target_warnings,
 )
 from drake_pose.person.pose_tracker import shape_parts, shape_values
-from drake_pose.registration.bundle import adjust_bundle
 from drake_pose.registration.joint_offsets import calibrate_joints
+from drake_pose.registration.per_frame_fit import adjust_bundle
 from drake_pose.registration.picture_acceptance import PictureRegistration, evaluate_pictures
 from drake_pose.registration.picture_registration import offsets_in_pictures
 from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrame, PosedFrames
@@ -80,7 +80,7 @@ from drake_pose.registration.standing_object import (
     find_target_frames,
     require_detections,
 )
-from drake_pose.registration.standing_scene.track_registration import (
+from drake_pose.registration.track_registration import (
     TrackRegistration,
     register_tracks,
 )

@@ -29,7 +29,7 @@ from drake_pose.registration.picture_search import rotation_between
 from drake_pose.registration.recording import Recording
 from drake_pose.registration.register import RegistrationBody, evenly_spaced
 from drake_pose.registration.shared_fit import SHARED
-from drake_pose.registration.standing_scene.track_registration import TrackRegistration
+from drake_pose.registration.track_registration import TrackRegistration
 
 
 def watch_cameras(inputs: RegistrationInputs) -> RegistrationInputs:

@@ -39,6 +39,7 @@ from drake_pose.jobs.registration.words import (
 )
 from drake_pose.registration.findings import Finding, FrameDiagnosis
 from drake_pose.registration.joint_offsets import KinematicParameter, undetermined
+from drake_pose.registration.picture_matches import Sightings
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.recording import Recording, TimeOffset
 from drake_pose.registration.register import (
@@ -47,7 +48,6 @@ from drake_pose.registration.register import (
     RegistrationBody,
     TargetPose,
 )
-from drake_pose.registration.standing_scene.picture_matches import Sightings
 from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.scoring import draw_mask

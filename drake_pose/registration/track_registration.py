@@ -10,29 +10,29 @@ from numpy.typing import NDArray
 from scipy.special import stdtr, stdtrit
 
 from drake_pose.arrays import Array, Picture
+from drake_pose.body import inverse_transforms
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, listed
-from drake_pose.registration.hand_eye import rotation_spread
-from drake_pose.registration.joint_offsets import KinematicParameter
-from drake_pose.registration.recording import Recording, TimeOffset, choose_pictures
-from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
-from drake_pose.registration.standing_scene.hand_eye_tracks import (
+from drake_pose.registration.hand_eye import (
     EpipolarSearch,
+    LinkPoses,
     TrackFit,
     TrackProblem,
-    explaining_link,
     fit_tracks,
     gauge_constants,
     intrinsics_effect,
     jackknife,
     poses_differ,
-    recorded_link_poses,
+    rotation_spread,
 )
-from drake_pose.registration.standing_scene.picture_matches import (
+from drake_pose.registration.joint_offsets import KinematicParameter
+from drake_pose.registration.picture_matches import (
     Matches,
     Sightings,
     match_pictures,
 )
+from drake_pose.registration.recording import Recording, TimeOffset, choose_pictures
+from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
 
 
 class TrackRegistrationSettings(NamedTuple):
@@ -127,15 +127,14 @@ def register_tracks(
     lens_sds = [settings.focal_sd * focal, settings.time_sd * timed]
     sds = np.concatenate([lens_sds, settings.joint_sd * asked])
     problem = TrackProblem(camera, link_poses, seen, sds)
-    scene = _Scene(body, link, problem, matches, focal, timed)
     _require_motion(camera, link, link_poses(np.zeros(1 + len(names))))
     _require_matches(camera, matches, len(rows))
-    start = scene.search()
+    start = _search(problem, matches, focal, timed)
     if start.explained < settings.least_gain * start.chance:
         search, values = EpipolarSearch(camera, matches), recording.values_at(0.0)[rows]
-        _refuse_unexplained(camera, link, start, *explaining_link(body, base, values, search))
-    fitted = scene.fit(start)
-    problem, fit, covariance = fitted.problem, fitted.fit, fitted.covariance
+        elsewhere = explaining_link(body, base, values, search)
+        _refuse_unexplained(camera, link, start, len(matches.uv), *elsewhere)
+    problem, fit, covariance, alike, likely = _fit_scene(body, link, problem, start)
     scale = float(np.exp(fit.constants[0]))
     placed = replace(
         camera, focal_x=scale * camera.focal_x, focal_y=scale * camera.focal_y
@@ -143,7 +142,7 @@ def register_tracks(
     J = np.kron(np.eye(2), fit.X_LC[:3, :3])
     misfits = _misfits([recording.names[k] for k in rows], seen, fit)
     found = RegisteredCamera(
-        placed, J @ covariance[:6, :6] @ J.T, misfits, np.array(fitted.alike).reshape(-1, 4, 4)
+        placed, J @ covariance[:6, :6] @ J.T, misfits, np.array(alike).reshape(-1, 4, 4)
     )
     deviations = np.sqrt(np.diag(covariance))
     return TrackRegistration(
@@ -151,7 +150,7 @@ def register_tracks(
         _time_offset(recording, float(fit.constants[1]), float(deviations[7])),
         float(deviations[6]),
         _describe_offsets(names, offset_joints, problem, fit, deviations),
-        fitted.likely,
+        likely,
         start.explained,
         start.chance,
         seen,
@@ -165,105 +164,112 @@ class _Start(NamedTuple):
 
     X_LC: poses (4, 4), best first. constants: (2 + m,) logarithm of the focal length's ratio, time
     offset [s] and joint offsets of the best pose. explained, chance: see ``TrackRegistration``.
-    matches: number of matches.
     """
 
     X_LC: list[Array]
     constants: Array
     explained: float
     chance: float
-    matches: int
 
 
-class _SceneFit(NamedTuple):
-    """Result of a bundle adjustment.
-
-    problem, fit: what was fitted, and the result. covariance: (7 + k, 7 + k) as of ``TrackFit``.
-    alike: other poses (4, 4) that fit as well. likely: see ``TrackRegistration``.
-    """
-
-    problem: TrackProblem
-    fit: TrackFit
-    covariance: Array
-    alike: Sequence[Array] = ()
-    likely: tuple[str, ...] = ()
-
-
-class _Scene(NamedTuple):
-    """A scene that stands still, in a camera's pictures.
-
-    body, link: the robot, and the name of the camera's link. problem: what is fitted. matches: of
-    its pictures. focal, timed: whether the focal length and the time offset are searched.
-    """
-
-    body: RegistrationBody
-    link: str
-    problem: TrackProblem
-    matches: Matches
-    focal: bool
-    timed: bool
-
-    def search(self) -> _Start:
-        """Search the pose, the time offset and the focal length."""
-        settings, camera = STANDING_SCENE, self.problem.camera
-        constants = np.zeros(len(self.problem.prior_sds))
-        X_WL = self.problem.link_poses(constants[1:])
-        searches = []
-        for scale in settings.focals if self.focal else (1.0,):
-            focal_x, focal_y = scale * camera.focal_x, scale * camera.focal_y
-            scaled = replace(camera, focal_x=focal_x, focal_y=focal_y)
-            search = EpipolarSearch(scaled, self.matches)
-            searches.append((search.search(X_WL), scale, search))
-        candidates, scale, search = max(searches, key=lambda item: item[0][0][0])
-        constants[0] = math.log(scale)
-        explained, X_LC, constants = self._timed(search, *candidates[0], constants)
-        candidates = [(explained, X_LC), *candidates[1:]]
-        # Shifts give each picture the joint positions of another one.
-        count = int(self.problem.seen.frames.max()) + 1
-        chance = max(
-            search.search(np.roll(X_WL, shift, axis=0), settings.chance_rotations)[0][0]
-            for shift in {max(1, round(part * count)) for part in (0.25, 0.5, 0.75)}
+def _search(problem: TrackProblem, matches: Matches, focal: bool, timed: bool) -> _Start:
+    """Search the pose, and where asked the focal length and the time offset, in all matches."""
+    settings, camera = STANDING_SCENE, problem.camera
+    constants = np.zeros(len(problem.prior_sds))
+    X_WL = problem.link_poses(constants[1:])
+    searches = []
+    for scale in settings.focals if focal else (1.0,):
+        focal_x, focal_y = scale * camera.focal_x, scale * camera.focal_y
+        search = EpipolarSearch(replace(camera, focal_x=focal_x, focal_y=focal_y), matches)
+        searches.append((search.search(X_WL), scale, search))
+    candidates, scale, search = max(searches, key=lambda item: item[0][0][0])
+    constants[0] = math.log(scale)
+    (explained, X_LC), *others = candidates
+    for time in settings.times if timed else ():
+        gain, X = search.refine(
+            problem.link_poses(np.append(time, constants[2:])), candidates[0][1]
         )
-        poses = [X for gain, X in candidates if gain > 0.7 * explained]
-        return _Start(poses[:3], constants, explained, chance, len(self.matches.uv))
+        if gain > explained:
+            explained, X_LC, constants[1] = gain, X, time
+    # Shifts give each picture the joint positions of another one.
+    count = int(problem.seen.frames.max()) + 1
+    chance = max(
+        search.search(np.roll(X_WL, shift, axis=0), settings.chance_rotations)[0][0]
+        for shift in {max(1, round(part * count)) for part in (0.25, 0.5, 0.75)}
+    )
+    poses = [X for gain, X in others if gain > 0.7 * explained]
+    return _Start([X_LC, *poses[:2]], constants, explained, chance)
 
-    def _timed(
-        self, search: EpipolarSearch, explained: float, X_LC: Array, constants: Array
-    ) -> tuple[float, Array, Array]:
-        """Return `explained`, `X_LC` (4, 4) and `constants` at the best of the time offsets."""
-        best = explained, X_LC, constants
-        for time in STANDING_SCENE.times if self.timed else ():
-            at = constants.copy()
-            at[1] = time
-            gain, X = search.refine(self.problem.link_poses(at[1:]), X_LC)
-            if gain > best[0]:
-                best = gain, X, at
-        return best
 
-    def fit(self, start: _Start) -> _SceneFit:
-        """Fit from a start.
+def _fit_scene(
+    body: RegistrationBody, link: str, problem: TrackProblem, start: _Start
+) -> tuple[TrackProblem, TrackFit, Array, list[Array], tuple[str, ...]]:
+    """Fit from a start.
 
-        Raises RegistrationError: the pose is not determined.
-        """
-        asked = bool((self.problem.prior_sds[2:] > 0.0).any())
-        problem, fit = _fit_determined(self.problem, start.X_LC[0], start.constants)
-        self._require(problem, fit, fit.covariance)
-        likely: tuple[str, ...] = ()
-        if not asked:
-            likely, problem, fit = _with_likely_offsets(self.body, problem, fit)
-        covariance = jackknife(problem, fit) + intrinsics_effect(problem, fit)
-        self._require(problem, fit, covariance, likely)
-        others = [fit_tracks(problem, X, start.constants) for X in start.X_LC[1:]]
-        as_good = (other.X_LC for other in others if other.sigma < 1.1 * fit.sigma)
-        alike = [X_LC for X_LC in as_good if poses_differ(X_LC, fit.X_LC)]
-        return _SceneFit(problem, fit, covariance, alike, likely)
+    Returns what was fitted; the fit; the covariance (7 + k, 7 + k) as of ``TrackFit``; other poses
+    (4, 4) that fit as well; and `likely` of ``TrackRegistration``.
 
-    def _require(
-        self, problem: TrackProblem, fit: TrackFit, covariance: Array, likely: Sequence[str] = ()
-    ) -> None:
-        """Refuse a fit that is not determined, as `_require_determined` does."""
+    Raises RegistrationError: the pose is not determined.
+    """
+
+    def require(covariance: Array) -> None:
         X_WL = problem.link_poses(fit.constants[1:])
-        _require_determined(problem.camera, self.link, X_WL, fit.X_LC, covariance, likely)
+        _require_determined(problem.camera, link, X_WL, fit.X_LC, covariance, likely)
+
+    asked, likely = bool((problem.prior_sds[2:] > 0.0).any()), tuple[str, ...]()
+    problem, fit = _fit_determined(problem, start.X_LC[0], start.constants)
+    require(fit.covariance)
+    if not asked:
+        likely, problem, fit = _with_likely_offsets(body, problem, fit)
+    covariance = jackknife(problem, fit) + intrinsics_effect(problem, fit)
+    require(covariance)
+    others = [fit_tracks(problem, X, start.constants) for X in start.X_LC[1:]]
+    as_good = (other.X_LC for other in others if other.sigma < 1.1 * fit.sigma)
+    alike = [X_LC for X_LC in as_good if poses_differ(X_LC, fit.X_LC)]
+    return problem, fit, covariance, alike, likely
+
+
+def recorded_link_poses(
+    body: RegistrationBody, base: int, recording: Recording, rows: Sequence[int]
+) -> LinkPoses:
+    """Return a function of (1 + m,) constants: a time offset [s], and an offset for each value.
+
+    It returns the link's poses (pictures, 4, 4) at pictures `rows`, in the frame of node `base`.
+    """
+    logged_values = recording.values_at(0.0)[rows]
+
+    def poses(constants: Array) -> Array:
+        values = recording.values_at(float(constants[0]))[rows]
+        # The log may end before the last picture's time.
+        values = np.where(np.isfinite(values), values, logged_values) + constants[1:]
+        return inverse_transforms(np.array([body.kinematics.poses(row)[base] for row in values]))
+
+    return poses
+
+
+def explaining_link(
+    body: RegistrationBody,
+    base: int,
+    values: Array,
+    search: EpipolarSearch,
+    links: int = 4,
+) -> tuple[float, str]:
+    """Return the fraction of the matches that a camera on another link explains, and that link.
+
+    Args:
+        body, base: as of ``recorded_link_poses``; the tree's first link is left out.
+        values: (pictures, m) of the pose tree.
+        search: in the pictures.
+        links: number of links that are tried, the nearest ones in the tree.
+    """
+    poses = np.array([body.kinematics.poses(row) for row in values])
+    X_WN = inverse_transforms(poses[:, [base]]) @ poses
+    gains = [
+        (search.search(X_WN[:, k], STANDING_SCENE.chance_rotations)[0][0], node.name)
+        for k, node in enumerate(body.tree.nodes[: links + 1])
+        if k and np.ptp(X_WN[:, k], axis=0).max() > 0.01
+    ]
+    return max(gains, default=(0.0, ""))
 
 
 def _require_matches(camera: PinholeCamera, matches: Matches, count: int) -> None:
@@ -280,18 +286,19 @@ def _require_matches(camera: PinholeCamera, matches: Matches, count: int) -> Non
 
 
 def _refuse_unexplained(
-    camera: PinholeCamera, link: str, start: _Start, explained: float, other: str
+    camera: PinholeCamera, link: str, start: _Start, matches: int, explained: float, other: str
 ) -> NoReturn:
     """Raise RegistrationError because joint positions of other moments explain about as much.
 
-    explained, other: fraction that the best other link explains, and its name.
+    matches: their number. explained, other: fraction that the best other link explains, and its
+    name.
     """
     hint = f"Does the camera ride on link '{link}' (name the one that does: --camera NAME)"
     if explained > STANDING_SCENE.least_gain * max(start.chance, 0.5 * start.explained):
         hint = f"On link '{other}' a pose explains {explained:.0%}: give it (--on {other}). Else"
     raise RegistrationError(
         f"camera '{camera.name}': no pose on link '{link}' explains how its pictures move: the "
-        f"best one explains {start.explained:.0%} of {start.matches} matched points, where "
+        f"best one explains {start.explained:.0%} of {matches} matched points, where "
         f"joint positions of other moments explain {start.chance:.0%}; twice as much is "
         f"needed. {hint}, does the scene stand still, are the joint positions those of these "
         "pictures, are the pictures not mirrored, and is the focal length about right? If the "

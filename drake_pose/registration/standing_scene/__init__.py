@@ -1,1 +1,0 @@
-"""Cameras on a link, registered from whatever stands still in their pictures."""

@@ -107,8 +107,8 @@ def batch(
         raise SceneError(f"{len(result.failed)} of {len(result.scenes)} scenes failed")
 
 
-def _print_batch(result: Batch, most: int = 4) -> None:
-    """Print a row for each scene, with up to ``most`` errors of audited ones, and the folder."""
+def _print_batch(result: Batch) -> None:
+    """Print a row for each scene, with some errors of audited ones, and the folder."""
     estimates = Table("scene", "state", "found", "E_total", "chunks", "seconds", title="Batch")
     audits = Table("scene", "state", "consistent", "errors", "seconds", title="Audits")
     for name, state in result.scenes.items():
@@ -121,7 +121,7 @@ def _print_batch(result: Batch, most: int = 4) -> None:
             estimates.add_row(*row, percent(totals.get("mean_E_total")), chunks, seconds)
         else:
             named = [f"{one['what']} {one['name']}" for one in totals.get("findings", ())]
-            audits.add_row(*row, escape(listed(named, most)), seconds)
+            audits.add_row(*row, escape(listed(named)), seconds)
     console = output_console()
     for table in (estimates, audits):
         if table.row_count:

@@ -34,7 +34,7 @@ def has_dask() -> bool:
 
 @contextmanager
 def open_cluster(
-    workers: int | None = None, scheduler: str | None = None, tries: int = 3, timeout: float = 5.0
+    workers: int | None = None, scheduler: str | None = None, timeout: float = 5.0
 ) -> Iterator[Client]:
     """Open a Dask client and, without ``scheduler``, workers on this machine; yields the client.
 
@@ -42,7 +42,6 @@ def open_cluster(
         workers: number of worker processes with one thread each, which listen on the loopback
             address only; None: one for each core.
         scheduler: address of a Dask scheduler whose workers are used instead; None: no scheduler.
-        tries: number of workers that a task may kill before it fails; not used with ``scheduler``.
         timeout: timeout of the connection to a scheduler [s].
 
     Raises ClusterError: distributed is not installed, or the scheduler cannot be reached.
@@ -71,7 +70,6 @@ def open_cluster(
 
         settings = {
             "distributed.worker.multiprocessing-method": "spawn",
-            "distributed.scheduler.allowed-failures": tries - 1,
             # Tasks that wait at a killed worker would count as having killed it.
             "distributed.scheduler.worker-saturation": 1.0,
             "distributed.logging.distributed": "critical",

@@ -115,11 +115,8 @@ def _shared_pose(
     return (in_order[best] if is_shared else None), p_values[best]
 
 
-def _describe_moves(rows: Sequence[Sequence[Any]], most: int = 8) -> tuple[str, ...]:
-    """Return sentences about each camera's poses over the episodes.
-
-    ``rows``: rows of the table. ``most``: maximum number of episodes that are named for each pose.
-    """
+def _describe_moves(rows: Sequence[Sequence[Any]]) -> tuple[str, ...]:
+    """Return sentences about each camera's poses over the episodes, given the table's rows."""
     sentences, columns = list[str](), {name: k for k, name in enumerate(COLUMNS)}
     for camera in dict.fromkeys(row[columns["camera"]] for row in rows):
         own = [row for row in rows if row[columns["camera"]] == camera]
@@ -141,7 +138,7 @@ def _describe_moves(rows: Sequence[Sequence[Any]], most: int = 8) -> tuple[str, 
                 )
         for number in sorted({*numbers}) if len({*numbers}) > 1 else ():
             sharing = [str(row[0]) for row in own if row[columns["pose"]] == number]
-            sentences.append(f"camera '{camera}', pose {number}: {listed(sharing, most)}")
+            sentences.append(f"camera '{camera}', pose {number}: {listed(sharing)}")
     return tuple(sentences)
 
 

@@ -206,7 +206,10 @@ def refuse_mask(mask: Mask, max_fraction: float = 0.98) -> str:
     if not mask.any():
         return "the object is not found: the mask is empty"
     if mask.mean() >= max_fraction:
-        return "the mask fills the picture: object and background are not separated"
+        return (
+            "the mask fills the picture: object and background are not separated, or the light or "
+            "the camera has changed"
+        )
     return ""
 
 
@@ -222,7 +225,8 @@ def doubt_mask(mask: Mask, max_border: float = 0.6, second_patch: float = 0.25) 
     border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()
     if border > max_border:
         warnings.append(
-            f"the mask covers {border:.0%} of the picture's border; check that it shows the object"
+            f"the mask covers {border:.0%} of the picture's border; check that it shows the "
+            "object, and that neither the light nor the camera has changed"
         )
     _, _, statistics, middles = cv2.connectedComponentsWithStats(mask.view(np.uint8))
     areas = statistics[1:, cv2.CC_STAT_AREA]
@@ -272,7 +276,6 @@ def _differing_regions(
     room: Background,
     doubts: tuple[str, ...],
     thresholds: Sequence[float] = (0.7, 1.4),
-    changed: float = 0.6,
 ) -> Iterator[FoundMask]:
     """Yield the region of each of a camera's pictures that differs from its background.
 
@@ -282,8 +285,6 @@ def _differing_regions(
         room: its background.
         doubts: warnings of the background, which are given once.
         thresholds: factors of the background's noise for masks to compare with.
-        changed: fraction of a picture in the mask above which a changed light or camera is
-            suspected.
     """
     backgrounds = [room.with_noise(k) for k in (1.0, *thresholds)]
     for frame, where, picture in source.read(camera):
@@ -293,11 +294,6 @@ def _differing_regions(
                 f"{where}: differs in size from the background, {width} x {height} (width x height)"
             )
         mask, *again = (person_region(picture, one) for one in backgrounds)
-        if (part := mask.mean()) > changed:
-            doubts += (
-                f"{part:.0%} of it differ from the background; check whether the light has changed "
-                "or the camera has moved",
-            )
         agreement = min(intersection_over_union(mask, one) for one in again)
         yield FoundMask(camera, frame, where, mask, picture, doubts, agreement)
         doubts = ()

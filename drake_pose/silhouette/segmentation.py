@@ -37,30 +37,33 @@ class Background:
         self.tolerance = np.repeat(largest[:, :, None], 3, axis=2)
         """(H, W, 3) largest difference of each channel from the mean [grey levels]."""
 
+    @staticmethod
+    def of_noise(mean: Picture, noise: Floats, least: float = 3.0) -> "Background":
+        """Return the background of a mean and its noise (H, W), ``least`` or more [grey levels]."""
+        return Background(mean, np.maximum(noise, np.float32(least)))
+
     def with_noise(self, factor: float) -> "Background":
         """Return the background with its standard deviations multiplied by a factor."""
         return Background(self.mean, factor * self.deviation, self._threshold)
 
 
-def learn_background(pictures: Sequence[Picture], min_deviation: float = 3.0) -> Background:
-    """Return the background model of pictures (H, W, 3) of the empty scene.
+def learn_background(pictures: Sequence[Picture]) -> Background:
+    """Return the background of pictures (H, W, 3) of the empty scene.
 
-    ``min_deviation``: least one [grey levels]. SettingsError: no picture, or sizes differ.
+    SettingsError: there is no picture, or sizes differ.
     """
     _require_one_size(pictures, 1, "a background needs one or more pictures of the same size")
     stack = np.stack([picture.astype(np.float32) for picture in pictures])
     deviation = np.sqrt(stack.var(axis=0).mean(axis=-1))
     mean = np.rint(stack.mean(axis=0)).astype(np.uint8)
-    return Background(mean, np.maximum(deviation, min_deviation))
+    return Background.of_noise(mean, deviation)
 
 
-def background_of_recording(pictures: Sequence[Picture], min_deviation: float = 3.0) -> Background:
+def background_of_recording(pictures: Sequence[Picture]) -> Background:
     """Return the background model of a recording: each pixel's median over three or more pictures.
 
     An object that covers a pixel in half of the pictures, or never moves, is taken for background.
     The standard deviation is the same for all pixels.
-
-    ``min_deviation``: lower bound of the standard deviation [grey levels].
 
     Raises SettingsError: there are too few pictures, or sizes differ.
     """
@@ -75,8 +78,8 @@ def background_of_recording(pictures: Sequence[Picture], min_deviation: float = 
         spread[row] = np.median(np.abs(stack - middle), axis=0).mean(axis=-1)
     # The spread of a pixel that the body covers at times is the body's, so the noise is the median
     # over pixels. A normal standard deviation is 1.4826 median absolute deviations.
-    noise = max(min_deviation, float(1.4826 * np.median(spread)))
-    return Background(mean, np.full(spread.shape, noise, dtype=np.float32))
+    noise = np.full_like(spread, 1.4826 * np.median(spread))
+    return Background.of_noise(mean, noise)
 
 
 def _require_one_size(pictures: Sequence[Picture], min_count: int, message: str) -> None:

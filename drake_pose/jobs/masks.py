@@ -36,7 +36,6 @@ from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, SCENE_FILE
 from drake_pose.silhouette.segmentation import (
     Background,
     background_of_recording,
-    background_support,
     learn_background,
     person_region,
 )
@@ -378,45 +377,27 @@ def _background(
 
 
 def _doubt_median(
-    room: Background,
-    recording: Sequence[Picture],
-    support: float = 0.75,
-    doubtful: float = 0.5,
-    radius: float = 0.3,
-    stays: float = 0.6,
+    room: Background, recording: Sequence[Picture], radius: float = 0.3, stays: float = 0.6
 ) -> tuple[str, ...]:
-    """Return warnings if a recording's median is not a good background.
+    """Return a warning if the body stays around one place, so that the median may show it.
 
     Args:
         room: the background from the median.
         recording: pictures (H, W, 3) spread over the recording.
-        support: a pixel may belong to the body if a smaller fraction of pictures shows the median.
-        doubtful: fraction of such pixels in a mask (median of all masks) above which there is a
-            warning.
         radius: radius within which the body stays, as a fraction of the square root of its area.
         stays: fraction of the pictures from which the body stays near one point (simulated arms:
             0.8 and more; a person walking by: 0.3).
     """
-    shown = background_support(recording, room)
     masks = [person_region(picture, room) for picture in recording]
-    unsure = [float((shown[mask] < support).mean()) for mask in masks if mask.any()] or [0.0]
-    part = float(np.median(unsure))
-    text = (
-        f"the median of {len(recording)} pictures is not a good background for this camera: in "
-        f"{part:.0%} of the masks' area fewer than three of four pictures show it, so it may "
-        "contain the body; give pictures of the empty room, or a longer recording in which the "
-        "body does not stay in one place"
-    )
-    texts: tuple[str, ...] = (text,) if part > doubtful else ()
     bodies = [mask.astype(np.uint8) for mask in masks if mask.any()]
     size = math.sqrt(float(np.median([mask.sum() for mask in bodies] or [0])))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * round(radius * size) + 1,) * 2)
     about = sum((cv2.dilate(mask, disc).astype(np.float32) for mask in bodies), np.zeros((1, 1)))
-    if about.max() > stays * len(masks):
-        y, x = np.unravel_index(int(np.argmax(about)), about.shape)
-        texts += (
-            f"the body stays around one place of this camera's pictures, ({x}, {y}): its parts "
-            "that do not move, such as an arm's base, count as background and are missing in the "
-            "masks; give pictures of the empty room",
-        )
-    return texts
+    if about.max() <= stays * len(masks):
+        return ()
+    y, x = np.unravel_index(int(np.argmax(about)), about.shape)
+    return (
+        f"the body stays around one place of this camera's pictures, ({x}, {y}): parts that do not "
+        "move, such as an arm's base, count as background and are missing in the masks; give "
+        "pictures of the empty room, or a recording in which the body leaves every place",
+    )

@@ -88,14 +88,6 @@ def _require_one_size(pictures: Sequence[Picture], min_count: int, message: str)
         raise SettingsError(message)
 
 
-def background_support(pictures: Sequence[Picture], background: Background) -> Floats:
-    """Return (H, W) the fraction of pictures within ``Background.tolerance`` of the background."""
-    shown = np.zeros(background.deviation.shape, dtype=np.float32)
-    for picture in pictures:
-        shown += _differs(picture, background.mean, background.tolerance) == 0
-    return np.asarray(shown / len(pictures), dtype=np.float32)
-
-
 def person_region(picture: Picture, background: Background, min_fraction: float = 0.1) -> Mask:
     """Return the mask (H, W) where a picture (H, W, 3 or 4) differs from the background: a person.
 

@@ -48,6 +48,19 @@ def skin_file(model_path: Path) -> Path:
     return model_path.with_suffix(".skin.yaml")
 
 
+@dataclass
+class BandEntry:
+    """An entry of ``bands`` in a skin file; ``load_skin`` describes its fields."""
+
+    parent: str = ""
+    child: str = ""
+    mesh: str = ""
+    axis: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    begin: float = 0.0
+    end: float = 0.0
+    colour: np.ndarray = field(default_factory=lambda: np.full(3, 0.8))
+
+
 def load_skin(model_path: Path, link_names: Sequence[str]) -> tuple[SkinBand, ...]:
     """Read the skin file beside a model file; return () where there is none.
 
@@ -72,58 +85,38 @@ def load_skin(model_path: Path, link_names: Sequence[str]) -> tuple[SkinBand, ..
         raise ModelError(f"{path}: not a skin file (a list 'bands')")
     if not entries:
         raise ModelError(f"{path}: declares no band; add one under 'bands' or remove the file")
-    bands = [_make_band(path, entry, link_names) for entry in entries]
-    pairs = [(band.parent, band.child) for band in bands]
-    for parent, child in pairs:
-        if pairs.count((parent, child)) > 1:
-            raise ModelError(f"{path}: two bands between '{parent}' and '{child}'; join them")
+    bands = list[SkinBand]()
+    for entry in entries:
+        where = f"{path}: band '{entry.get('parent')}' - '{entry.get('child')}'"
+        given = typed_entry(entry, BandEntry, where, ModelError)
+        for link in (given.parent, given.child):
+            if link not in link_names:
+                raise UnknownNameError("link", link, link_names, str(path))
+        if given.parent == given.child:
+            raise ModelError(f"{where}: parent and child must be two links")
+        axis, begin, end, colour = given.axis, given.begin, given.end, given.colour
+        if axis.shape != (3,) or not np.all(np.isfinite(axis)) or not axis.any():
+            raise ModelError(f"{where}: axis must be three finite numbers, not all zero")
+        if not -np.inf < begin < end < np.inf:
+            raise ModelError(f"{where}: give begin and end along the axis [m], begin below end")
+        if colour.shape != (3,) or not np.all((colour >= 0.0) & (colour <= 1.0)):
+            raise ModelError(f"{where}: colour must be three numbers from 0 to 1")
+        if not given.mesh:
+            raise ModelError(f"{where}: name its mesh")
+        mesh = read_mesh_file(path.parent / given.mesh)
+        if not is_watertight(mesh):
+            raise ModelError(f"{where}: {given.mesh} is not closed; close the band's ends")
+        along = mesh.vertices @ (axis / np.linalg.norm(axis))
+        # The weight of a vertex is the smoothstep of the fraction of the way from begin to end.
+        fraction = np.clip((along - begin) / (end - begin), 0.0, 1.0)
+        red, green, blue = colour.tolist()
+        weights = fraction**2 * (3.0 - 2.0 * fraction)
+        if any((given.parent, given.child) == (one.parent, one.child) for one in bands):
+            raise ModelError(
+                f"{path}: two bands between '{given.parent}' and '{given.child}'; join them"
+            )
+        bands.append(SkinBand(given.parent, given.child, mesh, weights, (red, green, blue)))
     return tuple(bands)
-
-
-@dataclass
-class BandEntry:
-    """An entry of ``bands`` in a skin file; ``load_skin`` describes its fields."""
-
-    parent: str = ""
-    child: str = ""
-    mesh: str = ""
-    axis: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    begin: float = 0.0
-    end: float = 0.0
-    colour: np.ndarray = field(default_factory=lambda: np.full(3, 0.8))
-
-
-def _make_band(path: Path, entry: dict[str, Any], link_names: Sequence[str]) -> SkinBand:
-    """Check one entry of the skin file ``path`` and return its band.
-
-    ``entry``: the fields of ``BandEntry`` by name, as YAML has them. ``link_names``: the names of
-    the model's links. The weight of a vertex is the smoothstep w = f^2 (3 - 2 f) of the fraction f
-    of the way from ``begin`` to ``end``.
-    """
-    where = f"{path}: band '{entry.get('parent')}' - '{entry.get('child')}'"
-    given = typed_entry(entry, BandEntry, where, ModelError)
-    for link in (given.parent, given.child):
-        if link not in link_names:
-            raise UnknownNameError("link", link, link_names, str(path))
-    if given.parent == given.child:
-        raise ModelError(f"{where}: parent and child must be two links")
-    axis, begin, end, colour = given.axis, given.begin, given.end, given.colour
-    if axis.shape != (3,) or not np.all(np.isfinite(axis)) or not axis.any():
-        raise ModelError(f"{where}: axis must be three finite numbers, not all zero")
-    if not -np.inf < begin < end < np.inf:
-        raise ModelError(f"{where}: give begin and end along the axis [m], begin below end")
-    if colour.shape != (3,) or not np.all((colour >= 0.0) & (colour <= 1.0)):
-        raise ModelError(f"{where}: colour must be three numbers from 0 to 1")
-    if not given.mesh:
-        raise ModelError(f"{where}: name its mesh")
-    mesh = read_mesh_file(path.parent / given.mesh)
-    if not is_watertight(mesh):
-        raise ModelError(f"{where}: {given.mesh} is not closed; close the band's ends")
-    along = mesh.vertices @ (axis / np.linalg.norm(axis))
-    fraction = np.clip((along - begin) / (end - begin), 0.0, 1.0)
-    red, green, blue = colour.tolist()
-    weights = fraction**2 * (3.0 - 2.0 * fraction)
-    return SkinBand(given.parent, given.child, mesh, weights, (red, green, blue))
 
 
 PositionKind = Literal["angle", "length", "quaternion"]

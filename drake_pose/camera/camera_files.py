@@ -18,7 +18,6 @@ from drake_pose.camera.models import (
     camera_tuple,
     check_number,
     check_pose,
-    write_file,
 )
 from drake_pose.camera.pose_files import RecordedPose, recorded_poses, recording_names, same_camera
 from drake_pose.errors import CameraError, listed
@@ -241,7 +240,10 @@ def save_cameras(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Came
     Raises:
         CameraError: the file cannot be written.
     """
-    write_file(path, dump_cameras(cameras), "the cameras")
+    try:
+        Path(path).write_text(dump_cameras(cameras), encoding="utf-8")
+    except OSError as error:
+        raise CameraError(f"{path}: cannot write the cameras: {error.strerror}") from error
 
 
 def dump_cameras(

@@ -38,7 +38,6 @@ class MappedJoints:
     # (n, m) whether a reading is at an end of its range, so that the joint is there or beyond.
     clipped: Mask
     not_logged: tuple[str, ...]  # Names of the model's joints without a column.
-    unused: tuple[str, ...]  # Names of columns without a joint.
     warnings: tuple[str, ...]  # Assumptions that were made, and anomalies.
     columns: Mapping[str, Column]  # By name of each logged joint, the linear map from its column.
     # Of columns that LeRobot recorded from servos; None: they are angles or lengths.
@@ -133,7 +132,7 @@ def map_joints(
             warnings += [f"joint '{joint}': column '{column.name}' {text}" for text in anomalies]
     missing = tuple(name for name in names if name not in columns)
     used_columns = {column.name for column in columns.values()}
-    unused = tuple(name for name in log.names if name not in used_columns)
+    unused = [name for name in log.names if name not in used_columns]
     if missing:
         warnings.append(
             f"joints that are not logged: {', '.join(missing)}; hold them (--hold) or map columns "
@@ -142,9 +141,7 @@ def map_joints(
     if unused:
         warnings.append(f"columns of the joint log that are not joints: {', '.join(unused)}")
     mapped = JointLog(tuple(names), log.times, positions, log.frames, log.servos)
-    return MappedJoints(
-        mapped, clipped, missing, unused, tuple(warnings), columns, encoding, tuple(joints)
-    )
+    return MappedJoints(mapped, clipped, missing, tuple(warnings), columns, encoding, tuple(joints))
 
 
 def without_followers(

@@ -5,7 +5,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any, TypeVar
 
 import cv2
@@ -96,18 +95,6 @@ def check_pose(value: Any, field: str, where: str) -> np.ndarray:
     matrix[3] = [0.0, 0.0, 0.0, 1.0]
     matrix.flags.writeable = False
     return matrix
-
-
-def write_file(path: str | Path, text: str, what: str) -> None:
-    """Write a text file, replacing an existing one; CameraError if it cannot be written.
-
-    Args:
-        what: name of the content, for the message.
-    """
-    try:
-        Path(path).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise CameraError(f"{path}: cannot write {what}: {error.strerror}") from error
 
 
 def _short(value: Any) -> str:

@@ -69,7 +69,7 @@ def test_positions_have_the_models_order_and_missing_joints_are_reported():
     expected = np.where(np.arange(7) == 4, np.nan, POSES)
     np.testing.assert_array_equal(found.log.positions, expected)
     np.testing.assert_allclose(found.log.at(np.array([0.05]))[0, 0], 0.15)
-    assert (found.not_logged, found.unused) == (("panda_joint5",), ("gripper",))
+    assert found.not_logged == ("panda_joint5",)
     assert found.warnings[-2:] == (
         "joints that are not logged: panda_joint5; hold them (--hold) or map columns to them "
         "(joint map)",
@@ -233,7 +233,7 @@ def test_real_logs_are_mapped(shared_data):
     found = map_log(log.names, log.positions, model)
     arms = [k for k, name in enumerate(model["names"]) if name not in found.not_logged]
     np.testing.assert_array_equal(found.log.positions[:, arms], log.positions[:, :14])
-    assert found.unused == log.names[14:]
+    assert found.warnings[-1].endswith(f"are not joints: {', '.join(log.names[14:])}")
     robot = joints_of(shared_data / "droid_episodes" / "robot" / "panda_robotiq.urdf")
     log = open_episode(shared_data / "droid_episodes" / "cloth").joints
     table = {"finger_joint": Column("gripper_position", 0.8)}

@@ -202,7 +202,8 @@ def _joint_rows(
             "name": name, "unit": unit, "estimate": _range(ends, digits), "interval": interval,
             "determined": of_frames if has_interval.any() else "–",
             "any_determined": sure > 0, "any_open": has_interval.any() and sure < count,
-            "measured": _range(_ends(measured[:, k]), digits), "limits": _limits_text(own),
+            "measured": _range(_ends(measured[:, k]), digits),
+            "limits": " to ".join("none" if math.isinf(x) else f"{round(x, 1):g}" for x in own),
             "mean_error": f"{scale[k] * errors['mean']:.{digits}f}" if errors else "–",
             "largest_error": f"{scale[k] * errors['largest']:.{digits}f}" if errors else "–",
             "bar": _bar(own, ends, _ends(low, high), is_open=sure < count),
@@ -218,11 +219,6 @@ def _range(ends: tuple[float, float], digits: int) -> str:
     """
     low, high = ("none" if math.isinf(one) else f"{one:z.{digits}f}" for one in ends)
     return "–" if math.isnan(ends[0]) else low if low == high else f"{low} to {high}"
-
-
-def _limits_text(limits: tuple[float, float]) -> str:
-    """Return ``lower to upper``, rounded to a tenth; an infinite limit becomes ``none``."""
-    return " to ".join("none" if math.isinf(one) else f"{round(one, 1):g}" for one in limits)
 
 
 def _bar(
@@ -404,7 +400,6 @@ def plot_curves(
     limits: tuple[float, float] | None = None,
     intervals: tuple[Array, Array, Mask] | None = None,
     least: float | None = None,
-    limits_within: float = 0.3,
     onto: "Figure | None" = None,
 ) -> "Figure":
     """Plot curves over frames; nan leaves a gap.
@@ -413,12 +408,11 @@ def plot_curves(
         frames: names of the frames.
         values: label and (frames,) values of each curve; the curve "measured" is wide.
         joined: whether neighbouring frames are joined by a line.
-        limits: lower and upper limit, each drawn only if it is near; None: no limits.
+        limits: lower and upper limit, each drawn only if its distance to curves and intervals is at
+            most their span; None: no limits.
         intervals: low and high (frames,), and whether the joint is determined (frames,), drawn as
             bars behind the curves; None: no bars, and a legend if there are several curves.
         least: lower end of the axis, such as 0; None: chosen from the curves.
-        limits_within: a limit is near if its distance to curves and intervals is at most this
-            fraction of their span.
         onto: plot of the same frames by an earlier call, without a legend. Its curves are replaced,
             which takes a third of the time of a new plot; None: a new one is made.
     """
@@ -437,7 +431,7 @@ def plot_curves(
             axes.vlines(places[where], low[where], high[where], colour, linewidth=width)
     shown = shown[np.isfinite(shown)]
     bottom, top = (float(shown.min()), float(shown.max())) if len(shown) else (0.0, 1.0)
-    near = limits_within * (top - bottom)
+    near = top - bottom
     if limits is not None and bottom - near <= limits[0] < bottom:
         bottom = limits[0]
     if limits is not None and top < limits[1] <= top + near:

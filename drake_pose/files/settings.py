@@ -257,14 +257,11 @@ def take_single_names(settings: Any) -> None:
             continue
         if kind is not str and get_origin(kind) is not Literal:
             continue
-        names = (value,) if isinstance(value, str) else tuple(value) if _is_many(value) else None
-        if names is None or not all(isinstance(name, str) for name in names):
+        is_many = isinstance(value, Iterable) and not isinstance(value, Mapping | str)
+        names = tuple(value) if is_many else (value,)
+        if not all(isinstance(name, str) for name in names):
             raise SettingsError(f"{one.name} must be names like ('a', 'b'), not {value!r}")
         object.__setattr__(settings, one.name, names)
-
-
-def _is_many(value: object) -> bool:
-    return isinstance(value, Iterable) and not isinstance(value, Mapping)
 
 
 Names = Annotated[tuple[str, ...], Parameter(metavar="NAME")]

@@ -145,25 +145,20 @@ class DateResult:
         """Return the figures by key, over all frames but those of the registered pose."""
         leading = np.array(self.errors[self._method])[np.isin(self.names, self.motions)]
         all_motions = self._of_motions(self.motions)
-        spent = self.milliseconds(self._method)
-        cameras = len(self.studio.cameras)
         return {
             "joint_error_mm": _mean(leading),
             "joint_error_p95_mm": float(np.percentile(leading, 95)),
             "ik_only_mm": all_motions["ik_only_mm"],
             "paper_mm": all_motions["paper_mm"],
-            "elbows_and_knees": self._of_joints(("elbow", "knee")),
-            "elbows": self._of_joints(("elbow",)),
-            "knees": self._of_joints(("knee",)),
+            "elbows": self._of_joints("elbow"),
+            "knees": self._of_joints("knee"),
             **self._as_found(UPRIGHT),
             "as_found": {motion: self._as_found((motion,)) for motion in self.motions},
             "face_error_deg": all_motions["face_error_deg"],
-            "ms_per_frame": spent,
-            "fps": 1e3 / spent["all"],
-            "camera_frames_per_second": 1e3 * cameras / spent["all"],
+            "ms_per_frame": self.milliseconds(self._method),
             "motions": {motion: self._of_motions((motion,)) for motion in self.motions},
             "frames": len(self.names),
-            "cameras": cameras,
+            "cameras": len(self.studio.cameras),
             "method": self._method,
         }
 
@@ -189,10 +184,10 @@ class DateResult:
         }
         return {**errors, "face_error_deg": _mean(np.array(self.face_errors)[chosen])}
 
-    def _of_joints(self, ends: tuple[str, ...]) -> dict[str, float]:
-        """Return mean errors [mm] by method, in all motions, of joints with these endings."""
+    def _of_joints(self, ending: str) -> dict[str, float]:
+        """Return mean errors [mm] by method, in all motions, of joints with this ending."""
         moving = np.isin(self.names, self.motions)
-        chosen = [i for i, name in enumerate(self._landmarks.names) if name.endswith(ends)]
+        chosen = [i for i, name in enumerate(self._landmarks.names) if name.endswith(ending)]
         return {
             f"{method}_mm": _mean(np.array(one)[moving][:, chosen])
             for method, one in self.errors.items()

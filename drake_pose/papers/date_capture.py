@@ -229,7 +229,8 @@ class SilhouetteTrack(_StagedRun):
 
     def place(self, q: Array) -> None:
         """Set the person's positions to q (nq,)."""
-        self._set_state(self._tracker.start(self._tracker.values(q)))
+        person, state = self._capture.estimator, self._tracker.start(self._tracker.values(q))
+        person.set_person(person.GetMyMutableContextFromRoot(self.context), state)
 
     def _state(self) -> TrackState:
         """Return the tracker's state after the last frame."""
@@ -238,7 +239,3 @@ class SilhouetteTrack(_StagedRun):
         if state is None:
             raise SettingsError("fewer than two cameras saw a person in the first frame")
         return state
-
-    def _set_state(self, state: TrackState) -> None:
-        person = self._capture.estimator
-        person.set_person(person.GetMyMutableContextFromRoot(self.context), state)

@@ -120,9 +120,9 @@ def save_hands(result: HandsResult, folder: Path) -> None:
     Above: true hands (grey, or their silhouettes) and estimates (blue). Below: the palm's rotation,
     a joint angle, and the length in question, with two standard deviations.
     """
-    for case, (trial, *_) in result.trials.items():
+    for case, (track, *_) in result.trials.items():
         figure = Figure(figsize=(13.0, 7.0), layout="tight")
-        grid, states, track = figure.subplots(2, 3), trial.sequence.states, trial.track
+        grid, states = figure.subplots(2, 3), track.sequence.states
         for axes, frame in zip(grid[0], (7, 23, 39), strict=True):
             if frame in track.kept:
                 mask = track.kept[frame]

@@ -9,7 +9,6 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,20 +58,11 @@ PICTURES = "pictures"
 """Value of `observed`, besides OBSERVED, for silhouettes by Drake's renderer, parts unlabelled."""
 
 
-class FilteredHand(NamedTuple):
-    """A filtered sequence."""
-
-    sequence: SyntheticSequence  # True states and measurements.
-    track: HandTrack  # Beliefs of the filter.
-    # (n,) final mean of a filter that linearises at the truth and has no limits; nan with pictures.
-    bound: Array
-
-
 @dataclass(frozen=True)
 class HandsResult:
     """All runs of both cases, by the keys of ``CASES``, and the arguments of `run_experiment`."""
 
-    trials: Mapping[str, tuple[FilteredHand, ...]]
+    trials: Mapping[str, tuple[HandTrack, ...]]
     seed: int
     settings: FilterSettings
     observed: str
@@ -146,7 +136,7 @@ def run_experiment(
     seen = "lines" if observed == PICTURES else observed
     follow = _filter_pictures if observed == PICTURES else _filter_sequence
 
-    def filtered(run: int, r_13: float) -> FilteredHand:
+    def filtered(run: int, r_13: float) -> HandTrack:
         generator = np.random.default_rng([seed, run, int(r_13)])
         return follow(hand_filter, make_sequence(r_13, seen, observation, generator))
 
@@ -189,7 +179,7 @@ def angle_error(means: Array, truths: Array) -> Array:
     return np.asarray(np.degrees(np.sqrt(np.mean(errors**2, axis=-1))))
 
 
-def _filter_sequence(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> FilteredHand:
+def _filter_sequence(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> HandTrack:
     """Filter a sequence, also without limits and at the truth; a failure keeps the last belief."""
     states, times, broken = [], [], False
     state = hand_filter.start(sequence.guess)
@@ -211,10 +201,10 @@ def _filter_sequence(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
         if t:
             belief = hand_filter.predict_belief(belief)
         belief = update(belief, make_measurement(hand_filter.observation, y), 1, truth).belief
-    return FilteredHand(sequence, track_of(states, times), belief.mean)
+    return track_of(sequence, states, times)._replace(bound=belief.mean)
 
 
-def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> FilteredHand:
+def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> HandTrack:
     """Filter a sequence's silhouettes in a diagram of plant, renderer, sensor and filter."""
     # The focal length is so long that perspective is weak: half the picture is 0.3 degrees wide.
     width, height, distance, period = 480, 400, 50.0, 1.0 / 30.0
@@ -237,24 +227,19 @@ def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
     silhouette = HandSilhouette(hand_filter, width, height, center)
     parts = build_hand_estimation(model, camera, silhouette, sequence.guess, positions, period)
     # Keep three frames for the pictures.
-    track = follow_pictures(parts, period, (7, 23, 39))
-    return FilteredHand(sequence, track, np.full(len(HAND_STATE), math.nan))
+    return follow_pictures(sequence, parts, period, (7, 23, 39))
 
 
-def _figures(trials: Sequence[FilteredHand]) -> dict[str, float | int]:
+def _figures(tracks: Sequence[HandTrack]) -> dict[str, float | int]:
     """Return the figures of a case by key, from all its runs.
 
     The NEES of the six lengths is 6 on average if the filter's covariance is consistent.
     """
     lengths_of, angles_of = HAND_STATE.indices(LENGTHS), HAND_STATE.indices((*SPREADS, *FLEXIONS))
-    truths = np.array([trial.sequence.states for trial in trials])
-    tracks = [trial.track for trial in trials]
+    truths = np.array([track.sequence.states for track in tracks])
     means = np.array([track.means for track in tracks])
     errors = (means - truths)[:, -1]
-    lengths, bounds = (
-        PIXELS_PER_METRE * np.mean(np.abs(off[:, lengths_of]), axis=1)
-        for off in (errors, [trial.bound for trial in trials] - truths[:, -1])
-    )
+    lengths = PIXELS_PER_METRE * np.mean(np.abs(errors[:, lengths_of]), axis=1)
     angles = angle_error(means, truths)
     watched = np.concatenate([lengths_of, angles_of])
     nees = np.array(
@@ -266,8 +251,6 @@ def _figures(trials: Sequence[FilteredHand]) -> dict[str, float | int]:
         ]
     )
     low, high = chdtri(len(LENGTHS), [0.975, 0.025])
-    last = HAND_STATE.index("length_13")
-    r_13 = PIXELS_PER_METRE * np.array([means[:, -1, last], truths[:, -1, last]])
     lost = ~((lengths < 5.0) & (angles[:, -1] < LOST_ANGLE_ERROR))
     milliseconds = np.array([track.milliseconds for track in tracks])
     inside = np.abs(means - truths) < 2 * np.array([track.deviations for track in tracks])
@@ -276,7 +259,8 @@ def _figures(trials: Sequence[FilteredHand]) -> dict[str, float | int]:
     if len(tracks[0].differences):
         own["silhouette_difference"] = float(np.median([track.differences for track in tracks]))
     else:
-        own["bound_length_error_mean"] = float(bounds.mean())
+        bounds = (np.array([track.bound for track in tracks]) - truths[:, -1])[:, lengths_of]
+        own["bound_length_error_mean"] = float(PIXELS_PER_METRE * np.mean(np.abs(bounds)))
     return {
         "length_error_mean": float(lengths.mean()),
         "length_error_p95": float(np.percentile(lengths, 95)),
@@ -291,8 +275,6 @@ def _figures(trials: Sequence[FilteredHand]) -> dict[str, float | int]:
         "rejected_by_an_inequality": sum(track.rejected for track in tracks),
         "lost": int(np.count_nonzero(lost)),
         "angle_rmse_at_end": float(np.sqrt(np.mean(angles[:, -1] ** 2))),
-        "r_13_mean": float(r_13[0].mean()),
-        "r_13_rmse": float(np.sqrt(np.mean((r_13[0] - r_13[1]) ** 2))),
         **own,
     }
 

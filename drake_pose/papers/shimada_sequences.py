@@ -185,34 +185,42 @@ def _product(a: Array, b: Array) -> Array:
 
 
 class HandTrack(NamedTuple):
-    """Beliefs of a filter after each frame.
+    """Beliefs of a filter after each frame of a sequence.
 
     Attributes:
+        sequence: true states and measurements.
         means, deviations: (frames, n) of the best hypothesis.
         covariance: (n, n) of the last one.
         milliseconds: (frames,) processor time of prediction, update and, with pictures, of the
             measurement, but not of rendering; nan after a failure.
         mirrored, rejected: number of hypotheses made by mirroring, and rejected by an inequality.
+        bound: (n,) final mean of a filter that linearises at the truth and has no limits; () with
+            pictures.
         differences: (frames,) fraction by which silhouette and matched pose differ; () without
             pictures.
         kept: masks (H, W) of some frames, by index.
     """
 
+    sequence: SyntheticSequence
     means: Array
     deviations: Array
     covariance: Array
     milliseconds: Array
     mirrored: int
     rejected: int
+    bound: Array = np.zeros(0)
     differences: Array = np.zeros(0)
     kept: Mapping[int, Mask] = MappingProxyType({})
 
 
-def track_of(states: Sequence[FilterState], milliseconds: Sequence[float]) -> HandTrack:
+def track_of(
+    sequence: SyntheticSequence, states: Sequence[FilterState], milliseconds: Sequence[float]
+) -> HandTrack:
     """Return the track of a filter from its state after each frame, and each frame's time [ms]."""
     best = [state.best for state in states]
     ends = [end.reason for state in states for end in state.rejections]
     return HandTrack(
+        sequence,
         np.array([one.mean for one in best]),
         np.array([one.deviations() for one in best]),
         best[-1].covariance,
@@ -223,11 +231,15 @@ def track_of(states: Sequence[FilterState], milliseconds: Sequence[float]) -> Ha
 
 
 def follow_pictures(
-    parts: tuple[Diagram, TruncatedEkf, HandSensor], period: float, kept_frames: Sequence[int]
+    sequence: SyntheticSequence,
+    parts: tuple[Diagram, TruncatedEkf, HandSensor],
+    period: float,
+    kept_frames: Sequence[int],
 ) -> HandTrack:
     """Run a diagram of ``build_hand_estimation`` frame by frame.
 
     Args:
+        sequence: whose hand the diagram renders.
         parts: the diagram, with the filter and the sensor in it.
         period: between frames [s].
         kept_frames: indices of the frames whose masks are kept.
@@ -247,7 +259,7 @@ def follow_pictures(
         simulator.AdvanceTo((t + 1) * period)
         states.append(ekf.filter_state(ekf_context))
         milliseconds.append(1e3 * (time.thread_time() - begin))
-    track = track_of(states, milliseconds)
+    track = track_of(sequence, states, milliseconds)
     return track._replace(differences=np.array(differences), kept=kept)
 
 

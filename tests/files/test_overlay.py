@@ -39,14 +39,18 @@ def test_agreement_missing_and_excess_have_their_colours():
         assert count(picture, colour) == pixels
 
 
-def test_only_borders_between_segments_are_drawn():
-    mask = rectangle((6, 8), slice(1, 5), slice(1, 7))
-    segments = np.where(mask, 1, -1)
-    assert count(paint_agreement(mask, mask, segments), OUTLINE_RGB) == 0
-    segments[1:5, 4:7] = 2
-    picture = paint_agreement(mask, mask, segments)
-    assert (picture[1:5, 3] == OUTLINE_RGB).all()
-    assert count(picture, OUTLINE_RGB) == 4
+def test_borders_are_pixels_of_the_body_before_another_segment():
+    """To the right or below, both within the body."""
+    rng = np.random.default_rng(3)
+    body, segments = rng.random((12, 15)) < 0.8, rng.integers(0, 3, (12, 15))
+    drawn = (paint_agreement(body, body, segments) == OUTLINE_RGB).all(axis=2)
+    for v, u in np.ndindex(12, 15):
+        differs = any(
+            a < 12 and b < 15 and body[a, b] and segments[a, b] != segments[v, u]
+            for a, b in ((v, u + 1), (v + 1, u))
+        )
+        assert drawn[v, u] == (body[v, u] and differs)
+    assert count(paint_agreement(body, body), OUTLINE_RGB) == 0
 
 
 def test_a_large_overlay_is_cropped_to_the_body():

@@ -114,7 +114,7 @@ def test_lengths_converge_with_drakes_pictures(tmp_path):
         assert figures["silhouette_difference"] < 0.045
         assert figures["mirrored"] > 0
         trial = result.trials[key][0]
-        drawn, means = trial.sequence, trial.track.means
+        drawn, means = trial.sequence, trial.means
         first = np.abs(drawn.guess.mean - drawn.states[0])[LENGTH].mean()
         assert np.abs(means[-1] - drawn.states[-1])[LENGTH].mean() < 0.2 * first
     save_hands(result, tmp_path)
@@ -128,14 +128,14 @@ def test_each_case_converges_to_its_true_lengths_inside_table_1(result):
         trials = result.trials[key]
         truths = [trial.sequence.states[-1] for trial in trials]
         assert truths[0][HAND_STATE.index("length_13")] == r_13 / 1000
-        ends = [trial.track.means[-1] for trial in trials]
+        ends = [trial.means[-1] for trial in trials]
         errors = 1000 * np.mean(np.abs(np.subtract(ends, truths)[:, LENGTH]), axis=1)
         assert np.mean(errors) < 0.7
         assert figures[key]["length_error_mean"] == pytest.approx(np.mean(errors))
         assert figures[key]["lost"] == 0
         assert figures[key]["angle_rmse"] < 3.0
         assert figures[key]["inside_2sigma"] > 0.8
-        assert all((rows.b - trial.track.means @ rows.phi.T).min() > -1e-6 for trial in trials)
+        assert all((rows.b - trial.means @ rows.phi.T).min() > -1e-6 for trial in trials)
     assert (figures["runs"], figures["truncation"]) == (6, "joint")
     assert result_table(result).row_count >= 7
 

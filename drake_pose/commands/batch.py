@@ -72,7 +72,7 @@ def batch(
         chunk: Number of frames in a chunk. Default: that of the job file.
     """
     from drake_pose.jobs.batch import run_batch
-    from drake_pose.jobs.batch_file import read_job
+    from drake_pose.jobs.batch_tasks import read_job
     from drake_pose.jobs.cluster import has_dask, open_cluster, require_fit_workers
 
     read = read_job(jobs, chunk)

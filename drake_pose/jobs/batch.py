@@ -22,9 +22,9 @@ from drake_pose.errors import ClusterError, DrakePoseError, OutputError
 from drake_pose.files.folder import without_nan, write_file, writes_folder
 from drake_pose.files.records import next_summary
 from drake_pose.input_files import csv_text
-from drake_pose.jobs.batch_file import SceneJob
 from drake_pose.jobs.batch_tasks import (
     Outcome,
+    SceneJob,
     Task,
     camera_set,
     describe_failure,

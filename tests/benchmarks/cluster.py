@@ -31,7 +31,7 @@ from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.batch import run_batch
-from drake_pose.jobs.batch_file import SceneJob
+from drake_pose.jobs.batch_tasks import SceneJob
 from drake_pose.jobs.cluster import open_cluster
 from drake_pose.papers.kameda import experiment_camera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer

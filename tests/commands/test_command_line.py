@@ -85,7 +85,7 @@ def test_every_failure_is_reported_in_one_line(
         os.kill(os.getpid(), ending)
         time.sleep(10.0)
 
-    monkeypatch.setattr("drake_pose.jobs.batch_file.read_job", read_job)
+    monkeypatch.setattr("drake_pose.jobs.batch_tasks.read_job", read_job)
     result = run_command(["batch", "jobs.yaml", "--out", "nowhere"])
     assert result.exit_code == 1
     assert result.output.startswith(f"drake-pose: error: {message}")

@@ -23,8 +23,7 @@ from drake_pose.commands.batch import batch
 from drake_pose.errors import ClusterError, OutputError, SettingsError
 from drake_pose.files.settings import GONE, EstimateSettings
 from drake_pose.jobs.batch import run_batch
-from drake_pose.jobs.batch_file import SceneJob, read_job
-from drake_pose.jobs.batch_tasks import Outcome, Task, perform, plan_scene
+from drake_pose.jobs.batch_tasks import Outcome, SceneJob, Task, perform, plan_scene, read_job
 from drake_pose.jobs.cluster import call_in_child, open_cluster, require_fit_workers
 from drake_pose.jobs.estimate.scene import estimate_scene
 from tests.cli import run_json, run_to_end

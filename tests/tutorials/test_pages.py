@@ -20,7 +20,7 @@ from drake_pose.camera.camera_files import load_cameras
 from drake_pose.camera.sources import load_sources
 from drake_pose.commands.main import app
 from drake_pose.filtering.inequalities import load_couplings
-from drake_pose.jobs.batch_file import read_job
+from drake_pose.jobs.batch_tasks import read_job
 from tests.cli import run_command
 
 ROOT = Path(__file__).resolve().parents[2]

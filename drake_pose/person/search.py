@@ -15,7 +15,7 @@ import numpy as np
 from drake_pose.arrays import Array, Indices, Mask, halton_sequence
 from drake_pose.body import landmarks_of_nodes, load_landmarks
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.errors import ModelError, SettingsError
+from drake_pose.errors import ModelError
 from drake_pose.fit.contour_fit import ContourFit, PoseFit, Prior
 from drake_pose.fit.kernel import Sum
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
@@ -53,12 +53,6 @@ class PersonSettings:
     headings_per_frame: int = 3  # Number of them in each frame of a sequence.
     limbs_per_frame: int = 2  # Number of doubtful limbs searched in each frame of a sequence.
     min_limb_ratio: float = 0.8  # A limb is doubtful below this inlier ratio of its contour.
-    # A limb is doubtful if the score of another of its poses is higher by this: the fraction of the
-    # limb that covers unexplained silhouette.
-    limb_gain: float = 0.15
-    # A limb is doubtful if its visible contour, in the mean of the cameras, is shorter than this
-    # fraction of its length.
-    min_limb_contour: float = 0.5
     # Fraction of the fresh starts that is fitted, the most promising first.
     fitted_fraction: float = 0.5
     searched_starts: int = 3  # Number of fresh starts whose doubtful limbs are searched.
@@ -74,10 +68,6 @@ class PersonSettings:
     ambiguity_margin: float = 0.02
     ranking_stages: int = 3  # Number of fit stages after which guesses are ranked.
     ranking_spacing: float = 1.5  # Factor on the spacing of contour points in these stages.
-
-    def __post_init__(self) -> None:
-        if not self.follow or not self.search:
-            raise SettingsError("a tracker needs one or more stages in `follow` and in `search`")
 
     @property
     def cycle(self) -> int:
@@ -122,12 +112,6 @@ class PlannedLimb(NamedTuple):
     poses: Array  # (n, k) these values in n poses between their limits; the first is at rest [rad].
     samples_T: Array  # (n, m, 3) points along the limb in the trunk's frame in each pose [m].
     weights: Array  # (n, m) weights of the points.
-    length: float  # From root to end, stretched out [m].
-
-    def points_at(self, X_WT: Array) -> Array:
-        """Return the points (n, m, 3) in the world [m] where the trunk is at X_WT (4, 4)."""
-        placed = self.samples_T.reshape(-1, 3) @ X_WT[:3, :3].T + X_WT[:3, 3]
-        return np.asarray(placed.reshape(self.samples_T.shape))
 
 
 class BodyPlan:
@@ -211,10 +195,8 @@ class BodyPlan:
         X_WT = X_WN[0, self.trunk]
         samples_W = self._samples(joints, X_WN).reshape(-1, 3)
         samples_T = ((samples_W - X_WT[:3, 3]) @ X_WT[:3, :3]).reshape(count, -1, 3)
-        a, b, c = self.landmarks.positions(X_WN[0])[joints]
-        length = float(np.linalg.norm(b - a) + np.linalg.norm(c - b))
         weights = crowding_weights(samples_T)
-        return PlannedLimb(nodes, values, joints, poses, samples_T, weights, length)
+        return PlannedLimb(nodes, values, joints, poses, samples_T, weights)
 
     def samples(self, limb: PlannedLimb, X_WN: Array) -> Array:
         """Return points (m, 3) along a limb in the world [m], nodes at X_WN (nodes, 4, 4)."""
@@ -424,21 +406,18 @@ class PersonSearch:
         return self._fit.fit(partial(frame.compare, self._fit), values, stages, prior, self._held)
 
     def _doubtful_limbs(self, fitted: PoseFit, frame: FrameViews) -> list[PlannedLimb]:
-        """Return the limbs that fit badly, hardly show or would cover more elsewhere, worst first.
+        """Return the limbs that fit badly, those that would cover more elsewhere first.
 
         The worst limb is always among them. `fitted` is a fit to `frame`.
         """
-        settings = self._settings
         lengths, fitting = fitted.sums[:, [Sum.COMPARED, Sum.FITTING]].T
         ratios = np.where(lengths > 0.0, fitting / np.maximum(lengths, 1e-9), 1.0)
         found = []
         for limb in self._plan.limbs.values():
             ratio = ratios[limb.nodes].min()
-            shown = lengths[limb.nodes].sum() / (limb.length * len(frame.cameras))
             scores, now = self._score_poses(fitted.values, limb, frame)
             gain = float(scores.max() - now)
-            doubtful = ratio < settings.min_limb_ratio or shown < settings.min_limb_contour
-            found.append((not (doubtful or gain > settings.limb_gain), ratio - gain, limb))
+            found.append((ratio >= self._settings.min_limb_ratio, ratio - gain, limb))
         found.sort(key=lambda one: one[:2])
         return [limb for k, (good, _, limb) in enumerate(found) if k == 0 or not good]
 
@@ -455,7 +434,9 @@ class PersonSearch:
         others = np.ones(len(X_WN), dtype=np.bool_) if placed is None else placed.copy()
         others[limb.nodes] = False
         outlines = [self._fit.outlines[node] for node in np.flatnonzero(others)]
-        places = limb.points_at(X_WN[self._plan.trunk])
+        X_WT = X_WN[self._plan.trunk]
+        placed = limb.samples_T.reshape(-1, 3) @ X_WT[:3, :3].T + X_WT[:3, 3]
+        places = np.asarray(placed.reshape(limb.samples_T.shape))
         here = self._plan.samples(limb, X_WN)[None]
         scores, now, weights = np.zeros(len(places)), 0.0, crowding_weights(here)
         for camera, region in zip(*frame.scoring_regions, strict=True):

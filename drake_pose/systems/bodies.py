@@ -8,8 +8,6 @@ from drake import lcmt_robot_state
 from pydrake.geometry import (
     GeometryConfigurationVector,
     Meshcat,
-    MeshcatVisualizer,
-    MeshcatVisualizerParams,
     Rgba,
     SceneGraph,
 )
@@ -66,39 +64,6 @@ def add_posed_plant(
         poser.get_output_port(), scene_graph.get_source_pose_port(plant.get_source_id())
     )
     return plant
-
-
-def add_avatar(
-    builder: DiagramBuilder,
-    model: ParsedModel,
-    positions: OutputPort,
-    meshcat: Meshcat,
-    prefix: str,
-    period: float,
-) -> None:
-    """Show a body in Meshcat from a SceneGraph of its own, which sensors do not see.
-
-    Args:
-        builder: the diagram to which the systems are added.
-        model: the body.
-        positions: port of the positions (nq,) in the plant's order [rad or m]; while they are NaN
-            the body has the model's default positions.
-        prefix: Meshcat path under which it is drawn.
-        period: time between two drawings [s].
-    """
-    scene_graph = builder.AddNamedSystem("avatar_scene_graph", SceneGraph())
-    default = model.default_positions
-    # Estimators output NaN until a body is found; a plant does not accept NaN.
-    known = builder.AddNamedSystem(
-        "avatar_positions",
-        PositionFunction(
-            len(default), len(default), lambda q: q if np.isfinite(q).all() else default
-        ),
-    )
-    builder.Connect(positions, known.get_input_port())
-    add_posed_plant(builder, scene_graph, model, known.get_output_port(), "avatar_pose")
-    parameters = MeshcatVisualizerParams(prefix=prefix, publish_period=period)
-    MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, parameters)
 
 
 MESHCAT_PERIOD = 1.0 / 64.0

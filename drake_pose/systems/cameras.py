@@ -177,8 +177,8 @@ class CameraRig:
     """A diagram of a body and the cameras that see it.
 
     The body is posed by the input port ``positions`` (nq) or by a trajectory. The output ports
-    ``color_image_<camera>``, ``label_image_<camera>`` and ``depth_image_<camera>`` render when they
-    are evaluated. Render in one thread only: Drake's engine gives wrong images in another thread.
+    ``color_image_<camera>`` and ``label_image_<camera>`` render when they are evaluated. Render in
+    one thread only: Drake's engine gives wrong images in another thread.
     """
 
     diagram: Diagram  # The diagram.
@@ -246,7 +246,6 @@ def build_camera_rig(
     for name, sensor in sensors.items():
         builder.ExportOutput(sensor.color_image_output_port(), f"color_image_{name}")
         builder.ExportOutput(sensor.label_image_output_port(), f"label_image_{name}")
-        builder.ExportOutput(sensor.depth_image_32F_output_port(), f"depth_image_{name}")
     return CameraRig(builder.Build(), dict(cameras), sensors)
 
 

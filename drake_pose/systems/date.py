@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from pydrake.geometry import Meshcat
 from pydrake.systems.framework import (
     Context,
     DiagramBuilder,
@@ -41,7 +40,6 @@ from drake_pose.person.date.features import (
 from drake_pose.person.date.pose import estimate_pose
 from drake_pose.person.date.skeleton import FEATURES, LIMBS, Skeleton, load_skeleton
 from drake_pose.silhouette.segmentation import Background, person_region
-from drake_pose.systems.bodies import add_avatar
 from drake_pose.systems.cameras import build_camera_rig, colour_image_to_picture
 from drake_pose.systems.picture_capture import PersonRegion, connect_images
 from drake_pose.systems.ports import (
@@ -496,9 +494,8 @@ def build_paper_capture(
     setup: CaptureSetup,
     source: System | None = None,
     period: float = 1.0 / 30.0,
-    meshcat: Meshcat | None = None,
 ) -> StagedDiagram[PaperPoseEstimator]:
-    """Build a diagram that captures a person: images, the paper's stages, the pose, and the avatar.
+    """Build a diagram that captures a person: images, the paper's stages, and the pose.
 
     Its output ports are those of ``PaperPoseEstimator``, ``person_view_<camera>``, if the setup
     allows them ``face_direction``, ``recognised_positions`` and ``similarity``, and if the source
@@ -513,7 +510,6 @@ def build_paper_capture(
             pictures in each period has the output port ``fresh``. None: the images are inputs of
             the diagram.
         period: time between two frames [s].
-        meshcat: where to show the avatar; None: nowhere.
 
     Raises SettingsError: the source lacks an output port, or the period is not positive.
     """
@@ -569,7 +565,4 @@ def build_paper_capture(
         if source.HasOutputPort("time"):
             builder.ExportOutput(source.GetOutputPort("time"), "time")
     export_outputs(builder, estimator)
-    if meshcat is not None:
-        positions = estimator.GetOutputPort("estimated_positions")
-        add_avatar(builder, setup.skeleton.model, positions, meshcat, "avatar", period)
     return StagedDiagram(builder.Build(), stages, estimator)

@@ -186,7 +186,6 @@ class MatchingDiagram:
     # positions_log, error_log: logs of ``estimated_positions`` and ``error``, one sample a period.
     positions_log: VectorLogSink
     error_log: VectorLogSink
-    player: MaskPlayer | None = None  # Source of recorded masks; None: the cameras are simulated.
 
     def estimate(self, context: Context) -> PoseEstimate | None:
         """Return the last update's estimate, by the diagram's context; None: there is none."""
@@ -244,7 +243,7 @@ def build_recorded_matching(
         scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
         estimate = matcher.GetOutputPort("estimated_positions")
         show_estimate(builder, scene_graph, search.tree.model, estimate, meshcat)
-    return _finish(builder, matcher, player.period, player)
+    return _finish(builder, matcher, player.period)
 
 
 def build_simulated_matching(
@@ -281,7 +280,7 @@ def build_simulated_matching(
         show_estimate(builder, scene_graph, model, estimate, meshcat, ESTIMATE_COLOUR)
         # After show_estimate, because its visualizer clears its part of Meshcat's tree.
         add_meshcat_skin(builder, meshcat, model, truth, "true")
-    return _finish(builder, matcher, period, None)
+    return _finish(builder, matcher, period)
 
 
 def add_simulated_cameras(
@@ -408,16 +407,14 @@ def show_estimate(
     add_meshcat_skin(builder, meshcat, model, positions, "estimated", colour)
 
 
-def _finish(
-    builder: DiagramBuilder, matcher: SilhouetteMatcher, period: float, player: MaskPlayer | None
-) -> MatchingDiagram:
-    """Log a matcher's outputs each ``period`` [s], and build; ``player``: of recorded masks."""
+def _finish(builder: DiagramBuilder, matcher: SilhouetteMatcher, period: float) -> MatchingDiagram:
+    """Log a matcher's outputs each ``period`` [s], and build."""
     # A log samples before the update at the same time: sample k + 1 has the estimate of frame k.
     positions_log = LogVectorOutput(
         matcher.GetOutputPort("estimated_positions"), builder, publish_period=period
     )
     error_log = LogVectorOutput(matcher.GetOutputPort("error"), builder, publish_period=period)
-    return MatchingDiagram(builder.Build(), matcher, positions_log, error_log, player)
+    return MatchingDiagram(builder.Build(), matcher, positions_log, error_log)
 
 
 @dataclass(frozen=True)
@@ -435,7 +432,6 @@ def build_simulated_registration(
     camera: PinholeCamera,
     true_positions: Trajectory | np.ndarray,
     period: float,
-    meshcat: Meshcat | None = None,
 ) -> RegistrationDiagram:
     """Build a diagram that registers a simulated camera; its pose is not an input.
 
@@ -445,7 +441,6 @@ def build_simulated_registration(
         true_positions: the body's positions (nq,) [rad or m], constant or over time, measured
             without error.
         period: time between two images and updates [s].
-        meshcat: where to show the body; None: nowhere.
     """
     builder = DiagramBuilder()
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
@@ -454,8 +449,6 @@ def build_simulated_registration(
     truth, images = add_simulated_cameras(builder, scene_graph, model, [camera], true_positions)
     builder.Connect(images[0], system.GetInputPort("label_image"))
     builder.Connect(truth, system.GetInputPort("measured_positions"))
-    if meshcat is not None:
-        MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
     status_log = LogVectorOutput(system.GetOutputPort("status"), builder, publish_period=period)
     diagram = builder.Build()
     sensor = diagram.GetSubsystemByName(f"camera_{camera.name}")

@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiagramBuilder, System
 
@@ -23,7 +22,7 @@ from drake_pose.person.views import (
     see_silhouette,
 )
 from drake_pose.silhouette.segmentation import Background
-from drake_pose.systems.bodies import add_avatar, body_poses
+from drake_pose.systems.bodies import body_poses
 from drake_pose.systems.picture_capture import PersonRegion, connect_images
 from drake_pose.systems.ports import (
     MemorySystem,
@@ -337,7 +336,6 @@ def build_silhouette_capture(
     period: float = 1.0 / 30.0,
     edge_points: float = EDGE_POINTS,
     source: System | None = None,
-    meshcat: Meshcat | None = None,
     with_deviations: bool = False,
 ) -> StagedDiagram[PersonTracker]:
     """Build a diagram that tracks a person in the cameras' images.
@@ -355,7 +353,6 @@ def build_silhouette_capture(
         source: of the images instead of input ports, for example a rig's diagram or a
             PictureCapture; see add_silhouette_sensors. Without an output port ``time``, each update
             has new pictures.
-        meshcat: where to show the person; None: nowhere.
         with_deviations: whether there is an output port ``deviations``.
 
     Raises SettingsError: there are fewer than two cameras, one has no background, or the period is
@@ -369,9 +366,6 @@ def build_silhouette_capture(
         builder.Connect(sensor.silhouette, person.GetInputPort(f"silhouette_{name}"))
     if source is not None and source.HasOutputPort("time"):
         builder.Connect(source.GetOutputPort("time"), person.GetInputPort("time"))
-    if meshcat is not None:
-        positions = person.GetOutputPort("last_positions")
-        add_avatar(builder, tracker.fit.tree.model, positions, meshcat, "avatar", period)
     for name, sensor in sensors.items():
         builder.ExportOutput(sensor.silhouette, f"silhouette_{name}")
     export_outputs(builder, person)

@@ -7,7 +7,7 @@ from scipy.stats import qmc
 from drake_pose.arrays import halton_sequence
 from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.models import circle_of_cameras
-from drake_pose.errors import ModelError, SettingsError
+from drake_pose.errors import ModelError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walking import make_motion
@@ -123,11 +123,6 @@ class TestTracker:
         assert tried[0] == [0, 4, 8]
         assert tried[1] == [2, 6, 10]
         assert EXACT.headings_of(4) == tried[0]
-
-    @pytest.mark.parametrize("rounds", ["follow", "search"])
-    def test_settings_are_checked(self, rounds):
-        with pytest.raises(SettingsError, match="stage"):
-            replace(EXACT, **{rounds: ()})
 
 
 class TestPlan:

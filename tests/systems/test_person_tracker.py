@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.analysis import Simulator
 from pydrake.trajectories import PiecewisePolynomial
 
@@ -49,16 +48,15 @@ def views(cameras):
     return views
 
 
-def test_a_moving_person_is_tracked_and_shown(person, cameras):
+def test_a_moving_person_is_tracked(person, cameras):
     start = posed(person, left_upper_arm_z=40, right_upper_arm_z=-40)
     end = posed(
         person, left_upper_arm_z=53, right_upper_arm_z=-40, left_thigh_x=-13, left_shin_x=13
     )
     path = PiecewisePolynomial.FirstOrderHold([0.0, 0.1], np.column_stack([start, end]))
-    meshcat = Meshcat(MeshcatParams(host="localhost"))
     tracker = PersonPoseTracker(ContourFit(person.pose_tree()))
     rig = build_camera_rig(person, cameras, path).diagram
-    capture = build_silhouette_capture(tracker, cameras, {}, 1 / 30, source=rig, meshcat=meshcat)
+    capture = build_silhouette_capture(tracker, cameras, {}, 1 / 30, source=rig)
     diagram = capture.diagram
     simulator = Simulator(diagram)
     simulator.AdvanceTo(0.101)
@@ -69,7 +67,6 @@ def test_a_moving_person_is_tracked_and_shown(person, cameras):
         index = person.position_index(name)
         off = run["estimated_positions"][index] - end[index]
         assert np.degrees(off) == pytest.approx(0.0, abs=4.0), name
-    assert meshcat.HasPath("/drake/avatar") or meshcat.HasPath("avatar")
 
 
 @pytest.mark.slow

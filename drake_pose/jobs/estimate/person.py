@@ -12,7 +12,7 @@ from drake_pose.errors import MaskError
 from drake_pose.files.records import FrameRecord, record_modes
 from drake_pose.files.writer import Drawn, OnStage, ResultWriter
 from drake_pose.jobs.estimate.inputs import EstimateInputs, draw_parts
-from drake_pose.person.capture import CheckedCapture, PersonCapture, capture_checked
+from drake_pose.person.capture import PersonCapture, capture_checked
 from drake_pose.person.faults import CameraFault, RigFault
 from drake_pose.person.figures import ReadFrame, ViewFaults
 from drake_pose.search import PoseEstimate
@@ -57,7 +57,7 @@ def follow_person(
         inputs.model.pose_tree(), inputs.scene.cameras, reader, len(inputs.frames),
         inputs.tracked, reader.count_followed,
     )  # fmt: skip
-    captured, faults = checked.captured, describe_faults(checked, inputs.frames)
+    captured = checked.captured
     reader.on_stage = None
     seconds = (time.perf_counter() - begin) / len(inputs.frames)
     result.records.clear()
@@ -73,9 +73,15 @@ def follow_person(
         for index, X_WN in enumerate(captured.tree.node_poses_batch(nodes)):
             masks = checked.read(index)
             yield _record_frame(inputs, captured, index, X_WN, masks, reader, seconds, overlay)
-        unread = describe_unreadable(reader.refused, inputs.scene.frames)
-        doubts = describe_alternatives(captured, inputs.frames)
-        result.warnings += (*unread, *faults, *doubts)
+        frames = inputs.frames
+        result.warnings += (
+            *describe_unreadable(reader.refused, inputs.scene.frames),
+            *describe_views(checked.views, frames),
+            *describe_fit(captured.inlier_ratios.tolist()),
+            *describe_rig(checked.rig),
+            *(describe_camera(one, frames) for one in checked.cameras),
+            *describe_alternatives(captured, frames),
+        )
 
     return inputs, finished()
 
@@ -157,16 +163,6 @@ def _record_frame(
     known = record_modes(inputs.model, answers if found else answers[:1])
     return inputs.record_frame(
         frame, pose, masks, parts, shown, inlier_ratio=float(captured.inlier_ratios[index]), **known
-    )
-
-
-def describe_faults(checked: CheckedCapture, frames: Sequence[str]) -> tuple[str, ...]:
-    """Return all warnings of a checked capture; ``frames`` are the names of its frames."""
-    return (
-        *describe_views(checked.views, frames),
-        *describe_fit(checked.captured.inlier_ratios.tolist()),
-        *describe_rig(checked.rig),
-        *(describe_camera(one, frames) for one in checked.cameras),
     )
 
 

@@ -16,7 +16,7 @@ from pydrake.multibody.tree import BodyIndex, Joint, RigidBody
 
 from drake_pose.arrays import Array
 from drake_pose.body.meshes import TriangleMesh, join_meshes
-from drake_pose.body.parsed_model import FLOATING_TYPES, ParsedModel, link_names
+from drake_pose.body.parsed_model import FLOATING_TYPES, ParsedModel
 from drake_pose.errors import ModelError
 
 
@@ -206,42 +206,32 @@ def build_link_graph(model: ParsedModel, preferred_frame: str | None) -> LinkGra
                 members.append([far])
                 found.append((joint, group_of_body[body], group_of_body[far]))
             queue.append(far)
-    kinematics = PlantKinematics(model)
-    groups = tuple(_make_group(model, kinematics, group, preferred_frame) for group in members)
+    kinematics, groups = PlantKinematics(model), list[LinkGroup]()
+    for bodies in members:
+        # The meshes of welded bodies are joined in one frame.
+        links = tuple(model.link_names[body] for body in bodies)
+        with_geometry = [name for name in links if name in model.link_meshes]
+        frame = (with_geometry or links)[0]
+        if preferred_frame is not None and preferred_frame in links:
+            frame = preferred_frame
+        body = bodies[links.index(frame)]
+        X_NB = inverse_transforms(kinematics.pose(body))
+        meshes = [
+            model.link_meshes[name]
+            if own == body
+            else model.link_meshes[name].transformed(X_NB @ kinematics.pose(own))
+            for name, own in zip(links, bodies, strict=True)
+            if name in model.link_meshes
+        ]
+        groups.append(LinkGroup(frame, links, body, join_meshes(meshes)))
     edges = tuple(
         _make_edge(kinematics, groups, joint, inner, outer) for joint, inner, outer in found
     )
-    return LinkGraph(groups, edges)
-
-
-def _make_group(
-    model: ParsedModel, kinematics: PlantKinematics, bodies: list[int], preferred_frame: str | None
-) -> LinkGroup:
-    """Return the group of welded bodies, their meshes joined in one frame.
-
-    ``kinematics``: forward kinematics of the model. ``bodies``: indices of the bodies in the plant,
-    the one nearest to the world first. ``preferred_frame``: as for ``build_link_graph``.
-    """
-    names = link_names(model.plant)
-    links = tuple(names[body] for body in bodies)
-    with_geometry = [name for name in links if name in model.link_meshes]
-    name = (with_geometry or links)[0]
-    if preferred_frame is not None and preferred_frame in links:
-        name = preferred_frame
-    body = bodies[links.index(name)]
-    X_NB = inverse_transforms(kinematics.pose(body))
-    meshes = [
-        model.link_meshes[link]
-        if other == body
-        else model.link_meshes[link].transformed(X_NB @ kinematics.pose(other))
-        for link, other in zip(links, bodies, strict=True)
-        if link in model.link_meshes
-    ]
-    return LinkGroup(name, links, body, join_meshes(meshes))
+    return LinkGraph(tuple(groups), edges)
 
 
 def _make_edge(
-    kinematics: PlantKinematics, groups: tuple[LinkGroup, ...], joint: Joint, inner: int, outer: int
+    kinematics: PlantKinematics, groups: Sequence[LinkGroup], joint: Joint, inner: int, outer: int
 ) -> JointEdge:
     """Return the edge of one joint, with its map fitted to the plant.
 

@@ -66,7 +66,22 @@ def open_bag(path: Path, joints: JointLog | None) -> Episode:
         for topic, why in ignored.items()
         if why != "depths"
     ]
-    warnings += _name_joints(states)
+    # Positions without names are named only if they are the only ones.
+    bare = [key for key in states if isinstance(key[1], int)]
+    if len(bare) == len(states) == 1:
+        topic, count = bare[0]
+        states[topic, tuple(f"joint_{k}" for k in range(count))] = states.pop(bare[0])
+        warnings.append(
+            f"{topic}: its JointState has no names: its {count} positions are taken for joints in "
+            "the model's order, if it has as many; record the names, or give a joint map"
+        )
+    elif bare:
+        states = {key: rows for key, rows in states.items() if key not in bare}
+        warnings += [
+            f"{topic} is left out: its JointState has {count} positions without names; record the "
+            "names"
+            for topic, count in bare
+        ]
     shifts, texts = _clock_shifts(pictures, states)
     warnings += texts
     if joints is None and states:
@@ -190,30 +205,6 @@ def _encoding(coding: str) -> tuple[int, int | None, bool] | None:
         return None
     size, how = _ENCODINGS[eight]
     return 2 * size, how, True
-
-
-def _name_joints(states: dict[Any, list[_Row]]) -> list[str]:
-    """Name positions without names joint_0 and so on, or remove them; return warnings.
-
-    They are named only if no message has names, and all have as many positions and one topic.
-
-    Args:
-        states: rows by (topic, names), or (topic, number of positions); they are changed.
-    """
-    bare = [key for key in states if isinstance(key[1], int)]
-    if len(bare) == len(states) == 1:
-        topic, count = bare[0]
-        states[topic, tuple(f"joint_{k}" for k in range(count))] = states.pop(bare[0])
-        return [
-            f"{topic}: its JointState has no names: its {count} positions are taken for joints in "
-            "the model's order, if it has as many; record the names, or give a joint map"
-        ]
-    for key in bare:
-        del states[key]
-    return [
-        f"{topic} is left out: its JointState has {count} positions without names; record the names"
-        for topic, count in bare
-    ]
 
 
 def _clock_shifts(

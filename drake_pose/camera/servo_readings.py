@@ -379,10 +379,10 @@ def servo_columns(
                 )
         elif is_degrees[joint.name]:
             scale, offset = inner[joint.name][1:3]
-            outer = degrees.get(joint.name) or _degree_column(joint, servos)
+            outer = degrees.get(joint.name) or _plain_column(joint, servos, "deg")
             column = Column(joint.column, outer.scale * scale, outer.scale * offset + outer.offset)
         elif encoding == "steps":
-            column = _step_column(joint, servos)
+            column = _plain_column(joint, servos, encoding)
         else:
             length = range_in_steps(joint, servos.turn)
             if length is None and joint.is_called(servos.full_turns):
@@ -451,24 +451,20 @@ def _as_counted(joint: ServoJoint, servos: Servos, encoding: Encoding) -> Column
     return Column(joint.column, sign * scale, scale * joint.motor.homing)
 
 
-def _step_column(joint: ServoJoint, servos: Servos) -> Column:
-    """Return a joint's map from encoder steps; without calibration half a turn is its zero."""
+def _plain_column(joint: ServoJoint, servos: Servos, encoding: Encoding) -> Column:
+    """Return a joint's map from encoder steps, or from degrees of which LeRobot counts 360 to 4095.
+
+    Without a calibration the zero of steps is half a turn.
+    """
     motor, turn = joint.motor, servos.turn
-    step = 2.0 * math.pi / turn
-    sign = -1.0 if motor is not None and motor.is_inverted and not servos.is_dynamixel else 1.0
-    if motor is None:
-        return Column(joint.column, step, -step * (turn // 2))
-    middle, length = 0.5 * (motor.low + motor.high), motor.high - motor.low
-    return Column(joint.column, sign * step, _zero(joint, length, turn) - sign * step * middle)
-
-
-def _degree_column(joint: ServoJoint, servos: Servos) -> Column:
-    """Return a joint's map from degrees, of which LeRobot counts 360 to 4095 steps."""
-    motor, scale = joint.motor, math.radians(1.0)
-    if motor is None or not math.isfinite(motor.high):
-        return Column(joint.column, scale)
-    zero = _zero(joint, motor.high - motor.low, servos.turn)
-    return Column(joint.column, scale * (servos.turn - 1) / servos.turn, zero)
+    step = 2.0 * math.pi / turn if encoding == "steps" else math.radians(1.0)
+    if motor is None or not (encoding == "steps" or math.isfinite(motor.high)):
+        return Column(joint.column, step, -step * (turn // 2) if encoding == "steps" else 0.0)
+    zero = _zero(joint, motor.high - motor.low, turn)
+    if encoding == "deg":
+        return Column(joint.column, step * (turn - 1) / turn, zero)
+    step = -step if motor.is_inverted and not servos.is_dynamixel else step
+    return Column(joint.column, step, zero - step * (0.5 * (motor.low + motor.high)))
 
 
 def _so_degrees(joints: Sequence[ServoJoint], servos: Servos) -> dict[str, Column]:

@@ -13,7 +13,7 @@ Once the pose is approximately known, so are the background of each pixel and th
 pixel shows the body. Search lines across the contour then locate its edge (``fit.colours``).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -419,13 +419,17 @@ def largest(channels: Floats) -> Floats:
     return np.maximum(np.maximum(red, green), blue)
 
 
-def _median(pictures: Floats, rows: int = 16) -> Floats:
-    """Return the median over the first axis of (f, H, ...), in strips of some rows."""
+def _in_strips(of_rows: Callable[[slice], Floats], height: int, rows: int = 8) -> list[Floats]:
+    """Return what a function returns of each strip of ``rows`` rows, which fit in the cache."""
+    return map_ordered(of_rows, [slice(k, k + rows) for k in range(0, height, rows)])
 
-    def median(k: int) -> Floats:
-        return np.asarray(np.median(pictures[:, k : k + rows], axis=0))
 
-    return np.concatenate(map_ordered(median, range(0, pictures.shape[1], rows)))
+def _median(pictures: Floats) -> Floats:
+    """Return the median over the first axis of (f, H, ...)."""
+    height = pictures.shape[1]
+    return np.concatenate(
+        _in_strips(lambda rows: np.asarray(np.median(pictures[:, rows], axis=0)), height)
+    )
 
 
 def colour_slopes(picture: Floats) -> tuple[Floats, Floats]:
@@ -475,20 +479,20 @@ def log_frequencies(numbers: Array) -> Floats:
     return np.log(np.minimum(times, MODEL.max_frequency) + MODEL.base_frequency).astype(np.float32)
 
 
-def _find_colours(pictures: Floats, deviations: Floats, rows: int = 8) -> Floats:
+def _find_colours(pictures: Floats, deviations: Floats) -> Floats:
     """Return (3, H, W, 3) the colours shared by most frames, then by most of the remaining frames.
 
-    The colours of all pairs of frames are compared, in strips of rows that fit in the cache.
+    The colours of all pairs of frames are compared.
 
     ``pictures``: (f, H, W, 3) images after photometric correction. ``deviations``: (H, W) standard
-    deviations of a background's colours. ``rows``: height of a strip [pixel].
+    deviations of a background's colours.
     """
 
-    def find(k: int) -> Floats:
-        own, count = pictures[:, k : k + rows], len(pictures)
+    def find(rows: slice) -> Floats:
+        own, count = pictures[:, rows], len(pictures)
         deviation = np.zeros((count, count, *own.shape[1:3]), np.float32)
         for f, picture in enumerate(own):
-            deviation[f, f:] = largest(np.abs(own[f:] - picture)) / deviations[k : k + rows]
+            deviation[f, f:] = largest(np.abs(own[f:] - picture)) / deviations[rows]
             deviation[f:, f] = deviation[f, f:]
         close = deviation < MODEL.match_deviations
         # Among colours with equally many supporters prefer the closer ones.
@@ -504,5 +508,4 @@ def _find_colours(pictures: Floats, deviations: Floats, rows: int = 8) -> Floats
             remaining &= ~shared
         return np.array(found)
 
-    strips = map_ordered(find, range(0, pictures.shape[1], rows))
-    return np.concatenate(strips, axis=1)
+    return np.concatenate(_in_strips(find, pictures.shape[1]), axis=1)

@@ -135,7 +135,7 @@ class Source:
             yield camera, file.stem, coco, one
 
 
-def open_source(path: Path, camera_file: Path | None = None, episode: int | None = None) -> Source:
+def open_source(path: Path, camera_file: Path | None, episode: int | None) -> Source:
     """Return a source of masks; pictures and videos are not read yet.
 
     Args:
@@ -236,10 +236,9 @@ def _open_folder(path: Path) -> Source:
         return Source(path, annotated=annotated)
     # As in scenes, a folder of pictures takes precedence over a video of the same camera.
     videos = {name: file for name, file in videos.items() if name not in pictures}
-    if "" in pictures and len(pictures) > 1:
+    if "" in pictures and (videos or len(pictures) > 1):
         raise SceneError(
-            f"{roots[0]}: has pictures beside folders of pictures; move them into a camera's folder"
+            f"{roots[0]}: has pictures beside videos or folders of pictures; move them into a "
+            "camera's folder"
         )
-    if "" in pictures and videos:
-        raise SceneError(f"{roots[0]}: has pictures and videos; remove one of them")
     return Source(path, pictures=pictures, videos=videos)

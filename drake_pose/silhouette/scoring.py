@@ -160,14 +160,21 @@ class VisualHull:
         """
         self._center, self._side = outline.ball[:3], side
         self._size = float(outline.ball[3])
+        # Axes (2, 3) of each image in frame N [pixel/m], and its pixels' distances to the edge.
         self._views: list[tuple[np.ndarray, np.ndarray]] = []
         if self._size > 0.0 and len(outline.triangles):
             scale, middle = 0.46 * side / self._size, 0.5 * (side - 1)
             camera = ParallelCamera("hull", side, side, scale, middle, middle, np.eye(4))
-            self._views = [
-                _distance_image(outline, R_CN, camera) for R_CN in _rotations(directions)
-            ]
             self._scale = scale
+            for R_CN in _rotations(directions):
+                X_CN = np.eye(4)
+                X_CN[:3, :3], X_CN[:3, 3] = R_CN, -R_CN @ self._center
+                mask = draw_mask([outline], X_CN[None], camera).astype(np.uint8)
+                distances = cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+                # Squared distances are integers; OpenCV's rounding depends on the image's memory
+                # alignment.
+                exact = np.sqrt(np.rint(np.square(distances, dtype=np.float64)))
+                self._views.append((scale * R_CN[:2], exact))
 
     def radii(self, p_N: np.ndarray, shrink: float = 0.97) -> np.ndarray:
         """Return radii (n,) [m] of the largest balls inside the hull around points; 0 outside it.
@@ -227,30 +234,6 @@ def _rotations(count: int) -> np.ndarray:
     forward = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), z])
     right = np.column_stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(count)])
     return np.stack([right, np.cross(forward, right), forward], axis=1)
-
-
-def _distance_image(
-    outline: Outline, R_CN: np.ndarray, camera: ParallelCamera
-) -> tuple[np.ndarray, np.ndarray]:
-    """Draw a surface from one direction and measure distances to its silhouette's edge.
-
-    Args:
-        outline: the surface.
-        R_CN: (3, 3) rotation of the surface's frame N in the camera.
-        camera: parallel camera, in the middle of whose image the surface's ball is drawn.
-
-    Returns:
-        The image's axes (2, 3) in frame N [pixel/m], and each pixel's distance to the edge [pixel].
-    """
-    X_CN = np.eye(4)
-    X_CN[:3, :3] = R_CN
-    X_CN[:3, 3] = -R_CN @ outline.ball[:3]
-    mask = draw_mask([outline], X_CN[None], camera)
-    distances = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    # Squared distances are integers; OpenCV's rounding depends on the image's memory alignment.
-    return camera.pixels_per_metre * R_CN[:2], np.sqrt(
-        np.rint(np.square(distances, dtype=np.float64))
-    )
 
 
 def require_visible(

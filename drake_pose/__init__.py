@@ -43,10 +43,9 @@ if TYPE_CHECKING:
     from drake_pose.systems.bodies import RobotStateMessage
     from drake_pose.systems.cameras import MaskPlayer, SilhouetteCamera, cameras_from_drake
     from drake_pose.systems.diagrams import CameraRegistration
-    from drake_pose.systems.person import PersonTracker
+    from drake_pose.systems.person import PersonTracker, Walker
     from drake_pose.systems.silhouette_matcher import SilhouetteMatcher, SilhouetteTracker
     from drake_pose.systems.truncated_ekf import TruncatedEkf, plant_motion
-    from drake_pose.systems.walk import Walker
 
 __version__ = VERSION
 
@@ -78,7 +77,7 @@ _HOMES = {
     "TruncatedEkf": "systems.truncated_ekf",
     "TruncatedFilter": "filtering.truncated_filter",
     "View": "search",
-    "Walker": "systems.walk",
+    "Walker": "systems.person",
     "audit_scene": "jobs.registration.audit",
     "bundled_model": "body.model_files",
     "camera_to_drake": "camera.exchange",

@@ -34,7 +34,7 @@ from drake_pose.person.date.walking import (
 )
 from drake_pose.systems.bodies import add_posed_plant, held_positions
 from drake_pose.systems.cameras import add_sensors, colour_image_to_picture, picture_to_colour_image
-from drake_pose.systems.walk import Walker, add_garden, view_from_behind, walker_transform
+from drake_pose.systems.person import Walker, add_garden, view_from_behind, walker_transform
 
 SHOWN_CAMERA = "camera_0"
 TITLES = {

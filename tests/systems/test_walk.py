@@ -9,7 +9,7 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_pose.body import bundled_model, load_model
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.person.date.walking import WALK
-from drake_pose.systems.walk import (
+from drake_pose.systems.person import (
     Walker,
     add_garden,
     garden_obstacles,

@@ -2,7 +2,6 @@
 
 import re
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from drake_pose.files.records import FrameRecord
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.inputs import EstimateInputs, read_inputs
 from drake_pose.jobs.estimate.measurements import MeasuredPositions
-from drake_pose.jobs.estimate.scene import check_track, compare_cameras, estimate_scene
+from drake_pose.jobs.estimate.scene import check_track, estimate_scene
 from drake_pose.search import TRACKED
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.jobs.scenes import URDF, TinyScene, camera, edit_camera, write_scene
@@ -150,38 +149,3 @@ def test_a_track_of_a_wrong_pose_is_warned_of(scene: TinyScene, left: float, is_
     if is_told:
         assert "frame '0001': E_total is 30.00 % by tracking" in texts[0]
         assert "with other positions of luff" in texts[0]
-
-
-@pytest.mark.parametrize(
-    ("errors", "cameras", "exchanged"),
-    [
-        ({("b", "a"): 0.1}, ("a", "b"), True),
-        ({"a": 0.1, "b": 0.1, "c": 0.1, "bc": 0.1}, ("a",), False),
-        ({"a": 0.1, "b": 0.1, "c": 0.1}, ("a", "b", "c"), False),
-        ({"a": 0.9, "b": 0.1, "c": 0.1}, ("a",), False),
-        ({}, None, False),
-    ],
-)
-def test_inconsistent_and_exchanged_cameras_are_identified(errors, cameras, exchanged):
-    """E_total is 0.4 except for the given cameras; (b, a): with exchanged masks."""
-    rig = {name: camera(name) for name in "abc"}
-    masks = {name: np.arange(200) > k + np.zeros((160, 1)) for k, name in enumerate("cba")}
-
-    def match(views, root_position):
-        names = "".join(view.camera.name for view in views)
-        swapped = tuple("cba"[199 - int(view.mask[0].sum())] for view in views)[:2] == ("b", "a")
-        error = errors.get(("b", "a") if swapped else names, 0.4)
-        return SimpleNamespace(found=True, E_total=error)
-
-    scene = SimpleNamespace(
-        cameras=rig, images={}, masks=[(name, "0") for name in rig],
-        read=lambda name, frame: masks[name],
-    )  # fmt: skip
-    inputs = SimpleNamespace(scene=scene, root_positions=None)
-    record = FrameRecord("0", np.zeros(2), None, 0.4, 1.0, ious={"a": 0.1, "b": 0.2, "c": 0.9})
-    found = compare_cameras(inputs, SimpleNamespace(match=match), {"0": record}, None)
-    assert len(found) == (cameras is not None)
-    if cameras is not None:
-        named = " and ".join(f"'{name}'" for name in cameras)
-        what = "seem to be exchanged" if exchanged else "(is|are) inconsistent"
-        assert re.match(rf"cameras? {named} {what}", found[0])

@@ -20,7 +20,7 @@ from drake_pose.camera.picture_files import (
 )
 from drake_pose.errors import SceneError
 from drake_pose.jobs.estimate.measurements import frames_of
-from drake_pose.silhouette.pictures.masks import AnnotatedPicture, Annotations, read_coco
+from drake_pose.silhouette.pictures.masks import AnnotatedPicture, read_coco
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, common_rate
 
 
@@ -38,9 +38,9 @@ class Source:
     pictures: Mapping[str, Mapping[str, Path]] = field(default_factory=dict)
     # Video files by camera, of cameras without picture files.
     videos: Mapping[str, Path] = field(default_factory=dict)
-    # COCO files, each after the name of the folder that it lies in ("": the source's); then
-    # pictures and videos are empty.
-    annotated: Sequence[tuple[str, Annotations]] = ()
+    # Pictures of COCO files, each after the name of the folder that its COCO file lies in ("": the
+    # source's); then pictures and videos are empty.
+    annotated: Sequence[tuple[str, AnnotatedPicture]] = ()
     # Recorded episode whose pictures are read; None if there is none.
     episode: Episode | None = None
     _sizes: dict[str, tuple[int, ...]] = field(default_factory=dict, repr=False, compare=False)
@@ -102,8 +102,8 @@ class Source:
                 f"{size[1]} x {size[0]}"
             )
 
-    def annotated_pictures(self) -> Iterator[tuple[str, str, Annotations, AnnotatedPicture]]:
-        """Yield each picture of the COCO files: camera, frame, COCO file and annotated picture.
+    def annotated_pictures(self) -> Iterator[tuple[str, str, AnnotatedPicture]]:
+        """Yield each picture of the COCO files: camera, frame and annotated picture.
 
         With a camera file, the camera is the last folder in the picture's path that is a camera's
         name, else the COCO file's folder (in ``annotated``), else the only camera. Without, it is
@@ -113,10 +113,9 @@ class Source:
         Raises SceneError: the camera is unknown, or a frame occurs twice.
         """
         known = [] if self.cameras is None else list(self.cameras.cameras)
-        listed = [(folder, coco, one) for folder, coco in self.annotated for one in coco.pictures]
-        places = {folder or one.file.parent for folder, _, one in listed}
+        places = {folder or one.file.parent for folder, one in self.annotated}
         known_frames: set[tuple[str, str]] = set()
-        for folder, coco, one in listed:
+        for folder, one in self.annotated:
             file = one.file
             if known:
                 names = [*reversed(file.parent.parts), folder, *(known if len(known) == 1 else [])]
@@ -125,14 +124,14 @@ class Source:
                 camera = folder or (file.parent.name or None if len(places) > 1 else "")
             if camera is None:
                 raise SceneError(
-                    f"{coco.path}: picture '{file}': no folder of its path is a camera"
+                    f"{one.source}: picture '{file}': no folder of its path is a camera"
                     f"{f' of {self.camera_file}: ' + ', '.join(known) if known else ''}; the "
                     "paths must be <camera>/<frame>.png"
                 )
             if (camera, file.stem) in known_frames:
-                raise SceneError(f"{coco.path}: camera '{camera}' has frame {file.stem} twice")
+                raise SceneError(f"{one.source}: camera '{camera}' has frame {file.stem} twice")
             known_frames.add((camera, file.stem))
-            yield camera, file.stem, coco, one
+            yield camera, file.stem, one
 
 
 def open_source(path: Path, camera_file: Path | None, episode: int | None) -> Source:
@@ -193,7 +192,7 @@ def _open_file(path: Path) -> Source:
     """Return the source of a COCO file, video or picture; its camera is ""."""
     kind = path.suffix.lower()
     if kind == ".json":
-        return Source(path, annotated=[("", read_coco(path))])
+        return Source(path, annotated=[("", one) for one in read_coco(path)])
     if kind in VIDEOS:
         return Source(path, videos={"": path})
     if kind in SUFFIXES:
@@ -219,14 +218,14 @@ def _open_folder(path: Path) -> Source:
     ]
     pictures: dict[str, dict[str, Path]] = {}
     videos: dict[str, Path] = {}
-    annotated: list[tuple[str, Annotations]] = []
+    annotated: list[tuple[str, AnnotatedPicture]] = []
     for name, folder in folders:
         if files := list_pictures(folder, SceneError):
             pictures[name] = files
         for file in sorted(folder.iterdir()):
             kind = "" if file.name.startswith(".") else file.suffix.lower()
             if kind == ".json":
-                annotated.append((name, read_coco(file)))
+                annotated += [(name, one) for one in read_coco(file)]
             elif kind in VIDEOS and folder in roots:
                 if file.stem in videos:
                     raise SceneError(f"{file}: is a second video of '{file.stem}'; remove one")

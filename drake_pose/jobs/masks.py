@@ -300,28 +300,29 @@ def _differing_regions(
 
 def _read_given(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
     """Yield the masks of other tools in COCO files (``settings.classes``), pictures or videos."""
-    known = sorted({name for _, coco in source.annotated for name in coco.classes})
+    areas = [area for _, picture in source.annotated for area in picture.areas]
+    known = sorted({name for name, _, area in areas if area})
+    numbers = {number: name for name, number, area in areas if area}
     if not settings.classes and len(known) > 1:
         raise MaskError(
             f"{source.path}: has the classes {', '.join(known)}; choose those of the object: "
             f"--class '{known[0]}', or --class all"
         )
-    numbers = {number: name for _, coco in source.annotated for number, name in coco.names.items()}
     classes = {name if name in known else numbers.get(name, name) for name in settings.classes}
     if not classes or "all" in classes:
         classes = set(known)
     for name in classes - set(known):
         raise UnknownNameError("class", name, known, str(source.path))
-    for camera, frame, coco, entry in source.annotated_pictures():
-        where = f"{coco.path}: picture '{entry.file}'"
+    for camera, frame, entry in source.annotated_pictures():
+        where = f"{entry.source}: picture '{entry.file}'"
         source.check_size(camera, (entry.height, entry.width), where)
         try:
             mask = entry.draw(classes)
         except (KeyError, TypeError, ValueError) as error:
             raise MaskError(f"{where}: a segmentation cannot be drawn: {error}") from error
-        left_out = f"{coco.path}: {coco.boxes} annotations have a box, but no area: left out"
-        is_told = coco.boxes and entry is coco.pictures[0]
-        yield FoundMask(camera, frame, where, mask, warnings=(left_out,) if is_told else ())
+        boxes = sum(not area for *_, area in entry.areas)
+        left_out = f"{boxes} annotations have a box, but no area: left out"
+        yield FoundMask(camera, frame, where, mask, warnings=(left_out,) if boxes else ())
     for camera, files in source.pictures.items():
         for frame, path in files.items():
             mask = read_binary_mask(path, MaskError, may_be_empty=True, lossy=True)

@@ -3,7 +3,7 @@
 import io
 import json
 import zlib
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -106,49 +106,43 @@ def signed_distances(mask: np.ndarray) -> np.ndarray:
 class AnnotatedPicture:
     """A picture of a COCO file with its annotations."""
 
+    source: Path  # The COCO file.
     file: PurePosixPath  # The picture's file, as in the COCO file.
     # height, width: size [pixel].
     height: int
     width: int
-    areas: list[tuple[str, Any]]  # Class name and segmentation of each annotation.
+    # Name and number of the class, and segmentation (empty: a box alone), of each annotation.
+    areas: list[tuple[str, str, Any]]
 
     def draw(self, classes: Container[str]) -> Mask:
-        """Return the union (H, W) of the areas of ``classes``; ValueError: one is damaged."""
+        """Return the union (H, W) of the areas of named classes; ValueError: one is damaged."""
         mask = np.zeros((self.height, self.width), dtype=np.bool_)
-        for name, area in self.areas:
-            if name in classes:
+        for name, _, area in self.areas:
+            if name in classes and area:
                 mask |= draw_area(area, self.height, self.width)
         return mask
 
 
-@dataclass(frozen=True)
-class Annotations:
-    """The content of a COCO file."""
-
-    path: Path
-    pictures: Sequence[AnnotatedPicture]  # The pictures, in the file's order.
-    names: Mapping[str, str]  # Class names by class number.
-    boxes: int  # Number of annotations that have a box, but no area.
-
-    @property
-    def classes(self) -> set[str]:
-        """The names of all classes that have an area."""
-        return {name for picture in self.pictures for name, _ in picture.areas}
-
-
-def read_coco(path: Path) -> Annotations:
-    """Read a COCO file; MaskError names the file and what is invalid."""
+def read_coco(path: Path) -> list[AnnotatedPicture]:
+    """Read the pictures of a COCO file; MaskError names the file and what is invalid."""
     try:
         content = json.loads(read_regular(path, 1 << 30))
         names = {one["id"]: str(one["name"]) for one in content.get("categories", ())}
-        images = content["images"]
-        pictures = {one["id"]: _picture(one) for one in images}
-        if len(pictures) < len(images):
-            raise ValueError("an image is given twice")
-        drawn = [one for one in content["annotations"] if one.get("segmentation")]
-        for one in drawn:
+        pictures: dict[Any, AnnotatedPicture] = {}
+        for one in content["images"]:
+            if one["id"] in pictures:
+                raise ValueError(f"image {one['id']} is given twice")
+            file, height, width = (one[key] for key in ("file_name", "height", "width"))
+            if not all(isinstance(k, int) and 1 < k <= LARGEST_SIDE for k in (height, width)):
+                raise ValueError(
+                    f"width and height must be whole numbers of 2 to {LARGEST_SIDE} pixels"
+                )
+            if not str(file).isprintable():
+                raise ValueError(f"{file!r} is not a name of a picture file")
+            pictures[one["id"]] = AnnotatedPicture(path, PurePosixPath(file), height, width, [])
+        for one in content["annotations"]:
             number = one["category_id"]
-            area = (names.get(number, str(number)), one["segmentation"])
+            area = (names.get(number, str(number)), str(number), one.get("segmentation"))
             pictures[one["image_id"]].areas.append(area)
     except OSError as error:
         raise MaskError(f"{path}: cannot be read: {error.strerror}") from error
@@ -157,19 +151,7 @@ def read_coco(path: Path) -> Annotations:
         raise MaskError(
             f"{path}: is not a COCO file, which has images and their annotations: {what}"
         ) from error
-    numbers = {str(number): name for number, name in names.items()}
-    boxes = len(content["annotations"]) - len(drawn)
-    return Annotations(path, tuple(pictures.values()), numbers, boxes)
-
-
-def _picture(image: Mapping[str, Any]) -> AnnotatedPicture:
-    """Return the picture of a COCO file's image; KeyError, TypeError, ValueError: it is invalid."""
-    file, height, width = (image[key] for key in ("file_name", "height", "width"))
-    if not all(isinstance(side, int) and 1 < side <= LARGEST_SIDE for side in (height, width)):
-        raise ValueError(f"width and height must be whole numbers of 2 to {LARGEST_SIDE} pixels")
-    if not str(file).isprintable():
-        raise ValueError(f"{file!r} is not a name of a picture file")
-    return AnnotatedPicture(PurePosixPath(file), height, width, [])
+    return list(pictures.values())
 
 
 def draw_area(area: Any, height: int, width: int) -> Mask:

@@ -5,25 +5,36 @@ silhouettes. Section 6.2 (figure 8) is a walk through a virtual place by gesture
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
+from pydrake.common.value import AbstractValue
 from pydrake.geometry import RenderEngineVtkParams
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, TrajectorySource
+from pydrake.systems.sensors import ImageRgba8U
 from rich.table import Table
 
 from drake_pose.arrays import Array, Mask, Picture
-from drake_pose.body import ArticulatedModel, landmarks_of_nodes, load_landmarks
+from drake_pose.body import (
+    ArticulatedModel,
+    bundled_model,
+    landmarks_of_nodes,
+    load_landmarks,
+    load_model,
+)
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.camera.models import PinholeCamera, look_at
-from drake_pose.errors import require_choice
-from drake_pose.papers.date_capture import PERIOD, PaperTrack, SilhouetteTrack, Studio, one_core
+from drake_pose.camera.models import FACE_CAMERA, PinholeCamera, circle_of_cameras, look_at
+from drake_pose.errors import SettingsError, require_choice
+from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.papers.tables import Count, figure_table, uncounted
-from drake_pose.person.date.skeleton import LIMBS
+from drake_pose.person.date.skeleton import LIMBS, Skeleton, load_skeleton
 from drake_pose.person.date.walking import (
     COMMANDS,
     REGISTERED,
@@ -32,9 +43,32 @@ from drake_pose.person.date.walking import (
     make_gestures,
     make_motion,
 )
+from drake_pose.person.pose_tracker import PersonPoseTracker
+from drake_pose.silhouette.segmentation import Background, learn_background
 from drake_pose.systems.bodies import add_posed_plant, held_positions
-from drake_pose.systems.cameras import add_sensors, colour_image_to_picture, picture_to_colour_image
-from drake_pose.systems.person import Walker, add_garden, view_from_behind, walker_transform
+from drake_pose.systems.cameras import (
+    CameraRig,
+    add_sensors,
+    build_camera_rig,
+    colour_image_to_picture,
+    picture_to_colour_image,
+)
+from drake_pose.systems.date import CaptureSetup, build_paper_capture, prepare_paper_capture
+from drake_pose.systems.person import (
+    PersonTracker,
+    Walker,
+    add_garden,
+    build_silhouette_capture,
+    view_from_behind,
+    walker_transform,
+)
+from drake_pose.systems.ports import StagedDiagram
+
+# A power of two, so that frame times and the predicted motion are exact.
+PERIOD = 1.0 / 32.0
+"""Time between frames [s]."""
+
+Images = Mapping[str, ImageRgba8U]
 
 SHOWN_CAMERA = "camera_0"
 TITLES = {
@@ -43,6 +77,180 @@ TITLES = {
     "silhouette": "all silhouettes",
 }
 """Names of the methods in tables."""
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """Limit OpenCV to one thread, as all other measured code."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(threads)
+
+
+@dataclass(frozen=True, eq=False)
+class Studio:
+    """Simulated person before cameras."""
+
+    # model, skeleton: of the person.
+    model: ArticulatedModel
+    skeleton: Skeleton
+    cameras: Mapping[str, PinholeCamera]  # By name, the face camera included.
+    # rig, context: diagram that renders the cameras' pictures, and its context.
+    rig: CameraRig
+    context: Context
+    # Learnt from noisy pictures without the person, by camera.
+    backgrounds: Mapping[str, Background]
+    generator: np.random.Generator  # Of the pictures' noise.
+
+    @staticmethod
+    def build(cameras: int, size: tuple[int, int], generator: np.random.Generator) -> "Studio":
+        """Build a studio.
+
+        ``cameras``: number of cameras, including the face camera. ``size``: width and height of the
+        pictures [pixel]. ``generator``: of the pictures' noise. Raises SettingsError: there are
+        fewer than three cameras.
+        """
+        if cameras < 3:
+            raise SettingsError(f"cameras must be 3 or more, not {cameras}")
+        model = load_model(bundled_model("person"), check=False)
+        placed = circle_of_cameras(cameras - 1, size=size)
+        rig = build_camera_rig(model, placed)
+        context = rig.diagram.CreateDefaultContext()
+        absent = np.array(model.default_positions)
+        absent[model.position_index("position_z")] = -9.0
+        rig.set_positions(context, absent)
+        empty = {name: rig.picture(context, name) for name in placed}
+        backgrounds = {
+            name: learn_background([noisy(picture, generator) for _ in range(5)])
+            for name, picture in empty.items()
+        }
+        skeleton = load_skeleton(model)
+        return Studio(model, skeleton, placed, rig, context, backgrounds, generator)
+
+    def pictures(self, q: Array) -> dict[str, Picture]:
+        """Return the noisy pictures (H, W, 3) by camera of a person at q (nq,) [rad, m]."""
+        self.rig.set_positions(self.context, q)
+        pictures = {name: self.rig.picture(self.context, name) for name in self.cameras}
+        return {name: noisy(shot, self.generator) for name, shot in pictures.items()}
+
+    def prepare(self, q: Array) -> CaptureSetup:
+        """Prepare the paper's method: register a person in the registered pose q (nq,)."""
+        pictures = self.pictures(q)
+        return prepare_paper_capture(
+            self.model, self.cameras, FACE_CAMERA, q, pictures, self.backgrounds
+        )
+
+    def mask_at(self, q: Array, camera: str) -> Mask:
+        """Return the named camera's silhouette (H, W) of a person at q (nq,)."""
+        self.rig.set_positions(self.context, q)
+        return self.rig.mask(self.context, camera)
+
+
+def noisy(picture: Picture, generator: np.random.Generator, deviation: float = 3.0) -> Picture:
+    """Add Gaussian noise of standard deviation `deviation` [grey levels] to a picture (H, W, 3)."""
+    # OpenCV's 16-bit noise is precise enough, and four times as fast as doubles.
+    noise = np.empty(picture.shape, dtype=np.int16)
+    cv2.setRNGSeed(int(generator.integers(1 << 31)))
+    cv2.randn(noise, np.zeros(3), np.full(3, deviation))
+    return np.clip(picture + noise, 0, 255).astype(np.uint8)
+
+
+class _Track:
+    """A method's diagram run frame by frame.
+
+    Attributes:
+        milliseconds: processor times of each frame by stage [ms].
+    """
+
+    def __init__(self, capture: StagedDiagram[Any]) -> None:
+        self.milliseconds: list[Mapping[str, float]] = []
+        self._capture = capture
+        self._simulator = Simulator(capture.diagram)
+        self._frames = 0
+
+    @property
+    def context(self) -> Context:
+        """The diagram's context."""
+        return self._simulator.get_mutable_context()
+
+    def _process(self, images: Images) -> None:
+        """Evaluate all stages for a frame's images, by camera, and store their processor times."""
+        # Advance to just before the frame's update, which reads the images fixed then.
+        if self._frames:
+            self._simulator.AdvanceTo(PERIOD * self._frames)
+        self._frames += 1
+        for name, image in images.items():
+            port = self._capture.diagram.GetInputPort(f"color_image_{name}")
+            port.FixValue(self.context, AbstractValue.Make(image))
+        laps, last = {}, time.process_time()
+        for stage in (*self._capture.stages, "pose"):
+            if stage == "pose":
+                self._simulator.AdvancePendingEvents()
+            else:
+                self._capture.evaluate(self.context, stage)
+            now = time.process_time()
+            laps[stage], last = 1e3 * (now - last), now
+        self.milliseconds.append(laps)
+
+
+class PaperTrack(_Track):
+    """Track of the paper's method; frames that recognise the registered pose store no times."""
+
+    def __init__(self, setup: CaptureSetup) -> None:
+        super().__init__(build_paper_capture(setup, period=PERIOD))
+
+    def step(self, images: Images) -> Array:
+        """Process a frame's images, by camera; return its positions (nq,) [rad, m].
+
+        Raises SettingsError: the registered pose was not recognised in the first frame.
+        """
+        self._process(images)
+        diagram = self._capture.diagram
+        q = np.array(diagram.GetOutputPort("estimated_positions").Eval(self.context))
+        if not np.isfinite(q).all():
+            raise SettingsError(
+                "the registered pose was not recognised in the first frame: take more cameras, or "
+                "larger pictures"
+            )
+        if diagram.GetOutputPort("similarity").Eval(self.context)[0]:
+            self.milliseconds.pop()
+        return q
+
+    def middle_joints(self) -> Array:
+        """Return elbows and knees (4, 3) [m] of the last frame, as LIMBS; nan: registered pose."""
+        port = self._capture.diagram.GetOutputPort("limb_points")
+        return np.array(port.Eval(self.context)).reshape(len(LIMBS), 3, 3)[:, 1]
+
+
+class SilhouetteTrack(_Track):
+    """Track of all silhouettes at once; edge points are 8 rows of a 480-row picture apart."""
+
+    def __init__(self, studio: Studio) -> None:
+        tracker = PersonPoseTracker(ContourFit(studio.model.pose_tree()))
+        cameras, backgrounds = studio.cameras, studio.backgrounds
+        super().__init__(build_silhouette_capture(tracker, cameras, backgrounds, PERIOD, 60.0))
+        self._tracker = tracker
+
+    def step(self, images: Images) -> Array:
+        """Process a frame's images, by camera; return its positions (nq,), even if lost.
+
+        Raises SettingsError: fewer than two cameras saw the person in the first frame.
+        """
+        self._process(images)
+        person: PersonTracker = self._capture.estimator
+        state = person.known_person(person.GetMyContextFromRoot(self.context))
+        if state is None:
+            raise SettingsError("fewer than two cameras saw a person in the first frame")
+        return self._tracker.positions(state.values)
+
+    def place(self, q: Array) -> None:
+        """Set the person's positions to q (nq,)."""
+        person: PersonTracker = self._capture.estimator
+        state = self._tracker.start(self._tracker.values(q))
+        person.set_person(person.GetMyMutableContextFromRoot(self.context), state)
 
 
 class MotionSample(NamedTuple):
@@ -75,14 +283,16 @@ class DateResult:
     def __init__(self, studio: Studio, motion: Motion, method: str) -> None:
         self.studio, self.names = studio, motion.names
         self._motion, self._method = motion, method
+        places = [np.flatnonzero(np.array(self.names) == name) for name in self.motions]
+        self._middles = {int(one[len(one) // 2]) for one in places}
         setup = studio.prepare(motion.q[0])
         alone = replace(setup, search=False)
         self._tracks: dict[str, PaperTrack | SilhouetteTrack] = {
-            "ik_only": PaperTrack.build(alone),
-            "paper": PaperTrack.build(setup),
+            "ik_only": PaperTrack(alone),
+            "paper": PaperTrack(setup),
         }
         if method == "silhouette":
-            self._tracks[method] = SilhouetteTrack.build(studio)
+            self._tracks[method] = SilhouetteTrack(studio)
         landmarks, tree = load_landmarks(studio.model.path), studio.model.pose_tree()
         del landmarks["head_top"]
         self._kinematics = TreeKinematics(tree)
@@ -108,13 +318,13 @@ class DateResult:
         heads = [studio.skeleton.head_rotation(one)[:, 2] for one in (estimates[self._method], q)]
         cosine = float(np.clip(heads[0] @ heads[1], -1.0, 1.0))
         self.face_errors.append(math.degrees(math.acos(cosine)))
-        if _is_middle(self._motion, k):
-            masks = {method: studio.mask_at(one, SHOWN_CAMERA) for method, one in estimates.items()}
-            self.samples[self.names[k]] = MotionSample(
-                pictures[SHOWN_CAMERA],
-                self._limbs_seen(q),
-                {method: (self._limbs_seen(estimates[method]), masks[method]) for method in masks},
-            )
+        if k in self._middles:
+            captured = {
+                method: (self._limbs_seen(one), studio.mask_at(one, SHOWN_CAMERA))
+                for method, one in estimates.items()
+            }
+            picture, limbs = pictures[SHOWN_CAMERA], self._limbs_seen(q)
+            self.samples[self.names[k]] = MotionSample(picture, limbs, captured)
 
     def _limbs_seen(self, q: Array) -> Array:
         """Return MotionSample's limbs (4, 3, 2) [pixel] of a person at q (nq,)."""
@@ -272,12 +482,6 @@ def _table_of_motions(
     return figure_table(title, {motion: (motion, form) for motion in rows}, columns, "motion")
 
 
-def _is_middle(motion: Motion, k: int) -> bool:
-    """Return whether frame k is the middle one of its motion; never in the registered pose."""
-    same = [i for i, name in enumerate(motion.names) if name == motion.names[k]]
-    return motion.names[k] != REGISTERED and k == same[len(same) // 2]
-
-
 def _mean(values: Array | Sequence[Array]) -> float:
     return float(np.mean(values))
 
@@ -308,7 +512,7 @@ def run_walk_through(
         studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]))
         motion = make_gestures(studio.skeleton)
         names, model = np.array(motion.names), studio.model
-        track = PaperTrack.build(studio.prepare(motion.q[0]))
+        track = PaperTrack(studio.prepare(motion.q[0]))
         advance, q, pictures_shown = count("frames", len(names)), np.empty_like(motion.q), []
         for k, true_q in enumerate(motion.q):
             seen = studio.pictures(true_q)

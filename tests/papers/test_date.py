@@ -7,13 +7,13 @@ import pytest
 from drake_pose.errors import SettingsError
 from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
 from drake_pose.papers.date import (
+    PERIOD,
     active_frames,
     draw_walk,
     run_experiment,
     run_walk_through,
     walk_by,
 )
-from drake_pose.papers.date_capture import PERIOD
 from drake_pose.papers.pictures import save_captures, save_walk
 from drake_pose.person.date.features import SkinColour, skin_blobs
 from drake_pose.person.date.walking import (

@@ -498,7 +498,7 @@ def _minimum_detectable(residual: _Residual, causes: Sequence[_Cause]) -> dict[s
 def likeliest_inliers(
     explained: Mask,
     evaluate: Callable[[Mask], tuple[Array, Array]],
-    usual_deviation: float = 0.4,
+    usual_deviation: float,
     *,
     outlier_cost: float = 3.0,
     max_iterations: int = 10,

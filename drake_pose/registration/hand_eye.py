@@ -38,6 +38,8 @@ class TrackSettings(NamedTuple):
     fine: tuple[float, ...] = (30.0, 15.0, 8.0, 4.0)
     last: int = 10  # Number of further steps, whose scale follows from the residuals.
     inlier: float = 4.0  # A sighting within this many standard deviations is an inlier.
+    steps: int = 4  # Number of steps of each reweighted least squares.
+    difference: float = 1e-5  # Differences that estimate derivatives [rad, m or s].
     groups: int = 12  # Number of groups of successive frames in the jackknife.
 
 
@@ -97,10 +99,10 @@ class EpipolarSearch:
         i, j = self._pairs.T
         return np.asarray(inverse_transforms(X_WL[j]) @ X_WL[i])
 
-    def _positions(self, A: Array, R: Array, rounds: int = 4) -> tuple[Array, Array]:
+    def _positions(self, A: Array, R: Array) -> tuple[Array, Array]:
         """Return the best p_LC (n, 3) for rotations R_LC (n, 3, 3), and explained fractions (n,).
 
-        A: as of `_motions`. rounds: number of reweighted least squares.
+        A: as of `_motions`.
         """
         R_A, pair, scale = A[:, :3, :3], self._pair, TRACKS.coarse[0]
         R_B = np.einsum("nji,pjk,nkl->npil", R, R_A, R)[:, pair]
@@ -109,7 +111,7 @@ class EpipolarSearch:
         a = np.einsum("mji,nmj->nmi", (R_A - np.eye(3))[pair], normal)
         b = np.einsum("nmi,mi->nm", normal, A[pair, :3, 3])
         weight = np.ones(b.shape)
-        for _ in range(rounds):
+        for _ in range(TRACKS.steps):
             wa = weight[..., None] * a
             H = np.swapaxes(wa, 1, 2) @ a
             H += 1e-4 * np.einsum("nii->n", H)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
@@ -143,13 +145,13 @@ class EpipolarSearch:
         """
         return np.asarray(np.sqrt(_weights(self._residuals(A, X), scale)).mean(axis=1))
 
-    def _refined(self, A: Array, X: Array, scale: float, steps: int = 4, h: float = 1e-5) -> Array:
+    def _refined(self, A: Array, X: Array, scale: float) -> Array:
         """Return poses X_LC (n, 4, 4) after Gauss-Newton steps; steps that do not help are undone.
 
-        A: as of `_motions`. X: (n, 4, 4) X_LC at the start. scale: of the loss [rad]. h: difference
-        that estimates derivatives [rad and m].
+        A: as of `_motions`. X: (n, 4, 4) X_LC at the start. scale: of the loss [rad].
         """
-        for _ in range(steps):
+        h = TRACKS.difference
+        for _ in range(TRACKS.steps):
             r = self._residuals(A, X)
             shifted = [self._residuals(A, X @ motion(h * changed)) for changed in np.eye(6)]
             J = np.stack([(changed - r) / h for changed in shifted], axis=-1)
@@ -355,14 +357,14 @@ def _residuals(problem: TrackProblem, fit: TrackFit) -> tuple[Array, Array, Arra
     return r, A, np.einsum("nij,nkj->nik", D, X_WC[:, :3, :3])
 
 
-def _twists(problem: TrackProblem, X_LC: Array, constants: Array, h: float = 1e-4) -> Array:
+def _twists(problem: TrackProblem, X_LC: Array, constants: Array) -> Array:
     """Return derivatives (6 frames + 1, 7 + k) of all frames' camera twists and log focal length.
 
     They are by the twist of X_LC, the logarithm of the focal length, and the k constants.
 
-    X_LC, constants: (4, 4) and (1 + k,), as of `TrackFit`. h: difference that estimates the
-    derivatives [unit of the constants].
+    X_LC, constants: (4, 4) and (1 + k,), as of `TrackFit`.
     """
+    h = TRACKS.difference
     count = len(problem.prior_sds)
     frames, columns = int(problem.seen.frames.max()) + 1, []
     for sd, change in zip(problem.prior_sds[1:], h * np.eye(count - 1), strict=True):
@@ -423,17 +425,17 @@ def _without_points(
     return S, g, lambda step: -(Vb + VW @ step)
 
 
-def _triangulated(problem: TrackProblem, X_WC: Array, rounds: int = 4) -> Array:
+def _triangulated(problem: TrackProblem, X_WC: Array) -> Array:
     """Return the world points (p, 3) nearest to their sightings' rays, robustly [m].
 
-    X_WC: (frames, 4, 4) the camera's poses. rounds: number of reweighted least squares.
+    X_WC: (frames, 4, 4) the camera's poses.
     """
     seen = problem.seen
     d = rays(problem.camera, seen.uv)
     d = np.einsum("nij,nj->ni", X_WC[seen.frames, :3, :3], d / np.linalg.norm(d, axis=1)[:, None])
     c, count, w = X_WC[seen.frames, :3, 3], int(seen.points.max()) + 1, np.ones(len(d))
     P = np.eye(3) - d[:, :, None] * d[:, None, :]
-    for _ in range(rounds):
+    for _ in range(TRACKS.steps):
         H, b = np.zeros((count, 3, 3)), np.zeros((count, 3))
         np.add.at(H, seen.points, w[:, None, None] * P)
         np.add.at(b, seen.points, w[:, None] * np.einsum("nij,nj->ni", P, c))

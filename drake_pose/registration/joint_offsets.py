@@ -124,7 +124,6 @@ def calibrate_joints(
     joints: Sequence[str],
     focal: bool = False,
     links: Sequence[str] = (),
-    level: float = 0.05,
     start: Mapping[str, float] | None = None,
     static: Mapping[str, tuple[float, float]] | None = None,
 ) -> JointCalibration:
@@ -141,7 +140,6 @@ def calibrate_joints(
         joints: names of the positions whose offsets are fitted.
         focal: whether the cameras' focal lengths are fitted.
         links: the links whose scales are fitted.
-        level: probability that anything is significant by chance.
         start: offsets by name [rad or m] that the cameras were fitted with, 0 for other names.
             Only parameters that a camera hides are then dropped, and its covariance includes them.
         static: offsets that look like a rotation of a camera, as edges of static parts show them,
@@ -179,7 +177,7 @@ def calibrate_joints(
         # Each mask contributes six affine motions to the estimate of the error sizes.
         freedom = max(1, 6 * int(np.count_nonzero(included)) - len(fit.names))
         own, shared = fit.covariances(found, included)
-        covariance, least = own + shared, level / max(1, len(requested))
+        covariance, least = own + shared, SHARED.level / max(1, len(requested))
         values = describe(fit, found, freedom, least, covariance, sought)
         kept = _kept(values, fit if start else None)
         if kept == sought:
@@ -496,10 +494,11 @@ def describe_constants(
     names: Sequence[str],
     *,
     measured: Collection[str] = (),
-    determined: float = 0.2,
     min_correlation: float = 0.9,
 ) -> dict[str, KinematicParameter]:
     """Describe constants by name: 95 % interval, significance, and correlated unknowns.
+
+    A constant at the fit's bound is not determined.
 
     Args:
         fit, found, covariance: the fit, its values, and their covariance (u, u).
@@ -507,8 +506,6 @@ def describe_constants(
         freedom: degrees of freedom of Student's t distribution.
         level: p-value below which a constant is significant.
         measured: names of constants that something else determines, too.
-        determined: maximum standard deviation of a determined constant, over the prior's. A
-            constant at the fit's bound is not determined, either.
         min_correlation: minimum correlation of the unknowns listed for an undetermined constant.
     """
     deviations = np.sqrt(np.diag(covariance))
@@ -517,13 +514,13 @@ def describe_constants(
         k = fit.names.index(name)
         value, deviation = float(found.shared[k]), float(deviations[k])
         at_bound = abs(value) > 0.98 * SHARED.max_constant
-        wide = at_bound or deviation > determined * SHARED.constant_deviation
+        wide = at_bound or deviation > SHARED.determined * SHARED.constant_deviation
         if wide and name not in measured:
             correlated = np.abs(covariance[:, k]) > min_correlation * deviations * deviation
             gauge = tuple(fit.names[j] for j in np.flatnonzero(correlated) if j != k)
             parameters[name] = undetermined(name, gauge)
             continue
-        width = float(stdtrit(freedom, 1.0 - 0.5 * 0.05)) * deviation
+        width = float(stdtrit(freedom, 1.0 - 0.5 * SHARED.level)) * deviation
         p_value = 2.0 * float(stdtr(freedom, -abs(value) / deviation))
         low, middle, high = value - width, value, value + width
         if name not in fit.views[0].kinematics.names:

@@ -17,7 +17,7 @@ from drake_pose.arrays import Array, Mask
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.registration.per_frame_fit import FrameFit
 from drake_pose.registration.posed_frames import MultiViewFrame, common_size, reduced_sums
-from drake_pose.registration.register import RegistrationBody, evenly_spaced
+from drake_pose.registration.register import SEARCH, RegistrationBody, evenly_spaced
 from drake_pose.silhouette.scoring import draw_mask, score_bodies
 from drake_pose.workers import map_ordered
 
@@ -26,7 +26,6 @@ class LargeErrorSettings(NamedTuple):
     """Parameters of the search for large errors.
 
     Args:
-        side: square root of the silhouettes' area in the pictures that are compared [pixel].
         coarse_step, fine_step: steps of a joint's angle over its range, and about the best [deg].
         slide_steps: number of positions of a prismatic joint.
         max_remaining: a correction is accepted if at most this fraction of the area in body or
@@ -52,7 +51,6 @@ class LargeErrorSettings(NamedTuple):
     others 0.47.
     """
 
-    side: float = 100.0
     coarse_step: float = 5.0
     fine_step: float = 1.0
     slide_steps: int = 13
@@ -127,7 +125,7 @@ class LargeErrorSearch:
     ) -> None:
         self._body, self._cameras = body, tuple(cameras)
         self._frames = evenly_spaced(frames, LARGE.frame_count)
-        self._scale = min(1.0, LARGE.side / common_size(cameras, self._frames))
+        self._scale = min(1.0, SEARCH.refined_side / common_size(cameras, self._frames))
         self._sums = dict[int, tuple[Mask, NDArray[np.int32]]]()
 
     def find(
@@ -318,7 +316,7 @@ def mask_excess_and_lack(
             pictures, and stands for the size of an empty mask.
         band: pixels nearer to the other's outline do not count [pixel].
     """
-    small = downscaled(camera, min(1.0, LARGE.side / size))
+    small = downscaled(camera, min(1.0, SEARCH.refined_side / size))
     scale = small.width / camera.width
     shown = np.diff(reduced_sums(mask, small), axis=1).astype(np.uint8)
     drawn = draw_mask(body.medium, camera.X_CW @ body.kinematics.poses(values), small)

@@ -27,6 +27,7 @@ from drake_pose.registration.register import (
     RegistrationBody,
     overlap_areas,
 )
+from drake_pose.registration.shared_fit import SHARED
 
 
 class CameraStatus(IntEnum):
@@ -49,8 +50,6 @@ class OnlineSettings:
     most_frames: int = 12  # Maximum number of keyframes; the newest are kept.
     # Number of newest keyframes, or of outlier frames, that show a motion of the camera.
     newest: int = 3
-    # A frame is an outlier if its inlier ratio is below this fraction of the keyframes' median.
-    min_inlier_ratio: float = 0.7
     # Maximum rotation [rad] and shift [its distance from the body] of a camera that a local fit
     # finds again. After larger motions all poses are searched.
     bump: float = 0.2
@@ -139,7 +138,7 @@ class OnlineRegistration:
             return state
         keyframes = self._kept(state.keyframes, frame)
         enough = len(keyframes) >= self.settings.least_frames
-        found = self._find(keyframes) if enough else None
+        found = self._find(keyframes, 0.0) if enough else None
         if found is None:
             return replace(state, keyframes=keyframes)
         return _registered(state, found, keyframes)
@@ -228,7 +227,7 @@ class OnlineRegistration:
         limit = 6.0 * float(fdtri(6.0, trust + freedom, 1.0 - self.settings.false_alarm))
         return _distance(found, registered) > limit * max(1.0, scale)
 
-    def _find(self, frames: Sequence[PosedFrame], least: float = 0.0) -> RegisteredCamera | None:
+    def _find(self, frames: Sequence[PosedFrame], least: float) -> RegisteredCamera | None:
         """Search the camera's pose in frames without an initial guess; None: not determined.
 
         least: minimum median inlier ratio.
@@ -254,9 +253,12 @@ class OnlineRegistration:
         )
 
     def _least_inlier_ratio(self, registered: RegisteredCamera) -> float:
-        """Return the minimum inlier ratio of an inlier frame, given the known pose's keyframes."""
+        """Return the minimum inlier ratio of an inlier frame, given the known pose's keyframes.
+
+        It is the same fraction of their median as of a camera's best frames in a fit.
+        """
         ratios = [frame.inlier_ratio for frame in registered.frames]
-        return self.settings.min_inlier_ratio * float(np.median(ratios))
+        return SHARED.min_inlier_ratio * float(np.median(ratios))
 
     def _kept(
         self, frames: Sequence[PosedFrame], frame: PosedFrame, instead_of: int | None = None

@@ -51,7 +51,7 @@ from drake_pose.registration.recording import (
     posed_pictures,
     scan_time_offsets,
 )
-from drake_pose.registration.register import RegistrationBody
+from drake_pose.registration.register import SEARCH, RegistrationBody
 from drake_pose.registration.shared_fit import SHARED
 from drake_pose.workers import map_ordered
 
@@ -90,8 +90,8 @@ def register_near(
     camera: PinholeCamera,
     recording: Recording,
     by_chance: float,
-    focal: float = 0.0,
-    offset_joints: Sequence[str] = (),
+    focal: float,
+    offset_joints: Sequence[str],
 ) -> PictureRegistration:
     """As register_pictures, but begin at the camera's pose, and search only if it does not fit.
 
@@ -139,7 +139,7 @@ def _register(task: _Task) -> PictureRegistration:
             found = _fit(task, near[0], by_chance, *_other_poses(near, poses))
     if found is None:
         first = near[0]
-        _require_unmirrored(task, first, mirrored, by_chance, least=1.96)
+        _require_unmirrored(task, first, mirrored, by_chance, least=SEARCH.significance)
         more, near, others = _search_again(task, begun, near)
         if near[0] is not first:
             mirrored = [opposite_pose(near[0])]
@@ -232,7 +232,7 @@ def _require_unmirrored(
         other = _fit(task._replace(recording=recording, camera=camera), rival, by_chance)
     except RegistrationError:
         return
-    if found is None or ratio_margin(other.ratios, found.ratios) > 1.96:
+    if found is None or ratio_margin(other.ratios, found.ratios) > SEARCH.significance:
         raise RegistrationError(
             f"camera '{task.camera.name}': its pictures are mirrored: a pose explains them only "
             "with left and right exchanged. Mirror them again. Nothing was written"
@@ -260,7 +260,8 @@ def _other_poses(
     close = [
         one
         for one in near[1:]
-        if vuong_statistic(gains, one.search.compared.tile_gains(one.camera.X_CW)) <= 1.96
+        if vuong_statistic(gains, one.search.compared.tile_gains(one.camera.X_CW))
+        <= SEARCH.significance
     ]
     again = coarse_fits([one.search for one in close], [one.camera.X_CW for one in close])
     far = [one for one in poses if rotation_between(one, X_CW) > 8.0 * apart][:2]
@@ -269,7 +270,7 @@ def _other_poses(
     margins = [
         (one.camera.X_CW, ratio_margin(best.ratios, one.ratios)) for one in [*again, *others]
     ]
-    alike = [other for other, margin in margins if margin <= 1.96]
+    alike = [other for other, margin in margins if margin <= SEARCH.significance]
     runner_up = margins[len(again)] if others else None
     return level.distinct([X_CW, *alike])[1:], runner_up
 
@@ -339,8 +340,8 @@ def fit_pictures(
     body: RegistrationBody,
     start: PictureStart,
     recording: Recording,
-    focal: float = 0.0,
-    offset_joints: Sequence[str] = (),
+    focal: float,
+    offset_joints: Sequence[str],
     *,
     most_fits: int = 5,
     min_drift: float = 0.005,

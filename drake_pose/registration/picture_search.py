@@ -371,7 +371,7 @@ class PictureSearch:
         return RoughPose(self, camera, explained[0], {frame.name: ratio for frame, ratio in ratios})
 
     def fit(
-        self, camera: PinholeCamera, constants: Sequence[str] = (), focal: float = 0.0
+        self, camera: PinholeCamera, constants: Sequence[str], focal: float
     ) -> PictureFit | None:
         """Fit a camera from near its pose, on search lines across the contours.
 

@@ -26,6 +26,7 @@ from drake_pose.fit.explain_kernel import (
 )
 from drake_pose.registration.posed_frames import placed_points
 from drake_pose.registration.register import uniform_rotations
+from drake_pose.registration.shared_fit import SHARED
 from drake_pose.silhouette.outline import Outline, PackedOutlines, pack
 from drake_pose.workers import map_ordered
 
@@ -206,6 +207,9 @@ class PictureSettings(NamedTuple):
     # those in which backgrounds are estimated [pixel].
     compare_width: int = 160
     background_width: int = 320
+    # First simplex of a local search in rotation, shift [focal lengths] and logarithm of the depth,
+    # over its size in rotation.
+    simplex: tuple[float, ...] = (1.0, 1.0, 1.0, 0.4, 0.4, 0.6)
     fitted: int = 3  # Maximum number of a search's pose hypotheses that are fitted to contours.
     contour_weight: float = 4.0  # Weight of edges along the contours beside the explained fraction.
     # Half the interval of the differences that estimate joint velocities [s].
@@ -352,7 +356,7 @@ class PyramidLevel:
         )  # fmt: skip
         return gains
 
-    def starts(self, rotations: int = 1200) -> list[Array]:
+    def starts(self, rotations: int) -> list[Array]:
         """Return poses X_CW (4, 4) from which a search starts.
 
         They show the body where pictures change. Each rotation is combined with three depths, near
@@ -394,15 +398,13 @@ class PyramidLevel:
         Args:
             X_CW: n poses (4, 4).
             evaluations: maximum number of scores for each pose, at least 7.
-            turn: size of the first simplex in rotation [rad]. In picture shift [focal lengths] it
-                is 0.4 times, in logarithm of the depth 0.6 times as large.
+            turn: size of the first simplex in rotation [rad], see PICTURES.simplex.
 
         Returns the scores (n,), highest first, and the improved poses.
         """
         count = len(X_CW)
         signs = [np.random.default_rng(k).choice([-1.0, 1.0], 6) for k in range(count)]
-        # Rotation [rad], shift in the picture [focal lengths], logarithm of the depth.
-        steps = turn * np.array(signs) * np.array([1.0, 1.0, 1.0, 0.4, 0.4, 0.6])
+        steps = turn * np.array(signs) * np.array(PICTURES.simplex)
         corners = np.zeros((count, 7, 6))
         corners[:, np.arange(1, 7), np.arange(6)] = steps
         starts, costs = np.asarray(X_CW)[:, :3], np.zeros((count, 7))
@@ -468,13 +470,12 @@ def search_offsets(
     X_CW: Array,
     start: Array,
     joints: Sequence[int],
+    sweeps: int,
     *,
-    sweeps: int = 2,
     within: float = 0.45,
     steps: int = 11,
     evaluations: int = 300,
     first_step: float = 0.1,
-    deviation: float = 0.2,
     weight: float = 0.002,
 ) -> tuple[Array, Array]:
     """Improve a camera's pose and joint offsets by their score.
@@ -493,8 +494,8 @@ def search_offsets(
         within, steps: bound and number of the scanned offsets [rad].
         evaluations: maximum number of scores of a simplex search of all unknowns.
         first_step: size of the first simplex in rotation and offsets [rad].
-        deviation, weight: standard deviation of an offset [rad], and by how much the score
-            falls at that offset. A joint that hardly shows stays near 0.
+        weight: by how much the score falls at an offset of SHARED.constant_deviation. A joint that
+            hardly shows stays near 0.
 
     Returns the pose X_CW (4, 4), and the offsets (m,).
     """
@@ -503,14 +504,14 @@ def search_offsets(
     offsets = start.copy()
 
     def score(X: Array, tried: Array) -> float:
-        prior = weight * float(((tried / deviation) ** 2).sum())
+        prior = weight * float(((tried / SHARED.constant_deviation) ** 2).sum())
         return level.with_poses(poses(tried)).score(X) - prior
 
     def improve(free: Sequence[int], most: int, size: float) -> float:
         """Improve the pose and some offsets from a first simplex, and return their score."""
         nonlocal X_CW, offsets
         about, at = X_CW, offsets
-        columns = size * np.array([1.0, 1.0, 1.0, 0.4, 0.4, 0.6, *np.ones(len(free))])
+        columns = size * np.array([*PICTURES.simplex, *np.ones(len(free))])
 
         def place(x: Array) -> tuple[Array, Array]:
             turned = at.copy()

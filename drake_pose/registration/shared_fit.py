@@ -61,6 +61,8 @@ class SharedFitSettings(NamedTuple):
         steps: limits and damping of a step.
         constant_deviation: prior standard deviation of joint offsets [rad or m] and of the
             logarithms of link scales.
+        determined: maximum standard deviation of a determined constant, over the prior's.
+        level: probability that any of a registration's constants is significant by chance.
         max_constant: largest joint offset [rad or m] or logarithm of a link scale; without it, the
             offset of a hardly visible gripper became 130 degrees.
         focal_deviation, guessed_focal_deviation: prior standard deviation of the logarithms of
@@ -83,6 +85,8 @@ class SharedFitSettings(NamedTuple):
     final_stage: AnnealingStage = AnnealingStage(0.005, 0.005)
     steps: StepSettings = StepSettings(max_step=0.3, damping=1e-2, uniform_damping=1e-6)
     constant_deviation: float = 0.2
+    determined: float = 0.2
+    level: float = 0.05
     max_constant: float = 0.6
     focal_deviation: float = 0.1
     guessed_focal_deviation: float = 0.5

@@ -350,7 +350,7 @@ class TargetSearch:
         self,
         camera: PinholeCamera,
         choices: Sequence[Sequence[PosedFrame]],
-        explained: float = 0.15,
+        explained: float = np.inf,
         *,
         single_poses: int = 8,
         regions: int = 3,

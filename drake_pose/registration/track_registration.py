@@ -33,6 +33,7 @@ from drake_pose.registration.picture_matches import (
 )
 from drake_pose.registration.recording import Recording, TimeOffset, choose_pictures
 from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
+from drake_pose.registration.shared_fit import SHARED
 
 
 class TrackRegistrationSettings(NamedTuple):
@@ -43,13 +44,12 @@ class TrackRegistrationSettings(NamedTuple):
         least: minimum number of matches in all pairs of pictures.
         chance_rotations: number of rotations searched with joint positions of other moments.
         least_gain: minimum explained fraction, over that with joint positions of other moments.
-        joint_sd, time_sd, focal_sd: prior standard deviations of joint offsets [rad or m], of the
-            time offset [s], and of the logarithm of an unknown focal length.
+        time_sd, focal_sd: prior standard deviations of the time offset [s], and of the logarithm of
+            an unknown focal length.
         focals: tried values of an unknown focal length [focal length of the camera model].
         times: tried time offsets [s].
         least_turn: minimum rotation of the link about a second axis, see `rotation_spread` [deg].
         least_motion: minimum standard deviation of the link's position [mm].
-        determined: maximum standard deviation of a determined constant, over the prior's.
         max_sd: maximum standard deviation of a determined pose along any axis [rad and m].
         better: ratio of the residuals without and with joint offsets from which these are likely.
     """
@@ -59,14 +59,12 @@ class TrackRegistrationSettings(NamedTuple):
     least: int = 100
     chance_rotations: int = 1000
     least_gain: float = 2.0
-    joint_sd: float = 0.2
     time_sd: float = 0.2
     focal_sd: float = 0.2
     focals: tuple[float, ...] = (0.65, 0.8, 1.0, 1.25)
     times: tuple[float, ...] = (-0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3)
     least_turn: float = 2.0
     least_motion: float = 5.0
-    determined: float = 0.2
     max_sd: float = 0.04
     better: float = 1.5
 
@@ -125,16 +123,16 @@ def register_tracks(
     matches, seen = match_pictures(pictures)
     asked = np.array([name in offset_joints for name in names])
     lens_sds = [settings.focal_sd * focal, settings.time_sd * timed]
-    sds = np.concatenate([lens_sds, settings.joint_sd * asked])
+    sds = np.concatenate([lens_sds, SHARED.constant_deviation * asked])
     problem = TrackProblem(camera, link_poses, seen, sds)
     _require_motion(camera, link, link_poses(np.zeros(1 + len(names))))
     _require_matches(camera, matches, len(rows))
-    start = _search(problem, matches, focal, timed)
-    if start.explained < settings.least_gain * start.chance:
+    poses, constants, explained, chance = _search(problem, matches, focal, timed)
+    if explained < settings.least_gain * chance:
         search, values = EpipolarSearch(camera, matches), recording.values_at(0.0)[rows]
         elsewhere = explaining_link(body, base, values, search)
-        _refuse_unexplained(camera, link, start, len(matches.uv), *elsewhere)
-    problem, fit, covariance, alike, likely = _fit_scene(body, link, problem, start)
+        _refuse_unexplained(camera, link, len(matches.uv), explained, chance, *elsewhere)
+    problem, fit, covariance, alike, likely = _fit_scene(body, link, problem, poses, constants)
     scale = float(np.exp(fit.constants[0]))
     placed = replace(
         camera, focal_x=scale * camera.focal_x, focal_y=scale * camera.focal_y
@@ -144,36 +142,33 @@ def register_tracks(
     found = RegisteredCamera(
         placed, J @ covariance[:6, :6] @ J.T, misfits, np.array(alike).reshape(-1, 4, 4)
     )
-    deviations = np.sqrt(np.diag(covariance))
+    deviations, clock = np.sqrt(np.diag(covariance)), None
+    if timed:
+        is_known = deviations[7] < SHARED.determined * settings.time_sd
+        deviation = float(deviations[7]) if is_known else np.inf
+        clock = TimeOffset(float(fit.constants[1]), deviation, np.zeros((0, 2)))
     return TrackRegistration(
         found,
-        _time_offset(recording, float(fit.constants[1]), float(deviations[7])),
+        clock,
         float(deviations[6]),
         _describe_offsets(names, offset_joints, problem, fit, deviations),
         likely,
-        start.explained,
-        start.chance,
+        explained,
+        chance,
         seen,
         fit.inliers,
         dict(zip((misfit.frame for misfit in misfits), pictures, strict=True)),
     )
 
 
-class _Start(NamedTuple):
-    """Result of the search.
+def _search(
+    problem: TrackProblem, matches: Matches, focal: bool, timed: bool
+) -> tuple[list[Array], Array, float, float]:
+    """Search the pose, and where asked the focal length and the time offset, in all matches.
 
-    X_LC: poses (4, 4), best first. constants: (2 + m,) logarithm of the focal length's ratio, time
-    offset [s] and joint offsets of the best pose. explained, chance: see ``TrackRegistration``.
+    Returns poses X_LC (4, 4), best first; the constants (2 + m,) of the best one, as of
+    ``TrackFit``; and `explained` and `chance` of ``TrackRegistration``.
     """
-
-    X_LC: list[Array]
-    constants: Array
-    explained: float
-    chance: float
-
-
-def _search(problem: TrackProblem, matches: Matches, focal: bool, timed: bool) -> _Start:
-    """Search the pose, and where asked the focal length and the time offset, in all matches."""
     settings, camera = STANDING_SCENE, problem.camera
     constants = np.zeros(len(problem.prior_sds))
     X_WL = problem.link_poses(constants[1:])
@@ -198,13 +193,17 @@ def _search(problem: TrackProblem, matches: Matches, focal: bool, timed: bool) -
         for shift in {max(1, round(part * count)) for part in (0.25, 0.5, 0.75)}
     )
     poses = [X for gain, X in others if gain > 0.7 * explained]
-    return _Start([X_LC, *poses[:2]], constants, explained, chance)
+    return [X_LC, *poses[:2]], constants, explained, chance
 
 
 def _fit_scene(
-    body: RegistrationBody, link: str, problem: TrackProblem, start: _Start
+    body: RegistrationBody,
+    link: str,
+    problem: TrackProblem,
+    poses: Sequence[Array],
+    constants: Array,
 ) -> tuple[TrackProblem, TrackFit, Array, list[Array], tuple[str, ...]]:
-    """Fit from a start.
+    """Fit from poses X_LC (4, 4), best first, and constants (2 + m,).
 
     Returns what was fitted; the fit; the covariance (7 + k, 7 + k) as of ``TrackFit``; other poses
     (4, 4) that fit as well; and `likely` of ``TrackRegistration``.
@@ -217,13 +216,13 @@ def _fit_scene(
         _require_determined(problem.camera, link, X_WL, fit.X_LC, covariance, likely)
 
     asked, likely = bool((problem.prior_sds[2:] > 0.0).any()), tuple[str, ...]()
-    problem, fit = _fit_determined(problem, start.X_LC[0], start.constants)
+    problem, fit = _fit_determined(problem, poses[0], constants)
     require(fit.covariance)
     if not asked:
         likely, problem, fit = _with_likely_offsets(body, problem, fit)
     covariance = jackknife(problem, fit) + intrinsics_effect(problem, fit)
     require(covariance)
-    others = [fit_tracks(problem, X, start.constants) for X in start.X_LC[1:]]
+    others = [fit_tracks(problem, X, constants) for X in poses[1:]]
     as_good = (other.X_LC for other in others if other.sigma < 1.1 * fit.sigma)
     alike = [X_LC for X_LC in as_good if poses_differ(X_LC, fit.X_LC)]
     return problem, fit, covariance, alike, likely
@@ -286,20 +285,26 @@ def _require_matches(camera: PinholeCamera, matches: Matches, count: int) -> Non
 
 
 def _refuse_unexplained(
-    camera: PinholeCamera, link: str, start: _Start, matches: int, explained: float, other: str
+    camera: PinholeCamera,
+    link: str,
+    matches: int,
+    explained: float,
+    chance: float,
+    elsewhere: float,
+    other: str,
 ) -> NoReturn:
     """Raise RegistrationError because joint positions of other moments explain about as much.
 
-    matches: their number. explained, other: fraction that the best other link explains, and its
-    name.
+    matches: their number. explained, chance: see ``TrackRegistration``. elsewhere, other: fraction
+    that the best other link explains, and its name.
     """
     hint = f"Does the camera ride on link '{link}' (name the one that does: --camera NAME)"
-    if explained > STANDING_SCENE.least_gain * max(start.chance, 0.5 * start.explained):
-        hint = f"On link '{other}' a pose explains {explained:.0%}: give it (--on {other}). Else"
+    if elsewhere > STANDING_SCENE.least_gain * max(chance, 0.5 * explained):
+        hint = f"On link '{other}' a pose explains {elsewhere:.0%}: give it (--on {other}). Else"
     raise RegistrationError(
         f"camera '{camera.name}': no pose on link '{link}' explains how its pictures move: the "
-        f"best one explains {start.explained:.0%} of {matches} matched points, where "
-        f"joint positions of other moments explain {start.chance:.0%}; twice as much is "
+        f"best one explains {explained:.0%} of {matches} matched points, where "
+        f"joint positions of other moments explain {chance:.0%}; twice as much is "
         f"needed. {hint}, does the scene stand still, are the joint positions those of these "
         "pictures, are the pictures not mirrored, and is the focal length about right? If the "
         "camera sees little but the gripper, give a --target. Nothing was written"
@@ -382,7 +387,7 @@ def _fit_determined(
         fit = fit_tracks(problem, X_LC, np.where(sds > 0.0, constants, 0.0))
         deviations = np.sqrt(np.diag(fit.covariance)[8:].clip(min=0.0))
         ratios = deviations / np.where(sds[2:] > 0.0, sds[2:], np.inf)
-        if not len(ratios) or ratios.max() <= STANDING_SCENE.determined:
+        if not len(ratios) or ratios.max() <= SHARED.determined:
             return problem, fit
         sds = sds.copy()
         sds[2 + int(np.argmax(ratios))] = 0.0
@@ -396,7 +401,7 @@ def _with_likely_offsets(
     Without such joints the problem and the fit are returned as they are.
     """
     sds = problem.prior_sds.copy()
-    sds[2:] = np.where(body.kinematics.is_angle, STANDING_SCENE.joint_sd, 0.0)
+    sds[2:] = np.where(body.kinematics.is_angle, SHARED.constant_deviation, 0.0)
     free = problem._replace(prior_sds=sds)
     free, other = _fit_determined(free, fit.X_LC, fit.constants)
     if fit.sigma < STANDING_SCENE.better * other.sigma:
@@ -419,23 +424,14 @@ def _misfits(
     )
 
 
-def _time_offset(recording: Recording, value: float, deviation: float) -> TimeOffset | None:
-    """Return the time offset from its value and deviation [s]; None: the log has no times."""
-    if recording.times is None:
-        return None
-    known = deviation < STANDING_SCENE.determined * STANDING_SCENE.time_sd
-    return TimeOffset(value, deviation if known else np.inf, np.zeros((0, 2)))
-
-
 def _describe_offsets(
     names: Sequence[str],
     asked: Sequence[str],
     problem: TrackProblem,
     fit: TrackFit,
     deviations: Array,
-    level: float = 0.05,
 ) -> tuple[KinematicParameter, ...]:
-    """Return the offsets of the joints `asked`, by name, tested at a level for all of them.
+    """Return the offsets of the joints `asked`, by name, tested at SHARED.level for all of them.
 
     names: of the pose tree's values. deviations: (7 + k,) standard deviations, as of ``TrackFit``.
     """
@@ -447,11 +443,16 @@ def _describe_offsets(
             parameters.append(KinematicParameter(name, 0.0, *unknown))
             continue
         value, deviation = float(fit.constants[k]), float(deviations[6 + k])
-        width = float(stdtrit(freedom, 1.0 - 0.5 * level)) * deviation
+        width = float(stdtrit(freedom, 1.0 - 0.5 * SHARED.level)) * deviation
         p_value = 2.0 * float(stdtr(freedom, -abs(value) / deviation))
         parameters.append(
             KinematicParameter(
-                name, value, deviation, value - width, value + width, p_value < level / len(asked)
+                name,
+                value,
+                deviation,
+                value - width,
+                value + width,
+                p_value < SHARED.level / len(asked),
             )
         )
     return tuple(parameters)

@@ -12,7 +12,6 @@ from drake_pose.errors import RegistrationError, UnknownNameError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.jobs.registration.words import likely_offset_warnings
 from drake_pose.registration.joint_offsets import (
-    _kept,
     _unknown_rotations,
     ambiguous_constants,
     calibrate_joints,
@@ -21,7 +20,6 @@ from drake_pose.registration.joint_offsets import (
     require_frame_count,
     shrink_constants,
     shrink_measured,
-    undetermined,
     unseen_rotations,
 )
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
@@ -168,32 +166,6 @@ def test_shrinkage_reduces_the_mean_squared_error(size: float, least: float, mos
         assert least <= ratio < most
 
 
-def test_edges_of_static_parts_correct_a_first_offset_within_its_interval() -> None:
-    """Monte Carlo: errors of a first offset are 4 times as large as the fit's covariance says."""
-    rng, names = np.random.default_rng(5), ("first", *"bcdef")
-    kinematics = SimpleNamespace(names=names, is_angle=np.ones(6, bool))
-    views = [SimpleNamespace(kinematics=kinematics)]
-    fit = SimpleNamespace(names=("eye.turn_y", *names), constants=names, views=views)
-    A = np.diag([0.0005, 0.01, *([0.001] * 5)])
-    A[0, 1] = -0.01
-    actual = A.copy()
-    actual[:, 1] *= 4.0
-    squares, scores = [], []
-    for _ in range(200):
-        true = np.append(0.0, 0.1 * rng.normal(size=6))
-        seen = SharedValues(true + actual @ rng.normal(size=7), np.zeros(0))
-        measured = {"first": (float(true[1] + 0.005 * rng.normal()), 0.005)}
-        found, C, gauges = shrink_measured(fit, seen, A @ A.T, names, measured)
-        assert gauges == {"first": ("eye.turn_y",)}
-        off = (found.shared - true)[:2]
-        squares.append([off**2, (seen.shared - true)[:2] ** 2])
-        scores.append(off / np.sqrt(np.diag(C)[:2]))
-    after, before = np.mean(squares, axis=0)
-    # The camera follows.
-    assert (after < 0.15 * before).all()
-    assert (np.mean(np.abs(scores) < 1.96, axis=0) > 0.9).all()
-
-
 def test_first_offsets_that_no_edges_determine_are_not_fitted(model, body, camera) -> None:
     frames = see(model, body, camera, 4, 6)
     views = [PosedFrames(body.kinematics, body.full, camera, frames)]
@@ -282,18 +254,6 @@ def test_an_unknown_first_offset_turns_the_camera_about_its_axis(model, body, ca
     moved = np.append([0.0, 0.0, 1.0], (X[:3, 3] - camera.X_WC[:3, 3]) / by)
     expected = SHARED.constant_deviation**2 * np.outer(moved, moved)
     np.testing.assert_allclose(found, expected, atol=1e-5 * expected.max())
-
-
-def test_constants_without_a_bound_stay_unless_a_camera_hides_them() -> None:
-    """Those that are not determined go, except in a fit that began at known offsets."""
-    fit = SimpleNamespace(names=("eye.turn_y", "a", "b"), constants=("a", "b"))
-    values = {
-        "a": undetermined("a", ("b",)),
-        "b": undetermined("b", ("eye.turn_y", "a")),
-        "c": replace(undetermined("c", ()), deviation=0.1),
-    }
-    assert _kept(values, None) == ["c"]
-    assert _kept(values, fit) == ["a", "c"]
 
 
 def test_lost_fits_and_few_frames_are_refused() -> None:

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from drake_pose.body import load_model
-from drake_pose.camera.models import ParallelCamera, PinholeCamera
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.registration.large_errors import (
     Correction,
     LargeErrorSearch,
     apply_corrections,
-    downscaled,
     joint_inlier_ratios,
     mask_excess_and_lack,
     mismatched_links,
@@ -225,18 +224,6 @@ def test_corrections_are_applied_in_order(body, frames) -> None:
     assert apply_corrections([first, second], frames[0]).values[2] == -(q + 0.3) + 0.1
     assert apply_corrections([second, first], frames[0]).values[2] == -q + 0.1 + 0.3
     assert frames[0].values[2] == q
-
-
-def test_scaled_cameras_see_the_same_directions() -> None:
-    small = downscaled(CAMERAS[0], 0.25)
-    assert (small.width, small.height) == (80, 60)
-    p_W = np.array([[0.1, 0.2, 0.4], [-0.2, 0.1, 0.6]])
-    (uv, _), (small_uv, _) = CAMERAS[0].project(p_W), small.project(p_W)
-    np.testing.assert_allclose(small_uv + 0.5, 0.25 * (uv + 0.5))
-    tiny = downscaled(CAMERAS[0], 1e-3)
-    assert (tiny.width, tiny.height) == (8, 8)
-    parallel = ParallelCamera("flat", 64, 48, 100.0, 31.5, 23.5, np.eye(4))
-    assert downscaled(parallel, 0.25) is parallel
 
 
 @pytest.mark.parametrize("factor", [1, 3])

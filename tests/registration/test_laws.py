@@ -33,7 +33,6 @@ from drake_pose.registration.register import (
     CameraSearch,
     E_total,
     RegistrationBody,
-    _mask_bounds,
     add_bound_equations,
     intersection_over_union,
     positions_from_bounds,
@@ -70,21 +69,6 @@ def test_priors_add_their_information_to_the_normal_equations(posed: PosedFrames
     np.testing.assert_allclose(H.sum(axis=0)[1:, 1:], np.diag(known), atol=1e-6)
     np.testing.assert_allclose(g.sum(axis=0)[1:], known * shared, atol=1e-6)
     assert with_prior.cost - without.cost == pytest.approx(known @ shared**2)
-
-
-def test_gradient_matches_cost_differences(posed: PosedFrames) -> None:
-    """g is half the cost's derivative by pose, focal length, joint offset and boundary bias."""
-    fit, own = with_zero(posed), np.zeros(2)
-    at = np.array([0.02, -0.01, 0.02, 0.01, 0.01, 0.01, 0.02, 0.03])
-    wide = AnnealingStage(0.2, 0.01)
-    g = fit.equations(SharedValues(at, own), wide).g.sum(axis=0)[1:]
-    for k, slope in enumerate(g):
-        by = 2e-3 * np.eye(8)[k]
-        more, less = (fit.equations(SharedValues(at + s * by, own), wide).cost for s in (1.0, -1.0))
-        assert (more - less) / 8e-3 == pytest.approx(slope, abs=0.1 * np.abs(g).max()), k
-    wider, narrower = (fit.equations(SharedValues(at, own + w), wide).cost for w in (0.25, -0.25))
-    widths = fit.equations(SharedValues(at, own), wide).g[:, 0]
-    assert (wider - narrower) / 1.0 == pytest.approx(float(widths.sum()), rel=0.05)
 
 
 def test_camera_covariance_matches_derivatives(posed: PosedFrames) -> None:
@@ -172,23 +156,6 @@ def test_bound_gradient_matches_cost_differences(posed: PosedFrames) -> None:
     np.testing.assert_allclose(g, slopes, rtol=1e-4)
     # Four bounds determine three unknowns.
     assert np.linalg.matrix_rank(H) == 3
-
-
-def test_sides_at_the_picture_border_are_no_bounds() -> None:
-    """Pixel (i, j) is the square around its centre; sides within two rows do not count."""
-    for left, top, right, bottom in (
-        (5, 6, 12, 15),
-        (1, 2, 17, 17),
-        (2, 0, 19, 18),
-        (2, 2, 17, 17),
-    ):
-        mask = np.zeros((20, 20), bool)
-        mask[top : bottom + 1, left : right + 1] = True
-        bounds, seen = _mask_bounds(mask)
-        np.testing.assert_array_equal(
-            bounds, [[left - 0.5, top - 0.5], [right + 0.5, bottom + 0.5]]
-        )
-        assert seen.tolist() == [[left > 1, top > 1], [right < 18, bottom < 18]]
 
 
 def test_rotation_spread_about_one_axis_or_two(
@@ -316,22 +283,6 @@ def test_masks_of_wrong_size_and_empty_masks_are_refused(
         frame = PosedFrame("0007", posed.frames[0].values, mask)
         with pytest.raises(MaskError, match="camera 'eye', frame '0007'"):
             PosedFrames(body.kinematics, body.medium, posed.camera, [frame])
-
-
-def test_poses_of_a_target_are_distinct_up_to_symmetries(
-    make_target: Callable[[str], CalibrationTarget],
-) -> None:
-    """Poses nearer than 0.15 of the radius, or related by a symmetry, are the same."""
-    thing = make_target("box")
-    search, X = TargetSearch(thing), looking_at(PLACE, MIDDLE, 0.4).X_WC
-    near, far = X.copy(), X.copy()
-    near[0, 3] += 0.1 * thing.radius
-    far[0, 3] += 0.3 * thing.radius
-    # Rotations about the target's middle by small and large angles.
-    little, much = (thing.moved(X, np.array([0, 0, 0, turn, 0, 0])) for turn in (0.12, 0.4))
-    poses = [one[None] for one in (X, X, near, X @ thing.symmetry[0][2], far, little, much)]
-    kept = search._apart(poses, thing.symmetry[0])
-    np.testing.assert_array_equal(kept, [X[None], far[None], much[None]])
 
 
 def test_hand_eye_fit_finds_camera_and_target(

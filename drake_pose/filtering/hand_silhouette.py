@@ -404,7 +404,7 @@ class HandSilhouette:
             scale: known image scale; None: unknown.
         """
         observation, names = self._observation, self._observation.names
-        at, prior = names.index("scale"), self._hand.prior
+        at = names.index("scale")
         lines = slice(at - 2 * len(self._hand.line_ends), at)
         tips = [
             [names.index(f"point_{i}{self._hand.joints[-1]}_{axis}") for axis in "xy"]
@@ -416,11 +416,8 @@ class HandSilhouette:
             y[lines], R[lines, lines] = axes.lines.ravel(), block_covariance(axes.line_covariances)
             for rows, tip, covariance in zip(tips, axes.tips, axes.tip_covariances, strict=True):
                 y[rows], R[np.ix_(rows, rows)] = tip, covariance
-            y[[names.index(name) for name in self._hand.hidden]] = np.nan
             self._add_hidden_points(x, mask, edge, y, R)
             y[at] = math.nan if scale is None else scale
-            if prior is not None:
-                y[at + 1 :] = prior.mean
             if k < len(gates) - 1:
                 x = self.belief_filter.estimate_roughly(prediction, y, R, x)
         wrong = np.count_nonzero(self.draw(x) != mask)

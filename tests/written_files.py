@@ -1,7 +1,10 @@
-"""Compare files written by scripts as text and numbers; last digits depend on the machine."""
+"""Compare files written by scripts as text and numbers; write masks."""
 
 import re
 from pathlib import Path
+
+from drake_pose.arrays import Mask
+from drake_pose.silhouette.pictures.masks import encode_mask
 
 NUMBER = re.compile(r"[-+]?(?:\d+\.\d*|\.\d+|\d+)(?:[eE][-+]?\d+)?")
 LAST_PLACES = 2.1
@@ -32,3 +35,7 @@ def _tolerance(number: str) -> float:
     mantissa, _, exponent = number.lower().partition("e")
     decimals = len(mantissa.partition(".")[2])
     return LAST_PLACES * 10.0 ** (int(exponent or 0) - decimals) if "." in mantissa else 0.0
+
+
+def write_mask(path: Path, mask: Mask) -> None:
+    path.write_bytes(encode_mask(mask))

@@ -35,8 +35,8 @@ from drake_pose.jobs.batch_tasks import SceneJob
 from drake_pose.jobs.cluster import open_cluster
 from drake_pose.papers.kameda import experiment_camera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.silhouette.pictures.masks import write_mask
 from tests.benchmarks.tables import print_table
+from tests.written_files import write_mask
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -28,8 +28,8 @@ from drake_pose.files.settings import EstimateSettings
 from drake_pose.input_files import csv_text
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.silhouette.pictures.masks import write_mask
 from tests.benchmarks.tables import print_table
+from tests.written_files import write_mask
 
 Damage = Callable[[Mask, np.random.Generator, int], Mask]
 """Function of a mask, random numbers and the frame's number."""

@@ -24,10 +24,10 @@ from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.papers.kameda import continuous_figures, experiment_tree, run_experiment
 from drake_pose.search import MultiStartSearch
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.benchmarks.speed import measure_kernel
 from tests.benchmarks.tables import print_table
+from tests.written_files import write_mask
 
 _FRAMES, _RATE_HZ, _IMAGES = 24, 30.0, 20
 _ARM_JOINTS = ("A1", "A2", "A3", "A4")

@@ -24,7 +24,6 @@ from drake_pose.registration.picture_registration import register_pictures
 from drake_pose.registration.recording import Recording
 from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.scoring import prefix_sums, score_bodies
 from drake_pose.silhouette.segmentation import person_region
 from drake_pose.systems.cameras import picture_to_colour_image
@@ -32,6 +31,7 @@ from drake_pose.workers import use_workers
 from tests.benchmarks.tables import print_table
 from tests.registration.episodes import painted_episode
 from tests.silhouette.agreement import measure_agreement
+from tests.written_files import write_mask
 
 # Kameda's scale of 2.26 pixels per centimetre, and a limb of his body.
 _SIDE, _SCALE = 700, 226.0

@@ -9,8 +9,8 @@ import yaml
 from drake_pose.body import ArticulatedModel
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import circle_of_cameras
-from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.systems.cameras import build_camera_rig
+from tests.written_files import write_mask
 
 SIZE = (240, 180)
 RATE_HZ = 15.0

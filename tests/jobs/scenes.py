@@ -14,8 +14,8 @@ from drake_pose.body import ArticulatedModel, load_model
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.silhouette.pictures.masks import write_mask
 from tests.cli import Result, run_to_end
+from tests.written_files import write_mask
 
 LINK = """
   <link name="{name}">

@@ -36,14 +36,6 @@ def read_mask(
     return read_binary_mask(Path(path), MaskError, size, may_be_empty=may_be_empty)
 
 
-def write_mask(path: str | Path, mask: np.ndarray) -> None:
-    """Write a mask (H, W) as ``encode_mask`` does; MaskError names an unwritable file."""
-    try:
-        Path(path).write_bytes(encode_mask(mask))
-    except OSError as error:
-        raise MaskError(f"{path}: cannot write the mask: {error.strerror}") from error
-
-
 def encode_mask(mask: np.ndarray) -> bytes:
     """Return a mask (H, W) as the content of a black and white PNG file, white on the object."""
     stream = io.BytesIO()

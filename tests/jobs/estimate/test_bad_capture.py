@@ -22,10 +22,10 @@ from drake_pose.jobs.estimate.person import (
 )
 from drake_pose.person.faults import CameraFault, CameraMotion, RigFault
 from drake_pose.person.figures import ViewFaults
-from drake_pose.silhouette.pictures.masks import write_mask
 from tests.cli import run_to_end
 from tests.jobs.scenes import read_rows
 from tests.person.persons_in_view import see, stepping
+from tests.written_files import write_mask
 
 FRAMES = 8
 PLACE = tuple(f"position_{axis}" for axis in "xyz")

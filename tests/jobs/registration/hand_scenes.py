@@ -14,10 +14,10 @@ from drake_pose.body import load_model
 from drake_pose.camera.camera_files import dump_cameras
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.silhouette.pictures.masks import write_mask
 from tests.jobs.registration.arm_scenes import ArmScene
 from tests.registration.arm_pictures import damaged
 from tests.search.arms import LINKS, arm_urdf
+from tests.written_files import write_mask
 
 # A step and a post on a plate: it looks different from all sides.
 BASE = """<link name="base">

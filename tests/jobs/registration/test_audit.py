@@ -21,10 +21,10 @@ from drake_pose.errors import (
 from drake_pose.jobs.registration.audit import SceneAudit, audit_scene
 from drake_pose.jobs.registration.audit_page import corrected
 from drake_pose.registration.findings import Finding
-from drake_pose.silhouette.pictures.masks import write_mask
 from tests.cli import Result, run_to_end
 from tests.files.test_report_page import require_plain_page
 from tests.jobs.registration.arm_scenes import JOINTS, ArmScene, write_arm_scene
+from tests.written_files import write_mask
 
 
 def run(scene: ArmScene, *more: object) -> Result:

@@ -18,8 +18,9 @@ from drake_pose.jobs.registration.audit import SceneAudit, audit_scene
 from drake_pose.jobs.registration.diagnosis import last_before_change
 from drake_pose.jobs.registration.words import common_outlier_warnings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.silhouette.pictures.masks import read_mask, write_mask
+from drake_pose.silhouette.pictures.masks import read_mask
 from tests.jobs.registration.arm_scenes import ArmScene, write_arm_scene
+from tests.written_files import write_mask
 
 COUNT = 8
 

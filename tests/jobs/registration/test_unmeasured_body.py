@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.silhouette.pictures.masks import write_mask
 from tests.cli import assert_refused, run_command, run_json, run_to_end
 from tests.jobs.registration.arm_scenes import JOINTS, ArmScene, pose_errors
+from tests.written_files import write_mask
 
 BASE = ("base_x", "base_y", "base_z", "base_qw", "base_qx", "base_qy", "base_qz")
 PERSON = bundled_model("person").with_name("person_shape.urdf")

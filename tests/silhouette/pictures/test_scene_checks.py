@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import ParallelCamera, circle_of_cameras
 from drake_pose.errors import MaskError, SceneError
-from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scene_checks import (
     check_scene,
     check_upright,
@@ -22,6 +21,7 @@ from drake_pose.silhouette.pictures.scene_checks import (
     read_mask_of,
 )
 from drake_pose.silhouette.pictures.scenes import load_scene
+from tests.written_files import write_mask
 
 NAMES = ("left", "middle", "right")
 

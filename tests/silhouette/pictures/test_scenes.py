@@ -9,8 +9,8 @@ import pytest
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import CameraError, MaskError, SceneError, SettingsError, UnknownNameError
-from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scenes import load_scene
+from tests.written_files import write_mask
 
 MASK = np.zeros((20, 30), dtype=bool)
 MASK[4:9, 3:20] = True

@@ -17,7 +17,6 @@ from drake_pose.search import (
     PaperSearchSettings,
 )
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer, mask_to_label_image
-from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scenes import load_scene
 from drake_pose.systems.cameras import MaskPlayer
 from drake_pose.systems.diagrams import (
@@ -28,6 +27,7 @@ from drake_pose.systems.diagrams import (
 from drake_pose.systems.silhouette_matcher import STATISTICS, SilhouetteMatcher, SilhouetteTracker
 from tests.search.bodies import box_link, front_camera, joint, load_body, swinging_chain
 from tests.systems.bench import Bench
+from tests.written_files import write_mask
 
 PERIOD = 0.1
 TRUTH = np.radians([[30.0, -60.0, 0.0], [-30.0, 60.0, 90.0], [60.0, 30.0, -30.0]])

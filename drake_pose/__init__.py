@@ -23,7 +23,12 @@ if TYPE_CHECKING:
     from drake_pose.camera.models import PinholeCamera, look_at
     from drake_pose.errors import DrakePoseError
     from drake_pose.files.overlay import paint_agreement
-    from drake_pose.files.settings import EstimateSettings, MaskSettings
+    from drake_pose.files.settings import (
+        AuditSettings,
+        EstimateSettings,
+        MaskSettings,
+        RegistrationSettings,
+    )
     from drake_pose.filtering.contour_tracker import TrackingSettings
     from drake_pose.filtering.inequalities import from_bounds
     from drake_pose.filtering.motion import constant_velocity
@@ -34,7 +39,6 @@ if TYPE_CHECKING:
     from drake_pose.jobs.masks import make_masks
     from drake_pose.jobs.registration.audit import audit_scene
     from drake_pose.jobs.registration.register import register_scene
-    from drake_pose.jobs.registration.settings import AuditSettings, RegistrationSettings
     from drake_pose.registration.online_registration import OnlineRegistration
     from drake_pose.registration.register import RegistrationBody
     from drake_pose.search import MultiStartSearch, View
@@ -51,7 +55,7 @@ __version__ = VERSION
 
 _HOMES = {
     "ArticulatedModel": "body.model",
-    "AuditSettings": "jobs.registration.settings",
+    "AuditSettings": "files.settings",
     "Belief": "filtering.state",
     "CameraRegistration": "systems.diagrams",
     "DrakePoseError": "errors",
@@ -66,7 +70,7 @@ _HOMES = {
     "PersonTracker": "systems.person",
     "PinholeCamera": "camera.models",
     "RegistrationBody": "registration.register",
-    "RegistrationSettings": "jobs.registration.settings",
+    "RegistrationSettings": "files.settings",
     "RobotStateMessage": "systems.bodies",
     "RootRotation": "body.root",
     "SilhouetteCamera": "systems.cameras",

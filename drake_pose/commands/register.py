@@ -24,8 +24,7 @@ from drake_pose.commands.common import (
     worst_frames,
 )
 from drake_pose.errors import RegistrationError, listed
-from drake_pose.files.settings import percent
-from drake_pose.jobs.registration.settings import AuditSettings, RegistrationSettings
+from drake_pose.files.settings import AuditSettings, RegistrationSettings, percent
 
 if TYPE_CHECKING:
     from drake_pose.jobs.registration.audit import SceneAudit

@@ -31,13 +31,18 @@ from drake_pose.errors import (
 )
 from drake_pose.files.folder import OVERLAY, POSES, read_summary, write_file, write_summary
 from drake_pose.files.records import FrameRecord, describe_job, file_digest, mask_digests, summarize
-from drake_pose.files.settings import EpisodeSettings, EstimateSettings, FromText, say_gone
+from drake_pose.files.settings import (
+    AuditSettings,
+    EpisodeSettings,
+    EstimateSettings,
+    FromText,
+    say_gone,
+)
 from drake_pose.input_files import named_fields, read_yaml
 from drake_pose.jobs.estimate.inputs import bundled_person, follows_person
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.jobs.registration.audit import audit_scene
 from drake_pose.jobs.registration.inputs import uses_pictures
-from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, Scene, load_scene
 

@@ -21,8 +21,8 @@ import yaml
 from drake_pose.body import ArticulatedModel, load_model
 from drake_pose.camera.camera_files import dump_cameras
 from drake_pose.errors import RegistrationError
+from drake_pose.files.settings import RegistrationSettings
 from drake_pose.jobs.registration.register import SceneRegistration, register_scene
-from drake_pose.jobs.registration.settings import RegistrationSettings
 from tests.benchmarks.registration import pose_error
 from tests.benchmarks.rooms import LOG_HZ, SimulatedEpisode, simulate
 from tests.benchmarks.tables import print_table

@@ -24,11 +24,10 @@ from drake_pose.arrays import Array, Mask
 from drake_pose.body import load_model
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
-from drake_pose.files.settings import EstimateSettings
+from drake_pose.files.settings import EstimateSettings, RegistrationSettings
 from drake_pose.fit.parameters import carried_joints
 from drake_pose.jobs.estimate.inputs import make_tree
 from drake_pose.jobs.registration.inputs import read_inputs
-from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.registration.joint_offsets import scalable_links
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import CameraSearch, RegistrationBody, overlap_areas

@@ -17,8 +17,8 @@ import numpy as np
 
 from drake_pose.body import load_model
 from drake_pose.errors import RegistrationError
+from drake_pose.files.settings import RegistrationSettings
 from drake_pose.jobs.registration.register import register_scene
-from drake_pose.jobs.registration.settings import RegistrationSettings
 from tests.benchmarks.acceptance import as_positions
 from tests.benchmarks.episodes import write_episode
 from tests.benchmarks.registration import pose_error

@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 from drake_pose.camera.camera_files import describe_camera, load_cameras
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import SettingsError
+from drake_pose.files.settings import AuditSettings
 from drake_pose.jobs.batch import run_batch
 from drake_pose.jobs.batch_tasks import Outcome, plan_scene, read_job
 from drake_pose.jobs.episodes_table import COLUMNS, episodes_table
-from drake_pose.jobs.registration.settings import AuditSettings
 from tests.cli import run_to_end
 from tests.jobs.scenes import read_rows
 from tests.registration.episodes import painted_episode

@@ -20,7 +20,7 @@ from drake_pose.camera.models import Camera
 from drake_pose.errors import DrakePoseError, RegistrationError, SceneError, noted_warnings
 from drake_pose.files.folder import read_summary, write_summary, writes_folder
 from drake_pose.files.records import mask_digests, user_units
-from drake_pose.files.settings import percent
+from drake_pose.files.settings import AuditSettings, percent
 from drake_pose.jobs.estimate.measurements import left_out_warnings
 from drake_pose.jobs.registration.audit_page import write_audit_page
 from drake_pose.jobs.registration.diagnosis import compare_camera, compare_clock
@@ -32,7 +32,6 @@ from drake_pose.jobs.registration.result import (
     write_comparisons,
     write_overlays,
 )
-from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.jobs.registration.tracks import (
     describe_pictures,
     register_recordings,

@@ -123,18 +123,15 @@ def correction_row(finding: Mapping[str, Any], normal: float = 1.96) -> dict[str
     """
     parts = []
     for key in (key for key in finding if key.startswith(("angle_deg", "shift_"))):
-        if "_sd_" in key or not (deviation := finding[_sd_key(key)]) or not np.isfinite(deviation):
+        # The standard deviation of "shift_mm" is "shift_sd_mm".
+        name, _, unit = key.rpartition("_")
+        deviation = finding.get(f"{name}_sd_{unit}")
+        if not deviation or not np.isfinite(deviation):
             continue
-        value, unit = finding[key], key.rpartition("_")[2].replace("percent", "%")
+        value, unit = finding[key], unit.replace("percent", "%")
         low, high = value - normal * deviation, value + normal * deviation
         parts.append((f"{value:+z.2f} {unit}", f"{low:+z.2f} to {high:+z.2f} {unit}"))
     return {**finding, "parts": parts}
-
-
-def _sd_key(key: str) -> str:
-    """Return the key of a value's standard deviation: "shift_sd_mm" for "shift_mm"."""
-    name, _, unit = key.rpartition("_")
-    return f"{name}_sd_{unit}"
 
 
 def _cameras(summary: Mapping[str, Any]) -> list[str]:

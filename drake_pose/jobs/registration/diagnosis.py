@@ -1,7 +1,7 @@
 """Check registered cameras, clocks and frames, and word what is wrong with them."""
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -16,7 +16,7 @@ from drake_pose.files.settings import percent
 from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.jobs.registration.readings import likeliest_reading
 from drake_pose.registration.diagnosis import DIAGNOSIS
-from drake_pose.registration.findings import Diagnosis, Finding
+from drake_pose.registration.findings import Finding
 from drake_pose.registration.joint_offsets import calibrate_joints
 from drake_pose.registration.online_registration import pose_difference, squared_distance
 from drake_pose.registration.picture_acceptance import PictureRegistration
@@ -372,25 +372,6 @@ def last_before_change(wrong: Sequence[bool], least: int = 2) -> int | None:
     if len(turns) != 1 or min(sum(wrong), len(wrong) - sum(wrong)) < least:
         return None
     return int(turns[0])
-
-
-def changed_after(found: Diagnosis, cameras: Collection[str], least: int) -> tuple[list[int], str]:
-    """Return the outlier frames on one side of a change, and the last frame before the change.
-
-    Args:
-        found: the diagnosis.
-        cameras: names; only frames with masks of exactly these cameras are used.
-        least: minimum number of frames on each side of a change.
-
-    Returns:
-        the outliers' indices in ``found.frames``, and the last frame's name. ([], ""): no change.
-    """
-    rows = [k for k, frame in enumerate(found.frames) if {*frame.given_ratios} == {*cameras}]
-    wrong = [found.frames[k].finding is not None for k in rows]
-    last = last_before_change(wrong, least)
-    if last is None:
-        return [], ""
-    return [rows[k] for k in np.flatnonzero(wrong)], found.frames[rows[last]].frame
 
 
 def base_motion(

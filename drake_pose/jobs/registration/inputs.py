@@ -22,7 +22,7 @@ from drake_pose.camera.episode_files import JOINT_TABLE, open_episode, require_r
 from drake_pose.camera.joint_map import MappedJoints
 from drake_pose.camera.models import Camera, Lens, PinholeCamera
 from drake_pose.errors import CameraError, MaskError, SceneError, SettingsError, UnknownNameError
-from drake_pose.files.settings import EstimateSettings
+from drake_pose.files.settings import ALL, AuditSettings, EstimateSettings, RegistrationSettings
 from drake_pose.jobs.estimate.inputs import make_tree, missing_for_person
 from drake_pose.jobs.estimate.measurements import (
     TreeLog,
@@ -43,7 +43,6 @@ from drake_pose.jobs.registration.positions import (
     read_known_positions,
     read_target,
 )
-from drake_pose.jobs.registration.settings import ALL, AuditSettings, RegistrationSettings
 from drake_pose.registration.camera_motion import PictureMotion
 from drake_pose.registration.joint_offsets import (
     require_frame_count,

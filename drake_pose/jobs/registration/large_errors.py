@@ -11,9 +11,9 @@ from drake_pose.errors import CameraError, MaskError, RegistrationError
 from drake_pose.files.settings import percent
 from drake_pose.jobs.registration.diagnosis import (
     base_motion,
-    changed_after,
     compare_camera,
     explain_misfit,
+    last_before_change,
     require_seen_by,
 )
 from drake_pose.jobs.registration.inputs import RegistrationInputs
@@ -240,32 +240,33 @@ class SceneComparison:
         found = replace(found, common=common, minimum_detectable=detectable)
         return replace(now, found=found, findings=(), warnings=warnings)
 
-    def _find_moved(
-        self, now: SceneFit, found: Diagnosis, least: int = 2
-    ) -> tuple[list[Finding], Diagnosis]:
+    def _find_moved(self, now: SceneFit, found: Diagnosis) -> tuple[list[Finding], Diagnosis]:
         """Find cameras or a base that moved between two frames.
 
         A motion is found if the first or the last of the frames with the same cameras are outliers
         that agree with each other at another pose of a camera or of the base.
 
         ``now``: the scene's fit. ``found``: its diagnosis, with the findings that are known so far.
-        ``least``: minimum number of frames before and after. Returns the motions, of kind "moved";
-        and the diagnosis with them as the outliers' findings.
+        Returns the motions, of kind "moved"; and the diagnosis with them as the outliers' findings.
         """
         moved, explained = list[Finding](), dict[str, Finding]()
         for cameras in dict.fromkeys(tuple(frame.given_ratios) for frame in found.frames):
-            rows, last = changed_after(found, cameras, least)
-            if not rows:
+            group = [k for k, one in enumerate(found.frames) if {*one.given_ratios} == {*cameras}]
+            wrong = [found.frames[k].finding is not None for k in group]
+            before = last_before_change(wrong)
+            if before is None:
                 continue
+            rows = [group[k] for k in np.flatnonzero(wrong)]
+            last = found.frames[group[before]].frame
             again = diagnose_frames(now.fit, [now.fits[k] for k in rows], moved=True)
             motions, names = list(again.common), [*{frame.frame for frame in again.frames}]
             if again.outliers or any(motion.kind not in ("camera", "base") for motion in motions):
                 frames = [now.corrected(self._inputs.read(found.frames[k].frame)) for k in rows]
-                group = [camera for camera in now.cameras if camera.name in cameras]
-                placed = self._register(frames, group)
+                given = [camera for camera in now.cameras if camera.name in cameras]
+                placed = self._register(frames, given)
                 motions = [off for _, off in placed.values()]
                 base = base_motion(
-                    {body.name: body for body in group},
+                    {camera.name: camera for camera in given},
                     {k: one for k, (one, _) in placed.items()},
                 )
                 if base is not None and len(placed) == len(cameras):

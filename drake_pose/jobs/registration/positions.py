@@ -29,7 +29,7 @@ from drake_pose.camera.picture_files import frame_key
 from drake_pose.camera.servo_readings import Column
 from drake_pose.errors import SceneError, SettingsError
 from drake_pose.files.records import base_pose
-from drake_pose.files.settings import EstimateSettings
+from drake_pose.files.settings import EstimateSettings, RegistrationSettings
 from drake_pose.fit.parameters import carried_joints
 from drake_pose.jobs.estimate.inputs import make_tree, missing_for_person
 from drake_pose.jobs.estimate.measurements import (
@@ -39,7 +39,6 @@ from drake_pose.jobs.estimate.measurements import (
     read_measured_positions,
 )
 from drake_pose.jobs.estimate.scene import estimate_scene
-from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.person.pose_tracker import shape_parts
 from drake_pose.registration.joint_offsets import KinematicParameter
 from drake_pose.registration.standing_object import CalibrationTarget, fixed_link_error

@@ -14,6 +14,7 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError, RegistrationError, noted_warnings
 from drake_pose.files.folder import write_file, writes_folder
+from drake_pose.files.settings import RegistrationSettings
 from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.registration.diagnosis import (
     Search,
@@ -37,7 +38,6 @@ from drake_pose.jobs.registration.result import (
     describe_run,
     write_result,
 )
-from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.jobs.registration.tracks import (
     describe_pictures,
     describe_tracks,

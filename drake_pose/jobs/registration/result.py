@@ -25,10 +25,9 @@ from drake_pose.files.folder import OVERLAY, REPORT, without_nan, write_file, wr
 from drake_pose.files.overlay import draw_overlay, draw_shapes, encode_png
 from drake_pose.files.records import describe_job, file_digest, versions
 from drake_pose.files.report_page import new_plot, overlay_picture, page_template, plot_uri
-from drake_pose.files.settings import percent
+from drake_pose.files.settings import AuditSettings, percent
 from drake_pose.input_files import csv_text
 from drake_pose.jobs.registration.inputs import RegistrationInputs
-from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.jobs.registration.words import describe_reading
 from drake_pose.registration.joint_offsets import KinematicParameter
 from drake_pose.registration.posed_frames import PosedFrame

@@ -11,7 +11,7 @@ import numpy as np
 
 from drake_pose.arrays import Array
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, listed
 from drake_pose.files.folder import OVERLAY, write_file
 from drake_pose.files.overlay import EXCESS_RGB, encode_png
@@ -156,8 +156,17 @@ def describe_pictures(result: PictureRegistration | None, found: bool = False) -
     if result is None:
         masks = "found" if found else "given"
         return {"masks": masks, "time_offset_s": None, "time_offset_sd_s": None}
-    offset = result.time_offset
+    offset, X_WC, runner_up = result.time_offset, result.found.camera.X_WC, None
     drifting = offset if offset is not None and offset.drift else None
+    if result.runner_up is not None:
+        X_CW, margin = result.runner_up
+        other = np.linalg.inv(X_CW)
+        runner_up = {
+            "X_WC": other.tolist(),
+            "distance_mm": 1e3 * float(np.linalg.norm(other[:3, 3] - X_WC[:3, 3])),
+            "rotation_deg": math.degrees(rotation_between(X_CW, result.found.camera.X_CW)),
+            "margin_sd": margin,
+        }
     return {
         "masks": "found",
         **describe_lens_and_clock(result),
@@ -168,8 +177,7 @@ def describe_pictures(result: PictureRegistration | None, found: bool = False) -
         "explained_by_chance": result.by_chance,
         "p_value": result.p_value,
         "contour": result.fit.contour,
-        "runner_up": result.runner_up
-        and _describe_runner_up(result.found.camera, *result.runner_up),
+        "runner_up": runner_up,
     }
 
 
@@ -182,17 +190,6 @@ def describe_lens_and_clock(result: PictureRegistration | TrackRegistration) -> 
         "time_offset_sd_s": determined and determined.deviation,
         "focal_px": focal,
         "focal_sd_px": result.focal_deviation * focal if result.focal_deviation else None,
-    }
-
-
-def _describe_runner_up(camera: Camera, X_CW: Array, margin: float) -> dict[str, Any]:
-    """Return the summary's entry on a runner-up X_CW (4, 4); margin: see ``ratio_margin`` [sd]."""
-    X_WC = np.linalg.inv(X_CW)
-    return {
-        "X_WC": X_WC.tolist(),
-        "distance_mm": 1e3 * float(np.linalg.norm(X_WC[:3, 3] - camera.X_WC[:3, 3])),
-        "rotation_deg": math.degrees(rotation_between(X_CW, camera.X_CW)),
-        "margin_sd": margin,
     }
 
 

@@ -170,23 +170,35 @@ def lost_frames_warning(
     )
 
 
+def fit_of_inliers(
+    body: RegistrationBody,
+    found: RegisteredCamera,
+    frames: Sequence[PosedFrame],
+    most: int = 24,
+) -> SharedFit | None:
+    """Return a fit of a camera's inlier frames, at its pose; None: there are none.
+
+    ``body``: the robot's surfaces. ``found``: the registered camera. ``frames``: its frames.
+    ``most``: maximum number of inlier frames that are used.
+    """
+    names = {frame.frame for frame in found.frames if frame.is_inlier}
+    sample = evenly_spaced([frame for frame in frames if frame.name in names], most)
+    if not sample:
+        return None
+    posed = PosedFrames(body.kinematics, body.full, found.camera, sample, LAST_SPACING)
+    return SharedFit([posed], [found.camera.X_CW])
+
+
 def likely_offset_warnings(
     body: RegistrationBody, found: RegisteredCamera, frames: Sequence[PosedFrame]
 ) -> list[str]:
     """Return a warning of the likeliest joint offset that would explain all frames' residuals.
 
-    The list is empty if no offset is likely.
-
-    ``body``: the robot's surfaces. ``found``: the registered camera. ``frames``: the camera's
-    frames; at most 24 inlier frames are used.
+    The list is empty if no offset is likely. Arguments are those of `fit_of_inliers`.
     """
-    names = {frame.frame for frame in found.frames if frame.is_inlier}
-    sample = evenly_spaced([frame for frame in frames if frame.name in names], 24)
-    if not sample:
+    if (fit := fit_of_inliers(body, found, frames)) is None:
         return []
-    posed = PosedFrames(body.kinematics, body.full, found.camera, sample, LAST_SPACING)
-    fit = SharedFit([posed], [found.camera.X_CW])
-    all_frames = np.ones(len(sample), bool)
+    all_frames = np.ones(len(fit.views[0].frames), bool)
     likely = fit.likely_offsets(
         fit.fit(SHARED.stages_with_constants[-1:], fit.start, all_frames), all_frames
     )
@@ -211,14 +223,11 @@ def odd_link_warnings(
     max_ratio: float = 0.75,
     min_fraction: float = 0.04,
     min_elsewhere: float = 0.5,
-    most: int = 24,
 ) -> list[str]:
     """Return a warning of each link whose contour hardly fits while those of other links do.
 
     Args:
-        body: the robot's surfaces.
-        found: the registered camera.
-        frames: its frames; at most `most` inlier frames are used.
+        body, found, frames: as of `fit_of_inliers`.
         without: names of links that were left out; links welded to their parents are not judged.
         max_ratio: maximum fitting fraction of a named link's contour, over the links' median. In
             masks by Drake's renderer links as modelled have 0.93 or more, a link with another
@@ -226,14 +235,9 @@ def odd_link_warnings(
         min_fraction: minimum length of a judged link's contour [length of all contours].
         min_elsewhere: minimum fitting fraction of the other links' contours. Where these do not fit
             either, as with masks that are too wide everywhere, no link is odd.
-        most: maximum number of frames.
     """
-    names = {frame.frame for frame in found.frames if frame.is_inlier}
-    sample = evenly_spaced([frame for frame in frames if frame.name in names], most)
-    if not sample:
+    if (fit := fit_of_inliers(body, found, frames)) is None:
         return []
-    posed = PosedFrames(body.kinematics, body.full, found.camera, sample, LAST_SPACING)
-    fit = SharedFit([posed], [found.camera.X_CW])
     lengths, fitting = fit.matched_lengths(fit.start).T
     ratios = fitting / np.maximum(lengths, 1e-9)
     shown = lengths >= min_fraction * max(float(lengths.sum()), 1e-9)

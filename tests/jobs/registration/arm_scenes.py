@@ -11,8 +11,8 @@ import numpy as np
 from drake_pose.body import load_model
 from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.camera.models import Camera
+from drake_pose.files.settings import RegistrationSettings
 from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs
-from drake_pose.jobs.registration.settings import RegistrationSettings
 from tests.jobs.scenes import edit_camera, write_masks
 from tests.registration.arm_pictures import errors
 from tests.search.arms import LINKS, arm_cameras, arm_urdf

@@ -13,13 +13,12 @@ import pytest
 from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.errors import DrakePoseError
 from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
-from drake_pose.files.settings import EstimateSettings
+from drake_pose.files.settings import EstimateSettings, RegistrationSettings
 from drake_pose.jobs.estimate.inputs import read_inputs as read_estimate_inputs
 from drake_pose.jobs.estimate.measurements import is_episode
 from drake_pose.jobs.registration.audit import audit_scene
 from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs
 from drake_pose.jobs.registration.register import register_scene
-from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.benchmarks.registration import pose_error
 from tests.cli import run_command

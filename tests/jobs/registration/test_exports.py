@@ -13,8 +13,8 @@ from pydrake.systems.sensors import CameraConfig
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import CameraError, SettingsError
+from drake_pose.files.settings import RegistrationSettings
 from drake_pose.jobs.registration.result import check_exports, write_exports
-from drake_pose.jobs.registration.settings import RegistrationSettings
 
 TEXTS = ("ros", "mujoco", "drake")
 

@@ -12,9 +12,9 @@ import pytest
 from drake_pose.camera.lerobot_tables import camera_fields
 from drake_pose.camera.models import Lens
 from drake_pose.errors import CameraError, SettingsError
+from drake_pose.files.settings import AuditSettings, RegistrationSettings
 from drake_pose.jobs.registration.inputs import read_inputs
 from drake_pose.jobs.registration.lerobot_files import lerobot_files, require_data_set
-from drake_pose.jobs.registration.settings import AuditSettings, RegistrationSettings
 from tests.registration.episodes import painted_episode
 from tests.registration.recordings import NAMES, write_episode
 

@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
+from drake_pose.files.settings import RegistrationSettings
 from drake_pose.jobs.registration import tracks
 from drake_pose.jobs.registration.audit import audit_scene
 from drake_pose.jobs.registration.inputs import read_inputs
 from drake_pose.jobs.registration.register import register_scene
-from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.jobs.registration.tracks import require_unmoved, watch_cameras
 from drake_pose.registration.camera_motion import Nudge, PictureMotion
 from drake_pose.registration.recording import Recording

@@ -11,8 +11,8 @@ import yaml
 from drake_pose.body import load_model
 from drake_pose.camera.camera_files import dump_cameras
 from drake_pose.errors import UnknownNameError
+from drake_pose.files.settings import RegistrationSettings
 from drake_pose.jobs.registration.register import SceneRegistration, register_scene
-from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.benchmarks.registration import write_box_arm
 from tests.registration.arm_pictures import errors, looking_at

@@ -10,8 +10,8 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from drake_pose.errors import RegistrationError, SettingsError
+from drake_pose.files.settings import RegistrationSettings
 from drake_pose.jobs.registration.register import register_scene
-from drake_pose.jobs.registration.settings import RegistrationSettings
 
 NAMES = tuple(f"joint{k}" for k in range(6))
 JOINTS = (

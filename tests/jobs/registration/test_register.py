@@ -14,9 +14,9 @@ import yaml
 from drake_pose.body import load_model
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
+from drake_pose.files.settings import RegistrationSettings
 from drake_pose.jobs.registration.positions import joint_shifts
 from drake_pose.jobs.registration.register import register_scene
-from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.jobs.registration.words import common_outlier_warnings
 from drake_pose.registration.register import CameraSearch, FrameMisfit, RegisteredCamera
 from drake_pose.silhouette.pictures.scenes import load_scene

@@ -317,9 +317,7 @@ class KnownBackground:
             unseen=self.unseen[part],
         )
 
-    def foreground(
-        self, picture: Picture, gain: Floats, window: Window = (slice(None), slice(None))
-    ) -> tuple[Floats, Floats]:
+    def foreground(self, picture: Picture, gain: Floats, window: Window) -> tuple[Floats, Floats]:
         """Return (h, w) and (H, W) log-odds that each pixel of an image shows the body.
 
         In the first, each pixel counts as it is; it yields complete masks. The second allows for
@@ -384,7 +382,7 @@ def mask_reach(covered: Mask, reach: float = 0.1) -> int:
 def mask_of_foreground(
     foreground: Floats,
     covered: Mask,
-    tolerant: Floats | None = None,
+    tolerant: Floats,
     *,
     smooth: float = 0.7,
     rim: int = 2,
@@ -396,7 +394,7 @@ def mask_of_foreground(
         foreground: (H, W) log-odds.
         covered: (H, W) approximate silhouette of the body; the mask stays within ``mask_reach``.
         tolerant: (H, W) log-odds that allow for the noise of compressed images; they decide in the
-            mask's rim. None: the same as ``foreground``.
+            mask's rim.
         smooth: standard deviation of the Gaussian that smooths the log-odds [pixel].
         rim: width of the rim [pixel].
         least: pixels of the rim stay whose tolerant log-odds are larger. Chosen on simulated arms:
@@ -406,10 +404,9 @@ def mask_of_foreground(
     found = ((cv2.GaussianBlur(foreground, (0, 0), smooth) > 0.0) & near).astype(np.uint8)
     found = cv2.morphologyEx(found, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     found = cv2.morphologyEx(found, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-    if tolerant is not None:
-        # Beside the body, an encoder spreads differences over a pixel or two.
-        inner = cv2.erode(found, _disc(rim))
-        found = np.where(cv2.GaussianBlur(tolerant, (0, 0), smooth) > least, found, inner)
+    # Beside the body, an encoder spreads differences over a pixel or two.
+    inner = cv2.erode(found, _disc(rim))
+    found = np.where(cv2.GaussianBlur(tolerant, (0, 0), smooth) > least, found, inner)
     return np.asarray(found, bool)
 
 

@@ -101,9 +101,9 @@ def test_log_odds_are_positive_on_the_body(episode):
     for picture, fitted_gain, mask in zip(
         episode.pictures, backgrounds.gains, covered, strict=True
     ):
-        foreground, tolerant = known.foreground(picture, fitted_gain)
+        foreground, tolerant = known.foreground(picture, fitted_gain, np.s_[:, :])
         assert ((foreground > 0.0) == mask)[visible].mean() > 0.97
-        found = mask_of_foreground(foreground, mask)
+        found = mask_of_foreground(foreground, mask, foreground)
         # The mask of a picture is that of the window around the body.
         window = window_around(mask, mask_reach(mask) + 8)
         there, tolerant_again = known.foreground(picture, fitted_gain, window)
@@ -130,7 +130,7 @@ def test_contours_stay_where_compression_blurs_them():
         np.array([covered[0] & False, covered[0]]),
     )  # fmt: skip
     beside = cv2.dilate(covered[0].astype(np.uint8), np.ones((5, 5))).astype(bool) & ~covered[0]
-    as_is, tolerant = known.foreground(coded, gain)
+    as_is, tolerant = known.foreground(coded, gain, np.s_[:, :])
     wrong = [(one[beside] > 0.0).mean() for one in (as_is, tolerant)]
     assert wrong[1] < 0.5 * wrong[0]
     assert (tolerant[covered[0]] > 0.0).mean() > 0.95
@@ -154,5 +154,5 @@ def test_masks_lose_the_halo_of_an_encoder_and_keep_faint_parts():
     tolerant = np.where(body, 2.0, -2.0).astype(np.float32)
     # Inside, a part that looks like the background is no halo.
     tolerant[28:32, 30:50] = -2.0
-    np.testing.assert_array_equal(mask_of_foreground(as_is, body), halo)
+    np.testing.assert_array_equal(mask_of_foreground(as_is, body, as_is), halo)
     np.testing.assert_array_equal(mask_of_foreground(as_is, body, tolerant), body)

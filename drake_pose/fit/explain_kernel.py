@@ -130,13 +130,15 @@ def _sum_up(
     bottom: int,
     scratch: Words,
     side: float,
-    always_covered: float,
     totals: Array,
     tiles: Array,
+    always_covered: float = 0.3,
 ) -> None:
     """Add a body's sums to ``totals`` (4,) and ``tiles`` (t, t), and clear its words.
 
-    The other arguments are those of ``explain``, and rows and scratch of ``_cover``.
+    ``always_covered``: factor of the positive gain of pixels that the body covers in all frames,
+    whose background is unknown; a negative gain there counts 0. The other arguments are those of
+    ``explain``, and rows and scratch of ``_cover``.
     """
     words, ends, positions, one = scratch.words, scratch.ends, scratch.positions, np.uint64(1)
     zero, last, lowest = np.uint64(0), words.shape[1] - 1, words.shape[0] - 1
@@ -196,7 +198,6 @@ def explain(
     sums: PixelSums,
     side: float,
     tiles_per_side: int,
-    always_covered: float = 0.3,
 ) -> tuple[Array, Array]:
     """Score the poses of a body in all frames by sums over the pixels.
 
@@ -210,15 +211,13 @@ def explain(
         side: side of a tile in which the gain is also summed [pixel].
         tiles_per_side: t, number of tiles per row and column, to which their indices are taken
             modulo; 0: there are no tiles.
-        always_covered: factor of the positive gain of pixels that the body covers in all frames,
-            whose background is unknown; a negative gain there counts 0.
 
     Returns (4,) sums by ``Explained``, and (t, t) the gain of each tile (row, column).
     """
     totals, tiles = np.zeros(4), np.zeros((tiles_per_side, tiles_per_side))
     scratch, crossings = make_words(packed, camera)
     top, bottom, _ = _cover(packed, X_CN, is_static, camera, scratch, crossings)
-    _sum_up(X_CN.shape[0], sums, top, bottom, scratch, side, always_covered, totals, tiles)
+    _sum_up(X_CN.shape[0], sums, top, bottom, scratch, side, totals, tiles)
     return totals, tiles
 
 
@@ -234,7 +233,6 @@ def explain_pose(
     totals: Array,
     scratch: Words,
     crossings: np.ndarray,
-    always_covered: float = 0.3,
 ) -> np.ndarray:
     """Write the sums (4,) of ``explain`` for one pose of the camera into ``totals``.
 
@@ -261,7 +259,7 @@ def explain_pose(
     totals[:] = 0.0
     top, bottom, crossings = _cover(packed, X_CN, is_static, camera, scratch, crossings)
     none = np.zeros((0, 0))
-    _sum_up(frames, sums, top, bottom, scratch, 1.0, always_covered, totals, none)
+    _sum_up(frames, sums, top, bottom, scratch, 1.0, totals, none)
     return crossings
 
 

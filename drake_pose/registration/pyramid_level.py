@@ -13,7 +13,7 @@ import numpy as np
 
 from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.compiled import compiled, default_arguments
+from drake_pose.compiled import compiled
 from drake_pose.fit.background import Backgrounds
 from drake_pose.fit.explain_kernel import (
     Explained,
@@ -298,9 +298,8 @@ class PyramidLevel:
         """
         X_CN = X_CW[:3] @ (self._X_WN if X_WN is None else X_WN)
         return explain(
-            self._packed, X_CN, self._static, self._parameters, self.backgrounds.sums, 1.0, 0,
-            *default_arguments(explain),
-        )[0]  # fmt: skip
+            self._packed, X_CN, self._static, self._parameters, self.backgrounds.sums, 1.0, 0
+        )[0]
 
     def explained(self, X_CW: Array) -> tuple[float, float]:
         """Return a pose's `explained` fraction and mean `contour`, as of ``PictureFit``."""
@@ -352,7 +351,7 @@ class PyramidLevel:
         side = max(self.camera.width, self.camera.height) / squares
         _, gains = explain(
             self._packed, X_CW[:3] @ self._X_WN, self._static, self._parameters,
-            self.backgrounds.sums, side, squares, *default_arguments(explain),
+            self.backgrounds.sums, side, squares,
         )  # fmt: skip
         return gains
 

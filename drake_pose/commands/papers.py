@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from drake_pose.commands.common import (
-    SPREAD,
     Json,
     Pictures,
     Seed,
@@ -27,38 +25,15 @@ if TYPE_CHECKING:
     from drake_pose.papers.tables import Count
 
 
-@dataclass(frozen=True, kw_only=True)
-class KamedaOptions:
-    """Options of experiment A of Kameda et al."""
-
-    seed: Annotated[int | None, within(0)] = None
-    """Seed of the random poses. Default: 0."""
-    method: Literal["paper", "beam"] | None = None
-    """paper: the published search alone; beam: compare it with beam search. Default: paper."""
-    angles: Literal["grid", "continuous"] | None = None
-    """grid: true angles and samples are multiples of 20 degrees, as in the paper; continuous: true
-    angles are arbitrary, and poses are refined between the samples. Default: grid."""
-    views: Annotated[int | None, within(1)] = None
-    """With --angles continuous: number of cameras. Default: 1."""
-    out: Pictures = None
-
-    def refuse(self, needed: str, *but: str) -> None:
-        """Raise a UsageError if an option was given, because it needs another one.
-
-        Args:
-            needed: the other option, for the message.
-            but: names of the fields that may be given.
-        """
-        for field in fields(self):
-            if field.name not in but and getattr(self, field.name) is not None:
-                raise UsageError(f"--{field.name.replace('_', '-')} needs {needed}")
-
-
 def kameda(
     *,
     experiment: Literal["A", "B", "C"] = "A",
     images: Annotated[int, within(1)] = 219,
-    options: Annotated[KamedaOptions | None, SPREAD] = None,
+    seed: Annotated[int | None, within(0)] = None,
+    method: Literal["paper", "beam"] | None = None,
+    angles: Literal["grid", "continuous"] | None = None,
+    views: Annotated[int | None, within(1)] = None,
+    out: Pictures = None,
     json: Json = False,
 ) -> None:
     """Kameda, Minoh and Ikeda: poses of a woman (A), of a man in real pictures (B), of a hand (C).
@@ -72,34 +47,43 @@ def kameda(
         experiment: A: rendered silhouettes of random poses; B: six pictures of a man; C: two
             pictures of a hand.
         images: Maximum number of silhouettes.
+        seed: Seed of the random poses. Default: 0.
+        method: paper: the published search alone; beam: compare it with beam search. Default:
+            paper.
+        angles: grid: true angles and samples are multiples of 20 degrees, as in the paper;
+            continuous: true angles are arbitrary, and poses are refined between the samples.
+            Default: grid.
+        views: With --angles continuous: number of cameras. Default: 1.
     """
-    one = options or KamedaOptions()
-    is_continuous = one.angles == "continuous"
-    first = one.seed or 0
+    is_continuous = angles == "continuous"
+    needed, fit = "--angles continuous", {"seed", "method", "angles"}
     if experiment != "A":
-        one.refuse("--experiment A", "out")
+        needed, fit = "--experiment A", set()
     elif is_continuous:
-        one.refuse("--angles grid", "angles", "seed", "views")
-    elif one.views is not None:
-        raise UsageError("--views needs --angles continuous")
+        needed, fit = "--angles grid", {"seed", "angles", "views"}
+    given = {"seed": seed, "method": method, "angles": angles, "views": views}
+    for name, value in given.items():
+        if value is not None and name not in fit:
+            raise UsageError(f"--{name} needs {needed}")
+    first = seed or 0
     warnings: list[str] = []
-    with _experiment(one.out) as count:
+    with _experiment(out) as count:
         from drake_pose.papers import kameda as poses
         from drake_pose.papers.pictures import save_poses
         from drake_pose.search import MultiStartSearch
 
         if experiment != "A":
-            real = poses.run_real_experiment(experiment, images, one.out, count)
+            real = poses.run_real_experiment(experiment, images, out, count)
             figures, table = {**real["beam"], "paper_method": real["paper"]}, poses.real_table(real)
             for method, name in poses.METHODS.items():
                 warnings += [f"{name}: {text}" for text in real[method]["warnings"]]
         elif is_continuous:
             search = MultiStartSearch(poses.experiment_tree(), exact_masks=True)
-            result = poses.run_experiment(search, images, first, count, one.views or 1)
+            result = poses.run_experiment(search, images, first, count, views or 1)
             figures, table = poses.continuous_figures(result), poses.continuous_table(result)
         else:
             # For the comparison the published search runs on as many images as in the paper.
-            is_beam = one.method == "beam"
+            is_beam = method == "beam"
             few = min(images, int(poses.PAPER["images"])) if is_beam else images
             runs = [poses.run_experiment(poses.experiment_search(), few, first, count)]
             if is_beam:
@@ -108,34 +92,21 @@ def kameda(
             figures, table = poses.grid_figures(runs[-1]), poses.grid_table(runs)
             if is_beam:
                 figures["paper_method"] = poses.grid_figures(runs[0])
-            if one.out is not None:
-                save_poses(runs[-1], one.out)
+            if out is not None:
+                save_poses(runs[-1], out)
     _show(figures, [table], json, warnings)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ShimadaOptions:
-    """Options of the experiments with hands; some exclude each other."""
-
-    runs: Annotated[int | None, within(1)] = None
-    """Number of sequences for each of r_13 = 35 and 40. Default: 50, with --pictures 10."""
-    seed: Seed = 0
-    truncation: Literal["sequential", "joint", "clip", "none"] | None = None
-    """Truncation of the belief by the inequalities; sequential is the published one. Default:
-    joint, with --hypotheses sequential."""
-    iterations: Annotated[int | None, within(1)] = None
-    """Maximum number of linearisations in an update; the published filter has 1. Default: 20, with
-    --hypotheses 1."""
-    hypotheses: bool = False
-    """Run the experiment of figure 9 instead: fingers bend through the image plane. Shows which
-    hypotheses are created, and what rejects the wrong ones."""
-    pictures: bool = False
-    """Measure silhouettes drawn by Drake's renderer instead of noisy numbers."""
-    out: Pictures = None
-
-
 def shimada(
-    *, options: Annotated[ShimadaOptions | None, SPREAD] = None, json: Json = False
+    *,
+    runs: Annotated[int | None, within(1)] = None,
+    seed: Seed = 0,
+    truncation: Literal["sequential", "joint", "clip", "none"] | None = None,
+    iterations: Annotated[int | None, within(1)] = None,
+    hypotheses: bool = False,
+    pictures: bool = False,
+    out: Pictures = None,
+    json: Json = False,
 ) -> None:
     """Shimada, Shirai, Kuno and Miura: joint angles and lengths of a synthetic hand, one camera.
 
@@ -146,32 +117,39 @@ def shimada(
 
         drake-pose reproduce shimada --runs 20 --out results/shimada
         drake-pose reproduce shimada --pictures --out results/figure_17
+
+    Args:
+        runs: Number of sequences for each of r_13 = 35 and 40. Default: 50, with --pictures 10.
+        truncation: Truncation of the belief by the inequalities; sequential is the published one.
+            Default: joint, with --hypotheses sequential.
+        iterations: Maximum number of linearisations in an update; the published filter has 1.
+            Default: 20, with --hypotheses 1.
+        hypotheses: Run the experiment of figure 9 instead: fingers bend through the image plane.
+            Shows which hypotheses are created, and what rejects the wrong ones.
+        pictures: Measure silhouettes drawn by Drake's renderer instead of noisy numbers.
     """
-    one = options or ShimadaOptions()
-    if one.pictures and one.hypotheses:
+    if pictures and hypotheses:
         raise UsageError("--pictures excludes --hypotheses")
-    truncation, iterations = one.truncation, one.iterations
     warnings = []
-    with _experiment(one.out) as count:
-        from drake_pose.papers import pictures, shimada
+    with _experiment(out) as count:
+        from drake_pose.papers import shimada as hands
+        from drake_pose.papers.pictures import save_hands, save_hypotheses
         from drake_pose.papers.shimada_sequences import experiment_settings
 
-        if one.hypotheses:
+        if hypotheses:
             settings = experiment_settings(truncation or "sequential", iterations or 1)
-            hypotheses = shimada.run_hypotheses_experiment(
-                one.runs or 50, one.seed, settings, count
-            )
-            figures, table = hypotheses.as_json(), hypotheses.table()
-            if one.out is not None and not pictures.save_hypotheses(hypotheses, one.out):
+            found = hands.run_hypotheses_experiment(runs or 50, seed, settings, count)
+            figures, table = found.as_json(), found.table()
+            if out is not None and not save_hypotheses(found, out):
                 warnings = ["no wrong hypothesis was rejected by an inequality: nothing to draw"]
         else:
             settings = experiment_settings(truncation or "joint", iterations or 20)
-            observed = shimada.PICTURES if one.pictures else "lines"
-            runs = one.runs or (10 if one.pictures else 50)
-            result = shimada.run_experiment(runs, one.seed, settings, observed, count)
-            figures, table = result.as_json(), shimada.result_table(result)
-            if one.out is not None:
-                pictures.save_hands(result, one.out)
+            observed = hands.PICTURES if pictures else "lines"
+            number = runs or (10 if pictures else 50)
+            result = hands.run_experiment(number, seed, settings, observed, count)
+            figures, table = result.as_json(), hands.result_table(result)
+            if out is not None:
+                save_hands(result, out)
     _show(figures, [table], json, warnings)
 
 

@@ -54,6 +54,7 @@ from drake_pose.person.pose_tracker import (
     shape_values,
     tracker_of_person,
 )
+from drake_pose.person.search import LENIENT
 from drake_pose.person.views import shows_somebody
 from drake_pose.silhouette.pictures.masks import compare_masks
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
@@ -327,14 +328,13 @@ def capture_live(
 
 
 def _fit_first_frames(
-    scene: LiveScene, tree: PoseTree, on_report: Callable[[str], None], count: int = 40
+    scene: LiveScene, tree: PoseTree, on_report: Callable[[str], None]
 ) -> PersonShape | None:
     """Fit link lengths and radius scales to the first frames in which two cameras see somebody.
 
-    ``on_report``: gets messages about live cameras. ``count``: number of frames; fewer if
-    recordings end before, or live cameras are read for a minute. Returns the shape; None for a
-    model without shape joints. Raises SettingsError: two cameras never saw a person at the same
-    time.
+    The frames are fewer if recordings end before, or live cameras are read for a minute.
+    ``on_report``: gets messages about live cameras. Returns the shape; None for a model without
+    shape joints. Raises SettingsError: two cameras never saw a person at the same time.
     """
     if not shape_values(tree).any():
         return None
@@ -353,7 +353,7 @@ def _fit_first_frames(
             regions = {name: view.region for name, view in views.items() if shows_somebody(view)}
             if len(regions) >= 2:
                 frames.append(regions)
-        return len(frames) >= count
+        return len(frames) >= LENIENT.shape_frames
 
     look_until(builder.Build(), sensors, look, on_report)
     # Other people in view are removed from the masks.

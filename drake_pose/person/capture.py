@@ -152,16 +152,16 @@ class _Capture:
         return FrameViews(cameras, [see_silhouette(one, edge_spacing(c)) for c, one in pairs])
 
     def measure_shape(
-        self, frames: Sequence[int], first: int = 40, fitted: int = 10
+        self, frames: Sequence[int], fitted: int = 10
     ) -> tuple[PersonShape | None, dict[int, TrackState]]:
-        """Fit the shape to `fitted` of the first `first` frames, and give it to the tracker.
+        """Fit the shape to `fitted` of the first frames, and give it to the tracker.
 
         Returns the shape, and the tracker states in the fitted frames by frame; None and {} where
         the model has no shape joints.
         """
         if not self._has_shape:
             return None, {}
-        frames = frames[:first]
+        frames = frames[: self.tracker.settings.shape_frames]
         for frame in frames:
             self._kept[frame] = {
                 camera.name: (np.packbits(view.region, axis=1), view.edge)

@@ -49,6 +49,7 @@ class PersonSettings:
     lost_below: float = 0.75  # The person is lost below this fraction of the usual inlier ratio.
     memory: float = 60.0  # Number of frames over which the usual inlier ratio is averaged.
     usual_ratio: float = 0.95  # Usual inlier ratio at the start.
+    shape_frames: int = 40  # Number of first frames from which a person's shape is fitted.
     headings: int = 12  # Number of headings, evenly spread, in which a lost person is searched.
     headings_per_frame: int = 3  # Number of them in each frame of a sequence.
     limbs_per_frame: int = 2  # Number of doubtful limbs searched in each frame of a sequence.

@@ -27,7 +27,6 @@ from drake_pose.person.date.features import (
     Features,
     PersonView,
     RegisteredPose,
-    SkinColour,
     cut_face,
     find_face,
     find_features,
@@ -70,7 +69,6 @@ class CaptureSetup:
     registered: RegisteredPose | None = None
     # Background model of each camera that gives no masks, by name of the camera.
     backgrounds: Mapping[str, Background] = field(default_factory=dict)
-    skin: SkinColour = field(default_factory=SkinColour)  # Colour of the person's skin.
     # Whether elbows and knees are searched on their circles; see estimate_pose.
     search: bool = True
     # Smallest similarity at which the registered pose replaces the state.
@@ -115,20 +113,17 @@ def prepare_paper_capture(
     """
     if face_camera is not None and face_camera not in cameras:
         raise UnknownNameError("camera", face_camera, cameras, "the rig")
-    skin = SkinColour()
     ring = {name: camera for name, camera in cameras.items() if name != face_camera}
     own = load_skeleton(model)
-    views = [
-        see_person(pictures[n], person_region(pictures[n], backgrounds[n]), skin) for n in ring
-    ]
+    views = [see_person(pictures[n], person_region(pictures[n], backgrounds[n])) for n in ring]
     seen = find_features(list(ring.values()), views, own.features(q))
     places = np.where(seen.support[:, None] > 0, seen.positions, np.nan)
     skeleton = own.with_features(q, places)
     registered = render_registered_pose(skeleton, q, ring)
     if face_camera is not None and faces is None:
-        faces = learn_rendered_faces(model, own, q, skin)
+        faces = learn_rendered_faces(model, own, q)
     face = None if face_camera is None else cameras[face_camera]
-    return CaptureSetup(skeleton, ring, face, faces, registered, backgrounds, skin)
+    return CaptureSetup(skeleton, ring, face, faces, registered, backgrounds)
 
 
 def render_registered_pose(
@@ -145,9 +140,7 @@ def render_registered_pose(
     return register_pose(skeleton, q, list(cameras.values()), draw)
 
 
-def learn_rendered_faces(
-    model: ArticulatedModel, skeleton: Skeleton, q: Array, skin: SkinColour
-) -> FaceTemplates:
+def learn_rendered_faces(model: ArticulatedModel, skeleton: Skeleton, q: Array) -> FaceTemplates:
     """Return face templates from 300 rendered pictures at q (nq,); ``skeleton`` is of ``model``."""
     head = skeleton.features(q)[0]
     view, size = math.radians(11.0), (200, 200)
@@ -164,7 +157,7 @@ def learn_rendered_faces(
             posed[skeleton.head_positions] += head - skeleton.features(posed)[0]
             rig.set_positions(context, posed)
             picture = rig.picture(context, name)
-            seen = see_person(picture, rig.mask(context, name), skin)
+            seen = see_person(picture, rig.mask(context, name))
             face = cut_face(picture, seen.blobs)
             if face is not None:
                 faces.append(face)
@@ -204,14 +197,9 @@ class HorizontalImage(PersonRegion):
     Output ports:
         region: see ``PersonRegion``.
         person_view: a ``person.date.features.PersonView``; None if an image is missing.
-
-    Args:
-        skin: colour of the person's skin; None: the default.
     """
 
-    def __init__(
-        self, camera: Camera, background: Background | None = None, skin: SkinColour | None = None
-    ) -> None:
+    def __init__(self, camera: Camera, background: Background | None = None) -> None:
         super().__init__(camera, background)
         self.wanted = ("color_image",) if background is not None else ("color_image", "label_image")
 
@@ -219,7 +207,7 @@ class HorizontalImage(PersonRegion):
             picture, region = self.picture.Eval(context), self.region.Eval(context)
             if picture is None or region is None:
                 return None
-            return see_person(picture, region, skin or SkinColour())
+            return see_person(picture, region)
 
         self.add_output("person_view", None, see)
 
@@ -525,7 +513,7 @@ def build_paper_capture(
     regions = []
     for camera in [*cameras, *([] if face is None else [face])]:
         name = camera.name
-        image = HorizontalImage(camera, setup.backgrounds.get(name), setup.skin)
+        image = HorizontalImage(camera, setup.backgrounds.get(name))
         builder.AddNamedSystem(f"horizontal_image_{name}", image)
         regions.append(image.region)
         views[name] = image.GetOutputPort("person_view")

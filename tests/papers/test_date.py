@@ -15,7 +15,7 @@ from drake_pose.papers.date import (
     walk_by,
 )
 from drake_pose.papers.pictures import save_captures, save_walk
-from drake_pose.person.date.features import SkinColour, skin_blobs
+from drake_pose.person.date.features import skin_blobs
 from drake_pose.person.date.walking import (
     COMMANDS,
     MOTIONS,
@@ -100,7 +100,7 @@ class TestWalkThrough:
         )
         same = (np.abs(there.astype(int) - elsewhere) <= 8).all(axis=2)[:, 190:290]
         assert 0.1 < same.mean() < 0.9
-        assert (skin_blobs(there, np.ones(there.shape[:2], bool), SkinColour()).areas > 20).any()
+        assert (skin_blobs(there, np.ones(there.shape[:2], bool)).areas > 20).any()
 
     @pytest.mark.slow
     def test_captured_turns_last_as_long_as_the_true_ones(self, tmp_path):

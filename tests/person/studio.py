@@ -7,7 +7,6 @@ import numpy as np
 from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.models import FACE_CAMERA, circle_of_cameras
 from drake_pose.person.date.features import (
-    SkinColour,
     cut_face,
     find_features,
     learn_faces,
@@ -45,7 +44,7 @@ class Studio:
         return self.rig.mask(self.context, name)
 
     def view(self, q, name):
-        return see_person(self.picture(q, name), self.mask(q, name), SkinColour())
+        return see_person(self.picture(q, name), self.mask(q, name))
 
     def views(self, q):
         return {name: self.view(q, name) for name in self.ring}

@@ -8,7 +8,6 @@ from pydrake.trajectories import PiecewisePolynomial
 from drake_pose.camera.models import FACE_CAMERA
 from drake_pose.errors import CameraError, SettingsError, UnknownNameError
 from drake_pose.person.date.features import (
-    SkinColour,
     find_face,
     find_features,
     head_angles,
@@ -91,7 +90,7 @@ class Core:
     def step(self, pictures):
         setup = self.setup
         views = {
-            name: see_person(shot, person_region(shot, setup.backgrounds[name]), setup.skin)
+            name: see_person(shot, person_region(shot, setup.backgrounds[name]))
             for name, shot in pictures.items()
             if shot is not None
         }
@@ -275,7 +274,7 @@ class TestPreparation:
         views = {}
         for name, shot in pictures.items():
             region = person_region(shot, backgrounds[name])
-            views[f"person_view_{name}"] = see_person(shot, region, SkinColour())
+            views[f"person_view_{name}"] = see_person(shot, region)
         last = studio.skeleton.features(q)
         finder = Bench(FeatureFinder(list(ring.values()))).give(**views, last_features=last.ravel())
         assert (finder["support"] > 0).all()

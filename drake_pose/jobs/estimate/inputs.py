@@ -334,14 +334,14 @@ def read_inputs(
         truth, of_truth = _read_truth(scene_path, truth_path, model, frames)
         starts = {}
     tracked = scene.sequence and settings.track
+    few = [frame for frame in frames if scene.images and len(scene.cameras_of(frame)) < 2]
+    if few and follows_person(scene, model, replace(settings, start=None)):
+        raise SceneError(
+            f"{scene.path}: frame {frame_ranges(few, frames)} has pictures, but masks of fewer "
+            "than two cameras, and a person is captured from masks: make them (drake-pose "
+            "masks), or leave these frames out (--frame)"
+        )
     if follows_person(scene, model, settings):
-        few = [frame for frame in frames if scene.images and len(scene.cameras_of(frame)) < 2]
-        if few:
-            raise SceneError(
-                f"{scene.path}: frame {frame_ranges(few, frames)} has pictures, but masks of fewer "
-                "than two cameras, and a person is captured from masks: make them (drake-pose "
-                "masks), or leave these frames out (--frame)"
-            )
         upright = check_upright(scene.cameras.values())
         warnings = (*scene.warnings, *of_truth, *upright, *model.warnings)
         scene = replace(scene, images={})

@@ -305,7 +305,6 @@ def check_track(
     inputs: EstimateInputs,
     search: PoseSearch,
     records: Mapping[str, FrameRecord],
-    elsewhere: float = 0.2,
 ) -> list[str]:
     """Return a warning if the track follows a wrong pose, otherwise [].
 
@@ -316,7 +315,6 @@ def check_track(
         inputs: the inputs.
         search: the search.
         records: estimates by frame.
-        elsewhere: minimum difference of a joint to be named in the warning [rad or m].
     """
     searched, tracked = list[float](), dict[str, float]()
     for frame, one in records.items():
@@ -336,8 +334,8 @@ def check_track(
         return []
     model, q = inputs.model, records[worst].q
     off = nearest_turn(found.q, q, model.periodic) - q
-    joints = [model.position_names[k] for k in np.flatnonzero(np.abs(off) > elsewhere)]
-    where = f", with other positions of {listed(joints)}" if joints else ""
+    far = np.flatnonzero(np.abs(off) > 0.5 * np.abs(off).max())
+    where = f", with other positions of {listed([model.position_names[k] for k in far])}"
     return [
         f"frame '{worst}': E_total is {percent(tracked[worst])} by tracking, but "
         f"{percent(found.E_total)} by a search{where}: its pose is wrong, and those of other "

@@ -49,6 +49,9 @@ class SkinColour:
     darkest: float = 30.0  # Lowest brightness Y, 0 to 255: chroma is unreliable in the dark.
 
 
+SKIN = SkinColour()
+
+
 @dataclass(frozen=True, eq=False)
 class Blobs:
     """Skin-coloured blobs of one picture, the largest first."""
@@ -59,20 +62,18 @@ class Blobs:
     mask: Mask  # (H, W) pixels of the blobs.
 
 
-def skin_blobs(
-    picture: Picture, region: Mask, colour: SkinColour, min_area: int = 12, max_count: int = 12
-) -> Blobs:
+def skin_blobs(picture: Picture, region: Mask, min_area: int = 12, max_count: int = 12) -> Blobs:
     """Find skin-coloured blobs of a picture (H, W, 3) in the person's region (H, W) (3.1.1).
 
-    ``colour``: range of skin colours. ``min_area``: least area of a blob [pixel^2]. ``max_count``:
+    ``min_area``: least area of a blob [pixel^2]. ``max_count``:
     largest number of blobs; the largest blobs are kept.
     """
     # The bounding box of an empty region is empty; one pixel keeps OpenCV's functions working.
     left, top, width, height = cv2.boundingRect(np.ascontiguousarray(region).view(np.uint8))
     part = slice(top, top + max(height, 1)), slice(left, left + max(width, 1))
     chroma = cv2.cvtColor(np.ascontiguousarray(picture[part]), cv2.COLOR_RGB2YCrCb)
-    low = (colour.darkest, colour.red[0], colour.blue[0])
-    inner = (cv2.inRange(chroma, low, (255.0, colour.red[1], colour.blue[1])) > 0) & region[part]
+    low = (SKIN.darkest, SKIN.red[0], SKIN.blue[0])
+    inner = (cv2.inRange(chroma, low, (255.0, SKIN.red[1], SKIN.blue[1])) > 0) & region[part]
     joined = cv2.morphologyEx(inner.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     count, labels, statistics, middles = cv2.connectedComponentsWithStats(joined, connectivity=8)
     order = np.argsort(-statistics[1:, cv2.CC_STAT_AREA], kind="stable")[:max_count] + 1
@@ -100,14 +101,14 @@ class PersonView:
     contour: Contour | None
 
 
-def see_person(picture: Picture, region: Mask, skin: SkinColour) -> PersonView:
+def see_person(picture: Picture, region: Mask) -> PersonView:
     """Find skin and contour of the person's region (H, W) in one camera's picture (H, W, 3).
 
     Raises SettingsError: the region has another size than the picture.
     """
     if region.shape != picture.shape[:2]:
         raise SettingsError(f"the region is {region.shape}, but the picture {picture.shape}")
-    return PersonView(region, skin_blobs(picture, region, skin), measure_contour(region))
+    return PersonView(region, skin_blobs(picture, region), measure_contour(region))
 
 
 def measure_contour(region: Mask) -> Contour | None:
@@ -450,7 +451,7 @@ def learn_recorded_faces(folder: Path) -> FaceTemplates:
     for name in table:
         picture = read_picture(folder / name, SceneError)
         region = np.ones(picture.shape[:2], dtype=np.bool_)
-        face = cut_face(picture, skin_blobs(picture, region, SkinColour()))
+        face = cut_face(picture, skin_blobs(picture, region))
         if face is None:
             raise SceneError(
                 f"{folder / name}: no face: nothing in it has the colour of skin, or the largest "

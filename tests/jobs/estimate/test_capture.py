@@ -227,8 +227,9 @@ def test_pictures_with_few_masks_are_refused(own_recording: PersonScene) -> None
         shutil.copy(mask, picture)
         if mask.stem != "0000" and mask.parent.name != "camera_0":
             mask.unlink()
-    with pytest.raises(SceneError, match=r"frame 0001-0002 has pictures, but masks of fewer"):
-        estimate_scene(folder, own_recording.person.path)
+    for settings in (EstimateSettings(), EstimateSettings(start=folder / "start.csv")):
+        with pytest.raises(SceneError, match=r"frame 0001-0002 has pictures, but masks of fewer"):
+            estimate_scene(folder, own_recording.person.path, None, settings)
 
 
 def test_scenes_and_options_unfit_for_the_method_person_are_refused(

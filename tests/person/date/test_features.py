@@ -12,7 +12,6 @@ from drake_pose.errors import SceneError, SettingsError
 from drake_pose.person.date.features import (
     Blobs,
     PersonView,
-    SkinColour,
     cut_face,
     find_face,
     find_features,
@@ -50,7 +49,7 @@ class TestSkin:
         discs = [disc((120, 160), (40.0, 30.0), 12), disc((120, 160), (110.0, 80.0), 6)]
         for d in discs:
             picture[d] = np.array(SKIN) * shade
-        blobs = skin_blobs(picture, np.ones((120, 160), bool), SkinColour())
+        blobs = skin_blobs(picture, np.ones((120, 160), bool))
         np.testing.assert_allclose(blobs.centroids, [[40, 30], [110, 80]], atol=0.2)
         assert blobs.areas.tolist() == [d.sum() for d in discs]
         assert blobs.boxes[0].tolist() == [28, 18, 25, 25]
@@ -62,8 +61,8 @@ class TestSkin:
         picture[60:63, 60:63] = SKIN
         region = np.ones((120, 160), bool)
         region[:, :60] = False
-        assert not len(skin_blobs(picture, region, SkinColour()).areas)
-        assert not len(skin_blobs(picture, np.zeros_like(region), SkinColour()).areas)
+        assert not len(skin_blobs(picture, region).areas)
+        assert not len(skin_blobs(picture, np.zeros_like(region)).areas)
 
 
 class TestRays:
@@ -241,7 +240,7 @@ class TestFaces:
             picture, _ = studio.face(q)
             noisy = np.clip(picture + generator.normal(0, 3, picture.shape), 0, 255)
             noisy = noisy.astype(np.uint8)
-            blobs = skin_blobs(noisy, studio.mask(q, FACE_CAMERA), SkinColour())
+            blobs = skin_blobs(noisy, studio.mask(q, FACE_CAMERA))
             nearest, _ = nearest_template(cut_face(noisy, blobs), templates)
             # Turn about the vertical, then nod.
             ways = Rotation.from_euler("ZY", [direction, templates.directions[nearest]])
@@ -265,7 +264,7 @@ class TestFaces:
         )
         patches = np.zeros((240, 320, 3), np.uint8)
         patches[50:180:20, 60:140] = patches[40:180, 60:140:20] = SKIN
-        blobs = skin_blobs(patches, np.ones((240, 320), bool), SkinColour())
+        blobs = skin_blobs(patches, np.ones((240, 320), bool))
         assert np.isnan(find_face(patches, blobs, templates, 30.0)).all()
 
     def test_eigenspace_is_that_of_a_singular_value_decomposition(self):
@@ -279,9 +278,9 @@ class TestFaces:
     def test_missing_or_cut_off_faces_and_too_few_templates_are_refused(self):
         picture = np.zeros((50, 60, 3), np.uint8)
         region = np.ones((50, 60), bool)
-        assert cut_face(picture, skin_blobs(picture, region, SkinColour())) is None
+        assert cut_face(picture, skin_blobs(picture, region)) is None
         picture[0:20, 10:30] = SKIN
-        assert cut_face(picture, skin_blobs(picture, region, SkinColour())) is None
+        assert cut_face(picture, skin_blobs(picture, region)) is None
         with pytest.raises(SettingsError, match="three faces"):
             learn_faces([np.zeros((130, 80, 3), np.uint8)] * 2, np.zeros((2, 2)))
 

@@ -42,7 +42,6 @@ Replay = Annotated[bool, Parameter(negative="--no-replay", help="Write replay.ht
 Overlay = Annotated[
     bool, Parameter(negative="--no-overlay", help="Write overlay/<camera>/<frame>.png.")
 ]
-Browser = Annotated[bool, Parameter(negative="--no-browser", help="Open the page in a browser.")]
 Json = Annotated[bool, Parameter(help="Print the result as JSON.")]
 Truth = Annotated[
     Path | None,

@@ -149,20 +149,12 @@ def parse_packages(texts: Iterable[str]) -> dict[str, Path]:
     return folders
 
 
-def parse_numbers(text: str, count: int) -> tuple[float, ...]:
-    """Return the ``count`` numbers of a text ``A,B,...``."""
-    parts = text.split(",")
-    if len(parts) != count:
-        raise SettingsError(f"'{text}' must be {count} numbers separated by commas")
-    return tuple(map(parse_number, parts))
-
-
 def parse_root_position(text: str) -> Corner | tuple[Path, str] | Literal["unknown"]:
     """Return a position ``X,Y,Z`` [m], the file and joint of ``FILE.csv:JOINT``, or ``unknown``."""
     if text == "unknown":
         return "unknown"
     if text.count(",") == 2:
-        x, y, z = parse_numbers(text, 3)
+        x, y, z = map(parse_number, text.split(","))
         return x, y, z
     file, colon, joint = text.rpartition(":")
     if not (colon and file and joint):

@@ -79,8 +79,6 @@ class ContourSettings:
     correlation: float = 12.0
     reach: float = 40.0  # Largest distance between the model's contour and a mask's edge [pixel].
     robust_width: float = 2.5  # Scale of the Geman-McClure weight [standard deviations].
-    # Directions of the state with less than this fraction of the largest information are dropped.
-    negligible: float = 1e-12
 
 
 CONTOUR = ContourSettings()
@@ -516,7 +514,8 @@ class ContourObservation:
         slopes = weight * g[index] + prior_curvature @ x[self._state_index] - prior_slope
         curvature = weight * H[np.ix_(index, index)] + prior_curvature
         size, turns = np.linalg.eigh(curvature)
-        observable = size > CONTOUR.negligible * max(float(size[-1]), 1e-300)
+        # Directions whose information is zero up to rounding are dropped.
+        observable = size > max(float(size[-1]), 1e-300) * len(size) * np.finfo(np.float64).eps
         root, turns = np.sqrt(size[observable]), turns[:, observable]
         slope = np.zeros((len(root), len(self.layout)))
         slope[:, self._state_index] = root[:, None] * turns.T

@@ -56,8 +56,8 @@ class TrackingSettings:
         standstill: a frame's iteration ends when the pose changes by less [rad, m].
         first_rounds: factor on ``rounds`` in the first two frames with masks, when rates are
             unknown.
-        start_angle, start_length, start_log_scale: standard deviations at the start of angles
-            [rad], of the root's position and other lengths [m], and of the log scale.
+        start_deviation: standard deviation at the start of angles [rad], of the root's position and
+            other lengths [m], and of the log scale.
         lost_distance: a track is lost if the distance of its contour from the edges is larger
             [pixel].
         lost_inlier_ratio: a track is lost if a smaller fraction of its contour has an edge nearby.
@@ -83,9 +83,7 @@ class TrackingSettings:
     rest_time: float | None = None
     standstill: float = 1e-3
     first_rounds: int = 4
-    start_angle: float = 0.2
-    start_length: float = 0.03
-    start_log_scale: float = 0.1
+    start_deviation: float = 0.2
     lost_distance: float = 12.0
     lost_inlier_ratio: float = 0.6
     lost_colour_distance: float = 1.5
@@ -156,16 +154,11 @@ class ContourTracker:
 
     def acceleration(self, name: str) -> float:
         """Return the acceleration's standard deviation of ``name``, in its unit or 1 per s^2."""
-        s = self.settings
-        return self._of_kind(
-            name, s.log_scale_acceleration, s.angle_acceleration, s.length_acceleration
-        )
-
-    def _of_kind(self, name: str, log_scale: float, angle: float, length: float) -> float:
-        """Return ``log_scale``, ``angle`` or ``length``, whichever the element ``name`` is."""
+        settings = self.settings
         if name == LOG_SCALE:
-            return log_scale
-        return angle if self.observation.is_angle(name) else length
+            return settings.log_scale_acceleration
+        is_angle = self.observation.is_angle(name)
+        return settings.angle_acceleration if is_angle else settings.length_acceleration
 
     def start(self, x: Array) -> Track:
         """Return the track that starts at x (n,) with ``start_belief``, truncated by the limits."""
@@ -173,14 +166,11 @@ class ContourTracker:
 
     def start_belief(self, x: Array) -> Belief:
         """Return the initial belief with mean x (n,), before limits and measurements."""
-        layout, settings = self.observation.layout, self.settings
-        starts = (settings.start_log_scale, settings.start_angle, settings.start_length)
+        moving = self.observation.layout.moving
         # Standard deviation of a rate [unit/step] that accelerates during ``memory``.
         picked_up = self.settings.memory * self._period
-        deviations = [
-            *(self._of_kind(name, *starts) for name in layout.moving),
-            *(picked_up * self.acceleration(name) for name in layout.moving),
-        ]
+        rates = [picked_up * self.acceleration(name) for name in moving]
+        deviations = [*[self.settings.start_deviation] * len(moving), *rates]
         return Belief(x, np.diag(np.square(deviations)))
 
     def follow(

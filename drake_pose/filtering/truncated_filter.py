@@ -72,7 +72,7 @@ class Rejection:
 
     step: int  # Number of the step.
     hypothesis: Hypothesis  # As it was then; for "constraint" with the belief before truncation.
-    reason: str  # "constraint", "weight", "twin" (a duplicate) or "cap".
+    reason: str  # "constraint", "twin" (a duplicate) or "cap".
     row: str = ""  # Text of the violated inequality, for "constraint".
     # Margin c_k (24) of the mean from this inequality [standard deviations], for "constraint".
     c: float = math.nan
@@ -117,21 +117,14 @@ def merge_duplicates(
 
 
 def prune(
-    hypotheses: Sequence[Hypothesis], cap: int, smallest_weight: float, step: int
+    hypotheses: Sequence[Hypothesis], cap: int, step: int
 ) -> tuple[list[Hypothesis], list[Rejection]]:
-    """Return at most ``cap`` hypotheses, the heaviest, of at least ``smallest_weight``.
+    """Return at most ``cap`` hypotheses, the heaviest, and the rejections.
 
-    The heaviest is always kept. Also return the rejections. Weights that are kept sum to 1.
-    ``step``: number of the step, for the rejections.
+    Weights that are kept sum to 1. ``step``: number of the step, for the rejections.
     """
     ordered = normalise(hypotheses)
-    kept = [h for h in ordered[1:cap] if h.weight >= smallest_weight]
-    rejected = [
-        Rejection(step, h, "weight" if h.weight < smallest_weight else "cap")
-        for place, h in enumerate(ordered)
-        if place and h not in kept
-    ]
-    return normalise([ordered[0], *kept]), rejected
+    return normalise(ordered[:cap]), [Rejection(step, h, "cap") for h in ordered[cap:]]
 
 
 Truncation = Literal["joint", "sequential", "clip", "none"]
@@ -161,12 +154,10 @@ class FilterSettings:
         persistence: correlation time of the linearisation error of a measurement, so that frames in
             this time do not average it away [s]; for "spread".
         hypothesis_cap: largest number of hypotheses; 1: only the best.
-        smallest_weight: hypotheses with a smaller weight are removed.
         novelty: p-value below which a measurement differs from the first of its static view and
             begins a new one, for example 1e-9; see ``views``. 0: each frame is a new view, as in
             the paper, and always with "sequential" and "clip".
         twin_distance: hypotheses closer than this in all elements are merged [standard deviations].
-        tolerance: of the joint truncation [standard deviations].
         rough_iterations: largest number of linearisations for rough states, and smallest for
             mirrored hypotheses with "spread".
         rejected_below: a hypothesis with a smaller c_k (24) of any row is removed [standard
@@ -181,10 +172,8 @@ class FilterSettings:
     iterations: int = 1
     persistence: float = 0.15
     hypothesis_cap: int = 4
-    smallest_weight: float = 1e-4
     novelty: float = 0.0
     twin_distance: float = 0.3
-    tolerance: float = 1e-3
     rough_iterations: int = 3
     rejected_below: float = -4.0
 
@@ -196,8 +185,6 @@ class FilterSettings:
             raise SettingsError(f"persistence must be 0 or more, not {self.persistence}")
         if not 0 <= self.novelty < 1:
             raise SettingsError(f"novelty must be in [0, 1), not {self.novelty}")
-        if not 0 <= self.smallest_weight < 1:
-            raise SettingsError(f"smallest_weight must be in [0, 1), not {self.smallest_weight}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -405,7 +392,7 @@ class TruncatedFilter:
         ]
         leader = max(range(len(finished)), key=lambda i: finished[i].log_weight)
         merged, twins = merge_duplicates(normalise(finished), self.settings.twin_distance, step)
-        kept, pruned = prune(merged, settings.hypothesis_cap, settings.smallest_weight, step)
+        kept, pruned = prune(merged, settings.hypothesis_cap, step)
         best = alive[leader][1]
         return FilterState(
             step, tuple(kept), (*rejected, *twins, *pruned), best.distance, best.count, view
@@ -533,4 +520,4 @@ class TruncatedFilter:
             return truncate_sequential(belief, self.inequalities)
         if self.settings.truncation == "clip":
             return clip(belief, self.inequalities)
-        return truncate_joint(belief, self._rows, self.settings.tolerance, sites)
+        return truncate_joint(belief, self._rows, start=sites)

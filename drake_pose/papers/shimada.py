@@ -360,7 +360,6 @@ class HypothesesResult:
         return {
             "mirrored": len(self.histories) - len(self.sequences),
             "became_another": counts["twin"],
-            "too_light": counts["weight"],
             "too_many": counts["cap"],
             "alive_at_the_end": counts[""],
             "rejected_by_an_inequality": len(rejected),
@@ -380,7 +379,6 @@ class HypothesesResult:
             "mirrored": ("made by mirroring", "{}"),
             "became_another": ("dropped as equal to another", "{}"),
             "too_many": ("dropped as more than eight", "{}"),
-            "too_light": ("dropped for a small weight", "{}"),
             "alive_at_the_end": ("alive at the end", "{}"),
             "rejected_by_an_inequality": ("rejected by an inequality", "{}"),
             "rejected_later_than_made": ("  of these valid for a frame or more", "{}"),
@@ -406,12 +404,11 @@ def run_hypotheses_experiment(
 
     In figure 9 the depth of a third segment is ambiguous in frame 18, and the wrong hypothesis is
     rejected in frame 20. The motion is that of ``run_experiment``, with the fingers pointing out of
-    the image plane, and lines are observed. Weights, which the paper does not have, reject nothing
-    here. Arguments and errors are those of ``run_experiment``.
+    the image plane, and lines are observed. Arguments and errors are those of ``run_experiment``.
     """
     require_at_least(1, runs=runs)
     # A hypothesis ends only by an inequality, by being equal to another, or as one of more than 8.
-    settings = replace(settings, hypothesis_cap=8, smallest_weight=0.0)
+    settings = replace(settings, hypothesis_cap=8)
     hand_filter, observation = experiment_filter(settings)
     advance = count("sequences", runs)
     histories: list[HypothesisHistory] = []

@@ -52,8 +52,6 @@ class ExactSearchSettings:
     hopeless_fraction: float = 0.017
     exact: float = 0.18  # A pose with a smaller J is the answer.
     plausible: float = 0.5  # Above this J the pose of the robust fit is the answer.
-    # Two grids agree if the ratio of their Js is smaller: the model itself does not fit.
-    agreement: float = 1.1
     same: float = 0.1  # Poses are equal if no value differs by more [rad or m].
     # Ratio of the actual standard deviation to that of statistically independent distances.
     noise_factor: float = 1.4
@@ -110,10 +108,8 @@ class ExactSearch:
             found = self._descend(problem, poses, deadline)
             if found is None:
                 return None
-            pair = [*([reached] if reached else []), found]
-            reached, worse = min(pair, key=lambda one: one.J), max(one.J for one in pair)
-            agree = len(pair) > 1 and worse <= settings.agreement * reached.J
-            if reached.J <= settings.exact * length or agree:
+            reached = min((one for one in (reached, found) if one), key=lambda one: one.J)
+            if reached.J <= settings.exact * length:
                 break
         if reached is None:
             return None

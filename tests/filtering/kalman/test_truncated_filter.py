@@ -250,7 +250,6 @@ def test_transition_and_process_noise_of_constant_velocity():
         ),
         (lambda: make_filter(truncation="x"), "truncation"),
         (lambda: make_filter(iterations=0), "iterations"),
-        (lambda: make_filter(smallest_weight=1.0), "smallest_weight"),
         (lambda: make_filter(novelty=1.0), "novelty"),
         (lambda: LAYOUT.process_noise({"angle": -1.0}), "'angle'"),
         (lambda: LAYOUT.process_noise({}), "'angle'"),

@@ -30,10 +30,10 @@ GONE = {
     "masks --model": "take the masks of a segmentation network, or paint them",
     "undistort": "use cv2.undistort, as tutorials/commands.md shows",
     "walk": "use the system Walker in a diagram, as tutorials/people.md shows",
-    "capture --shape": "lengths and radii are fitted to the first frames of each capture",
+    "capture --shape": "leave it out; lengths and radii are fitted to the first frames",
     "--suggest": "the warning of several poses names the joint that tells them apart best",
     "--keep-out": "the warning of several poses names the joint that tells them apart best",
-    "capture --start": "a person is captured from masks of every frame",
+    "capture --start": "give masks of every frame, from which a person is captured",
     "reproduce all": "run reproduce kameda, shimada and date; tutorials/figures.md has the results",
     "reproduce --seeds": "run the command with several --seed",
     "reproduce --outside-limit": "use drake_pose.search.PaperSearch in Python",
@@ -44,7 +44,7 @@ GONE = {
     "reproduce --acceleration": "the filter is the one that tutorials/figures.md reports",
     "reproduce --sequence": "use drake-pose estimate, which tracks a recorded hand",
     "--export rerun": "log what drake_pose.load_cameras reads by rerun's own package",
-    "capture --tolerance": "pictures half a period apart are of one time",
+    "capture --tolerance": "correct the time stamps; pictures half a period apart are of one time",
 }
 """What to use instead of commands, their options ("--name", "command --name") and values ("--name
 value") that are gone.

@@ -20,7 +20,6 @@ from drake_pose.silhouette.pictures.label_renderer import LabelRenderer, mask_to
 from drake_pose.silhouette.pictures.scenes import load_scene
 from drake_pose.systems.cameras import MaskPlayer
 from drake_pose.systems.diagrams import (
-    _depth_range,
     build_recorded_matching,
     build_simulated_matching,
 )
@@ -64,24 +63,6 @@ def test_poses_rendered_by_drake_are_found(chain, camera):
     errors = built.error_log.FindLog(context).data()[0]
     assert np.isinf(errors[0])
     assert (errors[1:4] < 0.02).all()
-
-
-def test_the_depth_range_covers_the_whole_motion_tightly(tmp_path):
-    """For a body that slides towards a camera and back."""
-    model = load_body(
-        tmp_path,
-        box_link("sled", 10, 10),
-        joint("slide", "prismatic", "world", "sled", (-2.0, 2.0), axis="1 0 0"),
-    )
-    camera, times = front_camera(), np.linspace(0.0, 1.0, 9)
-    way = PiecewisePolynomial.FirstOrderHold(times, 2.0 * np.sin(2.0 * np.pi * times)[None])
-    near, far = _depth_range(camera, model, way)
-    corners = model.link_meshes["sled"].vertices
-    shifts = [[way.value(t)[0, 0], 0.0, 0.0] for t in np.linspace(0.0, 1.0, 401)]
-    depths = camera.project((corners + np.array(shifts)[:, None]).reshape(-1, 3))[1]
-    assert np.ptp(depths) > 3.9
-    for out in (depths.min() - near, far - depths.max()):
-        assert 0.5 <= out < 1.0
 
 
 def test_one_camera_of_two_is_enough(chain):

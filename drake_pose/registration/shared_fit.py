@@ -21,6 +21,7 @@ from drake_pose.arrays import Array, Mask
 from drake_pose.body import TARGET_POSITIONS
 from drake_pose.body.tree_kinematics import LinkVector
 from drake_pose.camera.models import PinholeCamera
+from drake_pose.fit.contour_fit import Comparison
 from drake_pose.fit.covariance import (
     Distances,
     ErrorSizes,
@@ -255,32 +256,24 @@ class SharedFit:
 
     def inlier_ratios(self, found: SharedValues) -> Array:
         """Return the inlier ratio (rows,) of each mask: the fraction of both contours that fits."""
-
-        def ratio(mask: tuple[Observation, Array]) -> float:
-            return self.problem.compare(*mask, SHARED.inlier_stage)[0].inlier_ratio
-
-        masks = zip(self._observations, self._parameters(found), strict=True)
-        return np.array(map_ordered(ratio, masks))
+        return np.array([one.inlier_ratio for one in self._compared(found, SHARED.inlier_stage)])
 
     def matched_lengths(self, found: SharedValues) -> Array:
         """Return (nodes, 2) the length of contours in all masks, and how much fits [pixel]."""
-
-        def lengths(mask: tuple[Observation, Array]) -> Array:
-            sums = self.problem.compare(*mask, SHARED.inlier_stage)[0].sums
-            return np.asarray(sums[:, :-1, [Sum.COMPARED, Sum.FITTING]].sum(axis=0))
-
-        masks = zip(self._observations, self._parameters(found), strict=True)
-        return np.sum(map_ordered(lengths, masks), axis=0)
+        sums = [one.sums for one in self._compared(found, SHARED.inlier_stage)]
+        return np.sum(
+            [own[:, :-1, [Sum.COMPARED, Sum.FITTING]].sum(axis=0) for own in sums], axis=0
+        )
 
     def costs(self, found: SharedValues) -> Array:
         """Return the cost (rows,) of each mask's contours, without priors, at the final stage."""
+        compared = self._compared(found, SHARED.final_stage)
+        return np.array([float(one.sums[..., Sum.COST].sum()) for one in compared])
 
-        def cost(mask: tuple[Observation, Array]) -> float:
-            sums = self.problem.compare(*mask, SHARED.final_stage)[0].sums
-            return float(sums[..., Sum.COST].sum())
-
+    def _compared(self, found: SharedValues, stage: AnnealingStage) -> list[Comparison]:
+        """Return the comparison of each mask's contours with the body's at a stage."""
         masks = zip(self._observations, self._parameters(found), strict=True)
-        return np.array(map_ordered(cost, masks))
+        return map_ordered(lambda mask: self.problem.compare(*mask, stage)[0], masks)
 
     def inliers(self, ratios: Array) -> Mask:
         """Return which masks (rows,) reach their camera's `inlier_threshold`, by inlier ratio."""

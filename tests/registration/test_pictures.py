@@ -47,7 +47,6 @@ from drake_pose.registration.recording import (
     posed_pictures,
     scan_time_offsets,
 )
-from drake_pose.registration.standing_object import require_detections
 from tests.benchmarks.registration import pose_error
 from tests.camera.recordings import write_pictures
 from tests.registration.arm_pictures import errors
@@ -166,25 +165,6 @@ def test_tile_gains_sum_to_the_gain(level: PyramidLevel, episode) -> None:
     v, u = np.unravel_index(pieces.argmax(), pieces.shape)
     covered = level.backgrounds.changed_frames()[5 * v : 5 * v + 5, 5 * u : 5 * u + 5]
     assert covered.mean() > level.backgrounds.changed_frames().mean()
-
-
-def test_distinct_poses_are_apart(level: PyramidLevel, episode) -> None:
-    rng = np.random.default_rng(5)
-    true = episode.camera.X_CW
-    poses = [level.moved(true, rng.normal(0.0, 0.03, 6)) for _ in range(30)]
-    points = level._points[:: max(1, len(level._points) // 50)]
-
-    def apart(one: np.ndarray, other: np.ndarray) -> float:
-        p = (points @ X[:3, :3].T + X[:3, 3] for X in (one, other))
-        return float(np.linalg.norm(np.subtract(*p), axis=1).mean() / level._size)
-
-    expected: list[np.ndarray] = []
-    for X in poses:
-        if all(apart(X, one) > 0.08 for one in expected):
-            expected.append(X)
-    assert 5 < len(expected) < 30
-    np.testing.assert_array_equal(level.distinct(poses), expected)
-    np.testing.assert_array_equal(level.distinct(poses, 3), expected[:3])
 
 
 def test_search_frames_are_slow_and_the_fastest_are_added(episode, recording) -> None:
@@ -392,12 +372,6 @@ def test_pictures_are_evaluated_with_the_registered_camera(registered, episode) 
     behind = registered.found.camera.with_pose(registered.found.camera.X_WC @ away)
     nothing = evaluate_pictures(episode.body, one, replace(registered.found, camera=behind))
     assert nothing == ((), (), ())
-
-
-@pytest.mark.parametrize(("count", "of", "enough"), [(3, 4, False), (4, 8, True), (4, 9, False)])
-def test_a_target_must_be_detected_in_four_pictures_and_half_of_them(count, of, enough) -> None:
-    with nullcontext() if enough else pytest.raises(RegistrationError, match=f"{count} of {of}"):
-        require_detections("hand", count, of)
 
 
 def near(camera, degrees=2.0):

@@ -15,7 +15,7 @@ from drake_pose.files.folder import OVERLAY, REPORT, write_file
 from drake_pose.files.overlay import draw_shapes, encode_png
 from drake_pose.files.report_page import overlay_picture, page_template
 from drake_pose.jobs.registration.inputs import RegistrationInputs
-from drake_pose.jobs.registration.result import AS_GIVEN, body_drawer
+from drake_pose.jobs.registration.result import AS_GIVEN, NORMAL, body_drawer
 from drake_pose.registration.findings import Diagnosis, Finding
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 
@@ -113,13 +113,13 @@ def detectable_offset(offset: float, kind: str) -> str:
     return f"{offset:.1f} deg" if kind == "angle" else f"{1e3 * offset:.1f} mm"
 
 
-def correction_row(finding: Mapping[str, Any], normal: float = 1.96) -> dict[str, Any]:
+def correction_row(finding: Mapping[str, Any]) -> dict[str, Any]:
     """Return an entry of ``findings`` of summary.json, with ``parts`` for the page's tables.
 
     Each part has two texts: an angle or a shift with a known standard deviation, and its 95 %
     interval.
 
-    finding: the entry. normal: half-width of an interval [standard deviations].
+    finding: the entry.
     """
     parts = []
     for key in (key for key in finding if key.startswith(("angle_deg", "shift_"))):
@@ -129,7 +129,7 @@ def correction_row(finding: Mapping[str, Any], normal: float = 1.96) -> dict[str
         if not deviation or not np.isfinite(deviation):
             continue
         value, unit = finding[key], unit.replace("percent", "%")
-        low, high = value - normal * deviation, value + normal * deviation
+        low, high = value - NORMAL * deviation, value + NORMAL * deviation
         parts.append((f"{value:+z.2f} {unit}", f"{low:+z.2f} to {high:+z.2f} {unit}"))
     return {**finding, "parts": parts}
 

@@ -142,9 +142,9 @@ class SceneComparison:
         now = self._correct(given, most)
         if now.is_doubtful:
             # Corrections that leave most frames unexplained are dropped.
-            placed = self._search_cameras(given)
+            placed = None if inputs.recordings else self._compare_registered(given.cameras)
             now = given if placed is None else self._correct(placed, most)
-        if now.is_doubtful and not self._inputs.recordings:
+        if now.is_doubtful and not inputs.recordings:
             shift = shift_correction(self.body, given.cameras, self._sample)
             if shift is not None:
                 now = self._record(given, self._compare(shift.cameras, (shift,)), shift)
@@ -164,13 +164,21 @@ class SceneComparison:
             reread = self._compare(correction.cameras, (correction,))
             if not reread.is_doubtful:
                 return replace(reread, findings=(finding,), warnings=(f"as given, {why}",))
-        placed = self._register(self._sample, given)
-        cameras = [placed[one.name][0].camera if one.name in placed else one for one in given]
-        findings = tuple(off for _, off in placed.values())
-        now = self._compare(cameras, ()) if placed else None
+        now = self._compare_registered(given)
         if now is None or now.is_doubtful:
             return None
-        return replace(now, findings=findings, warnings=(f"as given, {why}",))
+        return replace(now, warnings=(f"as given, {why}",))
+
+    def _compare_registered(self, given: Sequence[Camera]) -> SceneFit | None:
+        """Return the fit with cameras registered where they differ from their given poses.
+
+        The differences are its findings. None: no camera differs.
+        """
+        placed = self._register(self._sample, given)
+        if not placed:
+            return None
+        cameras = [placed[one.name][0].camera if one.name in placed else one for one in given]
+        return replace(self._compare(cameras, ()), findings=tuple(k for _, k in placed.values()))
 
     def _correct(self, now: SceneFit, most: int) -> SceneFit:
         """Return the fit with up to `most` more corrections, which its findings record."""
@@ -414,20 +422,6 @@ class SceneComparison:
         group = [camera.name for camera in now.cameras if f"'{camera.name}'" in lens.name]
         return focal_correction(now.cameras, group, lens.name, 1.0 + lens.shift)
 
-    def _search_cameras(self, now: SceneFit) -> SceneFit | None:
-        """Return the fit with cameras registered where they differ from their poses, as findings.
-
-        None: none differs, or the cameras were registered from pictures before.
-        """
-        if self._inputs.recordings:
-            return None
-        placed = self._register([now.corrected(frame) for frame in self._sample], now.cameras)
-        if not placed:
-            return None
-        cameras = [placed[one.name][0].camera if one.name in placed else one for one in now.cameras]
-        again = self._compare(cameras, now.corrections)
-        return replace(again, findings=(*now.findings, *(one for _, one in placed.values())))
-
     def _search(
         self,
         cameras: Sequence[Camera],
@@ -525,16 +519,8 @@ class SceneComparison:
         elif abs(correction.amount) > 1e-9:
             text += f"; to the reversed column add {factor * correction.amount:.0f} {unit}"
         angle, shift = (float(sizes.max()), 0.0) if turns else (0.0, float(sizes.max()))
-        return replace(off, link=self._link(correction.name), text=text, angle=angle, shift=shift)
-
-    def _link(self, joint: str) -> str:
-        """Return the name of the first link that a joint moves; "" if it moves none."""
-        tree, kinematics = self.body.tree, self.body.kinematics
-        values = kinematics.flatten(tree.default_values())
-        other_values = values.copy()
-        other_values[kinematics.names.index(joint)] += 0.1
-        motion = np.abs(kinematics.poses(other_values) - kinematics.poses(values)).max(axis=(1, 2))
-        return next((tree.nodes[k].name for k in np.flatnonzero(motion > 1e-9)), "")
+        link = self.body.tree.nodes[self.body.kinematics.value_nodes[j]].name
+        return replace(off, link=link, text=text, angle=angle, shift=shift)
 
     def _pixels(self, before: SceneFit, now: SceneFit) -> float:
         """Return the root mean square motion between two fits [pixel]; 0: nothing moves.

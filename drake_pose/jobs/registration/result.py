@@ -308,8 +308,8 @@ PARAMETERS = (
 )
 """Of each kind of parameter: its key in the summary, a title, who has it, and what it is."""
 
-# Half-width of a 95 % interval in standard deviations.
-_NORMAL = 1.96
+NORMAL = 1.96
+"""Half-width of a 95 % interval in standard deviations."""
 
 
 def parameter_rows(parameters: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ...]]:
@@ -381,7 +381,7 @@ def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
         # Cameras that see a target have no time offset.
         clocks=first["masks"] == "found" and "time_offset_scores" in first,
         offsets={name: figure and plot_uri(figure) for name, figure in figures},
-        normal=_NORMAL,
+        normal=NORMAL,
         pictures=[picture for picture in pictures if picture is not None],
         pairs=[picture for picture in pairs if picture is not None],
     )
@@ -441,7 +441,7 @@ def plot_offset(camera: Mapping[str, Any]) -> "Figure | None":
     figure, axes = new_plot()
     axes.plot(1e3 * tried[:, 0], 100.0 * tried[:, 1], marker=".", markersize=3)
     if camera["time_offset_s"] is not None:
-        value, margin = 1e3 * camera["time_offset_s"], 1e3 * _NORMAL * camera["time_offset_sd_s"]
+        value, margin = 1e3 * camera["time_offset_s"], 1e3 * NORMAL * camera["time_offset_sd_s"]
         axes.axvspan(value - margin, value + margin, color="#c5dfee")
         axes.axvline(value, color="#d55e00")
         axes.set_xlim(1e3 * tried[0, 0], 1e3 * tried[-1, 0])

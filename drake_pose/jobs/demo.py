@@ -25,11 +25,6 @@ def stored_scene(name: str) -> Path:
     raise SceneError(f"the bundled scene '{name}' is missing; install drake_pose again")
 
 
-def demo_scene() -> Path:
-    """Return the folder of the demonstration's scene."""
-    return stored_scene("human")
-
-
 def demo_settings(scene: Path) -> EstimateSettings:
     """Return the settings of Kameda, Minoh and Ikeda's experiment B for a standing person.
 
@@ -51,7 +46,7 @@ def run_demo(out: Path, on_frame: OnFrame | None = None) -> SceneEstimate:
     ``on_frame``: called before and after the only frame; None: not called. Raises OutputError: the
     folder holds other files.
     """
-    scene = demo_scene()
+    scene = stored_scene("human")
     with claimed(out, resume=True):
         try:
             summary = json.loads((out / SUMMARY).read_text(encoding="utf-8"))

@@ -19,7 +19,7 @@ import numpy as np
 from drake_pose.body import bundled_model, load_model
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.input_files import csv_text
-from drake_pose.jobs.demo import demo_scene, demo_settings
+from drake_pose.jobs.demo import demo_settings, stored_scene
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.papers.kameda import continuous_figures, experiment_tree, run_experiment
 from drake_pose.search import MultiStartSearch
@@ -59,7 +59,7 @@ class Work(NamedTuple):
 
 def works(data: Path | None, folder: Path) -> Iterator[Work]:
     """Yield the rows whose scenes exist; rendered scenes are written to a folder."""
-    man, demo = bundled_model("man"), demo_scene()
+    man, demo = bundled_model("man"), stored_scene("human")
     yield Work("demo: man, one view", demo, man, demo_settings(demo))
     if data is None:
         return

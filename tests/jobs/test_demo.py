@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from drake_pose.body import bundled_model, load_model
-from drake_pose.jobs.demo import demo_scene, demo_settings, run_demo
+from drake_pose.jobs.demo import demo_settings, run_demo, stored_scene
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.cli import run_command
@@ -16,7 +16,7 @@ def test_demo(tmp_path: Path) -> None:
     out = tmp_path / "demo"
     result = run_command(["demo", "--out", str(out)])
     assert result.exit_code == 0, result.output
-    scene = load_scene(demo_scene())
+    scene = load_scene(stored_scene("human"))
     (camera,) = scene.cameras.values()
     (frame,) = scene.frames
     overlay = out / "overlay" / camera.name / f"{frame}.png"
@@ -49,10 +49,10 @@ def test_demo(tmp_path: Path) -> None:
 
 
 def test_settings_are_those_of_the_paper() -> None:
-    settings = demo_settings(demo_scene())
+    settings = demo_settings(stored_scene("human"))
     assert settings.root == "right_foot"
-    assert settings.root_position == (demo_scene() / "root_position.csv", "right_ankle")
-    assert "BSD 3-Clause License" in (demo_scene() / "NOTICE").read_text()
+    assert settings.root_position == (stored_scene("human") / "root_position.csv", "right_ankle")
+    assert "BSD 3-Clause License" in (stored_scene("human") / "NOTICE").read_text()
 
 
 def test_an_earlier_demonstration_is_replaced(
@@ -60,7 +60,7 @@ def test_an_earlier_demonstration_is_replaced(
 ) -> None:
     (tmp_path / "overlay" / "front").mkdir(parents=True)
     (tmp_path / "overlay" / "front" / "0010.png").touch()
-    (tmp_path / "summary.json").write_text(json.dumps({"scene": str(demo_scene())}))
+    (tmp_path / "summary.json").write_text(json.dumps({"scene": str(stored_scene("human"))}))
     left = []
     monkeypatch.setattr(
         "drake_pose.jobs.demo.estimate_scene", lambda *given, **_: left.extend(given[2].iterdir())

@@ -22,8 +22,7 @@ from drake_pose.errors import SettingsError, for_caller, require_at_least, requi
 _Settings = TypeVar("_Settings", bound=type)
 Axis = Literal["x", "y", "z"]
 RootTurns = Literal["fixed", "free"] | Mapping[Axis, tuple[float, float]]
-Corner = tuple[float, float, float]
-"""Position x, y, z [m]."""
+RootPosition = tuple[float, float, float] | tuple[Path, str] | Literal["unknown"]
 
 GONE = {
     "masks --box": "take the masks of a segmentation network, or paint them",
@@ -149,7 +148,7 @@ def parse_packages(texts: Iterable[str]) -> dict[str, Path]:
     return folders
 
 
-def parse_root_position(text: str) -> Corner | tuple[Path, str] | Literal["unknown"]:
+def parse_root_position(text: str) -> RootPosition:
     """Return a position ``X,Y,Z`` [m], the file and joint of ``FILE.csv:JOINT``, or ``unknown``."""
     if text == "unknown":
         return "unknown"
@@ -379,10 +378,7 @@ class EstimateSettings(CaptureSettings, EpisodeSettings):
     repeat for several. Its joints are held. URDF models only."""
     root: Annotated[str | None, Parameter(metavar="LINK")] = None
     """Link at which the search starts; any link. Default: the model's root."""
-    root_position: Annotated[
-        tuple[float, float, float] | tuple[Path, str] | Literal["unknown"] | None,
-        from_text(parse_root_position, "POINT"),
-    ] = None
+    root_position: Annotated[RootPosition | None, from_text(parse_root_position, "POINT")] = None
     """Position of the root's origin in the world: X,Y,Z [m]; or FILE.csv:JOINT, a CSV file with the
     columns frame,joint,x,y,z and a row of that joint for each frame; or unknown, to search it (the
     default if the scene has no cameras.yaml)."""

@@ -292,7 +292,21 @@ def _pose_of(value: Any, where: str) -> RecordedPose | None:
     where: start of error messages. Raises CameraError: a rotation is none.
     """
     if not isinstance(value, dict):
-        return _pose_of_numbers(value, where)
+        numbers = _numbers(value)
+        if numbers is None or numbers.size not in (6, 7, 12, 16):
+            return None
+        if numbers.size in (12, 16):
+            matrix = np.eye(4)
+            matrix[: numbers.size // 4] = numbers.reshape(-1, 4)
+            if abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
+                return None
+            return _rigid(matrix[:3, :3], matrix[:3, 3], where)
+        if numbers.size == 7:
+            R, assumed = _quaternion(numbers[3:], "", where)
+        else:
+            R, unit = _euler(numbers[3:], "")
+            assumed = f"its six numbers are read as x, y, z [m], roll, pitch, yaw [{unit}]"
+        return _rigid(R, numbers[:3], where)._replace(assumed=assumed)
     keys = {_plain(key): one for key, one in value.items()}
     if (found := _moved_and_turned(keys, where)) is not None:
         return found
@@ -318,25 +332,6 @@ def _is_inverse(key: str) -> bool | None:
         return True
     plain = "transform|transformation|matrix|calibration"
     return False if re.match(f"^([txh]?({pose}){end}|({plain})$)", key) else None
-
-
-def _pose_of_numbers(value: Any, where: str) -> RecordedPose | None:
-    """Return the pose of a list of 6, 7, 12 or 16 numbers, or of nested lists; None: it is none."""
-    found = _numbers(value)
-    if found is None or found.size not in (6, 7, 12, 16):
-        return None
-    if found.size in (12, 16):
-        matrix = np.eye(4)
-        matrix[: found.size // 4] = found.reshape(-1, 4)
-        if abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
-            return None
-        return _rigid(matrix[:3, :3], matrix[:3, 3], where)
-    if found.size == 7:
-        R, assumed = _quaternion(found[3:], "", where)
-    else:
-        R, unit = _euler(found[3:], "")
-        assumed = f"its six numbers are read as x, y, z [m], roll, pitch, yaw [{unit}]"
-    return _rigid(R, found[:3], where)._replace(assumed=assumed)
 
 
 def _moved_and_turned(keys: Mapping[str, Any], where: str) -> RecordedPose | None:

@@ -217,38 +217,30 @@ class DeviceSource(FrameSource):
 
     def _run(self) -> None:
         """Read until closed; reopen the camera after failures."""
-        (first, longest), count = self._pauses, 0
+        given, (first, longest), count = self.specification, self._pauses, 0
         pause = first
         while not self.ended:
-            before, capture = count, self._open()
-            if capture is not None:
-                count = self._keep_newest(capture, count)
-                capture.release()
+            before = count
+            with suppress(cv2.error):
+                place = given.location
+                capture = cv2.VideoCapture(int(place) if place.isdigit() else place)
+                if capture.isOpened():
+                    if place.isdigit():
+                        capture.set(cv2.CAP_PROP_FRAME_WIDTH, given.width)
+                        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, given.height)
+                        if given.rate_hz is not None:
+                            capture.set(cv2.CAP_PROP_FPS, given.rate_hz)
+                    count = self._keep_newest(capture, count)
+                    capture.release()
             if self.ended:
                 return
             if not self._failed:
                 what = "stopped" if count else "cannot be opened"
-                self.report(f"'{self.specification.location}' {what}; retrying until it answers")
+                self.report(f"'{given.location}' {what}; retrying until it answers")
                 self._failed = True
             pause = first if count > before else pause
             self._stop.wait(pause)
             pause = min(2.0 * pause, longest)
-
-    def _open(self) -> cv2.VideoCapture | None:
-        """Return the open camera, set to the calibrated image size; None on failure."""
-        given = self.specification
-        by_number = given.location.isdigit()
-        with suppress(cv2.error):
-            capture = cv2.VideoCapture(int(given.location) if by_number else given.location)
-            if not capture.isOpened():
-                return None
-            if by_number:
-                capture.set(cv2.CAP_PROP_FRAME_WIDTH, given.width)
-                capture.set(cv2.CAP_PROP_FRAME_HEIGHT, given.height)
-                if given.rate_hz is not None:
-                    capture.set(cv2.CAP_PROP_FPS, given.rate_hz)
-            return capture
-        return None
 
     def _keep_newest(self, capture: cv2.VideoCapture, count: int) -> int:
         """Read until the camera is closed or fails, or an image is unusable.

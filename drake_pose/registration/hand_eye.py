@@ -170,7 +170,7 @@ LinkPoses = Callable[[Array], Array]
 """Returns the link's poses X_WL (frames, 4, 4) at constants (k,): time offset, joint offsets."""
 
 
-def pose_difference(X_LC: Array, other: Array) -> Array:
+def difference_along_camera(X_LC: Array, other: Array) -> Array:
     """Return rotation vectors [rad] and translations [m] (..., 6) from one pose to another.
 
     X_LC, other: (..., 4, 4) poses. The result is along the camera's axes at X_LC.
@@ -310,7 +310,7 @@ def intrinsics_effect(
 
 def _moved(fit: TrackFit, other: TrackFit) -> Array:
     """Return the difference (7 + k,), as of `TrackFit.covariance`, from a fit to another."""
-    difference = pose_difference(fit.X_LC, other.X_LC)
+    difference = difference_along_camera(fit.X_LC, other.X_LC)
     return np.concatenate([difference, other.constants - fit.constants])
 
 
@@ -374,7 +374,7 @@ def _twists(problem: TrackProblem, X_LC: Array, constants: Array) -> Array:
         behind, ahead = (
             problem.link_poses(constants[1:] + step) @ X_LC for step in (-change, change)
         )
-        columns.append(pose_difference(behind, ahead).ravel() / (2.0 * h))
+        columns.append(difference_along_camera(behind, ahead).ravel() / (2.0 * h))
     G = np.zeros((6 * frames + 1, 6 + count))
     G[:-1, :6], G[-1, 6] = np.tile(np.eye(6), (frames, 1)), 1.0
     for k, column in enumerate(columns):

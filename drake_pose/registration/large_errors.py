@@ -14,9 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Mask
-from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.camera.models import Camera
 from drake_pose.registration.per_frame_fit import FrameFit
-from drake_pose.registration.posed_frames import MultiViewFrame, common_size, reduced_sums
+from drake_pose.registration.posed_frames import (
+    MultiViewFrame,
+    common_size,
+    downscaled,
+    reduced_sums,
+)
 from drake_pose.registration.register import SEARCH, RegistrationBody, evenly_spaced
 from drake_pose.silhouette.scoring import draw_mask, score_bodies
 from drake_pose.workers import map_ordered
@@ -289,14 +294,6 @@ class LargeErrorSearch:
             return replace(frame, values=values)
 
         return changed
-
-
-def downscaled(camera: Camera, scale: float) -> Camera:
-    """Return a camera with pictures scaled, to 8 x 8 pixels at least; a parallel one unchanged."""
-    if not isinstance(camera, PinholeCamera):
-        return camera
-    width, height = (max(8, round(scale * side)) for side in (camera.width, camera.height))
-    return camera.resized(width, height)
 
 
 def mask_excess_and_lack(

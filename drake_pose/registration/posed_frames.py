@@ -134,15 +134,21 @@ class PosedFrames:
             for frame in self.frames
         ]
 
-    def downscaled(self, side: float) -> PinholeCamera:
+    def downscaled(self, side: float) -> Camera:
         """Return the camera with `size` at most `side` [pixel]; at least 8 x 8, never enlarged."""
-        camera, scale = self.camera, min(1.0, side / self.size)
-        width, height = max(8, round(scale * camera.width)), max(8, round(scale * camera.height))
-        return camera.resized(width, height)
+        return downscaled(self.camera, min(1.0, side / self.size))
 
-    def sums(self, frame: int, camera: PinholeCamera) -> NDArray[np.int32]:
+    def sums(self, frame: int, camera: Camera) -> NDArray[np.int32]:
         """Return prefix sums (H, W + 1) of a frame's mask in a small camera: ``reduced_sums``."""
         return reduced_sums(self.frames[frame].mask, camera)
+
+
+def downscaled(camera: Camera, scale: float) -> Camera:
+    """Return a camera with pictures scaled, to 8 x 8 pixels at least; a parallel one unchanged."""
+    if not isinstance(camera, PinholeCamera):
+        return camera
+    width, height = (max(8, round(scale * side)) for side in (camera.width, camera.height))
+    return camera.resized(width, height)
 
 
 def reduced_sums(mask: Mask, camera: Camera) -> NDArray[np.int32]:

@@ -220,18 +220,18 @@ class DeviceSource(FrameSource):
         given, (first, longest), count = self.specification, self._pauses, 0
         pause = first
         while not self.ended:
-            before = count
+            before, place, is_open = count, given.location, False
             with suppress(cv2.error):
-                place = given.location
                 capture = cv2.VideoCapture(int(place) if place.isdigit() else place)
-                if capture.isOpened():
-                    if place.isdigit():
-                        capture.set(cv2.CAP_PROP_FRAME_WIDTH, given.width)
-                        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, given.height)
-                        if given.rate_hz is not None:
-                            capture.set(cv2.CAP_PROP_FPS, given.rate_hz)
-                    count = self._keep_newest(capture, count)
-                    capture.release()
+                if capture.isOpened() and place.isdigit():
+                    capture.set(cv2.CAP_PROP_FRAME_WIDTH, given.width)
+                    capture.set(cv2.CAP_PROP_FRAME_HEIGHT, given.height)
+                    if given.rate_hz is not None:
+                        capture.set(cv2.CAP_PROP_FPS, given.rate_hz)
+                is_open = capture.isOpened()
+            if is_open:
+                count = self._keep_newest(capture, count)
+                capture.release()
             if self.ended:
                 return
             if not self._failed:

@@ -35,11 +35,6 @@ class HandSilhouetteSettings:
     edge_deviation: float = 0.35
     correlation: float = 8.0
     width_deviation: float = 0.4  # Standard deviation of half a segment's width [pixel].
-    # min_offset_deviation, min_angle_deviation, min_tip_deviation: smallest standard deviation of a
-    # line's offset [pixel] and direction [rad], and of a tip [pixel].
-    min_offset_deviation: float = 0.1
-    min_angle_deviation: float = math.radians(0.2)
-    min_tip_deviation: float = 0.15
     # max_angle_deviation, max_tip_deviation: a line [rad] or tip [pixel] with a larger standard
     # deviation is not measured.
     max_angle_deviation: float = math.radians(10.0)
@@ -122,8 +117,7 @@ def match_axes(
     one_sided = (rough.widths > 0) & (sides[:count].min(axis=1) < 0.3 * sides[:count].max(axis=1))
     shift, turn = solution[:count].T
     C = covariance[:count]
-    C[:, 0, 0] += np.where(one_sided, HAND.width_deviation**2, 0.0) + HAND.min_offset_deviation**2
-    C[:, 1, 1] += HAND.min_angle_deviation**2
+    C[:, 0, 0] += np.where(one_sided, HAND.width_deviation**2, 0.0)
     middle = rough.ends.mean(axis=1) - origin + shift[:, None] * normal
     alpha = np.arctan2(along[:, 1], along[:, 0]) + np.arctan(turn)
     alpha = np.remainder(alpha + np.pi, 2 * np.pi) - np.pi
@@ -134,7 +128,7 @@ def match_axes(
     J[:, 0, 1], J[:, 1, 0], J[:, 1, 1] = 1.0, 1.0, -(c * middle[:, 0] + s * middle[:, 1])
     lines[(C[:, 1, 1] > HAND.max_angle_deviation**2) | (size < HandObservation.shortest)] = np.nan
     tips = rough.ends[rough.tips, 1] - origin + solution[count:]
-    tip_covariances = covariance[count:] + HAND.min_tip_deviation**2 * np.eye(2)
+    tip_covariances = covariance[count:]
     # The end of a segment that points at the camera may be its joint.
     unsure = np.linalg.eigvalsh(tip_covariances)[:, 1] > HAND.max_tip_deviation**2
     tips[unsure | (size < rough.widths)[rough.tips]] = np.nan

@@ -230,11 +230,13 @@ def fit_sequence(
             kept.append(one)
     if step == 1:
         return kept
-    every = np.arange(len(masks), dtype=np.intp)
-    return [
-        fit(every, _interpolated(every, picked, one.fitted.parameters[:, : len(body.names)]), True)
-        for one in kept
-    ]
+    every, refined = np.arange(len(masks), dtype=np.intp), []
+    for one in kept:
+        # The picked frames' parameters, interpolated at every frame and constant beyond them.
+        columns = one.fitted.parameters[:, : len(body.names)].T
+        begin = np.column_stack([np.interp(every, picked, column) for column in columns])
+        refined.append(fit(every, begin, True))
+    return refined
 
 
 def pose_set(
@@ -292,8 +294,3 @@ def _limits(observation: ContourObservation) -> tuple[Array, Array]:
             else:
                 lower[k] = max(lower[k], b / phi[k])
     return lower, upper
-
-
-def _interpolated(every: Indices, picked: Indices, parameters: Array) -> Array:
-    """Interpolate ``picked`` frames' parameters (p, n) at ``every`` frame, constant beyond them."""
-    return np.column_stack([np.interp(every, picked, column) for column in parameters.T])

@@ -12,7 +12,7 @@ Static views: a filter that linearises anew in each frame of a static view becom
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -323,14 +323,9 @@ def next_view(
     if new_rows.any() or not both.any():
         return y, 1
     size = float(np.sum(change[both] ** 2 / (2.0 * np.diag(measurement.covariance)[both])))
-    is_new = size > _largest_change(significance, int(np.count_nonzero(both)))
+    # The chi-squared value with as many degrees of freedom and this p-value.
+    is_new = size > float(chdtri(int(np.count_nonzero(both)), significance))
     return (y, 1) if is_new else (reference, count + 1)
-
-
-@lru_cache(maxsize=1024)
-def _largest_change(significance: float, count: int) -> float:
-    """Return the chi-squared value with ``count`` degrees of freedom and this p-value."""
-    return float(chdtri(count, significance))
 
 
 def measure_curvature(model: ObservationModel, belief: Belief) -> Array:

@@ -264,17 +264,12 @@ class CoarseSearch:
         body: the sampled body.
         views: the silhouettes, one per camera.
         hypotheses: number of hypotheses kept after each node; None: that of the settings.
-        settings: parameters of the search; None: the defaults.
     """
 
     def __init__(
-        self,
-        body: SampledBody,
-        views: Sequence[View],
-        hypotheses: int | None = None,
-        settings: CoarseSettings | None = None,
+        self, body: SampledBody, views: Sequence[View], hypotheses: int | None = None
     ) -> None:
-        self.body, self._settings = body, settings or CoarseSettings()
+        self.body, self._settings = body, CoarseSettings()
         self._hypotheses = hypotheses or self._settings.hypotheses
         self._size = math.sqrt(float(np.mean([np.count_nonzero(view.mask) for view in views])))
         self.views = map_ordered(self._prepare, views)

@@ -367,7 +367,6 @@ class HypothesesResult:
             "of_these_wrong": sum(one.wrong for one in later),
             "of_these_by_coupled_joints": sum(one.row.startswith(COUPLED) for one in later),
             "frames_lived_median": float(np.median([f.lived for f in later])) if later else None,
-            "inequalities": dict(Counter(one.row for one in later).most_common()),
             "angle_error_at_end": float(np.median(self.final_errors)),
             "lost": int(np.count_nonzero(self.final_errors > LOST_ANGLE_ERROR)),
             **self.settings,

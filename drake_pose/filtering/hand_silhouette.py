@@ -35,6 +35,11 @@ class HandSilhouetteSettings:
     edge_deviation: float = 0.35
     correlation: float = 8.0
     width_deviation: float = 0.4  # Standard deviation of half a segment's width [pixel].
+    # min_offset_deviation, min_angle_deviation, min_tip_deviation: smallest standard deviation of a
+    # line's offset [pixel] and direction [rad], and of a tip [pixel].
+    min_offset_deviation: float = 0.1
+    min_angle_deviation: float = math.radians(0.2)
+    min_tip_deviation: float = 0.15
     # max_angle_deviation, max_tip_deviation: a line [rad] or tip [pixel] with a larger standard
     # deviation is not measured.
     max_angle_deviation: float = math.radians(10.0)
@@ -48,6 +53,7 @@ class HandSilhouetteSettings:
     # [pixel].
     beside: float = 2.0
     rounds: int = 4  # Iterations of the robust fit.
+    shortest: float = 5.0  # Segments shorter in the image have no line [pixel].
 
     # The cross-entropy search for a pose.
     searches: int = 3  # Largest number of searches.
@@ -117,7 +123,8 @@ def match_axes(
     one_sided = (rough.widths > 0) & (sides[:count].min(axis=1) < 0.3 * sides[:count].max(axis=1))
     shift, turn = solution[:count].T
     C = covariance[:count]
-    C[:, 0, 0] += np.where(one_sided, HAND.width_deviation**2, 0.0)
+    C[:, 0, 0] += np.where(one_sided, HAND.width_deviation**2, 0.0) + HAND.min_offset_deviation**2
+    C[:, 1, 1] += HAND.min_angle_deviation**2
     middle = rough.ends.mean(axis=1) - origin + shift[:, None] * normal
     alpha = np.arctan2(along[:, 1], along[:, 0]) + np.arctan(turn)
     alpha = np.remainder(alpha + np.pi, 2 * np.pi) - np.pi
@@ -126,9 +133,9 @@ def match_axes(
     # d rho / d alpha is minus the position along the axis.
     J = np.zeros((count, 2, 2))
     J[:, 0, 1], J[:, 1, 0], J[:, 1, 1] = 1.0, 1.0, -(c * middle[:, 0] + s * middle[:, 1])
-    lines[(C[:, 1, 1] > HAND.max_angle_deviation**2) | (size < HandObservation.shortest)] = np.nan
+    lines[(C[:, 1, 1] > HAND.max_angle_deviation**2) | (size < HAND.shortest)] = np.nan
     tips = rough.ends[rough.tips, 1] - origin + solution[count:]
-    tip_covariances = covariance[count:]
+    tip_covariances = covariance[count:] + HAND.min_tip_deviation**2 * np.eye(2)
     # The end of a segment that points at the camera may be its joint.
     unsure = np.linalg.eigvalsh(tip_covariances)[:, 1] > HAND.max_tip_deviation**2
     tips[unsure | (size < rough.widths)[rough.tips]] = np.nan
@@ -398,7 +405,7 @@ class HandSilhouette:
             scale: known image scale; None: unknown.
         """
         observation, names = self._observation, self._observation.names
-        at = names.index("scale")
+        at, prior = names.index("scale"), self._hand.prior
         lines = slice(at - 2 * len(self._hand.line_ends), at)
         tips = [
             [names.index(f"point_{i}{self._hand.joints[-1]}_{axis}") for axis in "xy"]
@@ -410,8 +417,11 @@ class HandSilhouette:
             y[lines], R[lines, lines] = axes.lines.ravel(), block_covariance(axes.line_covariances)
             for rows, tip, covariance in zip(tips, axes.tips, axes.tip_covariances, strict=True):
                 y[rows], R[np.ix_(rows, rows)] = tip, covariance
+            y[[names.index(name) for name in self._hand.hidden]] = np.nan
             self._add_hidden_points(x, mask, edge, y, R)
             y[at] = math.nan if scale is None else scale
+            if prior is not None:
+                y[at + 1 :] = prior.mean
             if k < len(gates) - 1:
                 x = self.belief_filter.estimate_roughly(prediction, y, R, x)
         wrong = np.count_nonzero(self.draw(x) != mask)

@@ -105,6 +105,7 @@ def shimada(
     iterations: Annotated[int | None, within(1)] = None,
     hypotheses: bool = False,
     pictures: bool = False,
+    sequence: tuple[Path, ...] = (),
     out: Pictures = None,
     json: Json = False,
 ) -> None:
@@ -117,6 +118,7 @@ def shimada(
 
         drake-pose reproduce shimada --runs 20 --out results/shimada
         drake-pose reproduce shimada --pictures --out results/figure_17
+        drake-pose reproduce shimada --sequence SCENE --out results/figure_17_hand
 
     Args:
         runs: Number of sequences for each of r_13 = 35 and 40. Default: 50, with --pictures 10.
@@ -127,16 +129,30 @@ def shimada(
         hypotheses: Run the experiment of figure 9 instead: fingers bend through the image plane.
             Shows which hypotheses are created, and what rejects the wrong ones.
         pictures: Measure silhouettes drawn by Drake's renderer instead of noisy numbers.
+        sequence: Use recorded silhouettes instead, of a right hand cut off at the wrist, in one
+            view of unknown scale (a scene with sequence: true); repeat for several.
     """
     if pictures and hypotheses:
         raise UsageError("--pictures excludes --hypotheses")
+    if sequence and (hypotheses or runs):
+        raise UsageError("--sequence excludes --hypotheses and --runs")
     warnings = []
     with _experiment(out) as count:
         from drake_pose.papers import shimada as hands
-        from drake_pose.papers.pictures import save_hands, save_hypotheses
+        from drake_pose.papers.pictures import save_hands, save_hypotheses, save_recorded_hand
         from drake_pose.papers.shimada_sequences import experiment_settings
 
-        if hypotheses:
+        if sequence:
+            from drake_pose.papers.recorded_hand import recorded_table, run_sequence
+
+            settings = experiment_settings(truncation or "joint", iterations or 20)
+            followed = [run_sequence(folder, settings, count) for folder in sequence]
+            figures: dict[str, Any] = {one.name: one.figures for one in followed}
+            table, warnings = recorded_table(followed), [one.warning() for one in followed]
+            if out is not None:
+                for one in followed:
+                    save_recorded_hand(one, out)
+        elif hypotheses:
             settings = experiment_settings(truncation or "sequential", iterations or 1)
             found = hands.run_hypotheses_experiment(runs or 50, seed, settings, count)
             figures, table = found.as_json(), found.table()

@@ -41,7 +41,6 @@ GONE = {
     "reproduce --observed": "the lines of the paper are observed, or silhouettes with --pictures",
     "reproduce --noise": "the noise is the one that tutorials/figures.md reports",
     "reproduce --acceleration": "the filter is the one that tutorials/figures.md reports",
-    "reproduce --sequence": "use drake-pose estimate, which tracks a recorded hand",
     "--export rerun": "log what drake_pose.load_cameras reads by rerun's own package",
     "capture --tolerance": "correct the time stamps; pictures half a period apart are of one time",
 }

@@ -55,6 +55,8 @@ class HandObservation:
     mirror_reach: float = 3.0
     shortest: float = 5.0  # Segments shorter in the image have no line [pixel].
     scale_deviation: float = 1e-3  # Standard deviation of a known scale.
+    # Number of frames in which the joints' prior counts as one measurement.
+    prior_frames: float = 30.0
     hand: HandModel = field(default=TWO_FINGERS, repr=False)  # The hand's fingers and palm.
 
     def __post_init__(self) -> None:
@@ -68,12 +70,14 @@ class HandObservation:
     @cached_property
     def variances(self) -> Array:
         """(m,) variances of the measurement noise."""
-        scale = self.names.index("scale")
+        scale, prior = self.names.index("scale"), self.hand.prior
         lines = scale - 2 * len(self.hand.line_ends)
         deviations = np.full(len(self.names), self.point_deviation)
         deviations[lines:scale:2] = self.angle_deviation
         deviations[lines + 1 : scale : 2] = self.distance_deviation
         deviations[scale] = self.scale_deviation
+        if prior is not None:
+            deviations[scale + 1 :] = math.sqrt(self.prior_frames) * prior.deviation
         return deviations**2
 
     @cached_property
@@ -82,13 +86,17 @@ class HandObservation:
         return np.array([name.startswith("alpha") for name in self.names])
 
     def predict(self, x: Array) -> tuple[Array, Array]:
-        """Return the measurements (m,) of (13) and scale ``|q|^2``, and the Jacobian (m, n).
+        """Return the measurements (m,) of (13), scale ``|q|^2`` and prior; and the Jacobian.
 
-        Lines of short segments are NaN.
+        The Jacobian is (m, n). Lines of short segments are NaN.
         """
+        hand = self.hand
         h, visible, *_ = self._project(x)
         H = np.zeros((len(self.names), len(x)))
-        H[:, self.hand.visible] = visible
+        H[: len(h), hand.visible] = visible
+        if hand.prior is not None:
+            H[len(h) :, hand.layout.indices(hand.angles)] = hand.prior.phi
+            h = np.r_[h, H[len(h) :] @ x]
         return h, H
 
     def drawing(self, x: Array) -> Array:

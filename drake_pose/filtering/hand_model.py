@@ -4,14 +4,18 @@ The palm's frame has its origin at the wrist, x towards the fingers, y in the di
 they bend, and z across the palm.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from pydrake.multibody.tree import Joint, RevoluteJoint
 
 from drake_pose.arrays import Array, Indices
+from drake_pose.body import ArticulatedModel
+from drake_pose.errors import ModelError
+from drake_pose.filtering.inequalities import JointPrior, couplings_file, load_joint_prior
 from drake_pose.filtering.state import StateLayout
 
 TURN, BASE, SEGMENT = 0, 1, 2
@@ -21,6 +25,9 @@ PALM = ("palm_width", "palm_height", "palm_thickness")
 WRIST = ("wrist_x", "wrist_y")
 QUATERNION = ("palm_qw", "palm_qx", "palm_qy", "palm_qz")
 PALM_EDGES = ("left", "right", "top", "bottom")
+
+# R_PL: from the palm's link (y along the fingers, z out of the palm) to the palm's frame.
+_FROM_LINK = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 
 
 class Chains(NamedTuple):
@@ -61,6 +68,8 @@ class HandModel:
     # (2, R, 2, 3) end points of candidates for its far and its near edge, as such fractions.
     rows: Array
     sizes: Mapping[str, float]  # Lengths and sizes of the palm in the model's file [m].
+    hidden: tuple[str, ...] = ()  # Names among ``measured`` that silhouettes do not show.
+    prior: JointPrior | None = None  # Prior of the joints, over ``angles``; None: there is none.
 
     @cached_property
     def flexions(self) -> tuple[str, ...]:
@@ -104,7 +113,7 @@ class HandModel:
 
     @cached_property
     def measured(self) -> tuple[str, ...]:
-        """The measurements (13): points [pixel]; alpha [rad]; rho [pixel]; scale."""
+        """The measurements (13): points [pixel]; alpha [rad]; rho [pixel]; scale; joints' prior."""
         points = [f"{i}{j}" for i in self.fingers for j in (0, *self.joints)]
         lines = [f"{i}{j}" for i in self.fingers for j in self.joints]
         lines += [f"palm_{edge}" for edge in PALM_EDGES]
@@ -113,6 +122,7 @@ class HandModel:
             *(f"point_{point}_{axis}" for point in points for axis in "xy"),
             *(f"{kind}_{line}" for line in lines for kind in ("alpha", "rho")),
             "scale",
+            *(f"prior_{k}" for k in range(0 if self.prior is None else len(self.prior.mean))),
         )
 
     @cached_property
@@ -168,3 +178,153 @@ def _two_fingers() -> HandModel:
 
 TWO_FINGERS = _two_fingers()
 """The hand of ``urdf/two_finger_hand``."""
+
+
+def palm_rotation(R_CL: Array) -> Array:
+    """Return R_CP (3, 3) of the palm in a camera, given that of its link, see ``read_hand``."""
+    return np.asarray(R_CL @ _FROM_LINK.T)
+
+
+def read_hand(model: ArticulatedModel, palm: str = "palm") -> HandModel:
+    """Return the hand of a model such as ``urdf/hand``: the hinges on its palm, and their places.
+
+    Args:
+        model: the model. The palm's link has its origin at the wrist, y along the fingers and z out
+            of the palm.
+        palm: name of the palm's link.
+
+    Raises UnknownNameError: the model has no such link; ModelError: a joint on the palm begins no
+    finger, fingers have different numbers of segments, or a mesh has no vertices where a thickness
+    is measured.
+    """
+    model.link_index(palm)
+    plant, context = model.plant, model.plant.CreateDefaultContext()
+    # A floating palm keeps its default quaternion, because zero is not a rotation.
+    floats = [kind == "quaternion" for kind in model.position_kinds]
+    plant.SetPositions(context, np.where(floats, model.default_positions, 0.0))
+    X_PW = plant.GetFrameByName(palm).CalcPoseInWorld(context).inverse()
+    beyond: dict[str, list[Joint]] = {}
+    for joint in map(plant.get_joint, plant.GetJointIndices()):
+        beyond.setdefault(joint.parent_body().name(), []).append(joint)
+    chains, frames = [], []
+    for first in beyond.get(palm, []):
+        chain = [first]
+        while found := beyond.get(chain[-1].child_body().name()):
+            chain += found
+        has_mesh = chain[-1].child_body().name() in model.link_meshes
+        if not has_mesh or not all(isinstance(joint, RevoluteJoint) for joint in chain):
+            raise ModelError(
+                f"{model.path}: '{first.name()}' on '{palm}' begins no finger: a finger is a chain "
+                "of hinges whose last link has a mesh"
+            )
+        poses = [X_PW @ j.frame_on_parent().CalcPoseInWorld(context) for j in chain]
+        chains.append(chain)
+        frames.append([(X.translation(), X.rotation().matrix()) for X in poses])
+    if not chains or palm not in model.link_meshes:
+        raise ModelError(f"{model.path}: '{palm}' has no fingers, or no mesh")
+    size = np.ptp(model.link_meshes[palm].vertices @ _FROM_LINK.T, axis=0)
+    size[0] = max(float(one[0][0][1]) for one in frames)
+    sizes = dict(zip(("palm_height", "palm_thickness", "palm_width"), size.tolist(), strict=True))
+    read = [_read_finger(model, *one, size, sizes) for one in zip(chains, frames, strict=True)]
+    if len({len(radii) for _, radii in read}) != 1:
+        raise ModelError(f"{model.path}: the fingers on '{palm}' differ in the number of segments")
+    rings = _palm_rings(model, palm, size[0]) / size
+    low, side = rings[0].min(axis=0), 0.8 * np.ptp(rings[0, :, 2]) * np.array([0.5, -0.5])
+    depths = 0.5 * np.array([rings[0, :, 1].min(), rings[0, :, 1].max()])
+    rows = np.array([[[[x, y, z] for z in side] for y in depths] for x in (1.0, low[0])])
+    names = tuple(chain[0].name().split("_")[0] for chain in chains)
+    hidden = ("alpha_palm_top", "rho_palm_top")
+    steps, radii = tuple(steps for steps, _ in read), np.array([radii for _, radii in read])
+    hand, file = (
+        HandModel(names, steps, radii, rings, rows, sizes, hidden),
+        couplings_file(model.path),
+    )
+    return replace(hand, prior=load_joint_prior(file, hand.angles)) if file.is_file() else hand
+
+
+def _read_finger(
+    model: ArticulatedModel,
+    chain: Sequence[Joint],
+    frames: Sequence[tuple[Array, Array]],
+    size: Array,
+    sizes: dict[str, float],
+) -> tuple[tuple[Step, ...], list[float]]:
+    """Return a finger's steps and radii [m], and add its lengths to ``sizes``.
+
+    ``chain``: joints from the palm outwards. ``frames``: by joint, origin (3,) and rotation (3, 3)
+    of its parent frame in the palm's link. ``size``: (3,) height, thickness, width of the palm [m].
+    """
+    base = _FROM_LINK @ frames[0][0] / size
+    elements = ("palm_height", "palm_thickness", "palm_width")
+    steps = [
+        Step(name, BASE, tuple(row)) for name, row in zip(elements, np.diag(base), strict=True)
+    ]
+    radii, last = [], ""
+    for k, (joint, (place, R)) in enumerate(zip(chain, frames, strict=True)):
+        offset = place - frames[max(k - 1, 0)][0]
+        length = float(np.linalg.norm(offset))
+        if length > 1e-6:
+            steps.append(Step(f"length_{last}", SEGMENT, tuple(_FROM_LINK @ offset / length)))
+            sizes[f"length_{last}"] = length
+        axis = _FROM_LINK @ R @ joint.revolute_axis()
+        steps.append(Step(joint.name(), TURN, tuple(axis)))
+        last = joint.child_body().name()
+        if last in model.link_meshes:
+            radii.append(_radius(model, last, -0.003, 0.003))
+    end = model.link_meshes[last].vertices[:, 1].max()
+    radii.append(_radius(model, last, end - 0.010, end - 0.004))
+    steps.append(Step(f"length_{last}", SEGMENT, tuple(_FROM_LINK @ R[:, 1])))
+    sizes[f"length_{last}"] = float(end - radii[-1])
+    return tuple(steps), radii
+
+
+def _radius(model: ArticulatedModel, link: str, low: float, high: float) -> float:
+    """Return half of the extent [m] along x of a link's vertices with low <= y <= high [m]."""
+    return 0.5 * float(np.ptp(_band(model, link, low, high)[:, 0]))
+
+
+def _band(model: ArticulatedModel, link: str, low: float, high: float) -> Array:
+    """Return the vertices (n, 3) of a link's mesh with low <= y <= high in its frame [m].
+
+    Raises ModelError: there is none.
+    """
+    vertices = model.link_meshes[link].vertices
+    band = vertices[(vertices[:, 1] >= low) & (vertices[:, 1] <= high)]
+    if not len(band):
+        raise ModelError(
+            f"{model.path}: the mesh of link '{link}' has no vertex {1e3 * low:.0f} to "
+            f"{1e3 * high:.0f} mm along the link's y axis, where a hand's thickness is measured; "
+            "give it more vertices there"
+        )
+    return band
+
+
+def _palm_rings(
+    model: ArticulatedModel,
+    palm: str,
+    height: float,
+    count: int = 16,
+    wrist: float = 0.07,
+    knuckles: tuple[float, float, float] = (0.78, 0.84, 0.85),
+) -> Array:
+    """Return a palm's outlines (2, count, 3) [m] at wrist and knuckles, in the palm's frame.
+
+    Args:
+        model: the hand.
+        palm: name of the palm's link.
+        height: height of the palm [m].
+        count: number of points of an outline.
+        wrist: the wrist's outline is that of the vertices up to this height.
+        knuckles: the other outline is that of the vertices between the first two heights, placed at
+            the third. All heights are fractions of ``height``.
+    """
+    low = float(model.link_meshes[palm].vertices[:, 1].min())
+    angles = 2.0 * np.pi * np.arange(count) / count
+    directions = np.column_stack([np.cos(angles), np.sin(angles)])
+    bands = ((low, low + wrist * height), [fraction * height for fraction in knuckles[:2]])
+    rings = np.zeros((2, count, 3))
+    for ring, (begin, end), x in zip(rings, bands, (low, knuckles[2] * height), strict=True):
+        band = _band(model, palm, begin, end) @ _FROM_LINK.T
+        ring[:] = band[np.argmax(band[:, 1:] @ directions.T, axis=0)]
+        ring[:, 0] = x
+    return rings

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from drake_pose.arrays import Array, Picture
+from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.files.folder import write_file
 from drake_pose.files.overlay import (
     BACKGROUND_RGB,
@@ -28,10 +28,12 @@ from drake_pose.filtering.hand import FLEXIONS, HAND_STATE, SPREADS, HandObserva
 from drake_pose.filtering.hand_model import QUATERNION
 from drake_pose.papers.date import TITLES, DateResult
 from drake_pose.papers.kameda import RandomPose, RandomPoses, experiment_camera
+from drake_pose.papers.recorded_hand import RecordedHand
 from drake_pose.papers.shimada import PIXELS_PER_METRE, HandsResult, HypothesesResult
 from drake_pose.papers.shimada_sequences import FRAMES
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
+_TWO_FINGERS = HandObservation(pixels_per_metre=PIXELS_PER_METRE)
 _TRUE, _ESTIMATE, _REJECTED = "0.35", "#0072b2", "#d55e00"
 
 OUTCOMES: Mapping[str, Callable[[RandomPose], bool]] = {
@@ -125,11 +127,7 @@ def save_hands(result: HandsResult, folder: Path) -> None:
         grid, states = figure.subplots(2, 3), track.sequence.states
         for axes, frame in zip(grid[0], (7, 23, 39), strict=True):
             if frame in track.kept:
-                mask = track.kept[frame]
-                # The state's origin is the picture's middle.
-                half = 0.5 * np.array(mask.shape)
-                extent = (-half[1], half[1], half[0], -half[0])
-                axes.imshow(mask, cmap="gray_r", alpha=0.35, extent=extent)
+                _draw_silhouette(axes, track.kept[frame])
             else:
                 _draw_hand(axes, states[frame], _TRUE)
                 axes.invert_yaxis()
@@ -181,9 +179,27 @@ def save_hypotheses(result: HypothesesResult, folder: Path) -> bool:
     return True
 
 
-def _draw_hand(axes: Axes, state: Array, colour: str) -> None:
+def save_recorded_hand(result: RecordedHand, folder: Path) -> None:
+    """Draw three frames of a recorded hand: its silhouette (grey) and the estimate (blue)."""
+    figure = Figure(figsize=(13.0, 4.5), layout="tight")
+    for axes, (frame, mask) in zip(figure.subplots(1, 3), result.kept.items(), strict=True):
+        _draw_silhouette(axes, mask)
+        _draw_hand(axes, result.means[frame], _ESTIMATE, result.observation)
+        axes.set(title=f"frame {frame + 1}", aspect="equal")
+    _save_figure(figure, folder, f"figure_17_{result.name}")
+
+
+def _draw_silhouette(axes: Axes, mask: Mask) -> None:
+    """Draw a mask (H, W) in grey; the state's origin is the picture's middle."""
+    half = 0.5 * np.array(mask.shape)
+    extent = (-half[1], half[1], half[0], -half[0])
+    axes.imshow(mask, cmap="gray_r", alpha=0.35, extent=extent)
+
+
+def _draw_hand(
+    axes: Axes, state: Array, colour: str, observation: HandObservation = _TWO_FINGERS
+) -> None:
     """Draw the fingers' axes and joints and the palm's outline for a state (n,) [pixel]."""
-    observation = HandObservation(pixels_per_metre=PIXELS_PER_METRE)
     points, shape = observation.drawing(state), observation.hand.radii.shape
     for finger in points[: shape[0] * shape[1]].reshape(*shape, 2):
         axes.plot(*finger.T, "-o", color=colour, markersize=3, linewidth=2)

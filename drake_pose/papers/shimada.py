@@ -35,12 +35,13 @@ from drake_pose.filtering.truncated_filter import FilterSettings, FilterState, T
 from drake_pose.filtering.update import make_measurement, update
 from drake_pose.papers.shimada_sequences import (
     ACCELERATIONS,
+    FRAMES,
     OBSERVED,
     HandTrack,
     SyntheticSequence,
     experiment_settings,
-    follow_pictures,
     make_sequence,
+    run_frames,
     track_of,
 )
 from drake_pose.papers.tables import Count, figure_table, uncounted
@@ -227,7 +228,9 @@ def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
     silhouette = HandSilhouette(hand_filter, width, height, center)
     parts = build_hand_estimation(model, camera, silhouette, sequence.guess, positions, period)
     # Keep three frames for the pictures.
-    return follow_pictures(sequence, parts, period, (7, 23, 39))
+    run = run_frames(parts, period, FRAMES, (7, 23, 39), lambda _done: None)
+    track = track_of(sequence, run.states, run.milliseconds)
+    return track._replace(differences=run.differences, kept=run.kept)
 
 
 def _figures(tracks: Sequence[HandTrack]) -> dict[str, float | int]:

@@ -34,6 +34,7 @@ from drake_pose.filtering.truncated_filter import (
     FilterState,
     Truncation,
 )
+from drake_pose.papers.tables import Advance
 from drake_pose.silhouette.pictures.label_renderer import label_image_to_mask
 from drake_pose.systems.truncated_ekf import (
     HandSensor,
@@ -213,36 +214,53 @@ class HandTrack(NamedTuple):
     kept: Mapping[int, Mask] = MappingProxyType({})
 
 
+def summarise_hypotheses(states: Sequence[FilterState]) -> tuple[int, int]:
+    """Return the numbers of hypotheses that were mirrored, and rejected by an inequality."""
+    ends = [end.reason for state in states for end in state.rejections]
+    return len(ends) + len(states[-1].hypotheses) - 1, ends.count("constraint")
+
+
 def track_of(
     sequence: SyntheticSequence, states: Sequence[FilterState], milliseconds: Sequence[float]
 ) -> HandTrack:
     """Return the track of a filter from its state after each frame, and each frame's time [ms]."""
     best = [state.best for state in states]
-    ends = [end.reason for state in states for end in state.rejections]
+    mirrored, rejected = summarise_hypotheses(states)
     return HandTrack(
         sequence,
         np.array([one.mean for one in best]),
         np.array([one.deviations() for one in best]),
         best[-1].covariance,
         np.array(milliseconds),
-        mirrored=len(ends) + len(states[-1].hypotheses) - 1,
-        rejected=ends.count("constraint"),
+        mirrored,
+        rejected,
     )
 
 
-def follow_pictures(
-    sequence: SyntheticSequence,
+class FilteredFrames(NamedTuple):
+    """What a diagram of hand sensor and filter gave in each frame."""
+
+    states: list[FilterState]
+    milliseconds: list[float]  # Processor time of measurement, prediction and update.
+    differences: Array  # (frames,) fraction by which silhouette and matched pose differ.
+    kept: dict[int, Mask]  # Masks (H, W) of some frames, by index.
+
+
+def run_frames(
     parts: tuple[Diagram, TruncatedEkf, HandSensor],
     period: float,
+    frames: int,
     kept_frames: Sequence[int],
-) -> HandTrack:
-    """Run a diagram of ``build_hand_estimation`` frame by frame.
+    advance: Advance,
+) -> FilteredFrames:
+    """Run a diagram of ``build_hand_estimation`` or of recorded masks frame by frame.
 
     Args:
-        sequence: whose hand the diagram renders.
         parts: the diagram, with the filter and the sensor in it.
         period: between frames [s].
+        frames: number of frames.
         kept_frames: indices of the frames whose masks are kept.
+        advance: reports progress.
     """
     diagram, ekf, sensor = parts
     simulator = Simulator(diagram)
@@ -250,7 +268,7 @@ def follow_pictures(
         one.GetMyContextFromRoot(simulator.get_context()) for one in (sensor, ekf)
     )
     states, milliseconds, differences, kept = [], [], [], {}
-    for t in range(FRAMES):
+    for t in range(frames):
         mask = label_image_to_mask(sensor.GetInputPort("label_image").Eval(sensor_context))
         if t in kept_frames:
             kept[t] = mask.copy()
@@ -259,8 +277,8 @@ def follow_pictures(
         simulator.AdvanceTo((t + 1) * period)
         states.append(ekf.filter_state(ekf_context))
         milliseconds.append(1e3 * (time.thread_time() - begin))
-    track = track_of(sequence, states, milliseconds)
-    return track._replace(differences=np.array(differences), kept=kept)
+        advance(t + 1)
+    return FilteredFrames(states, milliseconds, np.array(differences), kept)
 
 
 def experiment_settings(truncation: str = "joint", iterations: int = 20) -> FilterSettings:

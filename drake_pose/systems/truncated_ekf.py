@@ -12,7 +12,7 @@ import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
-from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder
+from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.sensors import ImageLabel16I
 from pydrake.trajectories import Trajectory
 from scipy.special import chdtri
@@ -26,6 +26,8 @@ from drake_pose.filtering.motion import FunctionMotion, MotionModel
 from drake_pose.filtering.state import Belief, StateLayout, make_belief
 from drake_pose.filtering.truncated_filter import FilterState, Hypothesis, TruncatedFilter
 from drake_pose.silhouette.pictures.label_renderer import label_image_to_mask
+from drake_pose.silhouette.pictures.scenes import Scene
+from drake_pose.systems.cameras import MaskPlayer
 from drake_pose.systems.diagrams import add_simulated_cameras
 from drake_pose.systems.ports import (
     BeliefSystem,
@@ -397,10 +399,33 @@ def build_hand_estimation(
     builder = DiagramBuilder()
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
     _, images = add_simulated_cameras(builder, scene_graph, model, [camera], true_positions)
+    return _add_hand_filter(builder, images[0], silhouette, start, period)
+
+
+def build_recorded_hand_estimation(
+    scene: Scene, silhouette: HandSilhouette, start: Belief
+) -> tuple[Diagram, TruncatedEkf, HandSensor]:
+    """Build the diagram of ``build_hand_estimation`` for recorded silhouettes, with a MaskPlayer.
+
+    ``scene``: recorded masks of one camera. ``silhouette``: makes the measurements, and has the
+    filter. ``start``: belief before the first image. Returns the diagram, the filter and the
+    sensor.
+    """
+    builder, player = DiagramBuilder(), MaskPlayer(scene, scene.cameras)
+    builder.AddNamedSystem("mask_player", player)
+    image = player.GetOutputPort("label_image")
+    return _add_hand_filter(builder, image, silhouette, start, player.period)
+
+
+def _add_hand_filter(
+    builder: DiagramBuilder, image: OutputPort, silhouette: HandSilhouette, start: Belief,
+    period: float,
+) -> tuple[Diagram, TruncatedEkf, HandSensor]:  # fmt: skip
+    """Add filter and sensor for the label images at the port ``image``; build and return all."""
     ekf = TruncatedEkf(silhouette.belief_filter, start, period)
     builder.AddNamedSystem("truncated_ekf", ekf)
     sensor = builder.AddNamedSystem("hand_sensor", HandSensor(silhouette))
-    builder.Connect(images[0], sensor.GetInputPort("label_image"))
+    builder.Connect(image, sensor.GetInputPort("label_image"))
     connect_matching_ports(builder, sensor, ekf)
     connect_matching_ports(builder, ekf, sensor)
     return builder.Build(), ekf, sensor

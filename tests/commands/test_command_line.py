@@ -90,7 +90,6 @@ def test_a_signal_during_parsing_is_reported_in_one_line(monkeypatch: pytest.Mon
         ("capture scene --out new --start=first.csv", "masks"),
         ("reproduce all --out results", "tutorials/figures.md"),
         ("reproduce kameda --images 3 --candidates 9", "PaperSearch"),
-        ("reproduce shimada --pictures --sequence hand", "drake-pose estimate"),
         ("register scene --model arm.urdf --out out --export rerun", "load_cameras"),
         ("register scene --model arm.urdf --out out --export=rerun", "load_cameras"),
         ("capture scene --out new --tolerance 0.1", "one time"),

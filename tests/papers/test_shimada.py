@@ -8,6 +8,7 @@ import pytest
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.hand import HAND_STATE, LENGTHS, MEASURED, HandObservation
 from drake_pose.papers.pictures import save_hands, save_hypotheses
+from drake_pose.papers.recorded_hand import run_sequence
 from drake_pose.papers.shimada import (
     CASES,
     OBLIQUENESS,
@@ -211,3 +212,18 @@ def test_iterated_filter_merges_mirrored_hypotheses(tmp_path):
     assert "nothing to draw" in reproduce(*words, "--out", str(tmp_path / "out"))
     papers = reproduce("--hypotheses", "--runs", "1", "--json")
     assert (papers["truncation"], papers["iterations"]) == ("sequential", 1)
+
+
+@pytest.mark.slow
+def test_recorded_hands_are_tracked(shared_data):
+    """Hands of other measures, rendered by another program, with angles by encoders."""
+    found = run_sequence(shared_data / "hand_sequences" / "wave")
+    figures = found.figures
+    assert (figures["frames"], figures["lost"]) == (80, 0)
+    assert figures["flexion_error_median"] < 10.0
+    # .07 to .11 for first poses that differ by .001 rad.
+    assert figures["silhouette_difference"] < 0.15
+    assert "deviations are too small" in found.warning()
+    figures = run_sequence(shared_data / "hand_sequences" / "count").figures
+    assert figures["lost"] == 0
+    assert 0 < figures["rejected_by_an_inequality"] <= figures["mirrored"]

@@ -111,21 +111,8 @@ _caller: ContextVar[str] = ContextVar("caller", default="python")
 
 
 @contextmanager
-def options_in_messages() -> Iterator[None]:
-    """Keep the names of command-line options in messages while the command line runs."""
-    with _called_by("command line"):
-        yield
-
-
-@contextmanager
-def keys_in_messages() -> Iterator[None]:
-    """Name the keys of a batch's job file in messages while its tasks run."""
-    with _called_by("job file"):
-        yield
-
-
-@contextmanager
-def _called_by(caller: str) -> Iterator[None]:
+def messages_for(caller: str) -> Iterator[None]:
+    """Write messages for "command line" or "job file": with its options' or its keys' names."""
     token = _caller.set(caller)
     try:
         yield

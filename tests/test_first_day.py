@@ -34,9 +34,8 @@ from drake_pose.errors import (
     CameraError,
     SettingsError,
     for_caller,
-    keys_in_messages,
+    messages_for,
     noted_warnings,
-    options_in_messages,
 )
 from drake_pose.jobs.batch_tasks import describe_failure
 from drake_pose.jobs.registration.inputs import still_joints
@@ -122,7 +121,7 @@ def test_a_models_repr_is_one_line(model):
 )
 def test_messages_name_arguments_in_python_and_options_on_the_command_line(cli_text, python_text):
     assert for_caller(cli_text) == python_text
-    with options_in_messages():
+    with messages_for("command line"):
         assert for_caller(cli_text) == cli_text
     assert for_caller(cli_text) == python_text
 
@@ -140,7 +139,7 @@ def test_messages_name_arguments_in_python_and_options_on_the_command_line(cli_t
     ],
 )
 def test_messages_of_a_batch_name_keys_of_the_job_file(cli_text, job_text):
-    with options_in_messages(), keys_in_messages():
+    with messages_for("command line"), messages_for("job file"):
         assert for_caller(cli_text) == job_text
 
 

@@ -295,12 +295,6 @@ def workspace() -> Path:
     return Path(folder)
 
 
-def drawable_file(path: Path) -> Path:
-    """Return an OBJ file with normals that shows the same surface as ``path``; make it once."""
-    path = path.resolve()
-    return write_obj(read_mesh_file(path), path.stem)
-
-
 # The meshes of the files that write_obj wrote, which need not be read again.
 _written: dict[Path, TriangleMesh] = {}
 
@@ -452,7 +446,9 @@ def make_drawable(
                     continue
                 scale: Any = shape.scale3()  # Drake's type stubs do not accept numpy's array type.
                 try:
-                    replacement = type(shape)(drawable_file(path), scale)
+                    replacement = type(shape)(
+                        write_obj(read_mesh_file(path), path.resolve().stem), scale
+                    )
                 except ModelError as error:
                     raise ModelError(f"link '{body.name()}': {error}") from error
                 scene_graph.ChangeShape(source, geometry, replacement)

@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from drake_pose.arrays import Array, Indices, Picture
 from drake_pose.camera.calibration_files import lens_of
 from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending_indices
-from drake_pose.camera.models import Lens
 from drake_pose.camera.picture_files import decode_colours, import_reader, upper_bits
 from drake_pose.errors import CameraError, DrakePoseError, SceneError
 from drake_pose.input_files import pointer_hint
@@ -373,7 +372,16 @@ def _read_camera(
             f"have {width} x {height}: its lens is unknown; calibrate it"
         )
     else:
-        lens = _lens(info, is_rectified="rect" in base.rpartition("/")[2], where=topic)
+        is_rectified = "rect" in base.rpartition("/")[2]
+        K, D, P = (_field(info, one) for one in ("k", "d", "p"))
+        # Rectified images have no distortion, and their camera matrix is in P, or in K if P is 0.
+        K = P.reshape(3, 4)[:, :3] if is_rectified and P.any() else K
+        plain = is_rectified or not D.any()
+        model, D = ("none", np.zeros(4)) if plain else (info.distortion_model, D)
+        try:
+            lens = lens_of((width, height), K, D, model, topic)
+        except CameraError as error:
+            raise SceneError(f"{error}; record rectified pictures") from error
         camera = lens.camera(topic, np.eye(4))
         lens = lens if lens.distortion.any() else None
     return EpisodeCamera(topic, width, height, times, camera, None, source.read, (), lens)
@@ -382,25 +390,6 @@ def _read_camera(
 def _field(info: Any, name: str) -> Array:
     """Return the numbers of a CameraInfo's field, given in lower case; ROS 1 has upper case."""
     return np.asarray(getattr(info, name, getattr(info, name.upper(), None)), dtype=np.float64)
-
-
-def _lens(info: Any, *, is_rectified: bool, where: str) -> Lens:
-    """Return the lens of a CameraInfo.
-
-    The distortion applies to raw images. Rectified images have no distortion, and their camera
-    matrix is in P, or in K if P is 0.
-
-    ``info``: the CameraInfo message. ``is_rectified``: whether the images are rectified. ``where``:
-    start of error messages. Raises SceneError: the distortion model is unknown.
-    """
-    size, K, D, P = (info.width, info.height), *(_field(info, one) for one in ("k", "d", "p"))
-    K = P.reshape(3, 4)[:, :3] if is_rectified and P.any() else K
-    plain = is_rectified or not D.any()
-    model, D = ("none", np.zeros(4)) if plain else (info.distortion_model, D)
-    try:
-        return lens_of(size, K, D, model, where)
-    except CameraError as error:
-        raise SceneError(f"{error}; record rectified pictures") from error
 
 
 class _TopicPictures:

@@ -34,6 +34,9 @@ _OPTIONAL = {
     ),
     "parallel": ("X_WC", "projection", "pixel_centers"),
 }  # fmt: skip
+_FIELDS = {
+    field for fields in (_REQUIRED, _OPTIONAL) for names in fields.values() for field in names
+}
 
 
 def load_cameras(
@@ -165,9 +168,8 @@ def load_camera_file(
 
         read = read_configs(configs, path)
         return CameraFile({_check_name(name, path): read[name] for name in read}, ())
-    own_fields = {field for kind in _REQUIRED for field in (*_REQUIRED[kind], *_OPTIONAL[kind])}
     entries = [entry for entry in content.values() if isinstance(entry, dict)]
-    if not (calibrated or any(own_fields & {*entry} for entry in entries)):
+    if not (calibrated or any(_FIELDS & {*entry} for entry in entries)):
         found = ", ".join(map(str, content))
         raise CameraError(
             f"{path}: is not a camera file: it has {found[:200]}; supported are {FORMATS}"
@@ -311,9 +313,8 @@ def _is_config(entry: dict[Any, Any]) -> bool:
         *("clipping_far", "z_near", "z_far", "renderer_name", "renderer_class", "background"),
         *("capture_offset", "output_delay", "do_compress", "lcm_bus"),
     }
-    own_fields = {field for kind in _REQUIRED for field in (*_REQUIRED[kind], *_OPTIONAL[kind])}
     return bool(drake_fields & set(entry)) and not set(entry) & (
-        own_fields - {*_COMMON, "clipping_near"}
+        _FIELDS - {*_COMMON, "clipping_near"}
     )
 
 

@@ -11,7 +11,6 @@ import numpy as np
 from drake_pose.arrays import Array, Indices, Picture
 from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending_indices
 from drake_pose.camera.lerobot_tables import (
-    StoredPictures,
     column_names,
     describe,
     find_states,
@@ -19,6 +18,7 @@ from drake_pose.camera.lerobot_tables import (
     read_numbers,
     row_times,
     shape_of,
+    stored_picture,
     with_fields,
 )
 from drake_pose.camera.picture_files import TimedVideo, import_reader
@@ -388,10 +388,11 @@ def _read_camera(
         if key not in table.column_names:
             raise SceneError(f"{video} is missing")
     column = table[key] if key in table.column_names else None
-    stored = StoredPictures(data.path, file, key, column, shape_of(feature), number)
 
     def recorded(k: int) -> Picture:
-        return stored.read(int(kept[k]))
+        row = int(kept[k])
+        cell = None if column is None else column[row]
+        return stored_picture(data.path, file, key, cell, shape_of(feature), number, row)
 
     height, width = recorded(0).shape[:2]
     return EpisodeCamera(key, width, height, stamps, None, None, recorded)

@@ -213,88 +213,78 @@ def is_picture(key: str, feature: Mapping[str, Any]) -> bool:
     return kind in ("video", "image") or (is_array and kind.startswith(("uint8", "float")))
 
 
-class StoredPictures:
-    """Images of a table: files inside it, paths of files, or arrays.
+def stored_picture(
+    root: Path, file: Path, key: str, cell: Any, shape: Sequence[int], number: int, k: int
+) -> Picture:
+    """Return the image (H, W, 3) of row k of a table, red, green, blue.
 
     Args:
         root: folder of the data set.
         file: the table, for messages.
         key: the images' feature.
-        column: the cells (pyarrow array or list); None: the table has no such column, and images
-            are in the format's folders.
+        cell: the row's cell (pyarrow): a file, the path of one, or an array; None: the table has no
+            such column, and images are in the format's folders.
         shape: shape of an image in `meta/info.json`; empty: unknown.
         number: number of the episode.
+
+    Raises SceneError: it is missing or damaged.
     """
-
-    def __init__(
-        self, root: Path, file: Path, key: str, column: Any, shape: Sequence[int], number: int
-    ) -> None:
-        self._root, self._file, self._key = root, file, key
-        self._column, self._shape, self._number = column, tuple(shape), number
-
-    def read(self, k: int) -> Picture:
-        """Return the image (H, W, 3) of row k, red, green, blue.
-
-        Raises SceneError: it is missing or damaged.
-        """
-        where = Path(f"{self._file}: '{self._key}', row {k}")
-        cell: Any = None
-        if self._column is not None:
-            cell = self._column[k]
-            kind = str(cell.type)
-            if kind.startswith(("list", "fixed_size_list", "large_list")):
-                return _array_picture(self._array(cell), str(where))
-            cell = cell.as_py()
-            if isinstance(cell, dict):
-                cell = cell.get("bytes") or cell.get("path")
-            if isinstance(cell, bytes):
-                return decode_colours(cell, where, SceneError)
-            if not isinstance(cell, str):
-                raise SceneError(
-                    f"{where}: holds {kind if cell is not None else 'nothing'}, but an image file, "
-                    "its path, or an array of height x width x 3 is expected"
-                )
-        tried = [*self._places(cell, k)]
-        for path in tried:
-            if path.is_file():
-                return read_picture(path, SceneError)
-        raise SceneError(f"{where}: no such image file; tried: {', '.join(map(str, tried))}")
-
-    def _places(self, stored: str | None, k: int) -> Iterable[Path]:
-        """Yield the paths at which the image of row k may be, by its stored path, if any."""
-        folders = [
-            self._root / "images" / key / f"episode{mark}{self._number:06d}"
-            for key in dict.fromkeys((self._key, self._key.rpartition(".")[2]))
-            for mark in "_-"
+    where = Path(f"{file}: '{key}', row {k}")
+    if cell is not None:
+        kind = str(cell.type)
+        if kind.startswith(("list", "fixed_size_list", "large_list")):
+            return _array_picture(_array(cell, shape, f"{file}: '{key}'"), str(where))
+        cell = cell.as_py()
+        if isinstance(cell, dict):
+            cell = cell.get("bytes") or cell.get("path")
+        if isinstance(cell, bytes):
+            return decode_colours(cell, where, SceneError)
+        if not isinstance(cell, str):
+            raise SceneError(
+                f"{where}: holds {kind if cell is not None else 'nothing'}, but an image file, "
+                "its path, or an array of height x width x 3 is expected"
+            )
+    folders = [
+        root / "images" / name / f"episode{mark}{number:06d}"
+        for name in dict.fromkeys((key, key.rpartition(".")[2]))
+        for mark in "_-"
+    ]
+    if cell is None:
+        tried = [
+            folder / f"frame{folder.name[len('episode')]}{k:06d}{end}"
+            for folder in folders
+            for end in (".png", ".jpg")
         ]
-        if stored is None:
-            for folder in folders:
-                mark = folder.name[len("episode")]
-                yield from (folder / f"frame{mark}{k:06d}{end}" for end in (".png", ".jpg"))
-            return
-        path = PurePath(stored.replace("\\", "/"))
-        yield self._root / path
-        yield self._file.parent / path
+    else:
+        path = PurePath(cell.replace("\\", "/"))
+        tried = [root / path, file.parent / path]
         if "images" in path.parts:
-            yield self._root.joinpath(*path.parts[path.parts.index("images") :])
-        yield self._root / "images" / path
-        yield from (folder / path.name for folder in folders)
+            tried.append(root.joinpath(*path.parts[path.parts.index("images") :]))
+        tried += [root / "images" / path, *(folder / path.name for folder in folders)]
+    for place in tried:
+        if place.is_file():
+            return read_picture(place, SceneError)
+    raise SceneError(f"{where}: no such image file; tried: {', '.join(map(str, tried))}")
 
-    def _array(self, cell: Any) -> Array:
-        """Return a cell of nested lists (pyarrow) as an array, in the shape of the lists."""
-        shape, values = list[int](), cell.values
-        while values is not None and str(values.type).partition("<")[0].endswith("list"):
-            inner = values.flatten()
-            shape.append(len(values))
-            values, outer = inner, len(values)
-            if outer == 0 or len(inner) % outer:
-                raise SceneError(f"{self._file}: '{self._key}': rows of an image differ in length")
-        flat = np.asarray(values.to_numpy(zero_copy_only=False))
-        sizes = [*shape, len(flat)]
-        lengths = [sizes[0], *(b // a for a, b in itertools.pairwise(sizes))]
-        # A flat list has the shape that the data set states.
-        given = self._shape if len(lengths) == 1 and math.prod(self._shape) == len(flat) else ()
-        return flat.reshape(given or lengths)
+
+def _array(cell: Any, given: Sequence[int], where: str) -> Array:
+    """Return a cell of nested lists (pyarrow) as an array, in the shape of the lists.
+
+    A flat list has the shape that the data set states, ``given``. Raises SceneError, begun by
+    ``where``: rows differ in length.
+    """
+    shape, values = list[int](), cell.values
+    while values is not None and str(values.type).partition("<")[0].endswith("list"):
+        inner = values.flatten()
+        shape.append(len(values))
+        values, outer = inner, len(values)
+        if outer == 0 or len(inner) % outer:
+            raise SceneError(f"{where}: rows of an image differ in length")
+    flat = np.asarray(values.to_numpy(zero_copy_only=False))
+    sizes = [*shape, len(flat)]
+    lengths = [sizes[0], *(b // a for a, b in itertools.pairwise(sizes))]
+    is_stated = len(lengths) == 1 and math.prod(given) == len(flat)
+    return flat.reshape((tuple(given) if is_stated else ()) or lengths)
 
 
 def _array_picture(values: Any, where: str) -> Picture:

@@ -23,7 +23,7 @@ from drake_pose.commands.estimate import capture, demo, empty_room, estimate
 from drake_pose.commands.papers import date, kameda, shimada
 from drake_pose.commands.prepare import check, masks
 from drake_pose.commands.register import audit, register
-from drake_pose.errors import DrakePoseError, SettingsError, options_in_messages
+from drake_pose.errors import DrakePoseError, SettingsError, messages_for
 from drake_pose.files.settings import say_gone
 from drake_pose.version import VERSION
 
@@ -116,7 +116,7 @@ def main(words: Sequence[str] | None = None) -> None:
     for ending in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(ending) is signal.SIG_DFL:
             signal.signal(ending, signal.default_int_handler)
-    with options_in_messages():
+    with messages_for("command line"):
         _run(words)
 
 

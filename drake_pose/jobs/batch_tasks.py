@@ -27,7 +27,7 @@ from drake_pose.errors import (
     OutputError,
     SettingsError,
     for_caller,
-    keys_in_messages,
+    messages_for,
 )
 from drake_pose.files.folder import OVERLAY, POSES, read_summary, write_file, write_summary
 from drake_pose.files.records import FrameRecord, describe_job, file_digest, mask_digests, summarize
@@ -325,7 +325,7 @@ def camera_set(job: SceneJob) -> tuple[Any, ...] | None:
     return folder, job.model, job.camera_file, settings.cameras
 
 
-@keys_in_messages()
+@messages_for("job file")
 def perform(task: Task) -> Outcome:
     """Run a task, unless its result folder exists; an error becomes part of the outcome."""
     begin = time.perf_counter()
@@ -342,7 +342,7 @@ def perform(task: Task) -> Outcome:
         return Outcome(describe_failure(error), time.perf_counter() - begin)
 
 
-@keys_in_messages()
+@messages_for("job file")
 def describe_failure(error: BaseException) -> str:
     """Return the message of a task's error; that of unexpected ones begins with their type."""
     if isinstance(error, DrakePoseError):

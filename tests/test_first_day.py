@@ -75,72 +75,53 @@ def test_a_single_name_is_a_collection_and_a_number_is_refused():
             RegistrationSettings(**wrong)
 
 
-@pytest.mark.parametrize("make", [MultiStartSearch, BeamSearch, RegistrationBody])
-def test_a_model_instead_of_its_tree_is_refused(make, model):
-    with pytest.raises(SettingsError, match=r"model\.pose_tree\(\).*ArticulatedModel, '"):
-        make(model)
-
-
-def test_a_single_camera_instead_of_several_is_refused(model, tmp_path):
-    search = MultiStartSearch(model.pose_tree())
-    calls = [
-        lambda: SilhouetteMatcher(search, CAMERA, 1.0),
-        lambda: save_cameras(tmp_path / "cameras.yaml", CAMERA),
-        lambda: PersonTracker(None, CAMERA, 1.0),
+def test_a_model_a_camera_or_a_tuple_where_others_are_expected_is_refused(model, tmp_path):
+    search, view = MultiStartSearch(model.pose_tree()), View(CAMERA, np.ones((48, 64), bool))
+    a_model, a_camera = r"model\.pose_tree\(\).*ArticulatedModel, '", "one camera, 'c'"
+    start = np.zeros(3), np.eye(3)
+    table = [
+        (a_model, lambda: MultiStartSearch(model)),
+        (a_model, lambda: BeamSearch(model)),
+        (a_model, lambda: RegistrationBody(model)),
+        (a_camera, lambda: SilhouetteMatcher(search, CAMERA, 1.0)),
+        (a_camera, lambda: save_cameras(tmp_path / "cameras.yaml", CAMERA)),
+        (a_camera, lambda: PersonTracker(None, CAMERA, 1.0)),
+        ("str where a camera", lambda: SilhouetteMatcher(search, "c", 1.0)),
+        (r"\[view\]", lambda: search.match(view)),
+        (
+            "start must be a Belief.*not a tuple",
+            lambda: TruncatedEkf(object.__new__(TruncatedFilter), start, 0.1),
+        ),
     ]
-    for call in calls:
-        with pytest.raises(CameraError, match="one camera, 'c'"):
+    for words, call in table:
+        with pytest.raises((CameraError, SettingsError), match=words):
             call()
-    with pytest.raises(CameraError, match="str where a camera"):
-        SilhouetteMatcher(search, "c", 1.0)
-    with pytest.raises(SettingsError, match=r"\[view\]"):
-        search.match(View(CAMERA, np.ones((48, 64), bool)))
-
-
-def test_a_tuple_instead_of_a_belief_is_refused():
-    with pytest.raises(SettingsError, match=r"start must be a Belief.*not a tuple"):
-        TruncatedEkf(object.__new__(TruncatedFilter), (np.zeros(3), np.eye(3)), 0.1)
-
-
-def test_a_models_repr_is_one_line(model):
-    for one in (model, model.pose_tree()):
-        assert "\n" not in repr(one)
-        assert len(repr(one)) < 300
-        assert "two_finger_hand" in repr(one)
 
 
 @pytest.mark.parametrize(
-    ("cli_text", "python_text"),
+    ("cli_text", "python_text", "job_text"),
     [
-        ("name those: --camera NAME", "name those: cameras=NAME"),
-        ("(--joints FILE): --hold elbow=VALUE", "(joints=FILE): hold={'elbow': VALUE}"),
-        ("in the zeros (--zeros all)?", "in the zeros (zeros='all')?"),
-        ("leave --no-track out (--joint-map)", "leave track=False out (joint_map)"),
-        ("(drake-pose masks --largest) or --out", "(drake-pose masks --largest) or out"),
+        ("name those: --camera NAME", "name those: cameras=NAME", "name those: cameras: NAME"),
+        (
+            "(--joints FILE): --hold elbow=VALUE",
+            "(joints=FILE): hold={'elbow': VALUE}",
+            "(audit: FILE): hold: {elbow: VALUE}",
+        ),
+        ("(--zeros all)?", "(zeros='all')?", None),
+        ("leave --no-track out (--joint-map)", "leave track=False out (joint_map)", None),
+        ("(--cameras FILE)", None, "(camera_file: FILE)"),
+        ("(drake-pose masks --largest) or --out", "(drake-pose masks --largest) or out", None),
+        ("(drake-pose register --zeros all)", None, "(drake-pose register --zeros all)"),
     ],
 )
-def test_messages_name_arguments_in_python_and_options_on_the_command_line(cli_text, python_text):
-    assert for_caller(cli_text) == python_text
+def test_messages_name_arguments_options_or_keys(cli_text, python_text, job_text):
+    """In Python, on the command line, and in a batch, whose settings are in a job file."""
+    assert python_text is None or for_caller(cli_text) == python_text
     with messages_for("command line"):
         assert for_caller(cli_text) == cli_text
-    assert for_caller(cli_text) == python_text
-
-
-@pytest.mark.parametrize(
-    ("cli_text", "job_text"),
-    [
-        ("give a camera file (--cameras FILE)", "give a camera file (camera_file: FILE)"),
-        ("name those: --camera NAME", "name those: cameras: NAME"),
-        ("(--joints FILE): --hold elbow=VALUE", "(audit: FILE): hold: {elbow: VALUE}"),
-        (
-            "(drake-pose register --zeros all) or --out",
-            "(drake-pose register --zeros all) or --out",
-        ),
-    ],
-)
-def test_messages_of_a_batch_name_keys_of_the_job_file(cli_text, job_text):
-    with messages_for("command line"), messages_for("job file"):
-        assert for_caller(cli_text) == job_text
+        with messages_for("job file"):
+            assert job_text is None or for_caller(cli_text) == job_text
+    assert python_text is None or for_caller(cli_text) == python_text
 
 
 def test_errors_of_python_calls_name_arguments():

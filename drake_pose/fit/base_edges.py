@@ -132,10 +132,10 @@ def locate_base(
 
     angles = np.arange(-BASE.within, BASE.within, BASE.step)
     bounds = angles[0], 0.0, angles[-1]
-    part = _part_with(base, [turned(angle) @ X_WN for angle in bounds], camera)
-    if part is None:
+    cropped = _cropped(base, [turned(angle) @ X_WN for angle in bounds], camera, pictures)
+    if cropped is None:
         return 0.0, np.inf
-    camera, shown = _cropped(camera, part, pictures)
+    camera, shown = cropped
     slopes = _median_slopes(kinematics, moving, camera, shown, values)
 
     def drawn(angle: float) -> _Edges:
@@ -182,15 +182,22 @@ def locate_base(
     return angle, float(np.sqrt(variance))
 
 
-def _part_with(
-    outlines: Sequence[Outline], poses: Sequence[Array], camera: PinholeCamera, margin: int = 8
-) -> tuple[slice, slice] | None:
-    """Return the rows and columns of a picture's part around surfaces; None: hardly visible.
+def _cropped(
+    outlines: Sequence[Outline],
+    poses: Sequence[Array],
+    camera: PinholeCamera,
+    pictures: Sequence[Picture],
+    margin: int = 8,
+) -> tuple[PinholeCamera, Floats] | None:
+    """Return the camera of the pictures' part around surfaces, and the f parts (f, h, w, 3).
+
+    h and w are reduced to `BASE.most_pixels` at most. None: the surfaces are hardly visible.
 
     Args:
         outlines: a surface for each node.
         poses: several times the nodes' poses (nodes, 4, 4) in the camera; the part shows all.
-        camera: its intrinsics; its pose is not used.
+        camera: its intrinsics; its pose stays.
+        pictures: f pictures (H, W, 3).
         margin: around the surfaces [pixel].
     """
     points = np.concatenate(
@@ -206,26 +213,15 @@ def _part_with(
         return None
     left, top = np.clip(np.floor(uv.min(axis=0)) - margin, 0, size).astype(int).tolist()
     right, bottom = np.clip(np.ceil(uv.max(axis=0)) + margin, 0, size).astype(int).tolist()
-    if min(right - left, bottom - top) <= 2 * margin:
-        return None
-    return slice(top, bottom), slice(left, right)
-
-
-def _cropped(
-    camera: PinholeCamera, part: tuple[slice, slice], pictures: Sequence[Picture]
-) -> tuple[PinholeCamera, Floats]:
-    """Return the camera of a part of the pictures, and the f parts (f, h, w, 3).
-
-    part: its rows and columns; h and w are reduced to `BASE.most_pixels` at most.
-    """
-    (top, bottom), (left, right) = ((bounds.start, bounds.stop) for bounds in part)
     width, height = right - left, bottom - top
+    if min(width, height) <= 2 * margin:
+        return None
     center = {"center_x": camera.center_x - left, "center_y": camera.center_y - top}
     scale = min(1.0, BASE.most_pixels / max(width, height))
-    size = max(1, round(scale * width)), max(1, round(scale * height))
-    small = replace(camera, width=width, height=height, **center).resized(*size)
-    parts = (np.asarray(picture[part], np.float32) for picture in pictures)
-    return small, np.array([cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in parts])
+    reduced = max(1, round(scale * width)), max(1, round(scale * height))
+    small = replace(camera, width=width, height=height, **center).resized(*reduced)
+    parts = (np.asarray(one[top:bottom, left:right], np.float32) for one in pictures)
+    return small, np.array([cv2.resize(p, reduced, interpolation=cv2.INTER_AREA) for p in parts])
 
 
 def _median_slopes(

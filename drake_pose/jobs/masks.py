@@ -248,8 +248,17 @@ def largest_patch(mask: Mask) -> Mask:
     return np.asarray(labels == 1 + int(np.argmax(statistics[1:, cv2.CC_STAT_AREA])))
 
 
-def find_masks(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
+def find_masks(
+    source: Source, settings: MaskSettings, thresholds: Sequence[float] = (0.7, 1.4)
+) -> Iterator[FoundMask]:
     """Yield the masks of a source by camera and frame, read or segmented as the settings say.
+
+    A segmented mask is the region that differs from the camera's background.
+
+    Args:
+        source: the source of the pictures or masks.
+        settings: the segmentation.
+        thresholds: factors of the background's noise for masks to compare with.
 
     Raises DrakePoseError: the message names the file, camera or frame at fault.
     """
@@ -266,36 +275,19 @@ def find_masks(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
     # All backgrounds are read before the first mask is written.
     rooms = {name: _background(source, name, background) for name in source.names}
     for camera, (room, doubts) in rooms.items():
-        yield from _differing_regions(source, camera, room, doubts)
-
-
-def _differing_regions(
-    source: Source,
-    camera: str,
-    room: Background,
-    doubts: tuple[str, ...],
-    thresholds: Sequence[float] = (0.7, 1.4),
-) -> Iterator[FoundMask]:
-    """Yield the region of each of a camera's pictures that differs from its background.
-
-    Args:
-        source: the source of the pictures.
-        camera: the camera's name.
-        room: its background.
-        doubts: warnings of the background, which are given once.
-        thresholds: factors of the background's noise for masks to compare with.
-    """
-    backgrounds = [room.with_noise(k) for k in (1.0, *thresholds)]
-    for frame, where, picture in source.read(camera):
-        if picture.shape != room.mean.shape:
-            height, width = room.mean.shape[:2]
-            raise SceneError(
-                f"{where}: differs in size from the background, {width} x {height} (width x height)"
-            )
-        mask, *again = (person_region(picture, one) for one in backgrounds)
-        agreement = min(intersection_over_union(mask, one) for one in again)
-        yield FoundMask(camera, frame, where, mask, picture, doubts, agreement)
-        doubts = ()
+        backgrounds = [room.with_noise(k) for k in (1.0, *thresholds)]
+        for frame, where, picture in source.read(camera):
+            if picture.shape != room.mean.shape:
+                height, width = room.mean.shape[:2]
+                raise SceneError(
+                    f"{where}: differs in size from the background, {width} x {height} "
+                    "(width x height)"
+                )
+            mask, *again = (person_region(picture, one) for one in backgrounds)
+            agreement = min(intersection_over_union(mask, one) for one in again)
+            yield FoundMask(camera, frame, where, mask, picture, doubts, agreement)
+            # The background's warnings are given once.
+            doubts = ()
 
 
 def _read_given(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:

@@ -14,7 +14,6 @@ from drake_pose.fit.contour_fit import (
     pack_cameras,
     pack_views,
     pixels_per_metre,
-    symmetric,
 )
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.kernel import assemble_normal_equations, match_points
@@ -149,13 +148,6 @@ def test_pixels_per_metre_match_projections():
         (size,) = pixels_per_metre(pack_cameras([camera]), place)
         ends = place + 1e-3 * np.outer([-1.0, 1.0], camera.X_WC[:3, 0])
         assert np.diff(camera.project(ends)[0][:, 0])[0] / 2e-3 == pytest.approx(size, rel=1e-6)
-
-
-def test_symmetric_completes_the_lower_triangle():
-    A = np.random.default_rng(0).normal(size=(2, 5, 5))
-    full = symmetric(np.tril(A))
-    np.testing.assert_array_equal(np.tril(full), np.tril(A))
-    np.testing.assert_array_equal(full, np.swapaxes(full, 1, 2))
 
 
 class TestFit:

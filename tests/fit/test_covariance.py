@@ -13,7 +13,6 @@ from drake_pose.fit.covariance import (
     ComparedMask,
     Distances,
     ErrorSizes,
-    _prior_information,
     distances_covariance,
     distances_in_masks,
     error_unit,
@@ -34,6 +33,8 @@ FINE = tuple(AnnealingStage(scale, 0.0125, 8) for scale in (0.025, 0.0125))
 STEP = AnnealingStage(0.025, 0.0125)
 ANGLES = np.ones(3, dtype=bool)
 ALL = np.arange(3)
+# The information of uniform priors over a full turn.
+PRIOR = 12.0 / (2.0 * np.pi) ** 2 * np.eye(3)
 
 
 def drawn_distances(generator, sizes, count=150):
@@ -69,7 +70,7 @@ def test_sizes_maximise_the_posterior(scale, prior):
 
     def log_likelihood(t):
         V = np.einsum("k,kij->ij", np.exp(2.0 * t), residuals.effects)
-        whole = V + residuals.X @ np.linalg.inv(_prior_information(ANGLES)) @ residuals.X.T
+        whole = V + residuals.X @ np.linalg.inv(PRIOR) @ residuals.X.T
         log_likelihoods = np.linalg.slogdet(whole)[1] + residuals.y @ np.linalg.solve(
             whole, residuals.y
         )
@@ -239,7 +240,7 @@ def test_nuisances_are_removed_by_their_posterior_mean():
     residuals, _ = drawn_distances(np.random.default_rng(5), sizes, 40)
     _, without = nuisance_covariance(residuals, sizes, ANGLES)
     (A,) = residuals.nuisances
-    values = residuals.X @ np.linalg.inv(_prior_information(ANGLES)) @ residuals.X.T
+    values = residuals.X @ np.linalg.inv(PRIOR) @ residuals.X.T
     whole = distances_covariance(residuals, sizes) + 4.0 * A @ A.T + values
     estimates = 4.0 * A.T @ np.linalg.solve(whole, residuals.y)
     np.testing.assert_allclose(without.y, residuals.y - A @ estimates, atol=1e-6)

@@ -1,11 +1,10 @@
 """Simplified surfaces: against exact shapes, bundled bodies, and brute-force distances."""
 
-import fast_simplification
 import numpy as np
 import pytest
 import trimesh
 
-from drake_pose.body import TriangleMesh, bundled_model, load_model
+from drake_pose.body import TriangleMesh
 from drake_pose.fit import surfaces
 from drake_pose.fit.surfaces import (
     FEW,
@@ -69,17 +68,6 @@ def test_surfaces_with_slivers_keep_their_shape(slivers):
     # Nothing is lost, and nothing protrudes.
     assert nearest_sample(on_surface(given, 400), simple).max() < 0.012
     assert distance_to_shape(on_surface(simple)).max() < 0.008
-
-
-def test_surfaces_without_slivers_are_the_simplifiers():
-    surfaces = TreeSurfaces(load_model(bundled_model("person"), check=False).pose_tree())
-    for count in (FEW, VERY_FEW):
-        for given, simple in zip(surfaces.rigid, simplify_surfaces(surfaces, count), strict=True):
-            if len(given.triangles) > count:
-                points, _ = fast_simplification.simplify(
-                    given.vertices, given.triangles, target_count=count
-                )
-                assert {*map(tuple, simple.vertices)} <= {*map(tuple, points.astype(float))}
 
 
 def test_a_thin_rod_is_kept():

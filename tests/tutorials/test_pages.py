@@ -226,12 +226,6 @@ def test_every_package_has_an_api_page() -> None:
     assert pages == {"index", "errors", *folders} - {"commands"}
 
 
-def test_pictures_are_small() -> None:
-    pictures = list((TUTORIALS / "pictures").glob("*.png"))
-    assert {picture.name for picture in pictures} == {"demo.png", "woman.png"}
-    assert sum(picture.stat().st_size for picture in pictures) < 200_000
-
-
 @each_page
 def test_no_absolute_path(page: str) -> None:
     assert not re.search(r"(?<![\w.)/:])/(home|root|tmp|usr|work|Users|opt|var)/", TEXTS[page])

@@ -207,7 +207,14 @@ class LabelRenderer:
         port.FixValue(self._context, self._skin.configuration(p_B))
         depths = None
         if isinstance(self.camera, ParallelCamera):
-            depths = self._depths(q, p_B, self.camera.X_CW @ X_BW.inverse().GetAsMatrix4())
+            # The depths of the body in the camera [m], with a margin.
+            X_CB, X_BL = self.camera.X_CW @ X_BW.inverse().GetAsMatrix4(), self.link_poses(q)
+            placed = [(X_CB @ X_BL[label], p_L) for label, p_L in self._vertices]
+            placed += [(X_CB, p) for p in p_B]
+            found = np.concatenate(
+                [p @ X[2, :3] + X[2, 3] for X, p in placed] or [np.array([-1.0, 1.0])]
+            )
+            depths = float(found.min()) - 0.01, float(found.max()) + 0.01
         color, _, X_WC = camera_to_drake(
             self.camera, renderer_name="silhouette", depth_range=depths
         )
@@ -249,24 +256,3 @@ class LabelRenderer:
             # Drake would abort the whole process.
             raise ValueError(f"q must be ({self._plant.num_positions()},) finite numbers")
         self._plant.SetPositions(self._plant_context, positions)
-
-    def _depths(
-        self, q: np.ndarray, bands: Sequence[np.ndarray], X_CB: np.ndarray
-    ) -> tuple[float, float]:
-        """Return the smallest and largest depth of the body in the camera [m], with a margin.
-
-        Args:
-            q: (nq,) positions.
-            bands: (v, 3) vertices of each skin band in the plant's world frame B [m].
-            X_CB: (4, 4) pose of B in the camera.
-
-        Returns:
-            The two depths; -1 and 1 if the model has no geometry.
-        """
-        X_BL = self.link_poses(q)
-        placed = [(X_CB @ X_BL[label], p_L) for label, p_L in self._vertices]
-        placed += [(X_CB, p_B) for p_B in bands]
-        if not placed:
-            return -1.0, 1.0
-        depths = np.concatenate([p @ X[2, :3] + X[2, 3] for X, p in placed])
-        return float(depths.min()) - 0.01, float(depths.max()) + 0.01

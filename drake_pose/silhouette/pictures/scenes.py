@@ -139,10 +139,6 @@ class Scene:
         )
         return scene, tuple(frame for frame in selected if frame in known)
 
-    def mask_path(self, camera: str, frame: str) -> Path:
-        """Return the mask file of a camera's frame; UnknownNameError if there is none."""
-        return self._file(self.masks, camera, frame)
-
     def read(self, camera: str, frame: str, *, may_be_empty: bool = False) -> np.ndarray:
         """Return the mask (H, W) of a camera's frame.
 
@@ -151,7 +147,7 @@ class Scene:
         Raises UnknownNameError: there is no such camera, or it has no such frame; MaskError: the
         file is not a mask of the camera's size, or has no object.
         """
-        path, size = self.mask_path(camera, frame), self.cameras[camera]
+        path, size = self._file(self.masks, camera, frame), self.cameras[camera]
         key = path, size.width, size.height
         if (packed := self._packed.get(key)) is None:
             mask = read_mask(path, size.width, size.height, may_be_empty=may_be_empty)

@@ -143,7 +143,7 @@ def test_leading_zeros_do_not_distinguish_frames(tmp_path):
     scene = load_scene(tmp_path)
     assert scene.frames == ("0001", "0002")
     assert check_scene(scene).warnings == ()
-    assert scene.mask_path("left", "0002").name == "2.png"
+    assert scene.masks["left", "0002"].name == "2.png"
 
 
 def test_misspelt_camera_is_reported(tmp_path):

@@ -35,7 +35,7 @@ def test_scene_has_cameras_frames_and_masks(tmp_path):
     assert scene.frames == ("0001", "0002", "0003")
     assert scene.cameras_of("0002") == ("left", "right")
     assert scene.cameras_of("0003") == ("right",)
-    assert scene.mask_path("left", "0001") == tmp_path / "masks" / "left" / "0001.png"
+    assert scene.masks["left", "0001"] == tmp_path / "masks" / "left" / "0001.png"
     np.testing.assert_array_equal(scene.read("right", "0003"), MASK)
     assert (scene.sequence, scene.frame_rate_hz) == (False, None)
 
@@ -43,7 +43,7 @@ def test_scene_has_cameras_frames_and_masks(tmp_path):
 def test_errors_list_existing_names(tmp_path):
     scene = load_scene(make_scene(tmp_path))
     with pytest.raises(UnknownNameError, match=r"camera 'middle'.*left, right"):
-        scene.mask_path("middle", "0001")
+        scene.read("middle", "0001")
     with pytest.raises(UnknownNameError, match=r"camera 'left' has no frame '0003'.*0001, 0002"):
         scene.read("left", "0003")
     with pytest.raises(UnknownNameError, match=r"frame '9'.*0001, 0002, 0003"):
@@ -147,7 +147,7 @@ def test_mask_size_is_checked_on_every_read(tmp_path):
     larger = replace(camera("left"), width=31)
     with pytest.raises(MaskError, match=r"left/0001\.png.*30 x 20"):
         replace(scene, cameras={**scene.cameras, "left": larger}).read("left", "0001")
-    write_mask(scene.mask_path("right", "0003"), MASK.T)
+    write_mask(scene.masks["right", "0003"], MASK.T)
     with pytest.raises(MaskError, match=r"right/0003\.png.*20 x 30"):
         scene.read("right", "0003")
 

@@ -30,16 +30,23 @@ INFO = Path("meta", "info.json")
 """File by which LeRobot data sets are recognised."""
 
 
-class _DataSet(NamedTuple):
-    """A data set's metadata.
+Metadata = Mapping[int, Mapping[str, Any]]
+"""Each episode's metadata, from column to value, by its number; {}: it has none."""
 
-    ``path``: its folder. ``info``: content of `meta/info.json`. ``rows``: metadata of each episode,
-    from column name to value, by the episode's number; {} for an episode without metadata.
-    """
 
-    path: Path
-    info: Mapping[str, Any]
-    rows: Mapping[int, Mapping[str, Any]]
+class _Rows(NamedTuple):
+    """The rows of an episode that is read."""
+
+    path: Path  # Folder of the data set.
+    info: Mapping[str, Any]  # Content of `meta/info.json`.
+    metadata: Metadata
+    number: int  # Number of the episode.
+    table: Any  # Its table (pyarrow.Table).
+    file: Path  # The table's file.
+    # stamps, kept: (k,) ascending times [s] and indices of the rows to use.
+    stamps: Array
+    kept: Indices
+    warnings: list[str]  # Is appended to.
 
 
 def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Episode:
@@ -60,12 +67,13 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
     parquet, warnings = import_reader("pyarrow.parquet", path), list[str]()
     try:
         info = _read_info(path)
-        data = _DataSet(path, info, _episode_rows(path, info, parquet))
-        number, features = _choose_episode(data, episode), info["features"]
-        table, file = _read_table(data, number, parquet, warnings)
+        metadata, features = _episode_rows(path, info, parquet), info["features"]
+        number = _choose_episode(path, info, metadata, episode)
+        file = _file(path, info, metadata, number)
+        table = _read_table(file, info, number, parquet, warnings)
         stamps = row_times(table, _rate(info), str(file), warnings)
         kept, late = ascending_indices(stamps, f"{file}: episode {number}")
-        stamps = stamps[kept]
+        rows = _Rows(path, info, metadata, number, table, file, stamps[kept], kept, warnings)
         warnings += [
             *late,
             *(
@@ -86,7 +94,7 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
             name = camera_name(key)
             names.append(key if name in names else name)
             try:
-                camera = _read_camera(data, number, key, table, file, stamps, kept, warnings)
+                camera = _read_camera(rows, key)
             except SceneError as error:
                 warnings.append(f"camera '{names[-1]}' is left out: {error}")
                 continue
@@ -95,8 +103,8 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
             cameras.append(with_fields(camera, fields, str(path / INFO)))
         own, lacking = None, ""
         if joints is None:
-            own, lacking = _read_joints(path, info, table, file, stamps, kept, warnings)
-        cameras, own, joints = _from_start(file, stamps, cameras, own, joints, warnings)
+            own, lacking = _read_joints(rows)
+        cameras, own, joints = _from_start(rows, cameras, own, joints)
     except OSError as error:
         what = f"{error.filename or path}: cannot be read: {error.strerror or error}"
         raise SceneError(f"{path}: a file of it is damaged: {what}") from error
@@ -163,7 +171,7 @@ def _rate(info: Mapping[str, Any]) -> float | None:
 def _episode_rows(
     path: Path, info: Mapping[str, Any], parquet: Any
 ) -> dict[int, Mapping[str, Any]]:
-    """Return the metadata of the episodes, see `_DataSet`.
+    """Return the metadata of the episodes.
 
     They are in `meta/episodes/*/*.parquet` (version 3) or `meta/episodes.jsonl` (version 2).
     Without either file the episodes are numbered from 0 to `total_episodes` - 1.
@@ -209,14 +217,15 @@ def _count(path: Path, info: Mapping[str, Any], field: str, default: int) -> int
         raise SceneError(f"{path / INFO}: {field} must be a number, not {found!r}") from error
 
 
-def _file(data: _DataSet, number: int, key: str = "") -> Path:
+def _file(
+    path: Path, info: Mapping[str, Any], metadata: Metadata, number: int, key: str = ""
+) -> Path:
     """Return the file of an episode's data, or of the video of a camera; it may be missing.
 
     The words in the templates of `meta/info.json` may be those of either version. Without a
     template it is the version's own. ``number``: of the episode. ``key``: the camera's feature; "":
     the data. Raises SceneError: the template has an unknown word, or one whose value is not known.
     """
-    path, info, rows = data
     is_v3, which = info["codebase_version"].startswith("3."), "video_path" if key else "data_path"
     # The templates of versions 2 and 3.
     own = [
@@ -231,7 +240,7 @@ def _file(data: _DataSet, number: int, key: str = "") -> Path:
     given = info.get(which)
     templates = [str(given).replace("\\", "/")] if given else own[::-1] if is_v3 else own
     size = _count(path, info, "chunks_size", 1000) or 1000
-    chunk, row, where = number // size, rows[number], f"videos/{key}" if key else "data"
+    chunk, row, where = number // size, metadata[number], f"videos/{key}" if key else "data"
     values: dict[str, Any] = dict.fromkeys(("video_key", "image_key", "camera_key", "key"), key)
     values |= dict.fromkeys(("episode_index", "episode_id", "episode"), number)
     values |= dict.fromkeys(("episode_chunk", "chunk"), chunk)
@@ -260,35 +269,38 @@ def _file(data: _DataSet, number: int, key: str = "") -> Path:
     return found or files[0]
 
 
-def _choose_episode(data: _DataSet, wanted: int | None) -> int:
+def _choose_episode(
+    path: Path, info: Mapping[str, Any], metadata: Metadata, wanted: int | None
+) -> int:
     """Return the number of the wanted episode, or of the only one whose data are present.
 
     ``wanted``: None: the only one. Raises UnknownNameError: the data of the wanted episode are not
     present; SceneError: none was wanted, and the data of none or of several episodes are present.
     """
-    numbers = list(data.rows)
+    numbers = list(metadata)
     candidates = numbers if wanted is None else [one for one in numbers if one == wanted]
-    present = [one for one in candidates if _file(data, one).is_file()]
+    present = [one for one in candidates if _file(path, info, metadata, one).is_file()]
     if len(present) == 1:
         return present[0]
-    present = [one for one in numbers if _file(data, one).is_file()]
+    present = [one for one in numbers if _file(path, info, metadata, one).is_file()]
     names = listed([*map(str, present)], 20)
     if wanted is not None and present:
-        raise UnknownNameError("episode", str(wanted), [names], str(data.path))
-    expected = f"; expected, for one, {_file(data, numbers[0])}" if numbers else ""
+        raise UnknownNameError("episode", str(wanted), [names], str(path))
+    expected = f"; expected, for one, {_file(path, info, metadata, numbers[0])}" if numbers else ""
     raise SceneError(
-        f"{data.path}: choose an episode (--episode N); of {len(numbers)} these are present: "
+        f"{path}: choose an episode (--episode N); of {len(numbers)} these are present: "
         f"{names or 'none' + expected}"
     )
 
 
-def _read_table(data: _DataSet, number: int, parquet: Any, warnings: list[str]) -> tuple[Any, Path]:
-    """Return the table (pyarrow.Table) of an episode, and its file; ``parquet`` is the module.
+def _read_table(
+    file: Path, info: Mapping[str, Any], number: int, parquet: Any, warnings: list[str]
+) -> Any:
+    """Return the table (pyarrow.Table) of an episode in a ``file``; ``parquet`` is the module.
 
     ``number``: of the episode. ``warnings``: appended to. Raises SceneError: the table is damaged,
     or has no row of the episode.
     """
-    file, info = _file(data, number), data.info
     try:
         schema = parquet.read_schema(file)
         available = schema.names
@@ -308,14 +320,14 @@ def _read_table(data: _DataSet, number: int, parquet: Any, warnings: list[str]) 
                 found = parquet.read_table(file, columns=["episode_index"])
                 others = read_numbers(found, "episode_index", str(file))[:, 0]
         if table.num_rows:
-            return table, file
+            return table
         others = np.unique(others)
         if len(others) == 1 and "episode" in str(info.get("data_path") or "episode"):
             warnings.append(
                 f"{file}: its column episode_index is {others[0]:g}, not {number}; all its rows "
                 "are used"
             )
-            return parquet.read_table(file, columns=used), file
+            return parquet.read_table(file, columns=used)
     except (ValueError, TypeError, NotImplementedError) as error:
         what = f"not a whole table: {error}{pointer_hint(file)}"
         raise SceneError(f"{file}: a file of it is damaged: {what}") from error
@@ -326,22 +338,10 @@ def _read_table(data: _DataSet, number: int, parquet: Any, warnings: list[str]) 
     )
 
 
-def _read_joints(
-    path: Path,
-    info: Mapping[str, Any],
-    table: Any,
-    file: Path,
-    stamps: Array,
-    kept: Indices,
-    warnings: list[str],
-) -> tuple[JointLog | None, str]:
-    """Return the joint log of an episode, None if there is none, and what is wrong with it.
-
-    ``info``: content of `meta/info.json`. ``table``: the episode's (pyarrow.Table), of a ``file``
-    for messages. ``stamps``, ``kept``: (k,) times [s] and indices of the rows to use. ``warnings``:
-    appended to.
-    """
-    features = info["features"]
+def _read_joints(rows: _Rows) -> tuple[JointLog | None, str]:
+    """Return the joint log of an episode, None if there is none, and what is wrong with it."""
+    path, table, file = rows.path, rows.table, rows.file
+    features = rows.info["features"]
     keys = [key for key in find_states(features) if key in table.column_names]
     if not keys:
         actions = [key for key in features if key.startswith("action")]
@@ -358,60 +358,46 @@ def _read_joints(
         return None, lacking
     values = [read_numbers(table, key, str(file)) for key in keys]
     names = column_names(keys, [one.shape[1] for one in values], features)
-    servos, texts = find_motors(path, str(info.get("robot_type") or ""), names)
-    warnings += texts
-    return JointLog(names, stamps, np.column_stack(values)[kept], servos=servos), ""
+    servos, texts = find_motors(path, str(rows.info.get("robot_type") or ""), names)
+    rows.warnings.extend(texts)
+    return JointLog(names, rows.stamps, np.column_stack(values)[rows.kept], servos=servos), ""
 
 
-def _read_camera(
-    data: _DataSet,
-    number: int,
-    key: str,
-    table: Any,
-    file: Path,
-    stamps: Array,
-    kept: Indices,
-    warnings: list[str],
-) -> EpisodeCamera:
+def _read_camera(rows: _Rows, key: str) -> EpisodeCamera:
     """Return a camera of an episode: of a video with its times, or of images with the rows' times.
 
-    ``number``: of the episode. ``key``: the camera's feature. ``table``: the episode's
-    (pyarrow.Table), of a ``file`` for messages. ``stamps``, ``kept``: (k,) times [s] and indices of
-    the rows to use. ``warnings``: appended to. Raises SceneError: the camera's images are missing
-    or damaged.
+    ``key``: the camera's feature. Raises SceneError: the camera's images are missing or damaged.
     """
-    feature = data.info["features"][key]
+    feature, table = rows.info["features"][key], rows.table
     if feature.get("dtype") == "video":
-        video = _file(data, number, key)
+        video = _file(rows.path, rows.info, rows.metadata, rows.number, key)
         if video.is_file():
-            return _video_camera(data, number, key, video, table.num_rows, warnings)
+            return _video_camera(rows, key, video)
         if key not in table.column_names:
             raise SceneError(f"{video} is missing")
     column = table[key] if key in table.column_names else None
 
     def recorded(k: int) -> Picture:
-        row = int(kept[k])
+        row = int(rows.kept[k])
         cell = None if column is None else column[row]
-        return stored_picture(data.path, file, key, cell, shape_of(feature), number, row)
+        shape = shape_of(feature)
+        return stored_picture(rows.path, rows.file, key, cell, shape, rows.number, row)
 
     height, width = recorded(0).shape[:2]
-    return EpisodeCamera(key, width, height, stamps, None, None, recorded)
+    return EpisodeCamera(key, width, height, rows.stamps, None, None, recorded)
 
 
-def _video_camera(
-    data: _DataSet, number: int, key: str, file: Path, count: int, warnings: list[str]
-) -> EpisodeCamera:
+def _video_camera(rows: _Rows, key: str, file: Path) -> EpisodeCamera:
     """Return the camera of a video, restricted to an episode; times start at 0 with the episode.
 
     Images up to half a period before the start belong to the episode, and those after the end less
     this do not. A video with as many images as rows, which begins at another time than the
     metadata say, has the rows' images in order.
 
-    ``number``: of the episode, which has ``count`` rows. ``key``: the camera's feature. ``file``:
-    the video. ``warnings``: appended to. Raises SceneError: the video is unreadable, or has no
-    image in the episode.
+    ``key``: the camera's feature. ``file``: the video. Raises SceneError: the video is unreadable,
+    or has no image in the episode.
     """
-    row = data.rows[number]
+    row, count, warnings = rows.metadata[rows.number], rows.table.num_rows, rows.warnings
     video, name = TimedVideo(file), key.removeprefix("observation.").removeprefix("images.")
     where = f"videos/{key}"
     ends = [f"{where}/{end}_timestamp" for end in ("from", "to")]
@@ -421,13 +407,13 @@ def _video_camera(
         places = [f"{where}/chunk_index", f"{where}/file_index"]
         same = [
             one
-            for one in data.rows.values()
+            for one in rows.metadata.values()
             if all(one.get(place) == row.get(place) for place in places)
         ]
         spans = np.array([[float(one[end]) for end in ends] for one in same])
         span = np.array([float(row[end]) for end in ends])
     steps = np.diff(video.times)
-    rate = _rate(data.info) or (1.0 / float(np.median(steps)) if len(steps) else 1.0)
+    rate = _rate(rows.info) or (1.0 / float(np.median(steps)) if len(steps) else 1.0)
     half = 0.5 / rate
     begin = float(spans[:, 0].min())
     total = (float(spans[:, 1].max()) - begin) * rate
@@ -461,12 +447,7 @@ def _video_camera(
 
 
 def _from_start(
-    file: Path,
-    stamps: Array,
-    cameras: Sequence[EpisodeCamera],
-    own: JointLog | None,
-    given: JointLog | None,
-    warnings: list[str],
+    rows: _Rows, cameras: Sequence[EpisodeCamera], own: JointLog | None, given: JointLog | None
 ) -> tuple[list[EpisodeCamera], JointLog | None, JointLog | None]:
     """Return cameras and joint logs of an episode, their times counted from its start.
 
@@ -474,21 +455,20 @@ def _from_start(
     begin with the episode.
 
     Args:
-        file: the table's file, for messages.
-        stamps: (n,) ascending times of the rows [s].
         cameras: the cameras; those of stored images have the times ``stamps``.
         own: the data set's own log, with the times ``stamps``; None: none.
         given: the user's log; None: none. It is moved, too, if it is from the rows' times.
-        warnings: list to which warnings are appended.
     """
+    stamps = rows.stamps
     period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     videos = [one.times for one in cameras if one.times is not stamps]
     end = max((float(times[-1]) for times in videos), default=float(stamps[-1] - stamps[0]))
     start = float(stamps[0])
     if start <= 0.5 * period or stamps[-1] <= end + 1.5 * period:
         return [*cameras], own, given
-    warnings.append(
-        f"{file}: the rows' times begin at {start:.6g} s, so they are counted from the first row"
+    rows.warnings.append(
+        f"{rows.file}: the rows' times begin at {start:.6g} s, so they are counted from the first "
+        "row"
     )
     moved = [
         one if any(one.times is times for times in videos) else replace(one, times=stamps - start)

@@ -156,50 +156,31 @@ def tube_obj(rings: int = 7, half: float = 0.999 * HALF, reach: float = REACH) -
 
 def prism(name: str, middle: float) -> str:
     """A link with one prism along z."""
-    size = f"{2 * HALF} {2 * HALF} {LENGTH}"
-    return (
-        f'<link name="{name}"><visual><origin xyz="0 0 {middle}"/><geometry><box size="{size}"/>'
-        "</geometry></visual></link>"
-    )
+    shape = f'<geometry><box size="{2 * HALF} {2 * HALF} {LENGTH}"/></geometry>'
+    return link(name, f'<visual><origin xyz="0 0 {middle}"/>{shape}</visual>')
 
 
-def hinge(name: str, parent: str, child: str, axis: str, z: float, limit: float = 2.5) -> str:
-    return (
-        f'<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
-        f'<origin xyz="0 0 {z}"/><axis xyz="{axis}"/>'
-        f'<limit lower="{-limit}" upper="{limit}" effort="1" velocity="1"/></joint>'
-    )
+def hinge(name: str, parent: str, child: str, axis: str, z: float) -> str:
+    ends = {"limits": 'lower="-2.5" upper="2.5"', "origin": f'xyz="0 0 {z}"'}
+    return joint(name, "revolute", parent, child, axis=axis, **ends)
 
 
 # Downwards: upper, an elbow of one axis, lower, a wrist of three axes, hand.
-LIMB_URDF = "".join(
-    [
-        '<robot name="limb"><link name="world"/>',
-        prism("upper", -LENGTH / 2),
-        prism("lower", -LENGTH / 2),
-        prism("hand", -LENGTH / 2),
-        '<link name="wrist_1"/><link name="wrist_2"/>',
-        hinge("shoulder", "world", "upper", "0 1 0", 0.3),
-        hinge("elbow", "upper", "lower", "1 0 0", -LENGTH),
-        hinge("wrist_x", "lower", "wrist_1", "1 0 0", -LENGTH),
-        hinge("wrist_z", "wrist_1", "wrist_2", "0 0 1", 0.0),
-        hinge("wrist_y", "wrist_2", "hand", "0 1 0", 0.0),
-        "</robot>",
-    ]
+LIMB_URDF = urdf(
+    *(link(name, "") for name in ("world", "wrist_1", "wrist_2")),
+    *(prism(name, -LENGTH / 2) for name in ("upper", "lower", "hand")),
+    hinge("shoulder", "world", "upper", "0 1 0", 0.3),
+    hinge("elbow", "upper", "lower", "1 0 0", -LENGTH),
+    hinge("wrist_x", "lower", "wrist_1", "1 0 0", -LENGTH),
+    hinge("wrist_z", "wrist_1", "wrist_2", "0 0 1", 0.0),
+    hinge("wrist_y", "wrist_2", "hand", "0 1 0", 0.0),
 )
 
 
 def band_entry(parent: str, child: str, **changes: object) -> str:
     """One entry of a skin file."""
-    entry: dict[str, object] = {
-        "parent": parent,
-        "child": child,
-        "mesh": "tube.obj",
-        "axis": [0, 0, -1],
-        "begin": -REACH,
-        "end": REACH,
-        "colour": [0.8, 0.6, 0.5],
-    }
+    entry: dict[str, object] = {"parent": parent, "child": child, "mesh": "tube.obj"}
+    entry |= {"axis": [0, 0, -1], "begin": -REACH, "end": REACH, "colour": [0.8, 0.6, 0.5]}
     entry |= changes
     return "- {" + ", ".join(f"{k}: {v}" for k, v in entry.items() if v is not None) + "}\n"
 

@@ -1,8 +1,9 @@
 """Images that encode their own numbers, and videos of them encoded by PyAV."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -82,3 +83,16 @@ def write_video(
     pictures, container = [numbered(k, width) for k in numbers], {"movflags": "faststart"} | options
     write_pictures(path, pictures, times, codec, container, 10, **settings)
     return path
+
+
+def write_table(path: Path, columns: Mapping[str, Any]) -> None:
+    """Write a parquet table of columns by name."""
+    import pyarrow.parquet
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pyarrow.parquet.write_table(pyarrow.table(columns), path)
+
+
+def png(number: int) -> bytes:
+    """Return the PNG file of a numbered image."""
+    return bytes(cv2.imencode(".png", numbered(number)[:, :, ::-1])[1])

@@ -148,35 +148,6 @@ def test_hand_camera_and_joints_of_two_publishers(tmp_path, kind):
     assert "depth" not in warnings
 
 
-def test_images_of_all_encodings_are_decoded(tmp_path):
-    bag, red, grey = Bag(tmp_path, "sqlite3"), numbered(0), np.full((SIDE, SIDE), 140, np.uint8)
-    with bag.writer:
-        bag.joints("/joint_states", 0.0, x=0.0)
-        bag.image("/rgb", 0.0, red, "rgb8")
-        bag.image("/bgr", 0.0, red[:, :, ::-1], "bgr8")
-        bag.image("/bgra", 0.0, np.dstack([red[:, :, ::-1], grey]), "bgra8")
-        bag.image("/mono", 0.0, grey, "mono8")
-        for pattern in ("rggb", "bggr", "gbrg", "grbg"):
-            place = np.tile(np.reshape(["rgb".index(c) for c in pattern], (2, 2)), (32, 32))
-            mosaic = np.take_along_axis(red, place[:, :, None], axis=2)[:, :, 0]
-            bag.image(f"/{pattern}", 0.0, mosaic, f"bayer_{pattern}8")
-        bag.image("/strange", 0.0, grey, "yuv444")
-        bag.image("/dark", 0.0, np.dstack([grey, grey // 20]), "mono16")
-        bag.image("/depth", 0.0, np.dstack([grey, grey]), "16UC1")
-    episode = open_episode(bag.path)
-    for name in ("rgb", "bgr", "bgra"):
-        np.testing.assert_array_equal(episode.camera(name).read(0), red)
-    np.testing.assert_array_equal(episode.camera("mono").read(0), np.dstack([grey] * 3))
-    for pattern in ("rggb", "bggr", "gbrg", "grbg"):
-        found = episode.camera(pattern).read(0).astype(int)
-        assert np.abs(found - red)[2 : SIDE // 4 - 2, 2:-2].max() < 3, pattern
-    assert not {"depth", "strange", "dark"} & set(episode.cameras)
-    warnings = "\n".join(episode.warnings)
-    assert "/strange is left out: 'yuv444' is not one of rgb8, bgr8" in warnings
-    assert "/dark, picture 0: has 16 bits per pixel, but no value above 1932 of 65535" in warnings
-    assert "/depth" not in warnings
-
-
 def yuv_of(picture):
     """Return intensities and colour differences (H, W, 3) of an image by ITU-R BT.601."""
     red, green, blue = np.moveaxis(picture / 255.0, 2, 0)
@@ -186,43 +157,57 @@ def yuv_of(picture):
     return np.rint(np.dstack([Y, U, V])).astype(np.uint8)
 
 
-def test_raw_and_deep_encodings_are_decoded(tmp_path):
+def test_images_of_all_encodings_are_decoded(tmp_path):
     bag, picture = Bag(tmp_path, "mcap"), numbered(5)
+    grey, reverse = np.full((SIDE, SIDE), 140, np.uint8), picture[:, :, ::-1]
     Y, U, V = np.moveaxis(yuv_of(picture), 2, 0)
     U, V = (one.reshape(SIDE, -1, 2)[:, :, 0] for one in (U, V))
-    colours = np.dstack([U, V]).reshape(SIDE, SIDE)
-    planes = np.vstack([Y, colours[::2]])
-    mosaic = picture[:, :, 1]
-    deep = {"<u2": 0, ">u2": 1}
+    colours, mosaic = np.dstack([U, V]).reshape(SIDE, SIDE), picture[:, :, 1]
+    uyvy, yuyv = np.dstack([colours, Y]), np.dstack([Y, colours])
+    plain = {
+        "rgb8": picture, "bgr8": reverse, "bgra8": np.dstack([reverse, grey]), "mono8": grey,
+        "8UC3": reverse, "8UC4": np.dstack([reverse, Y]), "8UC1": mosaic, "yuv444": grey,
+        "yuv422": uyvy, "uyvy": uyvy, "yuv422_yuy2": yuyv, "yuyv": yuyv,
+        "nv12": np.vstack([Y, colours[::2]]), "16UC1": np.dstack([grey, grey]),
+        "mono16": np.dstack([grey, grey // 20]),
+    }  # fmt: skip
+    patterns = {f"bayer_{pattern}8": pattern for pattern in ("rggb", "bggr", "gbrg", "grbg")}
     with bag.writer:
         bag.joints("/joint_states", 0.0, x=0.0)
-        for name in ("yuv422", "uyvy"):
-            bag.image(f"/{name}", 0.0, np.dstack([colours, Y]), name)
-        for name in ("yuv422_yuy2", "yuyv"):
-            bag.image(f"/{name}", 0.0, np.dstack([Y, colours]), name)
-        bag.image("/nv12", 0.0, planes, "nv12")
-        bag.image("/8UC3", 0.0, picture[:, :, ::-1], "8UC3")
-        bag.image("/8UC4", 0.0, np.dstack([picture[:, :, ::-1], Y]), "8UC4")
-        bag.image("/8UC1", 0.0, mosaic, "8UC1")
-        for kind, big in deep.items():
-            wide = (257 * picture[:, :, ::-1].astype(np.uint16)).astype(kind)
+        for coding, pixels in plain.items():
+            bag.image(f"/{coding}", 0.0, pixels, coding)
+        for coding, pattern in patterns.items():
+            place = np.tile(np.reshape(["rgb".index(c) for c in pattern], (2, 2)), (32, 32))
+            pixels = np.take_along_axis(picture, place[:, :, None], axis=2)[:, :, 0]
+            bag.image(f"/{coding}", 0.0, pixels, coding)
+        for big, kind in enumerate(("<u2", ">u2")):
+            wide = (257 * reverse.astype(np.uint16)).astype(kind)
+            green = wide[:, :, 1].copy().view(np.uint8)
             bag.image(f"/bgr{big}", 0.0, wide.view(np.uint8), "bgr16", big=big)
-            bag.image(f"/mono{big}", 0.0, wide[:, :, 1].copy().view(np.uint8), "mono16", big=big)
-            bayer = wide[:, :, 1].copy().view(np.uint8)
-            bag.image(f"/bayer{big}", 0.0, bayer, "bayer_rggb16", big=big)
+            bag.image(f"/mono{big}", 0.0, green, "mono16", big=big)
+            bag.image(f"/bayer{big}", 0.0, green, "bayer_rggb16", big=big)
     episode = open_episode(bag.path)
+    for name in ("rgb8", "bgr8", "bgra8", "8UC3", "8UC4", "bgr0", "bgr1"):
+        np.testing.assert_array_equal(episode.camera(name).read(0), picture)
+    np.testing.assert_array_equal(episode.camera("mono8").read(0), np.dstack([grey] * 3))
+    for name in ("8UC1", "mono0", "mono1"):
+        np.testing.assert_array_equal(episode.camera(name).read(0)[:, :, 2], mosaic)
+    for name in patterns:
+        found = episode.camera(name).read(0).astype(int)
+        assert np.abs(found - picture)[2 : SIDE // 4 - 2, 2:-2].max() < 3, name
     for name in ("yuv422", "uyvy", "yuv422_yuy2", "yuyv", "nv12"):
         found = episode.camera(name).read(0).astype(int)
         assert np.abs(found - picture)[:, 2:-2].max() < 5, name
-    for name in ("8UC3", "8UC4", "bgr0", "bgr1"):
-        np.testing.assert_array_equal(episode.camera(name).read(0), picture)
-    for name in ("8UC1", "mono0", "mono1"):
-        np.testing.assert_array_equal(episode.camera(name).read(0)[:, :, 2], picture[:, :, 1])
     bayer = [episode.camera(f"bayer{big}").read(0) for big in (0, 1)]
     np.testing.assert_array_equal(*bayer)
     np.testing.assert_array_equal(
         bayer[0][5:60, 5:60, 1], cv2.cvtColor(mosaic, cv2.COLOR_BayerRGGB2RGB)[5:60, 5:60, 1]
     )
+    assert not {"16UC1", "yuv444", "mono16"} & set(episode.cameras)
+    warnings = "\n".join(episode.warnings)
+    assert "/yuv444 is left out: 'yuv444' is not one of rgb8, bgr8" in warnings
+    assert "/mono16, picture 0: has 16 bits per pixel, but no value above 1932 of 65535" in warnings
+    assert "/16UC1" not in warnings
     guesses = [text for text in episode.warnings if "does not tell the order of colours" in text]
     assert [text.partition(":")[0] for text in guesses] == ["/8UC3", "/8UC4"]
 

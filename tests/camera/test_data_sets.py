@@ -2,13 +2,12 @@
 
 import json
 
-import cv2
 import numpy as np
 import pytest
 
 from drake_pose.camera.episode_files import open_episode
 from drake_pose.errors import SceneError, UnknownNameError
-from tests.camera.recordings import number_of, numbered, write_video
+from tests.camera.recordings import number_of, png, write_table, write_video
 
 LENGTHS = {0: 8, 1: 6, 2: 9}
 TOP, WRIST, DEPTH = (f"observation.images.{name}" for name in ("top", "wrist", "depth"))
@@ -31,38 +30,31 @@ def write_info(folder, version, template, names):
     (folder / "meta" / "info.json").write_text(json.dumps(content))
 
 
-def write_rows(path, episodes):
-    import pyarrow.parquet
-
-    path.parent.mkdir(parents=True, exist_ok=True)
+def rows_of(*episodes):
     pairs = [(n, k) for n in episodes for k in range(LENGTHS[n])]
-    coded = [cv2.imencode(".png", numbered(50 + k)[:, :, ::-1])[1].tobytes() for _, k in pairs]
-    columns = {
+    return {
         "observation.state": [[0.1 * k, -1.0, 10.0 * n] for n, k in pairs],
-        WRIST: [{"bytes": data, "path": None} for data in coded],
+        WRIST: [{"bytes": png(50 + k), "path": None} for _, k in pairs],
         "timestamp": [0.1 * k for _, k in pairs],
         "episode_index": [n for n, _ in pairs],
     }
-    pyarrow.parquet.write_table(pyarrow.table(columns), path)
 
 
-def write_v21(folder, names=(["pan", "lift", "grip"],)):
-    write_info(folder, "v2.1", V2, names)
+def write_v21(folder):
+    write_info(folder, "v2.1", V2, [["pan", "lift", "grip"]])
     for n, count in LENGTHS.items():
         where = V2.format(episode_chunk=n // 2, video_key=TOP, episode_index=n)
         numbers = [20 * n + k for k in range(count)]
         write_video(folder / "videos" / f"{where}.mp4", numbers, codec="libsvtav1")
         where = V2.format(episode_chunk=n // 2, video_key="", episode_index=n)
-        write_rows(folder / "data" / f"{where}.parquet", [n])
+        write_table(folder / "data" / f"{where}.parquet", rows_of(n))
 
 
 def write_v30(folder):
-    import pyarrow.parquet
-
     write_info(folder, "v3.0", V3, {"motors": ["pan", "lift", "grip"]})
     for file, own in enumerate(([0, 1], [2])):
         where = V3.format(chunk_index=0, video_key="", file_index=file)
-        write_rows(folder / f"data/{where}.parquet", own)
+        write_table(folder / f"data/{where}.parquet", rows_of(*own))
     numbers = [20 * n + k for n, count in LENGTHS.items() for k in range(count)]
     write_video(
         folder / f"videos/{V3.format(chunk_index=0, video_key=TOP, file_index=0)}.mp4", numbers
@@ -73,9 +65,8 @@ def write_v30(folder):
     meta = {"chunk_index": [0, 0, 0], "file_index": [0, 0, 0], **times}
     table = {"episode_index": [0, 1, 2], "data/chunk_index": [0] * 3, "data/file_index": [0, 0, 1]}
     table |= {f"videos/{TOP}/{name}": values for name, values in meta.items()}
-    path = folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
-    path.parent.mkdir(parents=True)
-    pyarrow.parquet.write_table(pyarrow.table(table | {"stats/max": [[9.0]] * 3}), path)
+    table |= {"stats/max": [[9.0]] * 3}
+    write_table(folder / "meta/episodes/chunk-000/file-000.parquet", table)
 
 
 @pytest.mark.parametrize("write", [write_v21, write_v30])

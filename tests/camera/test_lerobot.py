@@ -1,6 +1,7 @@
 """LeRobot data sets as users have them: other words, names, clocks and pictures, and damage."""
 
 import json
+import re
 import shutil
 
 import cv2
@@ -9,7 +10,7 @@ import pytest
 
 from drake_pose.camera.episode_files import open_episode
 from drake_pose.errors import DrakePoseError, SceneError
-from tests.camera.recordings import number_of, numbered, write_video
+from tests.camera.recordings import number_of, numbered, png, write_table, write_video
 
 COUNT, TOP = 10, "observation.images.top"
 V2 = "chunk-{episode_chunk:03d}/episode_{episode_index:06d}"
@@ -26,8 +27,6 @@ def write_set(
     data="data/chunk-000/episode_000000.parquet", start=0.0, numbers=range(COUNT),
 ):  # fmt: skip
     """Write a data set with one episode; ``paths``: templates; None in columns removes one."""
-    import pyarrow.parquet
-
     features = {"observation.state": STATE, TOP: MEDIA["video"]} if features is None else features
     content = {"codebase_version": version, "fps": 10, "total_episodes": episode + 1}
     content |= {"chunks_size": 1000, "features": features} | (paths or {}) | (info or {})
@@ -38,21 +37,10 @@ def write_set(
     (folder / "meta" / "info.json").write_text(json.dumps(content))
     own = {"observation.state": STATES, "timestamp": TIMES, "episode_index": [episode] * COUNT}
     own |= {"frame_index": range(COUNT)} | (columns or {})
-    (folder / data).parent.mkdir(parents=True, exist_ok=True)
-    own = {key: one for key, one in own.items() if one is not None}
-    pyarrow.parquet.write_table(pyarrow.table(own), folder / data)
+    write_table(folder / data, {key: one for key, one in own.items() if one is not None})
     if video:
         write_video(folder / video, numbers, start + 0.1 * np.arange(len(numbers)))
     return folder
-
-
-def write_episodes(folder, **columns):
-    """Write version 3's metadata of episode 0."""
-    import pyarrow.parquet
-
-    (folder / "meta/episodes/chunk-000").mkdir(parents=True)
-    table = pyarrow.table({"episode_index": [0]} | {key: [one] for key, one in columns.items()})
-    pyarrow.parquet.write_table(table, folder / "meta/episodes/chunk-000/file-000.parquet")
 
 
 def check(folder, shift=0.0, **more):
@@ -126,9 +114,9 @@ def test_a_video_begins_where_its_file_says(tmp_path):
         ends = {"from_timestamp": begin, "to_timestamp": begin + 1.0}
         meta = {"data/chunk_index": 0, "data/file_index": 0}
         meta |= {f"videos/{TOP}/{key}": one for key, one in ends.items()}
-        write_episodes(
-            tmp_path, **meta, **{f"videos/{TOP}/{k}_index": 0 for k in ("chunk", "file")}
-        )
+        meta |= {"episode_index": 0} | {f"videos/{TOP}/{k}_index": 0 for k in ("chunk", "file")}
+        columns = {key: [one] for key, one in meta.items()}
+        write_table(tmp_path / "meta/episodes/chunk-000/file-000.parquet", columns)
         assert (check(tmp_path).warnings == ()) == (begin == start)
 
 
@@ -176,12 +164,9 @@ def test_pictures_are_stored_in_many_ways(tmp_path, kind, is_jpeg):
 @pytest.mark.parametrize("is_video", [True, False])
 def test_stamps_of_any_unit_since_1970_are_counted_from_the_start(tmp_path, unit, is_video):
     stamps = np.array([round((1_700_000_000 + time) * 1000) for time in TIMES]) * (unit / 1000)
-    pictures = {
-        "bytes": [cv2.imencode(".png", numbered(k)[:, :, ::-1])[1].tobytes() for k in range(COUNT)]
-    }
     features = {"observation.state": STATE, TOP: MEDIA["video" if is_video else "image"]}
     columns = {"timestamp": stamps if unit < 10**9 else stamps.astype(np.int64)}
-    columns |= {} if is_video else {TOP: pictures["bytes"]}
+    columns |= {} if is_video else {TOP: [*map(png, range(COUNT))]}
     write_set(tmp_path, features=features, columns=columns)
     warnings = "\n".join(check(tmp_path).warnings)
     assert "the rows' times begin at 1.7e+09 s" in warnings
@@ -324,8 +309,6 @@ def test_careless_data_sets_are_read_or_named(tmp_path, change, message):
     except DrakePoseError as error:
         texts = str(error)
         assert message
-    import re
-
     assert re.search(message, texts), texts
     assert bool(message) == bool(texts)
 

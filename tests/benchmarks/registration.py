@@ -16,11 +16,10 @@ from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drake_pose.arrays import Array, Mask
+from drake_pose.arrays import Array
 from drake_pose.body import load_model
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
@@ -33,6 +32,7 @@ from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import CameraSearch, RegistrationBody, overlap_areas
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.benchmarks.tables import print_table
+from tests.registration.arm_pictures import damaged
 
 _SEED, _FRAMES = 13_000, 5
 # Maximum errors of a camera that counts as found [mm, deg].
@@ -44,7 +44,6 @@ _MIDDLE, _MIDDLE_SD = np.array([0.0, 0.0, 0.35]), 0.1
 _LEAST_PIXELS, _TRIES = 3000, 30
 # Standard deviations of errors: joint offsets [rad], link scales, focal length, centre [pixel].
 _ZERO_SD, _LENGTH_SD, _FOCAL_SD, _CENTER_SD = np.radians(0.3), 0.01, 0.01, 3.0
-_MOST_MORPHED, _HOLES, _HOLE_RADII = 2, 0.03, (3, 9)
 _LBR, _PANDA = "arm_two_views/med7/med7.urdf", "franka_one_view/panda/panda.urdf"
 _XARM = "cmeel.prefix/share/example-robot-data/robots/xarm_description/urdf/xarm7.urdf"
 # Recorded scenes, their arm, the table of their joints, and the cameras whose poses are withheld.
@@ -151,19 +150,6 @@ def _random_camera(rng: np.random.Generator) -> PinholeCamera:
     X_WC[:3, 3] = _MIDDLE + rng.normal(0.0, _MIDDLE_SD, 3) + rng.uniform(*_DISTANCE) * away
     centre = (_WIDTH / 2 - 0.5, _HEIGHT / 2 - 0.5)
     return PinholeCamera("camera", _WIDTH, _HEIGHT, _FOCAL, _FOCAL, *centre, X_WC)
-
-
-def damaged(mask: Mask, rng: np.random.Generator) -> Mask:
-    """Return a mask eroded or dilated by up to two pixels, with holes of 3 % of its area."""
-    size = int(rng.integers(-_MOST_MORPHED, _MOST_MORPHED + 1))
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(size) + 1,) * 2)
-    drawn = (cv2.dilate if size > 0 else cv2.erode)(mask.astype(np.uint8), disc)
-    rows, columns = np.nonzero(drawn)
-    left = (1.0 - _HOLES) * len(rows)
-    while np.count_nonzero(drawn) > left:
-        k = int(rng.integers(len(rows)))
-        cv2.circle(drawn, (int(columns[k]), int(rows[k])), int(rng.integers(*_HOLE_RADII)), 0, -1)
-    return drawn.astype(np.bool_)
 
 
 def measure_camera(

@@ -13,6 +13,7 @@ from drake_pose.commands.main import app
 from tests.benchmarks import figures, memory, registration, rooms
 from tests.benchmarks.tables import print_table
 from tests.body.models import joint, link, urdf, write
+from tests.registration.arm_pictures import damaged
 
 MIB = 2**20
 
@@ -23,7 +24,7 @@ def test_damage_moves_the_edge_by_two_pixels_at_most_and_cuts_holes():
     outside = ndimage.distance_transform_cdt(~mask, metric="chessboard")
     sizes = set()
     for seed in range(40):
-        drawn = registration.damaged(mask, np.random.default_rng(seed))
+        drawn = damaged(mask, np.random.default_rng(seed))
         assert outside[drawn].max() <= 2
         rows, columns = np.nonzero(drawn)
         width, height = np.ptp(columns) + 1, np.ptp(rows) + 1

@@ -12,7 +12,6 @@ from drake_pose.files.settings import (
     parse_packages,
     parse_root_position,
     parse_root_rotation,
-    percent,
     plain,
     within,
 )
@@ -20,10 +19,6 @@ from drake_pose.silhouette.pictures.scenes import select_frames
 from tests.cli import run_command
 
 FRAMES = ("0001", "0002", "0010", "still")
-
-
-def test_fractions_are_stated_in_percent():
-    assert (percent(0.12345), percent(1.0), percent(None)) == ("12.35 %", "100.00 %", "-")
 
 
 def test_option_texts_are_parsed():

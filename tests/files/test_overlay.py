@@ -96,19 +96,6 @@ def test_a_small_overlay_is_enlarged_by_an_integer_without_text_on_it():
     assert shown[0] - shown[1] == (40 * scale) ** 2
 
 
-def test_an_empty_overlay_is_not_cropped():
-    nothing = np.zeros((500, 700), dtype=bool)
-    assert draw_overlay(nothing, nothing, None, "title").shape[1] == 700
-
-
-def test_title_and_legend_are_written():
-    mask = rectangle((500, 700), slice(100, 400), slice(100, 600))
-    picture = PALETTE[draw_overlay(mask, mask, None, "cam  frame 1  E_total 3.0 %")]
-    assert (picture[:36] > 200).any()
-    legend = [count(picture[-38:], c) for c in (AGREEMENT_RGB, MISSING_RGB, EXCESS_RGB)]
-    assert 100 < max(legend) < 1.1 * min(legend)
-
-
 def test_png_of_rgb_and_of_palette_indices_are_equal():
     numbers = np.arange(len(PALETTE), dtype=np.uint8).reshape(4, -1)
     for picture in (numbers, PALETTE[numbers]):

@@ -1,15 +1,12 @@
 """Records of frames, summaries and warnings, from given numbers."""
 
 import math
-from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from drake_pose.body import load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.files import overlay
 from drake_pose.files.records import (
     FrameRecord,
     base_cells,
@@ -19,7 +16,6 @@ from drake_pose.files.records import (
     joint_table,
     measured_positions,
     mode_table,
-    next_summary,
     poor_fit_warnings,
     record_deviations,
     record_modes,
@@ -27,7 +23,6 @@ from drake_pose.files.records import (
     summarize,
     user_units,
 )
-from drake_pose.files.writer import ResultWriter
 from drake_pose.search import JointEstimate, PoseMode, PoseSet
 from tests.body.models import joint, link, urdf, write
 
@@ -144,21 +139,6 @@ def test_warning_of_a_bad_fit_names_joints_at_limits_and_held_ones(model):
     assert "the held positions (reach)" in told(1.5, 0.4)[0]
 
 
-def test_overlay_legend_has_fractions_of_the_silhouettes_area(monkeypatch):
-    seen, body = np.zeros((20, 20), dtype=bool), np.zeros((20, 20), dtype=bool)
-    seen[2:12, 2:12], body[4:14, 2:12] = True, True
-    legends = []
-
-    def framed(picture, title, legend=()):
-        legends.append(legend)
-        return picture
-
-    monkeypatch.setattr(overlay, "_framed", framed)
-    overlay.draw_overlay(seen, body, None, "title")
-    texts = [text for _, text in legends[0]]
-    assert texts == ["agreement 80.0 %", "missing 20.0 %", "excess 20.0 %"]
-
-
 def test_modes_of_a_frame_are_united_in_user_units(model):
     """Angles in degrees, lengths in metres; a joint is determined if it is so in all modes."""
     np.testing.assert_allclose(user_units(model), [math.degrees(1.0), 1.0, math.degrees(1.0)])
@@ -208,23 +188,3 @@ def test_pose_sets_are_recorded_with_values_of_each_mode(model):
             assert (one[name]["low"], one[name]["high"]) == pytest.approx((0.1 * unit, 0.4 * unit))
             assert one[name]["value"] == (None if value is None else pytest.approx(value))
     assert record_pose_set(None, tree) == {}
-
-
-@pytest.mark.parametrize(("took", "wait"), [(0.01, 2.0), (0.5, 10.0)])
-def test_summaries_are_written_rarely_if_that_takes_long(monkeypatch, took, wait):
-    """At least two seconds apart, and twenty times as long as writing takes."""
-    monkeypatch.setattr("drake_pose.files.records.time.monotonic", lambda: 100.0)
-    assert next_summary(100.0 - took) == pytest.approx(100.0 + wait)
-
-
-def test_frames_are_told_as_they_are_finished():
-    """Before the first one, and after each: how many of those asked for are done."""
-    told, done = [], {"0": record(), "9": record()}
-    stub = SimpleNamespace(records=done, folder=None)
-    stub.add = lambda one: done.__setitem__(one.frame, one)
-    given = [(replace(record(), frame=name), {}) for name in ("1", "2")]
-    asked = ["0", "1", "2"]
-    ResultWriter.add_all(stub, given, asked, lambda *one: told.append(one))
-    assert [one[:3] for one in told] == [(1, 3, ""), (2, 3, "1"), (3, 3, "2")]
-    assert [one[3] for one in told] == [None, given[0][0], given[1][0]]
-    ResultWriter.add_all(stub, given, asked, None)

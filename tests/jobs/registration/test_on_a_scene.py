@@ -1,6 +1,5 @@
 """Episodes of a camera on a wrist over a table, without masks or target."""
 
-import csv
 from pathlib import Path
 
 import cv2
@@ -12,6 +11,8 @@ from scipy.spatial.transform import Rotation
 from drake_pose.errors import RegistrationError, SettingsError
 from drake_pose.files.settings import RegistrationSettings
 from drake_pose.jobs.registration.register import register_scene
+from tests.benchmarks.registration import pose_error
+from tests.registration.recordings import write_log
 
 NAMES = tuple(f"joint{k}" for k in range(6))
 JOINTS = (
@@ -28,6 +29,7 @@ K = np.array([[FOCAL, 0.0, 159.5], [0.0, FOCAL, 119.5], [0.0, 0.0, 1.0]])
 X_LC = np.eye(4)
 X_LC[:3, :3] = Rotation.from_euler("zyx", [100.0, 8.0, -12.0], degrees=True).as_matrix()
 X_LC[:3, 3] = 0.04, -0.05, 0.03
+SWING = (0.15, 0.1, 0.12, 0.3, 0.25, 0.4)
 
 
 def write_arm(path: Path) -> Path:
@@ -90,29 +92,19 @@ def write_episode(folder: Path, swing: tuple[float, ...], objects: int = 150) ->
     camera |= {"center_x": 159.5, "center_y": 119.5}
     (folder / "cameras.yaml").write_text(yaml.safe_dump({"wrist": camera}))
     logged = np.arange(-0.5, 9.0, 1.0 / 15.0)
-    with (folder / "joint_angles.csv").open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["time", *NAMES])
-        writer.writerows(
-            [t, *row] for t, row in zip(logged, values_at(logged, np.array(swing)), strict=True)
-        )
+    write_log(folder / "joint_angles.csv", logged, values_at(logged, np.array(swing)), NAMES)
     return folder
 
 
 @pytest.mark.slow
 def test_a_wrist_camera_is_found_over_things_on_a_table(tmp_path):
-    scene = write_episode(tmp_path / "scene", (0.15, 0.1, 0.12, 0.3, 0.25, 0.4))
+    scene = write_episode(tmp_path / "scene", SWING)
     settings = RegistrationSettings(on="link5")
     result = register_scene(
         scene, write_arm(tmp_path / "arm.urdf"), out=tmp_path / "out", settings=settings
     )
     found = result.registered["wrist"]
-    off = np.concatenate(
-        [
-            Rotation.from_matrix(X_LC[:3, :3] @ found.camera.X_WC[:3, :3].T).as_rotvec(),
-            X_LC[:3, 3] - found.camera.X_WC[:3, 3],
-        ]
-    )
+    off = pose_error(found.camera.X_WC, X_LC)
     assert np.linalg.norm(off[:3]) < np.radians(0.5)
     assert np.linalg.norm(off[3:]) < 0.004
     assert np.all(np.abs(off) < 4.0 * np.sqrt(np.diag(found.covariance)))
@@ -124,24 +116,19 @@ def test_a_wrist_camera_is_found_over_things_on_a_table(tmp_path):
     assert "points that fit" in (tmp_path / "out/report.html").read_text()
 
 
-def test_a_wrist_that_turns_about_one_axis_is_refused(tmp_path):
-    scene = write_episode(tmp_path / "scene", (0.0, 0.0, 0.0, 0.0, 0.3, 0.0))
-    with pytest.raises(RegistrationError, match=r"link 'link5' turns by.*by 0\.0 about.*two axes"):
-        register_scene(
-            scene, write_arm(tmp_path / "arm.urdf"), settings=RegistrationSettings(on="link5")
-        )
-
-
-def test_a_bare_table_is_refused(tmp_path):
-    scene = write_episode(tmp_path / "scene", (0.15, 0.1, 0.12, 0.3, 0.25, 0.4), objects=0)
-    with pytest.raises(RegistrationError, match=r"camera 'wrist': .* without texture"):
-        register_scene(
-            scene, write_arm(tmp_path / "arm.urdf"), settings=RegistrationSettings(on="link5")
-        )
-
-
-def test_link_scales_need_masks(tmp_path):
-    scene = write_episode(tmp_path / "scene", (0.15, 0.1, 0.12, 0.3, 0.25, 0.4), objects=0)
-    settings = RegistrationSettings(on="link5", lengths=("all",))
-    with pytest.raises(SettingsError, match="lengths needs masks"):
+@pytest.mark.parametrize(
+    ("swing", "objects", "lengths", "error", "said"),
+    [
+        ((0, 0, 0, 0, 0.3, 0), 150, (), RegistrationError,
+         r"link 'link5' turns by.*by 0\.0 about.*two axes"),
+        (SWING, 0, (), RegistrationError, r"camera 'wrist': .* without texture"),
+        (SWING, 0, ("all",), SettingsError, "lengths needs masks"),
+    ],
+)  # fmt: skip
+def test_pictures_that_do_not_determine_what_is_asked_are_refused(
+    tmp_path, swing, objects, lengths, error, said
+):
+    scene = write_episode(tmp_path / "scene", swing, objects)
+    settings = RegistrationSettings(on="link5", lengths=lengths)
+    with pytest.raises(error, match=said):
         register_scene(scene, write_arm(tmp_path / "arm.urdf"), settings=settings)

@@ -17,14 +17,13 @@ from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
 from drake_pose.files.settings import RegistrationSettings
 from drake_pose.jobs.registration.positions import joint_shifts
 from drake_pose.jobs.registration.register import register_scene
-from drake_pose.jobs.registration.words import common_outlier_warnings
-from drake_pose.registration.register import CameraSearch, FrameMisfit, RegisteredCamera
+from drake_pose.registration.register import CameraSearch
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.cli import Result, assert_refused, run_command, run_json, run_to_end
 from tests.files.test_report_page import require_plain_page
 from tests.jobs.registration.arm_scenes import ArmScene, pose_errors
 from tests.jobs.scenes import TinyScene, write_truth
-from tests.search.arms import arm_cameras, arm_tree
+from tests.search.arms import arm_tree
 
 
 @pytest.fixture(scope="module")
@@ -138,25 +137,6 @@ class TestRecordedArms:
         assert "8 of 10: 0002-0009" in refused.stderr
         assert "give a scene of them alone" in refused.stderr
         assert not out.exists()
-
-
-def registered_camera(name: str, frames: dict[str, bool]) -> RegisteredCamera:
-    misfits = tuple(
-        FrameMisfit(frame, 0.0, 1.0, 1.0, is_inlier) for frame, is_inlier in frames.items()
-    )
-    return RegisteredCamera(replace(arm_cameras()[0], name=name), np.eye(6), misfits)
-
-
-def test_outliers_in_all_cameras_and_in_one_are_distinguished() -> None:
-    left = registered_camera("left", {"0000": True, "0001": False, "0002": False, "0003": False})
-    right = registered_camera("right", {"0000": True, "0001": False, "0002": True})
-    common, alone = common_outlier_warnings([left, right])
-    assert "frames 0001 are outliers in all cameras" in common
-    assert "joint positions are not those of the pictures" in common
-    assert "frames 0002 are outliers in camera 'left'" in alone
-    assert "masks are not" in alone
-    # A single camera cannot distinguish the two.
-    assert common_outlier_warnings([left]) == []
 
 
 def body_poses(path: Path, q: np.ndarray, names: tuple[str, ...]) -> dict[str, np.ndarray]:

@@ -8,7 +8,6 @@ import pytest
 
 from drake_pose.jobs.registration.result import (
     make_registration_report,
-    parameter_rows,
     plot_offset,
 )
 from drake_pose.jobs.registration.tracks import describe_pictures
@@ -55,33 +54,6 @@ def test_time_offset_is_drawn_at_the_peak_of_the_scores(tmp_path, late):
     np.testing.assert_allclose(line[:, 0], curve[curve[:, 1].argmax(), 0], atol=1e-9)
     band = axes.patches[0].get_extents().transformed(axes.transData.inverted())
     assert (band.x0, band.x1) == pytest.approx((1e3 * late - 39.2, 1e3 * late + 39.2))
-
-
-def test_undetermined_time_offset_and_given_focal_length(tmp_path):
-    page = make_registration_report(tmp_path, summary())
-    assert "The time offset is not determined" in page
-    assert "Focal length 500.0 pixels, as given" in page
-    assert 'class="plot"' not in page
-    page = make_registration_report(tmp_path, summary(masks="given"))
-    assert "from masks and joint positions" in page
-    assert "Clocks" not in page
-
-
-@pytest.mark.parametrize(
-    ("changes", "parts"),
-    [
-        ({}, ("3.00 deg", "2.80 to 3.20", "significant: reads 3.00 +- 0.10 degrees too low")),
-        ({"significant": False}, ("not significant at 5 %", "not written into the URDF")),
-        ({"significant": False, "low_deg": -0.1}, ("0 is in its interval",)),
-        ({"determined": False, "gauge": ["target_x"]}, ("not determined", "target_x")),
-    ],
-)
-def test_parameters_are_shown_with_their_significance(changes, parts):
-    one = {"value_deg": 3.0, "sd_deg": 0.1, "low_deg": 2.8, "high_deg": 3.2}
-    one |= {"determined": True, "significant": True, "gauge": []} | changes
-    ((name, *cells),) = parameter_rows({"elbow": one})
-    assert name == "elbow"
-    assert all(part in " ".join(cells) for part in parts)
 
 
 def test_summary_of_time_offset_focal_length_and_runner_up(tmp_path):

@@ -24,17 +24,15 @@ from drake_pose.jobs.registration.result import (
     describe_camera,
     describe_parameters,
 )
-from drake_pose.jobs.registration.tracks import describe_tracks, draw_tracks
+from drake_pose.jobs.registration.tracks import draw_tracks
 from drake_pose.jobs.registration.words import (
-    describe_common_finding,
+    common_outlier_warnings,
     describe_error,
-    describe_frame_finding,
     lost_frames_warning,
     mode_warnings,
     outlier_warnings,
-    parameter_warnings,
 )
-from drake_pose.registration.findings import Finding, FrameDiagnosis
+from drake_pose.registration.findings import Finding
 from drake_pose.registration.joint_offsets import KinematicParameter, undetermined
 from drake_pose.registration.picture_matches import Sightings
 from drake_pose.registration.posed_frames import PosedFrame
@@ -74,37 +72,6 @@ def test_the_sign_of_an_error_is_told(kind, angle, shift, below, above) -> None:
     deviations = DEGREE if angle else 0.0, 0.004
     assert above in describe_error(off(kind, "a", angle, shift, *deviations))
     assert below in describe_error(off(kind, "a", -angle, -shift, *deviations))
-
-
-@pytest.mark.parametrize(
-    ("finding", "parts"),
-    [
-        (off("joint", "a", DEGREE, alternatives=("b", "c")), ["'a' (or b, c"]),
-        (off("camera", "c", DEGREE, 0.004, DEGREE, 0.001, at_body=0.02),
-         ["camera 'c'", "1.00 +- 1.00 degrees and 4.0 +- 1.0 mm (20.0 mm at the robot)"]),
-        (off("sign", "a", link="l", text="much"), ["joint 'a'", "other sign", "link 'l'", "much"]),
-        (off("log", "a", link="l", text="much"), ["joint 'a' differs", "link 'l'", "much"]),
-        (off("moved", "c", DEGREE, 0.01, DEGREE, 0.002, link="camera", text="then"),
-         ["camera 'c' was moved then", "1.00 +- 1.00 degrees and 10.0 +- 2.0 mm"]),
-        (off("moved", "base", DEGREE, 0.0, DEGREE, link="base", text="then"),
-         ["the base was moved then"]),
-        (off("moved", "c", 2 * DEGREE, text="drifts"), ["camera 'c' drifts, as by turns of 2.00"]),
-    ],
-)  # fmt: skip
-def test_errors_name_what_is_wrong_and_the_motion_of_outlines(finding, parts) -> None:
-    text = describe_common_finding(replace(finding, pixels=2.5))
-    assert all(part in text for part in [*parts, "2.5 pixels"])
-
-
-def test_errors_of_a_frame_are_told() -> None:
-    frame = FrameDiagnosis("0", {}, {"left": 0.4, "right": 0.2}, 3.0, None)
-    assert "in camera 'right' 20.00 %" in describe_frame_finding(frame, off("unexplained"))
-    # Fits of single frames are good up to ten degrees.
-    for angle, word in ((11.0, "than 10 degrees too low"), (-11.0, "than 10 degrees too high"),
-                        (9.0, "reads 9.00 +- 1.00 degrees too low")):  # fmt: skip
-        assert word in describe_frame_finding(frame, off("joint", "a", angle * DEGREE, 0, DEGREE))
-    several = off("joints", "", joints={"a": 0.1, "b": -0.5, "c": 0.2, "d": 0.05})
-    assert "(b, c, a most)" in describe_frame_finding(frame, several)
 
 
 def registered(*agreeing: float, E: float = 0.1, **more: Any) -> RegisteredCamera:
@@ -147,6 +114,35 @@ def test_outliers_are_named_and_refused_where_they_are_many() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("left", "right", "said"),
+    [
+        # 1: an inlier, 0: an outlier, 2: an inlier that fits worse.
+        (
+            "1000",
+            "101",
+            ["frames 1 are outliers in all cameras", "frames 2 are outliers in camera"],
+        ),
+        ("11101", "11111", ["frames 3 are outliers in camera 'left'.* positions are right"]),
+        ("11101", "11121", ["check their joint positions"]),
+        ("11100", "00011", ["no common frame: 'left' on 0-2, 'right' on 3-4"]),
+        ("11100", "00111", [".*"]),
+        ("1000", "", []),
+    ],
+)
+def test_outliers_of_several_cameras_are_distinguished(left, right, said) -> None:
+    cameras = []
+    for name, agreeing in (("left", left), ("right", right)):
+        one = registered(*(0.9 if k != "0" else -0.9 for k in agreeing))
+        errors = [0.08 if k == "2" else 0.02 for k in agreeing]
+        frames = [replace(k, E_total=E) for k, E in zip(one.frames, errors, strict=True)]
+        cameras.append(replace(one, camera=replace(one.camera, name=name), frames=tuple(frames)))
+    texts = common_outlier_warnings(cameras if right else cameras[:1])
+    assert len(texts) >= len(said)
+    assert all(re.search(part, text) for part, text in zip(said, texts, strict=False))
+    assert any("no common frame" in text for text in texts) == ({left, right} == {"11100", "00011"})
+
+
 def test_poses_that_are_not_determined_are_refused() -> None:
     """By the largest deviation about, or along, any axis."""
     turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
@@ -162,27 +158,6 @@ def test_poses_that_are_not_determined_are_refused() -> None:
             continue
         with pytest.raises(RegistrationError, match=told):
             require_determined(one)
-
-
-def test_uncertain_offsets_and_lengths_are_told() -> None:
-    sure = KinematicParameter("a", 0.1, 0.01, 0.08, 0.12, True)
-    unsure = KinematicParameter("b", 0.0, 0.01, -0.1, 0.1, False)
-    hidden = replace(sure, name="c", gauge=("left.turn_x",), deviation=np.radians(0.5))
-    gone, alone = undetermined("d", ("left.turn_y",)), undetermined("e", ())
-
-    def told(*offsets: KinematicParameter, scales: tuple = ()) -> list[str]:
-        return parameter_warnings(SimpleNamespace(offsets=offsets, link_scales=scales))
-
-    assert told() == told(sure) == told(sure, unsure) == []
-    (none,) = told(unsure, gone)
-    assert none.startswith("none of the requested joint offsets and link lengths is significant")
-    first, second, third = told(sure, hidden, gone, scales=(alone,))
-    assert first.startswith("joint 'c': its offset is good to 0.5 degrees only, and turns")
-    assert "(correlated with left.turn_x)" in first
-    assert "'d': its offset is not determined" in second
-    assert "(correlated with left.turn_y: their values hold if it is 0); add frames" in second
-    assert third.startswith("link 'e': its length is not determined by these silhouettes and was ")
-    assert "correlated" not in third
 
 
 @pytest.fixture(scope="module")
@@ -280,21 +255,6 @@ def tracked(**more: Any) -> Any:
         "pictures": {f"{k}": np.zeros((30, 40, 3), np.uint8) for k in range(3)},
     }  # fmt: skip
     return SimpleNamespace(**(given | more))
-
-
-def test_a_camera_on_a_link_is_summarised(body: RegistrationBody) -> None:
-    kinematics = body.kinematics
-    told = describe_tracks(tracked(), kinematics)
-    assert (told["points"], told["sightings"]) == (2, 3)
-    assert told["sightings_that_fit"] == pytest.approx(2 / 3)
-    assert (told["explained"], told["explained_by_chance"]) == (0.7, 0.2)
-    assert (told["time_offset_s"], told["time_offset_sd_s"]) == (0.05, 0.01)
-    assert (told["focal_px"], told["focal_sd_px"]) == (288.0, None)
-    told = describe_tracks(tracked(focal_deviation=0.01, time_offset=None), kinematics)
-    assert told["focal_sd_px"] == pytest.approx(2.88)
-    assert told["time_offset_s"] is None
-    unknown = tracked(time_offset=TimeOffset(0.05, np.inf, np.zeros((0, 2))))
-    assert describe_tracks(unknown, kinematics)["time_offset_s"] is None
 
 
 def test_points_are_drawn_in_the_worst_pictures(tmp_path: Any) -> None:

@@ -17,9 +17,8 @@ from cyclopts.help import DefaultFormatter, HelpPanel
 from rich.console import Console, ConsoleOptions
 from rich.text import Text
 
-from drake_pose.commands.batch import batch
 from drake_pose.commands.common import UsageError, say
-from drake_pose.commands.estimate import capture, demo, empty_room, estimate
+from drake_pose.commands.estimate import batch, capture, demo, empty_room, estimate
 from drake_pose.commands.papers import date, kameda, shimada
 from drake_pose.commands.prepare import check, masks
 from drake_pose.commands.register import audit, register

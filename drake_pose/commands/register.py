@@ -198,8 +198,13 @@ def _print_registration(result: SceneRegistration) -> None:
             for row in parameter_rows(first[key]):
                 parameters.add_row(*map(escape, row))
             console.print(parameters)
-    if "target" in first:
-        console.print(_say_target(first["target"]))
+    if target := first.get("target"):
+        place = ", ".join(f"{row[3]:.4f}" for row in target["X_WT"][:3])
+        console.print(
+            f"target at {place} m in the robot's world, sd {target['translation_sd_mm']:.2f} mm, "
+            f"{target['rotation_sd_deg']:.3f} deg; "
+            f"poses in which it looks the same: {len(target['modes'])}"
+        )
     misfits = [(name, one) for name, own in result.registered.items() for one in own.frames]
     if "points" in first:
         shown, which = worst_frames([-misfit.inlier_ratio for _, misfit in misfits], 8)
@@ -231,12 +236,6 @@ def _say_clock(one: Mapping[str, Any]) -> str:
             f"its pose explains {percent(one['explained'])} of the changes in its pictures, and "
             f"chance {percent(one['explained_by_chance'])} (p-value {one['p_value']:.1g})"
         ]
-        if other := one["runner_up"]:
-            texts.append(
-                f"of the best other pose, {other['distance_mm']:.0f} mm and "
-                f"{other['rotation_deg']:.0f} degrees away, less of the contours fits by "
-                f"{other['margin_sd']:.1f} standard deviations"
-            )
     if one["time_offset_s"] is not None:
         value, deviation = 1e3 * one["time_offset_s"], 1e3 * one["time_offset_sd_s"]
         word = "later" if value > 0.0 else "earlier"
@@ -249,16 +248,6 @@ def _say_clock(one: Mapping[str, Any]) -> str:
     if one["focal_sd_px"] is not None:
         texts.append(f"focal length {one['focal_px']:.1f} pixels (sd {one['focal_sd_px']:.1f})")
     return "; ".join(texts)
-
-
-def _say_target(target: Mapping[str, Any]) -> str:
-    """Return a text of the position of the calibration target, from its entry of summary.json."""
-    place = ", ".join(f"{row[3]:.4f}" for row in target["X_WT"][:3])
-    return (
-        f"target at {place} m in the robot's world, sd {target['translation_sd_mm']:.2f} mm, "
-        f"{target['rotation_sd_deg']:.3f} deg; "
-        f"poses in which it looks the same: {len(target['modes'])}"
-    )
 
 
 def _print_audit(result: SceneAudit) -> None:

@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Sequence
 from itertools import product
-from typing import Any
 
 import numpy as np
 from pydrake.geometry import (
@@ -50,7 +49,13 @@ def make_replay(
         most_triangles: maximum number of triangles of the body; a ghost has at most half of it. A
             triangle takes about 100 bytes.
     """
-    meshcat = open_meshcat(port=0)  # Port 0 is any free port.
+    logger = logging.getLogger("drake")
+    level = logger.level
+    logger.setLevel(logging.WARNING)  # Drake logs the server's address.
+    try:
+        meshcat = Meshcat(MeshcatParams(host="localhost", port=0))  # Port 0 is any free port.
+    finally:
+        logger.setLevel(level)
     builder = DiagramBuilder()
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
     source = builder.AddNamedSystem("positions", ConstantVectorSource(positions[0]))
@@ -79,20 +84,6 @@ def make_replay(
     meshcat.SetCameraPose(p_WO + 1.7 * radius * beside / np.linalg.norm(beside), p_WO)
     _record(meshcat, builder.Build(), source, positions, X_WB, period, model, measured)
     return meshcat.StaticHtml()
-
-
-def open_meshcat(**params: Any) -> Meshcat:
-    """Return a Meshcat server that listens on the loopback address only; Drake logs no address.
-
-    ``params``: fields of Drake's MeshcatParams. Raises RuntimeError: the port cannot be used.
-    """
-    logger = logging.getLogger("drake")
-    level = logger.level
-    logger.setLevel(logging.WARNING)
-    try:
-        return Meshcat(MeshcatParams(host="localhost", **params))
-    finally:
-        logger.setLevel(level)
 
 
 def _lighten(scene_graph: SceneGraph, source: SourceId, most: int) -> None:

@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 
 from drake_pose.body import load_landmarks, load_model
-from drake_pose.files.motion_files import (
+from drake_pose.files.records import BASE_COLUMNS, FrameRecord
+from drake_pose.files.writer import (
     centres_as_csv,
     centres_as_trc,
     joint_centres,
     positions_as_mot,
     write_motion,
 )
-from drake_pose.files.records import BASE_COLUMNS, FrameRecord
 from tests.body.models import link_poses
 from tests.jobs.scenes import URDF
 

@@ -19,7 +19,7 @@ import psutil
 import pytest
 import yaml
 
-from drake_pose.commands.batch import batch
+from drake_pose.commands.estimate import batch
 from drake_pose.errors import ClusterError, OutputError, SettingsError
 from drake_pose.files.settings import GONE, EstimateSettings
 from drake_pose.jobs.batch import run_batch

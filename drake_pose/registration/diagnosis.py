@@ -236,7 +236,7 @@ class _Diagnoser:
             frames.append(FrameDiagnosis(fitted.name, *fitted.inlier_ratios, pixels, finding))
         kept = np.array([one.finding is None for one in frames])
         common_findings = self._common_findings(kept) if kept.any() else ((), None, {})
-        return Diagnosis(tuple(frames), common_findings[0], sizes, *common_findings[1:])
+        return Diagnosis(tuple(frames), *common_findings)
 
     def _pooled_sizes(self, indices: Sequence[int], together: int, most: int = 5) -> ErrorSizes:
         """Return the median error sizes of up to `most` groups of `together` frames.

@@ -3,8 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from drake_pose.fit.covariance import ErrorSizes
-
 
 @dataclass(frozen=True)
 class Finding:
@@ -60,7 +58,6 @@ class Diagnosis:
     Args:
         frames: the diagnosis of each frame.
         common: errors common to all inlier frames.
-        sizes: standard deviations of contour errors [pixel].
         center: correction of all principal points and its standard deviation, (2,) each [pixel],
             where they are off by half a pixel along x and y; otherwise None.
         minimum_detectable: by joint without a finding, the smallest offset in all frames that
@@ -69,7 +66,6 @@ class Diagnosis:
 
     frames: tuple[FrameDiagnosis, ...]
     common: tuple[Finding, ...]
-    sizes: ErrorSizes
     center: tuple[list[float], list[float]] | None = None
     minimum_detectable: Mapping[str, float] = field(default_factory=dict)
 

@@ -29,6 +29,7 @@ from drake_pose.input_files import csv_text
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.benchmarks.tables import print_table
+from tests.registration.arm_pictures import with_holes
 from tests.written_files import write_mask
 
 Damage = Callable[[Mask, np.random.Generator, int], Mask]
@@ -119,7 +120,7 @@ def _damages() -> Iterator[tuple[str, Damage]]:
     yield "exact masks", lambda mask, rng, k: mask
     yield "edges 1.5 px off", _with_ragged_edges
     yield "masks a pixel too wide", lambda mask, rng, k: _dilated(mask)
-    yield "holes", _with_holes
+    yield "holes", lambda mask, rng, k: with_holes(mask, rng)
 
 
 def _with_ragged_edges(mask: Mask, rng: np.random.Generator, k: int) -> Mask:
@@ -132,16 +133,6 @@ def _with_ragged_edges(mask: Mask, rng: np.random.Generator, k: int) -> Mask:
 
 def _dilated(mask: Mask) -> Mask:
     return cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.bool_)
-
-
-def _with_holes(mask: Mask, rng: np.random.Generator, k: int) -> Mask:
-    """Return a mask with round holes of 3 % of its area."""
-    drawn = mask.astype(np.uint8)
-    rows, columns = np.nonzero(drawn)
-    while np.count_nonzero(drawn) > 0.97 * len(rows):
-        k = int(rng.integers(len(rows)))
-        cv2.circle(drawn, (int(columns[k]), int(rows[k])), int(rng.integers(3, 9)), 0, -1)
-    return drawn.astype(np.bool_)
 
 
 def swinging(

@@ -7,14 +7,12 @@ end of these rows are not evaluated.
 """
 
 import argparse
-import csv
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import yaml
 
@@ -27,6 +25,7 @@ from tests.benchmarks.registration import pose_error
 from tests.benchmarks.rooms import LOG_HZ, SimulatedEpisode, simulate
 from tests.benchmarks.tables import print_table
 from tests.camera.recordings import write_pictures
+from tests.registration.recordings import write_images, write_log
 
 
 class Arm(NamedTuple):
@@ -172,11 +171,7 @@ def write_episode(
         write_pictures(video, episode.pictures, episode.times, codec, crf=str(crf))
     else:
         images = folder / "images" / episode.camera.name
-        images.mkdir(parents=True)
-        for k, picture in enumerate(episode.pictures):
-            cv2.imwrite(str(images / f"{k:04d}.png"), picture[..., ::-1])
-        rows = [f"{k:04d},{t}" for k, t in enumerate(episode.times)]
-        (images / "timestamps.csv").write_text("\n".join(["frame,time", *rows]))
+        write_images(images, episode.pictures, episode.times)
     content = yaml.safe_load(dump_cameras([episode.camera]))
     del content[episode.camera.name]["X_WC"]
     (folder / "cameras.yaml").write_text(yaml.safe_dump(content))
@@ -188,10 +183,8 @@ def write_episode(
     spoilt = np.flatnonzero((times >= wrong[0]) & (times < wrong[1]))
     positions[spoilt] = np.roll(positions, len(times) // 2, axis=0)[spoilt]
     moving = np.flatnonzero(np.isfinite(model.lower) & (model.lower < model.upper))
-    with (folder / "joint_angles.csv").open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["time", *(model.position_names[k] for k in moving)])
-        writer.writerows([t, *row[moving]] for t, row in zip(times, positions, strict=True))
+    names = [model.position_names[k] for k in moving]
+    write_log(folder / "joint_angles.csv", times, positions[:, moving], names)
 
 
 def _outcome(

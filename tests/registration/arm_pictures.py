@@ -46,7 +46,15 @@ def damaged(
     """Return a mask dilated or eroded by up to two pixels, with holes of 3 % of its area."""
     by = int(generator.integers(-2, 3))
     ball = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(by) + 1,) * 2)
-    drawn = (cv2.dilate if by > 0 else cv2.erode)(mask.astype(np.uint8), ball)
+    change = cv2.dilate if by > 0 else cv2.erode
+    return with_holes(change(mask.astype(np.uint8), ball), generator, radii)
+
+
+def with_holes(
+    mask: np.ndarray, generator: np.random.Generator, radii: tuple[int, int] = (3, 9)
+) -> np.ndarray:
+    """Return a mask with round holes of 3 % of its area."""
+    drawn = mask.astype(np.uint8)
     at = np.argwhere(drawn)
     while drawn.sum() > 0.97 * len(at):
         v, u = at[generator.integers(len(at))].tolist()

@@ -18,14 +18,18 @@ def write_log(path, times, values, names=NAMES):
         writer.writerows([t, *row] for t, row in zip(times, values, strict=True))
 
 
+def write_images(folder, pictures, times):
+    """Write pictures (n, H, W, 3) and their times [s]."""
+    folder.mkdir(parents=True)
+    for k, picture in enumerate(pictures):
+        cv2.imwrite(str(folder / f"{k:04d}.png"), picture[..., ::-1])
+    rows = [f"{k:04d},{t}" for k, t in enumerate(times)]
+    (folder / "timestamps.csv").write_text("\n".join(["frame,time", *rows]))
+
+
 def write_episode(scene, painted):
     """Write a folder of pictures with times, a joint log at another rate, and the camera."""
-    images = scene / "images" / "camera"
-    images.mkdir(parents=True)
-    for k, picture in enumerate(painted.pictures):
-        cv2.imwrite(str(images / f"{k:04d}.png"), picture[..., ::-1])
-    rows = [["frame", "time"], *([f"{k:04d}", t] for k, t in enumerate(painted.times))]
-    (images / "timestamps.csv").write_text("\n".join(",".join(map(str, row)) for row in rows))
+    write_images(scene / "images" / "camera", painted.pictures, painted.times)
     save_cameras(scene / "cameras.yaml", [painted.camera])
     times = np.arange(-0.5, painted.times[-1] + 0.5, 0.05)
     write_log(scene / "joint_angles.csv", times, painted.values_at(times))

@@ -164,9 +164,6 @@ def audit_scene(
             name: offset if math.isfinite(offset) else None for name, offset in detectable.items()
         },
         "principal_point_px": center and dict(zip(("offset", "sd"), center, strict=True)),
-        "error_sizes_px": {
-            name: float(getattr(found.sizes, name)) for name in ("surface", "mask", "camera")
-        },
         **describe_run(inputs, settings, warnings, seconds),
         "unseen": list(empty),
     }

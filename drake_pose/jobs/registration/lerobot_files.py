@@ -147,17 +147,16 @@ def _readme(
     """
     text = f"""Found by `drake-pose register` in {path}, which is left as it was.
 
-- `joint_map.yaml`: from the data set's columns to the model's joints [rad or m], {len(offsets)}
-  joint offsets included: `--joint-map joint_map.yaml`. For the episodes of this calibration.
-- `meta/`: a copy of the data set's, whose `info.json` has `camera_intrinsics` (matrix [pixel]) and
-  `camera_extrinsics` (4 x 4, camera in the robot's base [m]; x right, y down, z forward) in the
-  `info` of each camera: put it in the place of the data set's own.
+- `joint_map.yaml` (`--joint-map joint_map.yaml`): from the columns of episodes of this calibration
+  to the model's joints [rad or m], {len(offsets)} joint offsets included.
+- `meta/`, in place of the data set's own: `info.json` has `camera_intrinsics` (matrix [pixel]) and
+  `camera_extrinsics` (4 x 4, camera in the robot's base [m]; x right, y down, z forward).
 """
     if calibration is None:
         return text
-    text += f"""- `{calibration}`: the robot's calibration, with corrected `homing_offset`:
-  LeRobot then reads the model's angles. Put it in the place of the robot's own, connect, and let
-  LeRobot write it to the motors. Episodes recorded before belong to the old one.
+    text += f"""- `{calibration}`, in place of the robot's own: its calibration with corrected
+  `homing_offset`, by which LeRobot reads the model's angles. Connect, and let LeRobot write it to
+  the motors. Episodes recorded before belong to the old one.
 
 | motor | homing_offset | corrected | its positions change by [steps] |
 | --- | --- | --- | --- |
@@ -165,7 +164,6 @@ def _readme(
     for motor in corrections:
         text += f"| {motor.motor} | {motor.before} | {motor.after} | {motor.shift:+d} |\n"
     return (
-        text + "\n`range_min` and `range_max` are as they were, now about the model's zero: the "
-        "range is moved by as many steps as the positions, and at one end it may lie beyond where "
-        "the joint was moved. Approach its ends slowly, or record the ranges again.\n"
+        text + "\n`range_min` and `range_max` are as they were, now about the model's zero: at one "
+        "end the range may lie beyond where the joint was moved. Approach its ends slowly.\n"
     )

@@ -5,6 +5,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import combinations, product
+from operator import methodcaller
 from typing import NamedTuple
 
 import numpy as np
@@ -38,6 +39,15 @@ def scene_corrections(
         focal: factors of focal lengths.
         sizes: of pictures for which intrinsics may be meant [size of the camera's pictures].
     """
+
+    def mirrored(group: Collection[str], frame: MultiViewFrame) -> MultiViewFrame:
+        masks = frame.masks.items()
+        turned = {k: np.ascontiguousarray(v[:, ::-1]) if k in group else v for k, v in masks}
+        return replace(frame, masks=turned)
+
+    def with_row(rows: Mapping[str, Array], frame: MultiViewFrame) -> MultiViewFrame:
+        return replace(frame, values=rows[frame.name])
+
     for reading in readings():
         # Those of a misread rotation and a second mistake are for `likeliest_reading` alone.
         for group in () if reading.is_turned and reading.steps > 1 else _groups(cameras):
@@ -64,7 +74,7 @@ def scene_corrections(
     for group in _groups(cameras):
         whose = "all cameras" if len(group) > 1 else f"camera '{group[0]}'"
         text = f"the masks of {whose} seem to be mirrored: turn the pictures back"
-        yield Correction("reading", text, tuple(cameras), _mirrored(group))
+        yield Correction("reading", text, tuple(cameras), partial(mirrored, group))
         if not all(isinstance(camera, PinholeCamera) for camera in cameras if camera.name in group):
             continue
         text = "focal lengths" if len(cameras) > 1 and len(group) > 1 else "focal length of camera"
@@ -75,7 +85,7 @@ def scene_corrections(
     for which, shift in (("next", 1), ("previous", -1)) if len(frames) > 2 else ():
         rows = dict(zip(frames, np.roll(np.array(values), -shift, axis=0), strict=True))
         text = f"the masks fit with the joint positions of the {which} frame"
-        yield Correction("reading", text, tuple(cameras), partial(_with_row, rows))
+        yield Correction("reading", text, tuple(cameras), partial(with_row, rows))
 
 
 def joint_exchanges(
@@ -151,24 +161,16 @@ def _intrinsics_corrections(
 
     for size in sizes:
         first = next(one for one in cameras if one.name in group)
+        scaled = methodcaller("with_scaled_intrinsics", 1.0 / size, 1.0 / size)
         shape = f"{size * first.width:.0f} x {size * first.height:.0f} pixels"
         text = (
             f"the intrinsics of {whose} seem to be those of pictures of {shape}: divide focal "
             f"lengths and principal point by {size:.4g}"
         )
-        yield Correction("reading", text, changed(partial(_of_size, size)), unchanged)
+        yield Correction("reading", text, changed(scaled), unchanged)
     text = f"center_x and center_y of {whose} seem to be exchanged"
-    yield Correction("reading", text, changed(_with_exchanged_center), unchanged)
-
-
-def _of_size(size: float, camera: PinholeCamera) -> PinholeCamera:
-    """Return a camera whose intrinsics, as given, are those of pictures `size` times as large."""
-    return camera.with_scaled_intrinsics(1.0 / size, 1.0 / size)
-
-
-def _with_exchanged_center(camera: PinholeCamera) -> PinholeCamera:
-    """Return a camera with the coordinates of its principal point exchanged."""
-    return replace(camera, center_x=camera.center_y, center_y=camera.center_x)
+    exchanged = changed(lambda one: replace(one, center_x=one.center_y, center_y=one.center_x))
+    yield Correction("reading", text, exchanged, unchanged)
 
 
 def focal_correction(
@@ -195,24 +197,6 @@ def _groups(cameras: Sequence[Camera]) -> list[tuple[str, ...]]:
     """Return groups of cameras' names: all cameras, then each camera alone if there are several."""
     names = tuple(camera.name for camera in cameras)
     return [names, *((name,) for name in names if len(names) > 1)]
-
-
-def _mirrored(group: Collection[str]) -> Callable[[MultiViewFrame], MultiViewFrame]:
-    """Return a function that mirrors a frame's masks of the cameras in `group`, names."""
-
-    def change(frame: MultiViewFrame) -> MultiViewFrame:
-        masks = {
-            name: np.ascontiguousarray(mask[:, ::-1]) if name in group else mask
-            for name, mask in frame.masks.items()
-        }
-        return replace(frame, masks=masks)
-
-    return change
-
-
-def _with_row(rows: Mapping[str, Array], frame: MultiViewFrame) -> MultiViewFrame:
-    """Return a frame with the values (m,) that `rows` has for its name."""
-    return replace(frame, values=rows[frame.name])
 
 
 class Reading(NamedTuple):
@@ -247,6 +231,10 @@ def readings() -> Iterator[Reading]:
     units = {"": 1.0, "in millimetres": 1e-3, "in centimetres": 1e-2}
     turns = {"": np.asarray} | _rotations()
     inverses = {"": False, "the inverse of the camera's pose in the world": True}
+
+    def about_base(R: Array, X: Array) -> Array:
+        return np.vstack([R @ X[:3], X[3:]])
+
     for of_turn, of_unit, of_place, of_frame in product(turns, units, inverses, frames):
         words = [one for one in (of_place, of_frame, of_turn, of_unit) if one]
         if words:
@@ -255,7 +243,7 @@ def readings() -> Iterator[Reading]:
     for degrees in (90, 180, 270):
         R_turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
         text = f"that of a world turned by {degrees} degrees about the z axis of the robot's"
-        yield Reading(text, partial(_about_base, R_turn), 1, of_world=True)
+        yield Reading(text, partial(about_base, R_turn), 1, of_world=True)
 
 
 def _reread(
@@ -275,11 +263,6 @@ def _reread(
     reread = inverse_pose(reread).copy() if inverse else reread
     reread[:3, :3] = reread[:3, :3] @ R
     return reread
-
-
-def _about_base(R: Array, X: Array) -> Array:
-    """Return a pose X (4, 4) turned by R (3, 3) about the world's origin."""
-    return np.vstack([R @ X[:3], X[3:]])
 
 
 def _rotations() -> dict[str, Callable[[Array], Array]]:

@@ -255,8 +255,19 @@ class _Registration:
             self._find_each()
         elif inputs.target is not None:
             self._find_target(inputs.target)
-        elif self._settings.on is not None:
-            self._find_in_scene(self._settings.on)
+        elif (link := self._settings.on) is not None:
+            # From things that stand still in the pictures.
+            base = inputs.tree.node_index((inputs.visible_nodes or ())[0])
+            for camera in inputs.searched_cameras:
+                name, start = camera.name, time.perf_counter()
+                assumed = name in inputs.assumed_focal
+                with self._refusing(name):
+                    found = self.tracks[name] = register_tracks(
+                        self.body, link, base, camera, inputs.recordings[name],
+                        self._settings.focal or assumed, inputs.offset_joints,
+                    )  # fmt: skip
+                    self.warnings += track_warnings(found, assumed)
+                    self._note(found.found, start)
         else:
             frames, start = list[MultiViewFrame](), time.perf_counter()
             focal = [*inputs.recordings] if self._settings.focal else []
@@ -290,22 +301,6 @@ class _Registration:
             raise next(iter(self.refused.values()))
         if self.refused:
             self.inputs = self.inputs.without(self.refused)
-
-    def _find_in_scene(self, link: str) -> None:
-        """Register each camera on the link from things that stand still in its pictures."""
-        inputs = self.inputs
-        base = inputs.tree.node_index((inputs.visible_nodes or ())[0])
-        for camera in inputs.searched_cameras:
-            name, start = camera.name, time.perf_counter()
-            recording, assumed = inputs.recordings[name], name in inputs.assumed_focal
-            focal = self._settings.focal or assumed
-            with self._refusing(name):
-                result = register_tracks(
-                    self.body, link, base, camera, recording, focal, inputs.offset_joints
-                )
-                self.tracks[name] = result
-                self.warnings += track_warnings(result, assumed)
-                self._note(result.found, start)
 
     def _find_each(self) -> None:
         """Register each camera from its masks.

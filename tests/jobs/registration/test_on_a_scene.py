@@ -12,7 +12,7 @@ from drake_pose.errors import RegistrationError, SettingsError
 from drake_pose.files.settings import RegistrationSettings
 from drake_pose.jobs.registration.register import register_scene
 from tests.benchmarks.registration import pose_error
-from tests.registration.recordings import write_log
+from tests.registration.recordings import write_images, write_log
 
 NAMES = tuple(f"joint{k}" for k in range(6))
 JOINTS = (
@@ -77,17 +77,14 @@ def write_episode(folder: Path, swing: tuple[float, ...], objects: int = 150) ->
         )
     pixel = 1.0 / len(table)
     to_world = np.array([[pixel, 0, 0.0], [0, pixel, -0.5], [0, 0, 0], [0, 0, 1]])
-    images = folder / "images" / "wrist"
-    images.mkdir(parents=True)
-    times, rows = np.arange(40) / 5.0, [("frame", "time")]
-    for k, values in enumerate(values_at(times + LATE, np.array(swing))):
+    times, pictures = np.arange(40) / 5.0, []
+    for values in values_at(times + LATE, np.array(swing)):
         X_CW = np.linalg.inv(link_pose(values) @ X_LC)
         picture = cv2.warpPerspective(table, K @ X_CW[:3] @ to_world, SIZE, flags=cv2.INTER_AREA)
         picture[200:, 130:190] = table[100:140, 100:160] // 2  # A gripper.
         noisy = picture + rng.normal(0.0, 2.0, picture.shape)
-        cv2.imwrite(str(images / f"{k:04d}.png"), noisy.clip(0, 255).astype(np.uint8))
-        rows.append((f"{k:04d}", str(times[k])))
-    (images / "timestamps.csv").write_text("\n".join(",".join(row) for row in rows))
+        pictures.append(noisy.clip(0, 255).astype(np.uint8))
+    write_images(folder / "images" / "wrist", pictures, times)
     camera = {"width": SIZE[0], "height": SIZE[1], "focal_x": FOCAL, "focal_y": FOCAL}
     camera |= {"center_x": 159.5, "center_y": 119.5}
     (folder / "cameras.yaml").write_text(yaml.safe_dump({"wrist": camera}))

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from drake_pose.body.meshes import TriangleMesh, merge_duplicate_vertices, write_obj
 from drake_pose.body.model_files import (
@@ -31,6 +30,7 @@ from drake_pose.body.model_files import (
     Warn,
     colour_text,
     leave_out,
+    number_text,
     open_loops,
     read_limits,
     read_numbers,
@@ -441,13 +441,16 @@ def sanitise_mjcf(path: Path, warn: Warn) -> tuple[str, list[MjcfCoupling]]:
         ElementTree.SubElement(asset, "mesh", name=f"mesh{mesh}", file=str(file))
     for geom in drawn:
         kind = _shape_name(model, geom)
-        attributes = {"type": kind, "rgba": _text(model.geom_rgba[geom])}
+        attributes = {"type": kind, "rgba": number_text(model.geom_rgba[geom])}
         attributes |= {"contype": "0", "conaffinity": "0"}
-        attributes |= {"pos": _text(model.geom_pos[geom]), "quat": _text(model.geom_quat[geom])}
+        attributes |= {
+            "pos": number_text(model.geom_pos[geom]),
+            "quat": number_text(model.geom_quat[geom]),
+        }
         if kind == "mesh":
             attributes["mesh"] = f"mesh{model.geom_dataid[geom]}"
         else:
-            attributes["size"] = _text(model.geom_size[geom][: _SIZES[kind]])
+            attributes["size"] = number_text(model.geom_size[geom][: _SIZES[kind]])
         ElementTree.SubElement(bodies[model.geom_bodyid[geom]], "geom", attributes)
     return xml_text(text), couplings
 
@@ -538,7 +541,7 @@ def _add_body(model: Any, body: int, name: str, parent: ElementTree.Element) -> 
     """
     first = model.body_jntadr[body]
     joints = range(first, first + model.body_jntnum[body])
-    pose = {"pos": _text(model.body_pos[body]), "quat": _text(model.body_quat[body])}
+    pose = {"pos": number_text(model.body_pos[body]), "quat": number_text(model.body_quat[body])}
     names = [f"{name}__{_name(model, model.name_jntadr[j]) or k}" for k, j in enumerate(joints)]
     element = parent
     for nested, joint in itertools.zip_longest([*names[:-1], name], joints):
@@ -551,8 +554,11 @@ def _add_body(model: Any, body: int, name: str, parent: ElementTree.Element) -> 
     inertial = dict(_ALMOST_MASSLESS)
     if model.body_mass[body] > 0.0:
         inertial["mass"] = repr(float(model.body_mass[body]))
-        inertial["diaginertia"] = _text(model.body_inertia[body])
-        inertial |= {"pos": _text(model.body_ipos[body]), "quat": _text(model.body_iquat[body])}
+        inertial["diaginertia"] = number_text(model.body_inertia[body])
+        inertial |= {
+            "pos": number_text(model.body_ipos[body]),
+            "quat": number_text(model.body_iquat[body]),
+        }
     ElementTree.SubElement(element, "inertial", inertial)
     return element
 
@@ -565,13 +571,13 @@ def _add_joint(model: Any, joint: int, body: ElementTree.Element) -> None:
     if kind == "free":
         ElementTree.SubElement(body, "freejoint", attributes)
         return
-    attributes |= {"type": kind, "pos": _text(model.jnt_pos[joint]), "limited": "false"}
+    attributes |= {"type": kind, "pos": number_text(model.jnt_pos[joint]), "limited": "false"}
     if kind != "ball":
-        attributes["axis"] = _text(model.jnt_axis[joint])
+        attributes["axis"] = number_text(model.jnt_axis[joint])
         attributes["ref"] = repr(float(model.qpos0[model.jnt_qposadr[joint]]))
         attributes["damping"] = repr(float(np.ravel(model.dof_damping[model.jnt_dofadr[joint]])[0]))
     if model.jnt_limited[joint]:
-        attributes |= {"limited": "true", "range": _text(model.jnt_range[joint])}
+        attributes |= {"limited": "true", "range": number_text(model.jnt_range[joint])}
     ElementTree.SubElement(body, "joint", attributes)
 
 
@@ -584,8 +590,3 @@ def _mesh(model: Any, mesh: int) -> TriangleMesh:
             model.mesh_vert[first : first + count], model.mesh_face[begin : begin + triangles]
         )
     )
-
-
-def _text(values: ArrayLike) -> str:
-    """Return numbers as attribute text without loss of precision."""
-    return " ".join(repr(float(value)) for value in np.ravel(values))

@@ -27,7 +27,7 @@ from pydrake.multibody.tree import (
 from drake_pose.arrays import Array
 from drake_pose.body.link_graph import PlantKinematics
 from drake_pose.body.meshes import TriangleMesh, join_meshes, labelled_meshes, make_drawable
-from drake_pose.body.model_files import xml_text
+from drake_pose.body.model_files import number_text, xml_text
 from drake_pose.body.parsed_model import (
     ParsedModel,
     SkinBand,
@@ -226,18 +226,18 @@ class ArticulatedModel(ParsedModel):
             ElementTree.SubElement(joint, "parent", link=parent)
             ElementTree.SubElement(joint, "child", link=f"{name}_link")
             ElementTree.SubElement(
-                joint, "axis", xyz=_text(np.eye(3)[k if is_prismatic else 5 - k])
+                joint, "axis", xyz=number_text(np.eye(3)[k if is_prismatic else 5 - k])
             )
             limit = {"lower": "-100", "upper": "100"} if is_prismatic else {}
             ElementTree.SubElement(joint, "limit", {**limit, "effort": "1", "velocity": "1"})
             parent = f"{name}_link"
         # The translation axes are the world's; the model's own rotation follows the joints.
-        ElementTree.SubElement(root.findall("joint")[-6], "origin", xyz=_text(X_WB[:3, 3]))
+        ElementTree.SubElement(root.findall("joint")[-6], "origin", xyz=number_text(X_WB[:3, 3]))
         for base in bases:
             joint = ElementTree.SubElement(root, "joint", name=f"free_{base}", type="fixed")
             ElementTree.SubElement(joint, "parent", link=parent)
             ElementTree.SubElement(joint, "child", link=str(base))
-            ElementTree.SubElement(joint, "origin", rpy=_text(rpy))
+            ElementTree.SubElement(joint, "origin", rpy=number_text(rpy))
         moved = self._changed(xml_text(root), self.skin)
         positions, _ = describe_positions(moved.plant, self._source.limits, str(self.path))
         return replace(moved, **positions)
@@ -494,7 +494,7 @@ def _move_origin(
         return
     position = np.array(_numbers(_origin(element).get("xyz", "0 0 0")))
     position = position if scale is None else position * scale
-    _origin(element).set("xyz", _text(sum(vectors, start=position)))
+    _origin(element).set("xyz", number_text(sum(vectors, start=position)))
 
 
 def _offset_joint(joint: ElementTree.Element, offset: float) -> None:
@@ -508,11 +508,13 @@ def _offset_joint(joint: ElementTree.Element, offset: float) -> None:
     if joint.get("type") == "prismatic":
         _move_origin(joint, None, R.apply(offset * axis))
     else:
-        _origin(joint).set("rpy", _text((R * Rotation.from_rotvec(offset * axis)).as_euler("xyz")))
+        _origin(joint).set(
+            "rpy", number_text((R * Rotation.from_rotvec(offset * axis)).as_euler("xyz"))
+        )
     limit = joint.find("limit")
     for end in ("lower", "upper"):
         if limit is not None and joint.get("type") != "continuous" and end in limit.attrib:
-            limit.set(end, _text([float(limit.get(end, "0")) - offset]))
+            limit.set(end, number_text([float(limit.get(end, "0")) - offset]))
 
 
 def _origin(element: ElementTree.Element) -> ElementTree.Element:
@@ -534,14 +536,9 @@ def _scale_shapes(visual: ElementTree.Element, scale: Array) -> None:
             ("c", scale[2:]), ("radius", mean), ("length", scale[2:]),
         ):  # fmt: skip
             if name in shape.attrib:
-                shape.set(name, _text(np.array(_numbers(shape.get(name, ""))) * factor))
+                shape.set(name, number_text(np.array(_numbers(shape.get(name, ""))) * factor))
 
 
 def _numbers(text: str) -> list[float]:
     """Return the numbers in an attribute's text."""
     return [float(number) for number in text.split()]
-
-
-def _text(numbers: Sequence[float] | Array) -> str:
-    """Return numbers as attribute text without loss of precision."""
-    return " ".join(repr(float(number)) for number in numbers)

@@ -10,6 +10,8 @@ from pathlib import Path
 from urllib.parse import unquote
 from xml.parsers import expat
 
+import numpy as np
+from numpy.typing import ArrayLike
 from pydrake.multibody.parsing import PackageMap
 
 from drake_pose.errors import ModelError, UnknownNameError
@@ -66,6 +68,11 @@ def read_xml(path: Path) -> ElementTree.Element:
 def xml_text(root: ElementTree.Element) -> str:
     """Return the text of an element tree from ``read_xml``."""
     return ElementTree.tostring(root, encoding="unicode")
+
+
+def number_text(values: ArrayLike) -> str:
+    """Return numbers as attribute text without loss of precision."""
+    return " ".join(repr(float(value)) for value in np.ravel(values))
 
 
 def read_numbers(text: str | None, count: int, where: str) -> list[float]:

@@ -16,11 +16,11 @@ X = np.eye(4)
 X[:3, :3] = Rotation.from_euler("xyz", [-2.3, 0.1, 2.2]).as_matrix()
 X[:3, 3] = [0.71, -0.97, 1.13]
 CAMERA = PinholeCamera("left", 1280, 720, 640.0, 642.0, 639.5, 359.5, X)
-X_Y, Z, W = slice(0, 3), 2, 3
 PLACE = dict(zip("xyz", X[:3, 3].tolist(), strict=True))
 QUATERNION = Rotation.from_matrix(X[:3, :3]).as_quat().tolist()
 Q = dict(zip(("qx", "qy", "qz", "qw"), QUATERNION, strict=True))
 TURN = dict(zip("xyzw", QUATERNION, strict=True))
+RVEC = Rotation.from_matrix(X[:3, :3]).as_rotvec().tolist()
 SIX = [*X[:3, 3].tolist(), *Rotation.from_matrix(X[:3, :3]).as_euler("xyz").tolist()]
 # ROS: a camera's link has x forward, y left and z up.
 X_LINK = X.copy()
@@ -28,6 +28,9 @@ X_LINK[:3, :3] = X[:3, :3] @ np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0,
 LINK_Q = Rotation.from_matrix(X_LINK[:3, :3]).as_quat().tolist()
 FRAMES = {"robot_base_frame": "base_link", "robot_effector_frame": "tool0"}
 EASY = {"eye_on_hand": False, "tracking_base_frame": "camera_color_optical_frame", **FRAMES}
+BASE = {"parameters": EASY, "transformation": PLACE | Q}
+MOVED = {"translation": PLACE, "rotation": TURN}
+SAME = {"translation": dict.fromkeys("xyz", 0.0), "rotation": dict.fromkeys("xyz", 0.0) | {"w": 1}}
 LAUNCH = """<launch>
   <!-- xyz="0 0 0" rpy="0 0 0" -->
   <node pkg="tf2_ros" type="static_transform_publisher" name="camera_link_broadcaster"
@@ -38,6 +41,10 @@ LAUNCH = """<launch>
 
 def words(numbers):
     return " ".join(f"{x:.17g}" for x in numbers)
+
+
+def transform(parent, child, moved):
+    return {"header": {"frame_id": parent}, "child_frame_id": child, "transform": moved}
 
 
 @pytest.fixture
@@ -57,14 +64,11 @@ def load(path, content, intrinsics, recording=None):
 @pytest.mark.parametrize(
     ("name", "content"),
     [
-        ("easy.yaml", {"parameters": EASY, "transformation": PLACE | Q}),
+        ("easy.yaml", BASE),
         ("easy.yaml", EASY | {"transformation": PLACE | Q}),
         (
             "easy.calib",
-            {
-                "parameters": EASY | {"calibration_type": "eye_on_base"},
-                "transform": {"translation": PLACE, "rotation": TURN},
-            },
+            {"parameters": EASY | {"calibration_type": "eye_on_base"}, "transform": MOVED},
         ),
         (
             "easy.yaml",
@@ -90,19 +94,8 @@ def load(path, content, intrinsics, recording=None):
             "tf.yaml",
             {
                 "transforms": [
-                    {
-                        "header": {"frame_id": "base"},
-                        "child_frame_id": "mount",
-                        "transform": {"translation": PLACE, "rotation": TURN},
-                    },
-                    {
-                        "header": {"frame_id": "mount"},
-                        "child_frame_id": "camera_optical_frame",
-                        "transform": {
-                            "translation": dict.fromkeys("xyz", 0.0),
-                            "rotation": dict.fromkeys("xyz", 0.0) | {"w": 1.0},
-                        },
-                    },
+                    transform("base", "mount", MOVED),
+                    transform("mount", "camera_optical_frame", SAME),
                 ]
             },
         ),
@@ -121,15 +114,7 @@ def load(path, content, intrinsics, recording=None):
             {"left": {"position": SIX[:3], "quat_wxyz": [QUATERNION[3], *QUATERNION[:3]]}},
         ),
         ("parts.yaml", {"left": {"translation": SIX[:3], "rotation": X[:3, :3].tolist()}}),
-        (
-            "parts.yaml",
-            {
-                "left": {
-                    "tvec": SIX[:3],
-                    "rvec": Rotation.from_matrix(X[:3, :3]).as_rotvec().tolist(),
-                }
-            },
-        ),
+        ("parts.yaml", {"left": {"tvec": SIX[:3], "rvec": RVEC}}),
         ("parts.yaml", {"left": PLACE | dict(zip(("roll", "pitch", "yaw"), SIX[3:], strict=True))}),
         ("parts.yaml", {"left": {"xyz": SIX[:3], "rpy_deg": np.degrees(SIX[3:]).tolist()}}),
         ("parts.yaml", {"left": {"xyz": SIX[:3], "rpy": SIX[3:]}}),
@@ -197,7 +182,7 @@ def test_files_of_many_episodes_give_the_recordings_own(tmp_path):
     ("content", "words"),
     [
         ({"left": SIX}, ["has poses (left)", "--intrinsics FILE"]),
-        ({"parameters": EASY, "transformation": PLACE | Q}, ["camera_color_optical_frame"]),
+        (BASE, ["camera_color_optical_frame"]),
         ({"left": [*SIX[:3], 0.5, 0.5, 0.5, 0.9]}, ["camera 'left'", "length 1.25"]),
         ({"left": {"X_WC": (2.0 * X).tolist()}}, ["a pinhole camera needs width"]),
         ({"left": {"t": SIX[:3], "R": (1.2 * X[:3, :3]).tolist()}}, ["not a rotation"]),
@@ -211,15 +196,12 @@ def test_what_is_wanted_is_said(tmp_path, content, words):
         assert word in str(caught.value)
 
 
-def test_a_pose_of_no_camera_is_refused(tmp_path, scene):
+def test_a_pose_of_no_camera_is_refused(tmp_path):
     intrinsics = tmp_path / "two.yaml"
-    one = yaml.safe_load(scene.read_text())
     entry = {"width": 1280, "height": 720, "fx": 640, "fy": 642, "cx": 639.5, "cy": 359.5}
     intrinsics.write_text(yaml.safe_dump({"left": entry, "right": entry}))
-    assert one["image_width"] == 1280
-    content = {"parameters": EASY, "transformation": PLACE | Q}
     with pytest.raises(CameraError, match="cameras are left, right: name them alike") as caught:
-        load(tmp_path / "easy.yaml", content, intrinsics)
+        load(tmp_path / "easy.yaml", BASE, intrinsics)
     assert "--camera NAME" in str(caught.value)
 
 

@@ -158,8 +158,16 @@ def open_source(path: Path, camera_file: Path | None, episode: int | None) -> So
     try:
         if episode is not None or recording_format(path) in ("lerobot", "droid", "bag"):
             found = Source(path, episode=open_episode(path, episode=episode))
+        elif not path.is_file():
+            found = _open_folder(path)
+        elif (kind := path.suffix.lower()) == ".json":
+            found = Source(path, annotated=[("", one) for one in read_coco(path)])
+        elif kind in VIDEOS:
+            found = Source(path, videos={"": path})
+        elif kind in SUFFIXES:
+            found = Source(path, pictures={"": {path.stem: path}})
         else:
-            found = _open_file(path) if path.is_file() else _open_folder(path)
+            raise SceneError(f"{path}: is not a picture, video or COCO file")
     except OSError as error:
         raise SceneError(f"{error.filename or path}: cannot be read: {error.strerror}") from error
     if not (found.names or found.annotated):
@@ -186,18 +194,6 @@ def open_source(path: Path, camera_file: Path | None, episode: int | None) -> So
     return replace(
         found, camera_file=camera_file, cameras=cameras, pictures=pictures, videos=videos
     )
-
-
-def _open_file(path: Path) -> Source:
-    """Return the source of a COCO file, video or picture; its camera is ""."""
-    kind = path.suffix.lower()
-    if kind == ".json":
-        return Source(path, annotated=[("", one) for one in read_coco(path)])
-    if kind in VIDEOS:
-        return Source(path, videos={"": path})
-    if kind in SUFFIXES:
-        return Source(path, pictures={"": {path.stem: path}})
-    raise SceneError(f"{path}: is not a picture, video or COCO file")
 
 
 def _open_folder(path: Path) -> Source:

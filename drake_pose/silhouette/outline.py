@@ -189,7 +189,13 @@ def _pack_rest(outlines: tuple[Outline, ...]) -> PackedOutlines:
     starts = np.zeros((len(outlines) + 1, 3), dtype=np.int64)
     sizes = [(len(o.vertices), len(o.triangles), len(o.edges)) for o in outlines]
     starts[1:] = np.cumsum(np.array(sizes, dtype=np.int64).reshape(-1, 3), axis=0)
-    records = [_kernel_edges(outline) for outline in outlines]
+    # Edges in the kernel's convention: those with s1 = -1 first, then by triangle for locality.
+    records = []
+    for outline in outlines:
+        v0, v1, t0, t1, s1 = outline.edges.T
+        second = np.where(s1 == 0, len(outline.triangles), t1)
+        order = np.lexsort((t0, s1 != -1))
+        records.append(np.column_stack([v0, v1, t0, second, s1])[order])
     ordinary = [np.count_nonzero(record[:, 4] == -1) for record in records]
     edges = _stacked(records, 5, np.int32)
     return PackedOutlines(
@@ -202,15 +208,6 @@ def _pack_rest(outlines: tuple[Outline, ...]) -> PackedOutlines:
         starts=starts,
         ordinary_ends=starts[:-1, 2] + np.array(ordinary, dtype=np.int64),
     )
-
-
-def _kernel_edges(outline: Outline) -> np.ndarray:
-    """Return the records (e, 5) in the kernel's order and convention, those with s1 = -1 first."""
-    v0, v1, t0, t1, s1 = outline.edges.T
-    second = np.where(s1 == 0, len(outline.triangles), t1)
-    # Sorted by triangle for memory locality.
-    order = np.lexsort((t0, s1 != -1))
-    return np.column_stack([v0, v1, t0, second, s1])[order]
 
 
 def _stacked(parts: Sequence[np.ndarray], columns: int, dtype: type) -> np.ndarray:
@@ -406,6 +403,7 @@ class BendingOutline:
     def __init__(self, rigid: Outline, band: TriangleMesh) -> None:
         self.rigid = rigid
         own = outline_of_triangles(band.vertices, band.triangles)
+        self._band_triangles = own.triangles
         edges = own.edges.copy()
         edges[:, :2] += len(rigid.vertices)
         edges[:, 2] += len(rigid.triangles)
@@ -417,11 +415,6 @@ class BendingOutline:
             ),
             edges=np.concatenate([rigid.edges, edges]),
         )
-
-    @cached_property
-    def _band_triangles(self) -> np.ndarray:
-        """(m, 3) the band's triangles, as indices of the band's own vertices."""
-        return self.rest.triangles[len(self.rigid.triangles) :] - len(self.rigid.vertices)
 
     def at(self, band: np.ndarray) -> Outline:
         """Return the whole surface with the band's vertices at (v, 3) [m] in frame N."""
@@ -437,15 +430,8 @@ class BendingOutline:
         return outline
 
 
+# Outlines of nodes' meshes, while the meshes exist.
 _node_outlines: WeakKeyDictionary[TriangleMesh, Outline] = WeakKeyDictionary()
-
-
-def _node_outline(mesh: TriangleMesh) -> Outline:
-    """Return the outline of a node's mesh, cached while the mesh exists."""
-    outline = _node_outlines.get(mesh)
-    if outline is None:
-        outline = _node_outlines[mesh] = outline_from_mesh(mesh)
-    return outline
 
 
 class TreeSurfaces:
@@ -462,7 +448,10 @@ class TreeSurfaces:
         self._nodes = tree.nodes
         self.value_counts = [len(node.value_names) for node in tree.nodes]
         self.skins = [node.skin for node in tree.nodes]
-        self.rigid = [_node_outline(node.mesh) for node in tree.nodes]
+        for node in tree.nodes:
+            if node.mesh not in _node_outlines:
+                _node_outlines[node.mesh] = outline_from_mesh(node.mesh)
+        self.rigid = [_node_outlines[node.mesh] for node in tree.nodes]
         self.bending = [
             None if node.skin is None else BendingOutline(rigid, node.skin.mesh)
             for node, rigid in zip(tree.nodes, self.rigid, strict=True)

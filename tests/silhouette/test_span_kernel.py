@@ -1,5 +1,7 @@
 """Masks, areas and labels of the span kernel against ray casting."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -159,28 +161,24 @@ PARALLEL = ParallelCamera("flat", 64, 48, 20.0, 31.5, 23.5, np.eye(4))
 CUBE = outline_from_mesh(box(1.0))
 
 
-def at(x, y, z):
-    X_CN = np.eye(4)
-    X_CN[:3, 3] = (x, y, z)
-    return X_CN
-
-
-def test_visible_body_is_accepted():
-    require_visible([CUBE], at(0, 0, 3)[None], PINHOLE)
-    require_visible([CUBE], at(0, 0, -3)[None], PARALLEL)
-    require_visible([CUBE, CUBE], np.array([at(0, 0, 3), at(0, 0, -3)]), PINHOLE)
-    require_visible([CUBE], at(0.6, 0, 0)[None], PINHOLE)  # beside the camera, in part before it
-
-
-def test_invisible_body_is_refused():
-    with pytest.raises(CameraError, match=r"'eye'.*behind"):
-        require_visible([CUBE, CUBE], np.array([at(0, 0, -3), at(1, 0, -2)]), PINHOLE)
-    with pytest.raises(CameraError, match=r"'eye' is inside"):
-        require_visible([CUBE, CUBE], np.array([at(0, 0, 3), at(0.1, 0.2, 0.3)]), PINHOLE)
-    with pytest.raises(CameraError, match=r"'eye'.*outside the picture"):
-        require_visible([CUBE], at(50, 0, 3)[None], PINHOLE)
-    with pytest.raises(CameraError, match=r"'flat'.*outside the picture"):
-        require_visible([CUBE], at(0, 50, 3)[None], PARALLEL)
+@pytest.mark.parametrize(
+    ("camera", "places", "refused"),
+    [
+        (PINHOLE, [(0, 0, 3)], None),
+        (PARALLEL, [(0, 0, -3)], None),
+        (PINHOLE, [(0, 0, 3), (0, 0, -3)], None),
+        (PINHOLE, [(0.6, 0, 0)], None),  # Beside the camera, in part before it.
+        (PINHOLE, [(0, 0, -3), (1, 0, -2)], "'eye'.*behind"),
+        (PINHOLE, [(0, 0, 3), (0.1, 0.2, 0.3)], "'eye' is inside"),
+        (PINHOLE, [(50, 0, 3)], "'eye'.*outside the picture"),
+        (PARALLEL, [(0, 50, 3)], "'flat'.*outside the picture"),
+    ],
+)
+def test_a_body_that_a_camera_cannot_show_is_refused(camera, places, refused):
+    X_CN = np.tile(np.eye(4), (len(places), 1, 1))
+    X_CN[:, :3, 3] = places
+    with nullcontext() if refused is None else pytest.raises(CameraError, match=refused):
+        require_visible([CUBE] * len(places), X_CN, camera)
 
 
 def require_nearest(meshes, X_CN, camera):

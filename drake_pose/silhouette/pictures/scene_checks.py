@@ -156,7 +156,18 @@ def _find_repeats(scene: Scene, min_change: float = 0.02) -> tuple[dict[str, lis
     ``min_change``: change of the other cameras' silhouettes, as a fraction of their area, from
     which a camera that shows no change is frozen.
     """
-    repeats = _repeated_files(scene)
+    # Masks whose file equals that of the frame before; unreadable ones are not repeated.
+    repeats = set[tuple[str, str]]()
+    for name in scene.cameras:
+        before: tuple[Path, int] | None = None
+        for frame in scene.frames:
+            path, size = scene.masks.get((name, frame)), None
+            if path is not None:
+                with suppress(OSError):
+                    size = require_regular(path)
+                    if before and before[1] == size and filecmp.cmp(before[0], path, shallow=False):
+                        repeats.add((name, frame))
+            before = None if path is None or size is None else (path, size)
     frozen: dict[str, list[str]] = {}
     repeated = []
     for last, frame in pairwise(scene.frames):
@@ -175,22 +186,6 @@ def _find_repeats(scene: Scene, min_change: float = 0.02) -> tuple[dict[str, lis
                 for name in alike:
                     frozen.setdefault(name, []).append(frame)
     return frozen, repeated
-
-
-def _repeated_files(scene: Scene) -> set[tuple[str, str]]:
-    """Return (camera, frame) of masks whose file equals the frame's before; unreadable: no."""
-    found = []
-    for name in scene.cameras:
-        last: tuple[Path, int] | None = None
-        for frame in scene.frames:
-            path, size = scene.masks.get((name, frame)), None
-            if path is not None:
-                with suppress(OSError):
-                    size = require_regular(path)
-                    if last and last[1] == size and filecmp.cmp(last[0], path, shallow=False):
-                        found.append((name, frame))
-            last = None if path is None or size is None else (path, size)
-    return set(found)
 
 
 def _check_gaps(frames: Sequence[str]) -> list[str]:

@@ -3,6 +3,7 @@
 The shape of a URDF model is changed in its text: links are hidden, scaled and shifted.
 """
 
+import copy
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -305,7 +306,8 @@ class ArticulatedModel(ParsedModel):
 
     def _changed(self, text: str, skin: Sequence[SkinBand]) -> "ArticulatedModel":
         """Return the model parsed again from another URDF text, with the bands ``skin``."""
-        source = self._urdf().with_text(text)
+        source = copy.copy(self._urdf())
+        source.text = text
         plant, scene_graph, _, _ = _parse(self.path, source)
         plant.Finalize()
         return replace(

@@ -3,7 +3,6 @@
 Every failure is a ModelError that names the file.
 """
 
-import copy
 import faulthandler
 import functools
 import hashlib
@@ -70,12 +69,6 @@ class ModelSource:
         self._copies: dict[Path, Path] = {}
         self._open_files: list[Path] = []
         self.text, self.kind = self._sanitise(path)
-
-    def with_text(self, text: str) -> "ModelSource":
-        """Return a copy of the source with another text."""
-        other = copy.copy(self)
-        other.text = text
-        return other
 
     def parse(
         self, plant: MultibodyPlant, scene_graph: SceneGraph | None, prefix: str = ""

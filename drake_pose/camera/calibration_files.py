@@ -20,7 +20,6 @@ from drake_pose.camera.pose_files import (
     episode_entry,
     finite_numbers,
     read_launch,
-    read_lines,
     recorded_poses,
 )
 from drake_pose.errors import CameraError
@@ -60,8 +59,11 @@ def read_camera_content(
     text = data.decode("utf-8", errors="replace")
     if path.suffix == ".jsonl" or (is_json and len(data) > largest):
         try:
-            of_lines = path.suffix == ".jsonl"
-            return read_lines(text, episode_ids) if of_lines else json.loads(text)
+            if path.suffix == ".json":
+                return json.loads(text)
+            records = [line for line in text.splitlines() if line.strip()]
+            own = [line for line in records if any(f'"{one}"' in line for one in episode_ids)]
+            return [json.loads(line) for line in own or records]
         except ValueError as error:
             raise CameraError(f"{path}: not a JSON file: {error}") from error
     if len(data) <= largest and (launched := read_launch(text)) is not None:

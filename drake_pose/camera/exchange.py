@@ -121,28 +121,6 @@ def _pinhole(
     return PinholeCamera(name, *size, *focal, x, y, X_WC, near)
 
 
-def camera_from_config(config: CameraConfig) -> PinholeCamera:
-    """Return the camera of a CameraConfig's colour and label sensor, with X_WC = X_PB X_BC.
-
-    Raises CameraError: the camera is attached to a frame other than the world, a pose is
-    stochastic, or a value is invalid.
-    """
-    where = f"camera '{config.name}'"
-    frame = config.X_PB.base_frame
-    if frame not in (None, "", "world") or config.X_BC.base_frame not in (None, ""):
-        raise CameraError(
-            f"{where}: its pose is given in '{frame or config.X_BC.base_frame}', but poses must be "
-            "in the world: remove base_frame from X_PB and X_BC, and give the pose in the world"
-        )
-    poses = []
-    for name, pose in (("X_PB", config.X_PB), ("X_BC", config.X_BC)):
-        if not pose.IsDeterministic():
-            raise CameraError(f"{where}: {name} is stochastic; give a deterministic pose")
-        poses.append(pose.GetDeterministicValue())
-    X_WC = (poses[0] @ poses[1]).GetAsMatrix4()
-    return _pinhole(config.name, config, X_WC, near=config.clipping_near)
-
-
 def camera_to_config(camera: Camera) -> CameraConfig:
     """Return the CameraConfig of a pinhole camera, with label images enabled.
 
@@ -180,7 +158,8 @@ def camera_to_config(camera: Camera) -> CameraConfig:
 def read_configs(entries: Mapping[str, Any], path: Path) -> dict[str, PinholeCamera]:
     """Return the cameras of CameraConfig entries as read by ``read_yaml`` with tags, by name.
 
-    A camera's name is its ``name``, or else the entry's key.
+    A camera's name is its ``name``, or else the entry's key. It is that of the colour and label
+    sensor, with X_WC = X_PB X_BC, which must be known and in the world.
 
     ``entries``: entries by key, not yet checked; None: all defaults. ``path``: the file, for
     messages. Raises CameraError: names the file, the camera and the problem.
@@ -195,7 +174,20 @@ def read_configs(entries: Mapping[str, Any], path: Path) -> dict[str, PinholeCam
             config = yaml_load_typed(schema=CameraConfig, data=yaml_dump(content))
             if "name" not in content:
                 config.name = str(key)
-            camera = camera_from_config(config)
+            frame, own = config.X_PB.base_frame, f"camera '{config.name}'"
+            if frame not in (None, "", "world") or config.X_BC.base_frame not in (None, ""):
+                raise CameraError(
+                    f"{own}: its pose is given in '{frame or config.X_BC.base_frame}', but poses "
+                    "must be in the world: remove base_frame from X_PB and X_BC, and give the pose "
+                    "in the world"
+                )
+            poses = {"X_PB": config.X_PB, "X_BC": config.X_BC}
+            for name, pose in poses.items():
+                if not pose.IsDeterministic():
+                    raise CameraError(f"{own}: {name} is stochastic; give a deterministic pose")
+            X_PB, X_BC = (pose.GetDeterministicValue() for pose in poses.values())
+            X_WC = (X_PB @ X_BC).GetAsMatrix4()
+            camera = _pinhole(config.name, config, X_WC, near=config.clipping_near)
         except CameraError as error:
             raise CameraError(f"{path}: {error}") from error
         # yaml_load_typed raises these; some values of CameraConfig even raise SystemExit.

@@ -1,7 +1,7 @@
 """Read episodes of LeRobot data sets, versions 2.0, 2.1 and 3.0."""
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -121,11 +121,6 @@ def camera_name(key: str) -> str:
     """Return the usual name of the camera with a key in the features of `meta/info.json`."""
     name = key.replace("/", ".").removeprefix("observation.").removeprefix("images.")
     return name if "/" not in key else name.replace(".", "_")
-
-
-def camera_key(features: Iterable[str], name: str) -> str:
-    """Return the key of the camera with a name, which may be the key itself."""
-    return next(key for key in features if name in (key, camera_name(key)))
 
 
 def _read_info(path: Path) -> Mapping[str, Any]:

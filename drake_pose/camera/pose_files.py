@@ -164,16 +164,6 @@ def read_launch(text: str) -> list[dict[str, Any]] | None:
     return found
 
 
-def read_lines(text: str, episode_ids: Collection[str]) -> list[dict[str, Any]]:
-    """Return the records of a JSON Lines file that hold one of the episodes' names; all if none.
-
-    Raises ValueError: a line is not a JSON object.
-    """
-    lines = [line for line in text.splitlines() if line.strip()]
-    own = [line for line in lines if any(f'"{one}"' in line for one in episode_ids)]
-    return [json.loads(line) for line in own or lines]
-
-
 def _is_transform(entry: Any) -> bool:
     """Return whether an entry names its child frame, as TransformStamped does."""
     return isinstance(entry, dict) and bool({"child_frame_id", "child_frame"} & {*entry})

@@ -9,7 +9,7 @@ import re
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Generator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,9 +33,6 @@ from drake_pose.input_files import named_fields, read_csv, read_yaml
 
 CAMERAS, SOURCES, TIME_STAMPS = "cameras.yaml", "sources.yaml", "timestamps.csv"
 """Names of files: calibrated cameras, image sources, and times of a folder's frames."""
-
-Clock = Callable[[], float]
-"""Function that returns the time [s]."""
 
 
 @dataclass(frozen=True)
@@ -175,25 +172,21 @@ class FrameSource(abc.ABC):
 
 
 class DeviceSource(FrameSource):
-    """A live camera: its latest image, with its time of arrival by the clock [s].
+    """A live camera: its latest image, with its time of arrival by ``time.monotonic`` [s].
 
     Images that are not read in time are lost. A camera that cannot be opened or fails is reported
     once and reopened repeatedly, with growing pauses.
 
     Args:
         specification: the source.
-        clock: returns the time [s].
         pauses: initial and maximum pause before reopening [s]; they double until an image arrives.
     """
 
     def __init__(
-        self,
-        specification: SourceSpecification,
-        clock: Clock,
-        pauses: tuple[float, float] = (0.5, 10.0),
+        self, specification: SourceSpecification, pauses: tuple[float, float] = (0.5, 10.0)
     ) -> None:
         super().__init__(specification)
-        self._clock, self._pauses = clock, pauses
+        self._pauses = pauses
         self._newest: deque[TimedPicture] = deque(maxlen=1)
         self._failed = False
         self._stop = threading.Event()
@@ -254,7 +247,7 @@ class DeviceSource(FrameSource):
                 found, picture = capture.read()
             if not found or picture is None:
                 return count
-            time = self._clock() + self.specification.offset
+            stamp = time.monotonic() + self.specification.offset
             rgb = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
             if wrong := self.specification.size_problem(rgb):
                 self.report(f"'{self.specification.location}' {wrong}")
@@ -269,7 +262,7 @@ class DeviceSource(FrameSource):
                 self.report(str(error))
                 self._stop.set()
                 return count
-            self._newest.append(TimedPicture(time, f"{count:06d}", seen))
+            self._newest.append(TimedPicture(stamp, f"{count:06d}", seen))
             count += 1
         return count
 
@@ -485,14 +478,14 @@ def load_sources(
     return found
 
 
-def open_source(specification: SourceSpecification, clock: Clock = time.monotonic) -> FrameSource:
-    """Open a camera's source of images; ``clock`` gives a live camera's time stamps [s].
+def open_source(specification: SourceSpecification) -> FrameSource:
+    """Open a camera's source of images; a live camera's time stamps are ``time.monotonic``'s.
 
     Raises SceneError: a folder or video is unreadable, empty, or has images of another size than
     the calibrated one. A live camera does not raise; opening it is retried.
     """
     if specification.live:
-        return DeviceSource(specification, clock)
+        return DeviceSource(specification)
     return RecordedSource(specification)
 
 

@@ -172,7 +172,6 @@ def add_skin(
     scene_graph: SceneGraph,
     model: ParsedModel,
     positions: OutputPort,
-    name: str,
     labels: Mapping[str, int] | None = None,
 ) -> None:
     """Add a model's skin to a SceneGraph, so that sensors see it; do nothing if it has none.
@@ -181,19 +180,18 @@ def add_skin(
         builder: the diagram to which the system is added.
         scene_graph: a system of the diagram, which contains the body's rigid parts.
         positions: port of the positions (nq,) in the model's order [rad or m].
-        name: name of the new geometry source, and with ``_skin_poser`` of the new system.
         labels: render label of each link, by name, which its skin takes; Drake's own are the links'
             body indices. None: none.
     """
     if not model.skin:
         return
-    deformable = DeformableSkin(ModelSkin(model), scene_graph, labels or {}, f"{name}_skin")
+    deformable = DeformableSkin(ModelSkin(model), scene_graph, labels or {}, "true_skin")
     bend = PositionFunction(
         model.plant.num_positions(),
         GeometryConfigurationVector(),
         lambda q: deformable.configuration(deformable.skin.vertices(q)),
     )
-    poser = builder.AddNamedSystem(f"{name}_skin_poser", bend)
+    poser = builder.AddNamedSystem("true_skin_poser", bend)
     builder.Connect(positions, poser.get_input_port())
     builder.Connect(
         poser.get_output_port(), scene_graph.get_source_configuration_port(deformable.source)

@@ -307,7 +307,7 @@ def add_simulated_cameras(
     truth = source.get_output_port()
     add_posed_plant(builder, scene_graph, model, truth, "true_geometry_pose", "true")
     labels = {name: label for label, name in enumerate(model.link_names)}
-    add_skin(builder, scene_graph, model, truth, "true", labels)
+    add_skin(builder, scene_graph, model, truth, labels)
     ranges = {}
     for camera in cameras:
         nearest, farthest = _depth_range(camera, model, true_positions)

@@ -14,7 +14,7 @@ from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
 from drake_pose.arrays import Mask, Picture
 from drake_pose.camera.models import Camera
-from drake_pose.camera.sources import Clock, FrameSource, TimedPicture
+from drake_pose.camera.sources import FrameSource, TimedPicture
 from drake_pose.camera.synchroniser import CameraChange, Synchroniser
 from drake_pose.errors import CameraError, SettingsError, UnknownNameError
 from drake_pose.silhouette.pictures.label_renderer import fill_label_image, label_image_to_mask
@@ -79,7 +79,7 @@ class PictureCapture(PortedSystem):
         cameras: Mapping[str, Camera],
         period: float | None = None,
         *,
-        clock: Clock = time.monotonic,
+        clock: Callable[[], float] = time.monotonic,
         opening_timeout: float = 8.0,
     ) -> None:
         super().__init__()

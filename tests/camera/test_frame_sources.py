@@ -223,7 +223,7 @@ class TestDevice:
         def open_after(tries, **more):
             FakeCamera.opened = tries
             camera = specify("7", "device", **more)
-            opened.append(DeviceSource(camera, time.monotonic, pauses=(0.02, 10.0)))
+            opened.append(DeviceSource(camera, pauses=(0.02, 10.0)))
             return opened[0]
 
         yield open_after

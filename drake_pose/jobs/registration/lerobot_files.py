@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from drake_pose.camera.joint_map import MappedJoints, motors_of
-from drake_pose.camera.lerobot import INFO, camera_key, camera_name
+from drake_pose.camera.lerobot import INFO, camera_name
 from drake_pose.camera.lerobot_tables import camera_fields
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.camera.servo_readings import HomingCorrection, correct_homing, dump_column
@@ -80,7 +80,7 @@ def lerobot_files(
                 "pictures are distorted: use cameras.yaml"
             )
         else:
-            key = camera_key(info["features"], camera.name)
+            key = next(k for k in info["features"] if camera.name in (k, camera_name(k)))
             feature = info["features"][key]
             written.add(key)
             feature["info"] = (feature.get("info") or {}) | camera_fields(camera, link)

@@ -142,18 +142,19 @@ def test_subtracting_a_body_updates_prefix_sums(camera):
         assert not prefix[:, 0].any()
 
 
-def test_wrong_shapes_are_refused():
-    camera = CAMERAS[0]
-    outline = outline_from_mesh(box(1.0))
-    none = np.zeros((0, camera.height, camera.width + 1), dtype=np.int32)
-    with pytest.raises(ValueError, match="prefixes of camera 'parallel'"):
-        score_bodies([outline], np.eye(4)[None, None], camera, none[:, :-1])
-    with pytest.raises(ValueError, match="poses"):
-        score_bodies([outline], np.eye(4)[None, None, :3, :3], camera, none)
-    with pytest.raises(ValueError, match="poses"):
-        draw_mask([outline], np.tile(np.eye(4), (2, 1, 1)), camera)
-    with pytest.raises(ValueError, match="finite"):
-        draw_mask([outline], np.full((1, 4, 4), np.nan), camera)
+@pytest.mark.parametrize(
+    ("poses", "columns", "words"),
+    [
+        (np.eye(4)[None, None], 90, "prefixes of camera 'parallel'"),
+        (np.eye(4)[None, None, :3, :3], 91, "poses"),
+        (np.tile(np.eye(4), (1, 2, 1, 1)), 91, "poses"),
+        (np.full((1, 1, 4, 4), np.nan), 91, "finite"),
+    ],
+)
+def test_wrong_shapes_are_refused(poses, columns, words):
+    prefixes = np.zeros((0, 70, columns), dtype=np.int32)
+    with pytest.raises(ValueError, match=words):
+        score_bodies([outline_from_mesh(box(1.0))], poses, CAMERAS[0], prefixes)
 
 
 PINHOLE = PinholeCamera("eye", 64, 48, 60.0, 60.0, 31.5, 23.5, np.eye(4))

@@ -152,15 +152,14 @@ def test_mask_size_is_checked_on_every_read(tmp_path):
         scene.read("right", "0003")
 
 
-@pytest.mark.parametrize("width", [30, 31])
-def test_picture_size_must_match_the_camera(tmp_path, width):
+def test_picture_size_must_match_the_camera(tmp_path):
     save_cameras(tmp_path / "cameras.yaml", [camera("left")])
     folder = tmp_path / "images" / "left"
     folder.mkdir(parents=True)
-    cv2.imwrite(str(folder / "0001.png"), np.full((20, width, 3), (10, 20, 30), np.uint8))
+    for width in (30, 31):
+        picture = np.full((20, width, 3), (10, 20, 30), np.uint8)
+        cv2.imwrite(str(folder / f"{width}.png"), picture)
     scene = load_scene(tmp_path, sequence=True)
-    if width == 30:
-        np.testing.assert_array_equal(scene.read_image("left", "0001")[7, 8], [30, 20, 10])
-        return
-    with pytest.raises(SceneError, match=r"0001.png: is 31 x 20 pixels, but camera 'left' has 30"):
-        scene.read_image("left", "0001")
+    np.testing.assert_array_equal(scene.read_image("left", "30")[7, 8], [30, 20, 10])
+    with pytest.raises(SceneError, match=r"31.png: is 31 x 20 pixels, but camera 'left' has 30"):
+        scene.read_image("left", "31")

@@ -3,19 +3,21 @@
 Run as ``python -m tests.benchmarks.episodes DATA [--rooms N] [--first K] [--only TEXT]``; DATA is a
 folder with the arms ``arm_two_views/med7``, ``franka_one_view/panda``, ``droid_episodes/robot`` and
 ``so101``, N the number of rooms per arm and set. In sets with wrong rows, frames near the start and
-end of these rows are not evaluated.
+end of these rows are not evaluated. ``--spoilt``: instead, episodes that must be refused.
 """
 
 import argparse
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import yaml
 
+from drake_pose.arrays import Array
 from drake_pose.body import ArticulatedModel, load_model
 from drake_pose.camera.camera_files import dump_cameras
 from drake_pose.errors import RegistrationError
@@ -60,6 +62,8 @@ class EpisodeSet(NamedTuple):
     Attributes:
         off: bound of the offsets of all joints [deg]; zeros: offsets of three joints.
         codec: encoder of the pictures' video, with its option `crf`; "": PNG files.
+        spoilt: what no pose explains: "joints" of another episode, "mirrored" pictures, or the
+            "model" of another arm; "": nothing.
     """
 
     name: str
@@ -70,6 +74,7 @@ class EpisodeSet(NamedTuple):
     off: float = 0.0
     codec: str = ""
     crf: int = 23
+    spoilt: str = ""
 
 
 SETS = (
@@ -81,6 +86,11 @@ SETS = (
     EpisodeSet("all zeros off by up to 10 degrees", off=10.0),
     EpisodeSet("all zeros off by up to 20 degrees", off=20.0),
     EpisodeSet("a third of the rows wrong", wrong=True),
+)
+SPOILT = (
+    EpisodeSet("joints of another episode", codec="libx264", spoilt="joints"),
+    EpisodeSet("mirrored pictures", codec="libx264", spoilt="mirrored"),
+    EpisodeSet("model of another arm", codec="libx264", spoilt="model"),
 )
 
 
@@ -110,17 +120,18 @@ class Outcome(NamedTuple):
     named: tuple[float, float] = (np.nan, np.nan)
 
 
-def measure_episode(path: Path, arm: Arm, folder: Path, seed: int, kind: EpisodeSet) -> Outcome:
+def measure_episode(data: Path, name: str, folder: Path, seed: int, kind: EpisodeSet) -> Outcome:
     """Simulate an episode with errors, and find its camera.
 
     Args:
-        path: the arm's model file.
-        arm: where its camera stands.
+        data: folder of the models.
+        name: of the arm, a key of ARMS.
         folder: folder for the files.
         seed: seed of the episode.
         kind: errors of the episode.
     """
     rng = np.random.default_rng([10, seed])
+    arm, path = ARMS[name], data / ARMS[name].file
     model = load_model(path, check=False)
     late = float(rng.uniform(-_LATE, _LATE)) if kind.late else 0.0
     grey = seed % GREY == GREY - 1
@@ -141,6 +152,18 @@ def measure_episode(path: Path, arm: Arm, folder: Path, seed: int, kind: Episode
     if kind.wrong:
         begin = float(rng.uniform(0.5, episode.times[-1] - _WRONG - 0.5))
         wrong = (begin, begin + _WRONG)
+    if kind.spoilt == "joints":
+        other = simulate(model, folder, seed + 1000, grey, distance=arm.distance, middle=arm.middle)
+        episode = replace(episode, positions=other.positions)
+    elif kind.spoilt == "mirrored":
+        episode = replace(episode, pictures=np.ascontiguousarray(episode.pictures[:, :, ::-1]))
+    elif kind.spoilt == "model":
+        after = ([*ARMS] * 2)[[*ARMS].index(name) + 1 :]
+        # A Panda with another gripper is the same arm.
+        path = data / next(ARMS[k].file for k in after if not ("Panda" in k and "Panda" in name))
+        shown = load_model(path, check=False)
+        episode = replace(episode, positions=as_positions(model, episode.positions, shown))
+        model = shown
     write_episode(folder, model, episode, kind.log_hz, turned, wrong, kind.codec, kind.crf)
     settings = RegistrationSettings(zeros=("all",) if turned else ())
     start = time.process_time()
@@ -150,6 +173,18 @@ def measure_episode(path: Path, arm: Arm, folder: Path, seed: int, kind: Episode
         return Outcome(False, time.process_time() - start)
     seconds = time.process_time() - start
     return _outcome(found, episode, late, turned, wrong, seconds)
+
+
+def as_positions(model: ArticulatedModel, logged: Array, other: ArticulatedModel) -> Array:
+    """Return positions (n, nq) of a model as those of another one, joint by joint in order."""
+    moving = [
+        np.flatnonzero(np.isfinite(one.lower) & (one.upper - one.lower > 0.1))
+        for one in (model, other)
+    ]
+    count = min(len(one) for one in moving)
+    positions = np.tile(other.default_positions, (len(logged), 1))
+    positions[:, moving[1][:count]] = logged[:, moving[0][:count]]
+    return np.clip(positions, other.lower, other.upper)
 
 
 def write_episode(
@@ -254,15 +289,15 @@ def _row(name: str, outcomes: Sequence[Outcome]) -> list[str]:
     ]
 
 
-def _rows(data: Path, rooms: range, only: str) -> Iterator[list[str]]:
-    for kind in SETS:
+def _rows(data: Path, sets: Sequence[EpisodeSet], rooms: range, only: str) -> Iterator[list[str]]:
+    for kind in sets:
         for name, arm in ARMS.items():
-            text, path = f"{kind.name}, {name}", data / arm.file
-            if only in text and path.is_file():
+            text = f"{kind.name}, {name}"
+            if only in text and (data / arm.file).is_file():
                 outcomes = []
                 for seed in rooms:
                     with tempfile.TemporaryDirectory() as folder:
-                        outcomes.append(measure_episode(path, arm, Path(folder), seed, kind))
+                        outcomes.append(measure_episode(data, name, Path(folder), seed, kind))
                         print(text, seed, outcomes[-1], flush=True)
                 yield _row(text, outcomes)
 
@@ -274,6 +309,7 @@ def main() -> None:
     parser.add_argument("--rooms", type=int, default=10)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--only", default="")
+    parser.add_argument("--spoilt", action="store_true", help="episodes that must be refused")
     given = parser.parse_args()
     rooms = range(given.first, given.first + given.rooms)
     headings = (
@@ -282,7 +318,8 @@ def main() -> None:
         "first joint's zero (worst), determined",
         "frames named: wrong / right", "CPU s",
     )  # fmt: skip
-    print_table("Cameras from pictures alone", headings, _rows(given.data, rooms, given.only))
+    rows = _rows(given.data, SPOILT if given.spoilt else SETS, rooms, given.only)
+    print_table("Cameras from pictures alone", headings, rows)
 
 
 if __name__ == "__main__":

@@ -19,8 +19,7 @@ from drake_pose.body import load_model
 from drake_pose.errors import RegistrationError
 from drake_pose.files.settings import RegistrationSettings
 from drake_pose.jobs.registration.register import register_scene
-from tests.benchmarks.acceptance import as_positions
-from tests.benchmarks.episodes import write_episode
+from tests.benchmarks.episodes import as_positions, write_episode
 from tests.benchmarks.registration import pose_error
 from tests.benchmarks.rooms import LOG_HZ
 from tests.benchmarks.tables import print_table

@@ -34,7 +34,7 @@ def make_replay(
     X_WB: np.ndarray,
     cameras: Sequence[Camera],
     period: float,
-    measured: np.ndarray | None = None,
+    measured: np.ndarray | None,
     most_triangles: int = 8_000,
 ) -> str:
     """Return the HTML page of a Meshcat animation of a body and the cameras.

@@ -131,11 +131,7 @@ def audit_scene(
     warnings = [*inputs.warnings, *compared.warnings, *_audit_warnings(inputs, found, empty)]
     names = [camera.name for camera in inputs.known_cameras]
     units = zip(inputs.model.position_names, user_units(inputs.model), strict=True)
-    detectable = {
-        name: unit * found.minimum_detectable[name]
-        for name, unit in units
-        if name in found.minimum_detectable
-    }
+    least = found.minimum_detectable
     center = found.center
     summary = {
         "findings": _describe_findings(found),
@@ -161,7 +157,9 @@ def audit_scene(
             for name, result in pictures.found.items()
         },
         "minimum_detectable": {
-            name: offset if math.isfinite(offset) else None for name, offset in detectable.items()
+            name: unit * least[name] if math.isfinite(least[name]) else None
+            for name, unit in units
+            if name in least
         },
         "principal_point_px": center and dict(zip(("offset", "sd"), center, strict=True)),
         **describe_run(inputs, settings, warnings, seconds),

@@ -1,6 +1,6 @@
 """The page report.html of an audit: errors, their sizes, and minimum detectable offsets."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,16 +19,13 @@ from drake_pose.jobs.registration.result import AS_GIVEN, NORMAL, body_drawer
 from drake_pose.registration.findings import Diagnosis, Finding
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 
-OnePicture = tuple[str, str, list[Finding]]
-"""A frame to draw: its name, whose joints are corrected in words, and the correcting findings."""
-
 
 def write_audit_page(
     folder: Path,
     inputs: RegistrationInputs,
     found: Diagnosis,
     summary: Mapping[str, Any],
-    overlay: bool = True,
+    overlay: bool,
     most_pictures: int = 8,
 ) -> None:
     """Write report.html of an audit, and pictures of the robot as given and as found.
@@ -61,7 +58,7 @@ def write_audit_page(
         title=Path(str(summary["scene"])).resolve().name,
         model=Path(str(summary["model"])).name,
         corrections=[correction_row(finding) for finding in summary["findings"]],
-        cameras=[_camera_row(name, summary) for name in _cameras(summary)],
+        cameras=[*_camera_rows(summary)],
         joints=_joint_rows(inputs.tree, kinds, summary),
         pairs=pictures[AS_GIVEN],
         overlays=pictures[OVERLAY],
@@ -134,27 +131,24 @@ def correction_row(finding: Mapping[str, Any]) -> dict[str, Any]:
     return {**finding, "parts": parts}
 
 
-def _cameras(summary: Mapping[str, Any]) -> list[str]:
-    """Return the names of the cameras that were compared; summary: content of summary.json."""
-    return list(dict.fromkeys(name for one in summary["frames"].values() for name in one["fits"]))
-
-
-def _camera_row(name: str, summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a camera's row of the page's table.
+def _camera_rows(summary: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield the rows of the page's table of the cameras that were compared.
 
     "frames" is the number of frames, "given" the mean inlier ratio at the given values, "freed"
     that with each frame fitted by itself (None: unknown), and "off" the camera's errors common to
     all frames.
     """
-    frames = [one for one in summary["frames"].values() if name in one["fits"]]
-    freed = [frame["fits_when_freed"][name] for frame in frames if name in frame["fits_when_freed"]]
-    return {
-        "name": name,
-        "frames": len(frames),
-        "given": float(np.mean([frame["fits"][name] for frame in frames])),
-        "freed": float(np.mean(freed)) if freed else None,
-        "off": _errors_of(("camera", "clock", "rate", "moved"), name, summary),
-    }
+    every = summary["frames"].values()
+    for name in dict.fromkeys(name for one in every for name in one["fits"]):
+        frames = [one for one in every if name in one["fits"]]
+        freed = [one["fits_when_freed"][name] for one in frames if name in one["fits_when_freed"]]
+        yield {
+            "name": name,
+            "frames": len(frames),
+            "given": float(np.mean([frame["fits"][name] for frame in frames])),
+            "freed": float(np.mean(freed)) if freed else None,
+            "off": _errors_of(("camera", "clock", "rate", "moved"), name, summary),
+        }
 
 
 def _joint_rows(
@@ -202,20 +196,20 @@ def _draw_outlines(folder: Path, inputs: RegistrationInputs, found: Diagnosis, m
     """
     names = TreeKinematics(inputs.tree).names
     common = [one for one in found.common if corrected(np.zeros(len(names)), names, one)]
-    draw, chosen = body_drawer(inputs.tree, inputs.visible_nodes), list[OnePicture]()
+    draw, count = body_drawer(inputs.tree, inputs.visible_nodes), 0
     for frame in sorted(found.frames, key=lambda one: -one.pixels):
         of_frame = [] if frame.finding is None or frame.finding in found.common else [frame.finding]
         findings = [*common, *(x for x in of_frame if corrected(np.zeros(len(names)), names, x))]
-        if findings and len(chosen) < most:
-            chosen.append((frame.frame, "of this frame" if of_frame else "of all frames", findings))
-    for name, of, findings in chosen:
-        seen = inputs.read(name)
+        if not findings or count == most:
+            continue
+        count, name, seen = count + 1, frame.frame, inputs.read(frame.frame)
         values = seen.values
         for finding in findings:
             (values,) = corrected(values, names, finding)
         for camera in (camera for camera in inputs.known_cameras if camera.name in seen.masks):
             given = seen.of(camera.name)
             bodies = [draw(camera, replace(given, values=v)) >= 0 for v in (seen.values, values)]
+            of = "of this frame" if of_frame else "of all frames"
             title = f"{camera.name}  frame {name}  joints {of}"
             picture = draw_shapes(given.mask, bodies, ("as given", "as found"), title)
             write_file(folder, f"{AS_GIVEN}/{camera.name}/{name}.png", encode_png(picture))

@@ -117,10 +117,9 @@ class SceneComparison:
     ) -> None:
         self._inputs, self._on_frame = inputs, on_frame
         self.body = RegistrationBody(inputs.tree, inputs.visible_nodes)
-        frames = inputs.audited_frames
-        sample = [inputs.read(frame) for frame in evenly_spaced(frames, sample_size)]
+        names = evenly_spaced(inputs.audited_frames, sample_size)
+        sample = [inputs.read(name) for name in names]
         self._sample = [frame for frame in sample if frame.masks]
-        self._names = frozenset(inputs.audited_frames)
 
     def run(self, most: int = 3) -> SceneFit:
         """Return the scene's final fit and diagnosis.

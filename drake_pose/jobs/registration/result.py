@@ -152,8 +152,8 @@ def write_result(
     registered: Mapping[str, RegisteredCamera],
     summary: Mapping[str, Any],
     overlay: bool,
-    urdf: bytes | None = None,
-    pictures: Mapping[str, Mapping[str, Picture]] | None = None,
+    urdf: bytes | None,
+    pictures: Mapping[str, Mapping[str, Picture]],
 ) -> None:
     """Write the result folder; the camera file is written last.
 
@@ -166,7 +166,7 @@ def write_result(
         overlay: whether overlays are drawn.
         urdf: text of the robot with estimated joint offsets and link scales; None: no such file.
         pictures: (H, W, 3) by camera and frame name, of cameras registered from pictures, whose
-            masks and joint positions are written, too. Empty or None: masks were given.
+            masks and joint positions are written, too; empty: masks were given.
 
     Raises OutputError: the folder cannot be written.
     """
@@ -188,14 +188,14 @@ def write_result(
             write_comparisons(path, inputs, inputs.of(name), given, found, own)
     names = TreeKinematics(inputs.tree).names
     names = tuple(name for name in names if name not in TARGET_POSITIONS)
-    for camera in pictures or ():
+    for camera in pictures:
         # Masks of the camera's frames, and joint positions corrected by its time offset.
         rows = [["frame", *names]]
         for frame in inputs.of(camera):
             write_file(path, f"masks/{camera}/{frame.name}.png", encode_mask(frame.mask))
             # The target's positions are the last ones, and 0.
             rows.append([frame.name, *map(repr, frame.values[: len(names)].tolist())])
-        several = f"_{camera}" if len(pictures or ()) > 1 else ""
+        several = f"_{camera}" if len(pictures) > 1 else ""
         write_file(path, f"joint_angles{several}.csv", csv_text(rows))
     if urdf is not None:
         write_file(path, f"{inputs.model.path.stem}_calibrated.urdf", urdf)
@@ -226,8 +226,8 @@ def write_overlays(
     tree: PoseTree,
     camera: Camera,
     titled: Iterable[tuple[PosedFrame, str]],
-    visible_nodes: Collection[str] | None = None,
-    pictures: Mapping[str, Picture] | None = None,
+    visible_nodes: Collection[str] | None,
+    pictures: Mapping[str, Picture],
 ) -> None:
     """Draw the robot over each mask of a camera, or over its picture, below a title.
 
@@ -242,7 +242,7 @@ def write_overlays(
     draw = body_drawer(tree, visible_nodes)
     for frame, title in titled:
         segments = draw(camera, frame)
-        shown: NDArray[Any] = (pictures or {}).get(frame.name, frame.mask)
+        shown: NDArray[Any] = pictures.get(frame.name, frame.mask)
         picture = draw_overlay(shown, segments >= 0, segments, title)
         write_file(folder, f"{OVERLAY}/{camera.name}/{frame.name}.png", encode_png(picture))
 
@@ -387,9 +387,7 @@ def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
     )
 
 
-def registration_answer(
-    cameras: Mapping[str, Mapping[str, Any]], refused: Collection[str] = ()
-) -> str:
+def registration_answer(cameras: Mapping[str, Mapping[str, Any]], refused: Collection[str]) -> str:
     """Return the result in a few sentences.
 
     Args:

@@ -39,22 +39,20 @@ def watch_cameras(inputs: RegistrationInputs) -> RegistrationInputs:
     """
     motions, warnings = dict[str, PictureMotion](), list[str]()
     for camera in inputs.searched_cameras if inputs.recordings else ():
-        recording, who = inputs.recordings[camera.name], f"camera '{camera.name}'"
+        recording = inputs.recordings[camera.name]
         motion = find_camera_motion(recording.read, len(recording.names), camera)
         motions[camera.name] = motion
-        turns = [math.degrees(turn_of(camera, one)) for one in (motion.drift, motion.shake)]
-        if motion.drift:
-            warnings.append(
-                f"{who} drifts: its background shifts slowly by {motion.drift:.1f} pixels, a turn "
-                f"by {turns[0]:.2f} degrees or the like; the pose found is a mean; fix the camera, "
-                "or give fewer pictures (--frame)"
-            )
-        if motion.shake:
-            warnings.append(
-                f"{who} shakes: from picture to picture its background shifts by "
-                f"{motion.shake:.1f} pixels, a turn by {turns[1]:.2f} degrees or the like; the "
-                "pose found is a mean; fix the camera"
-            )
+        for pixels, what, how in (
+            (motion.drift, "drifts", "shifts slowly"),
+            (motion.shake, "shakes", "shifts from picture to picture"),
+        ):
+            if pixels:
+                degrees = math.degrees(turn_of(camera, pixels))
+                warnings.append(
+                    f"camera '{camera.name}' {what}: its background {how} by {pixels:.1f} pixels, "
+                    f"a turn by {degrees:.2f} degrees or the like; the pose found is a mean; fix "
+                    "the camera, or give fewer pictures (--frame)"
+                )
     return replace(inputs, motions=motions, warnings=(*inputs.warnings, *warnings))
 
 

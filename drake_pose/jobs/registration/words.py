@@ -218,7 +218,7 @@ def odd_link_warnings(
     body: RegistrationBody,
     found: RegisteredCamera,
     frames: Sequence[PosedFrame],
-    without: Collection[str] = (),
+    without: Collection[str],
     *,
     max_ratio: float = 0.75,
     min_fraction: float = 0.04,

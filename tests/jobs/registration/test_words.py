@@ -274,50 +274,38 @@ def test_points_are_drawn_in_the_worst_pictures(tmp_path: Any) -> None:
 
 
 def test_a_camera_is_summarised_with_deviations_and_misfits() -> None:
-    other = np.eye(4)
-    other[:3, 3] = 1.0, 2.0, 3.0
-    one = registered(0.9, -0.3, E=0.2, alternatives=other[None])
-    C = np.zeros((6, 6))
+    other, C = np.eye(4), np.zeros((6, 6))
     C[:3, :3], C[3:, 3:] = DEGREE**2 * np.diag([1.0, 4.0, 9.0]), 1e-6 * np.diag([4.0, 4.0, 16.0])
-    one = replace(one, covariance=C)
+    one = replace(registered(0.9, -0.3, E=0.2, alternatives=other[None]), covariance=C)
     told = describe_camera(one, 2.5)
-    np.testing.assert_allclose(told["X_WC"], one.camera.X_WC)
     assert told["translation_sd_mm"] == pytest.approx(np.sqrt(24.0 / 3.0))
     assert told["rotation_sd_deg"] == pytest.approx(np.sqrt(14.0 / 3.0))
     assert [mode["X_WC"] for mode in told["modes"]] == [one.camera.X_WC.tolist(), other.tolist()]
-    assert (told["seconds"], told["outliers"], told["mean_iou"]) == (2.5, ["1"], pytest.approx(0.8))
+    assert (told["outliers"], told["mean_iou"]) == (["1"], pytest.approx(0.8))
     assert told["frames"]["1"] == {
         "agrees": False, "E_total": 0.2, "iou": pytest.approx(0.8), "inlier_ratio": 0.3
     }  # fmt: skip
-    assert "target" not in told
-    on_link = describe_camera(one, 2.5, link="hand")
-    assert (on_link["link"], "X_WC" in on_link, len(on_link["modes"])) == ("hand", False, 2)
-    np.testing.assert_allclose(on_link["X_LC"], one.camera.X_WC)
     unknown = replace(one, frames=(FrameMisfit("0", np.nan, np.nan, 0.5, True),))
     assert describe_camera(unknown, 0.0)["frames"]["0"]["iou"] is None
-    target = TargetPose(other, C, other[None], np.zeros((0, 3)))
+    target = TargetPose(other, C, other[None], np.array([[0.0, 0.0, 1.0]]))
     told = describe_camera(replace(one, target=target), 0.0)["target"]
-    assert (told["determined"], len(told["modes"])) == (True, 2)
+    assert (told["determined"], len(told["modes"])) == (False, 2)
     assert told["translation_sd_mm"] == pytest.approx(np.sqrt(8.0))
-    round_one = replace(target, symmetry_axes=np.array([[0.0, 0.0, 1.0]]))
-    assert not describe_camera(replace(one, target=round_one), 0.0)["target"]["determined"]
 
 
 def test_parameters_are_summarised_in_their_units() -> None:
     kinematics = SimpleNamespace(names=("turn", "slide"), is_angle=np.array([True, False]))
     angle = KinematicParameter("turn", DEGREE, 2 * DEGREE, -DEGREE, 3 * DEGREE, True, ("x",))
     length = KinematicParameter("slide", 0.001, 0.002, 0.003, 0.004, False)
-    scale = KinematicParameter("arm", 0.01, 0.02, -0.03, 0.05, False)
-    told = describe_parameters([angle, length], [scale, undetermined("leg", ())], kinematics)
+    told = describe_parameters([angle, length], [undetermined("leg", ())], kinematics)
     assert told["zeros"]["turn"] == {
         "determined": True, "significant": True, "value_deg": pytest.approx(1.0),
         "sd_deg": pytest.approx(2.0), "low_deg": pytest.approx(-1.0),
         "high_deg": pytest.approx(3.0), "gauge": ["x"],
     }  # fmt: skip
     assert told["zeros"]["slide"]["sd_mm"] == pytest.approx(2.0)
-    assert told["lengths"]["arm"]["value_percent"] == pytest.approx(1.0)
-    assert told["lengths"]["leg"]["high_percent"] is told["lengths"]["leg"]["value_percent"] is None
-    assert not told["lengths"]["leg"]["determined"]
+    leg = told["lengths"]["leg"]
+    assert leg["high_percent"] is leg["value_percent"] is None
 
 
 def test_several_poses_name_the_joint_that_tells_them_apart_best(body: RegistrationBody) -> None:

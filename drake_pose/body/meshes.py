@@ -299,6 +299,7 @@ def workspace() -> Path:
 _written: dict[Path, TriangleMesh] = {}
 
 
+@functools.cache  # By identity, as a mesh is not hashed again each time its model is loaded.
 def write_obj(mesh: TriangleMesh, name: str) -> Path:
     """Write an OBJ file with normals in a temporary folder; meshes equal in ``name`` share it."""
     digest = hashlib.sha256(mesh.vertices.tobytes() + mesh.triangles.tobytes()).hexdigest()[:16]

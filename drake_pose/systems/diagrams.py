@@ -3,7 +3,7 @@
 A diagram connects simulated cameras or recorded masks to an estimator, Meshcat and logs.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,7 +69,8 @@ class CameraRegistration(BeliefSystem[OnlineState]):
 
     Input ports:
         label_image (ImageLabel16I): an image that is not connected, or without the body, is
-            ignored.
+            ignored. The body's render labels are those of its model if made of a plant
+            (``ArticulatedModel.from_plant``), else all but Drake's reserved ones.
         measured_positions (nq): of the body, synchronised with the image [rad or m]; ignored if not
             finite.
 
@@ -88,8 +89,6 @@ class CameraRegistration(BeliefSystem[OnlineState]):
     Args:
         registration: the method, with the body, and the camera with its intrinsics.
         period: time between two updates [s].
-        labels: render labels of the body; None: those of its model if made of a plant
-            (``ArticulatedModel.from_plant``), else all but Drake's reserved ones.
         max_coverage: largest fraction of the image that the body may cover.
 
     Raises:
@@ -101,15 +100,12 @@ class CameraRegistration(BeliefSystem[OnlineState]):
         self,
         registration: OnlineRegistration,
         period: float,
-        labels: Collection[int] | None = None,
         max_coverage: float = 0.6,
     ) -> None:
         super().__init__()
         require_period("registration", period)
         self._registration, self._max_coverage = registration, max_coverage
         self._tree, camera = registration.body.tree, registration.camera
-        labels = self._tree.model.labels if labels is None else labels
-        self._labels = None if labels is None else frozenset(labels)
         self.add_input("label_image", ImageLabel16I(camera.width, camera.height))
         self.add_input("measured_positions", len(self._tree.model.position_names))
         self.declare_belief(OnlineState(), period)
@@ -136,14 +132,14 @@ class CameraRegistration(BeliefSystem[OnlineState]):
         if not np.isfinite(q).all():
             return last
         values = np.concatenate(self._tree.values_from_positions(q))
-        mask = label_image_to_mask(image, self._labels)
+        mask = label_image_to_mask(image, self._tree.model.labels)
         covered = float(mask.mean())
         if covered > self._max_coverage:
             raise MaskError(
                 f"{self.get_name()}: labels of the body cover {covered:.0%} of the image of "
                 f"camera '{self._registration.camera.name}' ({self._max_coverage:.0%} at most); "
-                "they may include the ground. Give the body's own labels (labels=), or use a model "
-                "from ArticulatedModel.from_plant"
+                "they may include the ground; use a model from ArticulatedModel.from_plant, which "
+                "has the body's own labels"
             )
         return self._registration.next(last, PosedFrame(f"{context.get_time():g} s", values, mask))
 
@@ -211,7 +207,6 @@ def build_recorded_matching(
     cameras: Sequence[Camera],
     frames: Sequence[str] | None = None,
     root_positions: Mapping[str, np.ndarray] | None = None,
-    meshcat: Meshcat | None = None,
     tracking: TrackingSettings | None = None,
     starts: Mapping[str, np.ndarray] | None = None,
 ) -> MatchingDiagram:
@@ -227,7 +222,6 @@ def build_recorded_matching(
         frames: names of the frames to play; None: all.
         root_positions: the root's position (3,) in the world [m] by name of the frame; None: as in
             the pose tree.
-        meshcat: where to show the estimated body; None: nowhere.
         tracking: settings of a SilhouetteTracker; None: a SilhouetteMatcher matches each frame on
             its own.
         starts: approximate positions (nq,) [rad or m] by name of the frame: a track starts there
@@ -239,10 +233,6 @@ def build_recorded_matching(
     builder.AddNamedSystem("mask_player", player)
     builder.AddNamedSystem("silhouette_matcher", matcher)
     connect_matching_ports(builder, player, matcher)
-    if meshcat is not None:
-        scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
-        estimate = matcher.GetOutputPort("estimated_positions")
-        show_estimate(builder, scene_graph, search.tree.model, estimate, meshcat)
     return _finish(builder, matcher, player.period)
 
 

@@ -80,7 +80,7 @@ class TestCameraRegistration:
         (kept,) = system.belief(run.context).keyframes
         np.testing.assert_array_equal(kept.mask, labels[..., 0] == 5)
         # A model of a file has no labels.
-        with pytest.raises(MaskError, match=r"cover 100% of the image.*labels="):
+        with pytest.raises(MaskError, match=r"cover 100% of the image.*from_plant"):
             Bench(CameraRegistration(online, PERIOD)).update(
                 measured_positions=np.zeros(5), label_image=image
             )

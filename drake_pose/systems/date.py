@@ -243,9 +243,17 @@ class FeatureFinder(PortedSystem):
     def __init__(self, cameras: Sequence[Camera]) -> None:
         super().__init__()
         size = 3 * len(FEATURES)
-        self._seen = _add_views(self, cameras)
+        seen = _add_views(self, cameras)
         self.add_input("last_features", size)
-        found = self.add_output("found", None, self._find)
+
+        def find(context: Context) -> Features | None:
+            last = self.GetInputPort("last_features").Eval(context).reshape(-1, 3)
+            if not np.isfinite(last).all():
+                return None
+            cameras, views = seen(context)
+            return find_features(cameras, views, last)
+
+        found = self.add_output("found", None, find)
 
         def places(context: Context) -> Array:
             measured = found.Eval(context)
@@ -257,14 +265,6 @@ class FeatureFinder(PortedSystem):
 
         self.add_output("features", size, places)
         self.add_output("support", len(FEATURES), support)
-
-    def _find(self, context: Context) -> Features | None:
-        """Return the features in the context's views; None while the last ones are unknown."""
-        last = self.GetInputPort("last_features").Eval(context).reshape(-1, 3)
-        if not np.isfinite(last).all():
-            return None
-        cameras, views = self._seen(context)
-        return find_features(cameras, views, last)
 
 
 class FaceDirectionFinder(PortedSystem):
@@ -413,25 +413,6 @@ class PaperPoseEstimator(MemorySystem):
         unknown = {name: np.full(size, np.nan) for name, size in states.items()}
         self.declare_vectors(unknown, unknown, period)
 
-    def set_person(self, context: Context, q: Array, features: Array | None = None) -> None:
-        """Set the person's pose in a context.
-
-        ``q``: (nq,) positions [rad or m]. ``features``: (5, 3) head, hands and feet [m]; None:
-        those at q. Raises SettingsError: the number of positions or features is wrong, or one is
-        not finite.
-        """
-        checked: list[tuple[str, Array, tuple[int, ...]]] = [
-            ("positions", q, (len(self.setup.skeleton.lower),))
-        ]
-        if features is not None:
-            checked.append(("features", features, (len(FEATURES), 3)))
-        for kind, values, shape in checked:
-            if np.shape(values) != shape or not np.isfinite(values).all():
-                raise SettingsError(
-                    f"the person's {kind} must be {shape} finite numbers, not {values}"
-                )
-        self.set_vectors(context.get_mutable_discrete_state(), self._restarted(q, features))
-
     def next_vectors(self, context: Context, known: dict[str, Array]) -> Mapping[str, Array]:
         """Return the state vectors, by name, that the context's inputs change; ``known``: all."""
         fresh = self._finite_input(context, "fresh")
@@ -441,7 +422,12 @@ class PaperPoseEstimator(MemorySystem):
             self._finite_input(context, name) for name in ("recognised_positions", "features")
         )
         if recognised is not None:
-            return self._restarted(recognised, None)
+            return {
+                "estimated_positions": recognised,
+                "last_features": self.setup.skeleton.features(recognised),
+                "last_support": np.zeros(len(FEATURES)),
+                "limb_points": np.full(9 * len(LIMBS), np.nan),
+            }
         if features is None or not np.isfinite(known["estimated_positions"]).all():
             return {}
         features = features.reshape(-1, 3)
@@ -462,16 +448,6 @@ class PaperPoseEstimator(MemorySystem):
             "limb_points": np.array([limbs[name] for name in LIMBS]),
         }
 
-    def _restarted(self, q: Array, features: Array | None) -> dict[str, Array]:
-        """Return first state vectors by name at q (nq,); features (5, 3) [m], None: those at q."""
-        places = self.setup.skeleton.features(q) if features is None else features
-        return {
-            "estimated_positions": q,
-            "last_features": places,
-            "last_support": np.zeros(len(FEATURES)),
-            "limb_points": np.full(9 * len(LIMBS), np.nan),
-        }
-
     def _finite_input(self, context: Context, name: str) -> Array | None:
         """Return the vector at the input port ``name``; None if not connected or not finite."""
         value: Array | None = self.eval_input(context, name)
@@ -490,8 +466,7 @@ def build_paper_capture(
     has it ``time``. The source's input ports are exported under their names.
 
     Args:
-        setup: constants of the capture. Without a registered pose, the person's initial pose must
-            be set: see ``PaperPoseEstimator.set_person``.
+        setup: constants of the capture. Without a registered pose, the person is never found.
         source: has an output port ``color_image_<camera>`` for each camera, for example a rig's
             diagram (``build_camera_rig``), recorded pictures or live cameras. A camera without a
             background in the setup also needs ``label_image_<camera>``. A source without new

@@ -200,7 +200,6 @@ def estimate_pose(
     regions: Sequence[Mask],
     *,
     search: bool = True,
-    waist: Array | None = None,
 ) -> tuple[Array, dict[str, Array]]:
     """Estimate a frame's pose by the paper's method.
 
@@ -213,7 +212,6 @@ def estimate_pose(
         regions: (H, W) region of the person in each camera's picture; empty ones are skipped.
         search: whether elbows and knees are searched on their circles; if not, they stay where
             inverse kinematics puts them.
-        waist: (3,) half-way between the hips [m]; None: by the formula of section 4.2.
 
     Returns (nq,) positions inside their limits; and by limb (3, 3) positions of shoulder, elbow and
     hand, or hip, knee and foot, before the model is fitted to them [m].
@@ -226,10 +224,10 @@ def estimate_pose(
     q = move_upper_body(skeleton, q, features, face_known=head_angles is not None)
     # The head's angles may have changed: put its middle back to where it was measured.
     q[skeleton.head_positions] = features[0] - skeleton.head_rotation(q) @ skeleton.face_H
-    if waist is None:
-        feet = 0.5 * (features[4, 2] + features[3, 2])
-        share = SETTINGS.head_fraction
-        waist = np.array([*features[0, :2], share * features[0, 2] + (1.0 - share) * feet])
+    # The waist, half-way between the hips, by the formula of section 4.2.
+    feet = 0.5 * (features[4, 2] + features[3, 2])
+    share = SETTINGS.head_fraction
+    waist = np.array([*features[0, :2], share * features[0, 2] + (1.0 - share) * feet])
     # The model's trunk is rigid: it cannot fit shoulders and waist that were found separately. The
     # waist decides its pose, which also keeps the neck base from drifting from frame to frame.
     _, neck = skeleton.trunk_pose(q)

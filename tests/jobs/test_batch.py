@@ -6,7 +6,6 @@ import inspect
 import json
 import os
 import pickle
-import shutil
 import signal
 import socket
 import sys
@@ -26,7 +25,7 @@ from drake_pose.jobs.batch import run_batch
 from drake_pose.jobs.batch_tasks import Outcome, SceneJob, Task, perform, plan_scene, read_job
 from drake_pose.jobs.cluster import call_in_child, open_cluster, require_fit_workers
 from drake_pose.jobs.estimate.scene import estimate_scene
-from tests.cli import run_json, run_to_end
+from tests.cli import run_to_end
 from tests.jobs.scenes import write_scene
 
 MOTION = [(20.0 + 5.0 * k, -40.0 - 4.0 * k) for k in range(5)]
@@ -107,33 +106,6 @@ def test_results_are_independent_of_workers_and_their_deaths(jobs, alone, cluste
     assert not result.failed
     assert same_results(alone, out)
     cluster.wait_for_workers(2, timeout=30)
-
-
-@pytest.mark.slow
-def test_a_failed_scene_is_named_and_resume_runs_only_missing_tasks(
-    scenes, jobs, alone, tmp_path, out
-):
-    shutil.copytree(scenes, tmp_path / "own")
-    both = {"stills": {"scene": "stills"}, "motion": {"scene": "motion", "model": "broken.urdf"}}
-    (tmp_path / "own" / "broken.urdf").write_text("<robot")
-    path = write_job(tmp_path / "own", both)
-    words = ["batch", path, "--out", out, "--workers", 0]
-    failed = run_to_end(*words, status=1)
-    assert "scene 'motion'" in failed.stderr
-    assert "broken.urdf" in failed.stderr
-    assert rows(out / "stills") == rows(alone / "stills")
-    assert not (out / "motion").exists()
-    written = (out / "stills" / "poses.csv").stat().st_mtime_ns
-    assert "--resume" in run_to_end(*words, status=1).stderr
-    # The corrected model has another digest, so the job is another one.
-    shutil.copyfile(scenes / "crane.urdf", tmp_path / "own" / "broken.urdf")
-    assert "sha256" in run_to_end(*words, "--resume", status=1).stderr
-    write_job(tmp_path / "own", {"stills": both["stills"], "mended": both["motion"]})
-    report = run_json(*words, "--resume")
-    assert report["complete"]
-    assert report["scenes"]["stills"]["worker_seconds"] == 0.0
-    assert rows(out / "mended") == rows(alone / "motion")
-    assert (out / "stills" / "poses.csv").stat().st_mtime_ns == written
 
 
 def die_on_second_chunk(task: Task) -> Outcome:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from drake_pose.body import bundled_model, load_model
-from drake_pose.jobs.demo import demo_settings, run_demo, stored_scene
+from drake_pose.jobs.demo import run_demo, stored_scene
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.cli import run_command
@@ -46,13 +46,6 @@ def test_demo(tmp_path: Path) -> None:
         assert refused.exit_code == 1
         assert "not empty" in refused.stderr
         assert kept <= {path.name for path in folder.iterdir()}
-
-
-def test_settings_are_those_of_the_paper() -> None:
-    settings = demo_settings(stored_scene("human"))
-    assert settings.root == "right_foot"
-    assert settings.root_position == (stored_scene("human") / "root_position.csv", "right_ankle")
-    assert "BSD 3-Clause License" in (stored_scene("human") / "NOTICE").read_text()
 
 
 def test_an_earlier_demonstration_is_replaced(

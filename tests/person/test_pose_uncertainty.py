@@ -8,7 +8,7 @@ from drake_pose.camera.models import circle_of_cameras
 from drake_pose.fit.contour_fit import ContourFit, pack_views
 from drake_pose.fit.evidence import NO_EDGE, find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.person.pose_tracker import _SIDE_DEVIATION, _sides_information, pose_uncertainty
+from drake_pose.person.pose_tracker import pose_uncertainty
 from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.scoring import draw_mask
 from tests.person.persons_in_view import posed
@@ -123,11 +123,3 @@ class TestUncertainty:
             for fit in (world.fit, bold)
         )
         assert (np.abs(np.log(modest / assumed)) < 2.0 * np.log(1.5)).all()
-
-
-def test_prior_couples_left_and_right_lengths():
-    names, alike = ["left_shin", "trunk", "right_shin", "left_alone"], 3.0 * np.ones(6)
-    H = _sides_information(names, 2)
-    assert alike @ H @ alike == pytest.approx(0.0)
-    other = np.array([0.3, 0.5, 0.1, -0.2, 0.7, 0.9])
-    assert other @ H @ other == pytest.approx((0.2 / _SIDE_DEVIATION) ** 2)

@@ -343,8 +343,8 @@ def capture_checked(
     cameras: Mapping[str, Camera],
     read: ReadFrame,
     count: int,
-    is_sequence: bool = True,
-    on_frame: Callable[[int], None] | None = None,
+    is_sequence: bool,
+    on_frame: Callable[[int], None] | None,
     hull_frames: int = 3,
     min_cameras: int = 3,
 ) -> CheckedCapture:

@@ -26,7 +26,6 @@ from drake_pose.fit.contour_fit import (
     Comparison,
     ContourFit,
     Noise,
-    PoseFit,
     Prior,
     pack_views,
     symmetric,
@@ -263,7 +262,10 @@ class PersonPoseTracker:
         if last is None:
             found = self.search.find_person(frame, range(settings.headings))
             return None if found is None else self.start(found.values, found.inlier_ratio)
-        fitted = self._fit_predicted(last, frame)
+        expected = last.values + settings.step_fraction * last.step
+        prior = Prior(expected, self._information)
+        compare = partial(frame.compare, self.fit)
+        fitted = self.fit.fit(compare, expected, settings.follow, prior, self._held)
         enough = last.usual_ratio - settings.retry_below
         lost = fitted.inlier_ratio < settings.lost_below * last.usual_ratio
         # Limbs are searched again in the first four troubled frames, then in every eighth.
@@ -296,13 +298,6 @@ class PersonPoseTracker:
             usual_ratio=state.usual_ratio,
             troubled_frames=remaining,
         )
-
-    def _fit_predicted(self, last: TrackState, seen: FrameViews) -> PoseFit:
-        """Fit a frame's silhouettes from the pose that the last state predicts."""
-        expected = last.values + self.settings.step_fraction * last.step
-        prior = Prior(expected, self._information)
-        compare = partial(seen.compare, self.fit)
-        return self.fit.fit(compare, expected, self.settings.follow, prior, self._held)
 
 
 Frames = Sequence[tuple[Sequence[Camera], Sequence[EdgePoints]]]

@@ -1,7 +1,6 @@
 """Bodies posed by position inputs in a diagram, their skin, and position messages (LCM)."""
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from drake import lcmt_robot_state
@@ -70,27 +69,6 @@ MESHCAT_PERIOD = 1.0 / 64.0
 """Time between two drawings [s], as in Drake's MeshcatVisualizer."""
 
 
-class PositionFunction(PortedSystem):
-    """Outputs a function of positions.
-
-    .. pydrake_system::
-
-        name: PositionFunction
-        input_ports: [positions]
-        output_ports: [value]
-
-    Args:
-        count: number of positions.
-        model_value: model value of the output port.
-        function: maps positions (count,) to the value.
-    """
-
-    def __init__(self, count: int, model_value: Any, function: Callable[[Array], Any]) -> None:
-        super().__init__()
-        given = self.add_input("positions", count)
-        self.add_output("value", model_value, lambda context: function(given.Eval(context)))
-
-
 class MeshcatSkin(LeafSystem):
     """Draws a skin in Meshcat; MeshcatVisualizer does not draw deformable geometry.
 
@@ -126,10 +104,8 @@ class MeshcatSkin(LeafSystem):
         is_recorded: bool = False,
     ) -> None:
         super().__init__()
-        self._meshcat = meshcat
-        self._skin = skin
-        self._path = path
-        self._colour = colour
+        self._meshcat, self._path = meshcat, path
+        self._skin, self._colour = skin, colour
         self._recorded = is_recorded
         self._shapes = 0
         self._drawn: np.ndarray | None = None
@@ -144,8 +120,14 @@ class MeshcatSkin(LeafSystem):
             return EventStatus.DidNothing()
         path = self._path
         if self._recorded:
-            path = f"{self._path}/{self._shapes}"
-            self._show_alone(context.get_time())
+            path, time = f"{self._path}/{self._shapes}", context.get_time()
+            # Only this shape is visible from now on.
+            if self._shapes:
+                before = f"{self._path}/{self._shapes - 1}"
+                self._meshcat.SetProperty(before, "visible", False, time)
+                if time > 0.0:
+                    self._meshcat.SetProperty(path, "visible", False, 0.0)
+            self._meshcat.SetProperty(path, "visible", True, time)
         for band, vertices in zip(self._skin.bands, self._skin.vertices(positions), strict=True):
             self._meshcat.SetTriangleMesh(
                 f"{path}/{band.child}",
@@ -156,15 +138,6 @@ class MeshcatSkin(LeafSystem):
         self._drawn = positions
         self._shapes += 1
         return EventStatus.Succeeded()
-
-    def _show_alone(self, time: float) -> None:
-        """Show the shape that is drawn next, and hide the previous one, from ``time`` [s] on."""
-        here = f"{self._path}/{self._shapes}"
-        if self._shapes:
-            self._meshcat.SetProperty(f"{self._path}/{self._shapes - 1}", "visible", False, time)
-            if time > 0.0:
-                self._meshcat.SetProperty(here, "visible", False, 0.0)
-        self._meshcat.SetProperty(here, "visible", True, time)
 
 
 def add_skin(
@@ -186,12 +159,13 @@ def add_skin(
     if not model.skin:
         return
     deformable = DeformableSkin(ModelSkin(model), scene_graph, labels or {}, "true_skin")
-    bend = PositionFunction(
-        model.plant.num_positions(),
+    poser = builder.AddNamedSystem("true_skin_poser", PortedSystem())
+    q = poser.add_input("positions", model.plant.num_positions())
+    poser.add_output(
+        "configuration",
         GeometryConfigurationVector(),
-        lambda q: deformable.configuration(deformable.skin.vertices(q)),
+        lambda context: deformable.configuration(deformable.skin.vertices(q.Eval(context))),
     )
-    poser = builder.AddNamedSystem("true_skin_poser", bend)
     builder.Connect(positions, poser.get_input_port())
     builder.Connect(
         poser.get_output_port(), scene_graph.get_source_configuration_port(deformable.source)

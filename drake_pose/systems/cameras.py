@@ -39,10 +39,9 @@ from drake_pose.systems.ports import PortedSystem, camera_port
 
 def picture_to_colour_image(picture: Picture | None) -> ImageRgba8U:
     """Return a picture (H, W, 3), red, green, blue, as ImageRgba8U; None: one without pixels."""
-    if picture is None:
-        return ImageRgba8U()
     image = ImageRgba8U()
-    fill_colour_image(image, picture)
+    if picture is not None:
+        fill_colour_image(image, picture)
     return image
 
 
@@ -128,7 +127,8 @@ class MaskPlayer(PortedSystem):
         for name, values in given.items():
             if values:
                 unknown = np.full(len(next(iter(values.values()))), np.nan)
-                self._play(name, len(unknown), partial(_value_at, values, unknown))
+                shown = {frame: values.get(frame, unknown) for frame in self.frames}
+                self._play(name, len(unknown), shown.__getitem__)
         self.add_output(
             "frame_index",
             1,
@@ -162,11 +162,6 @@ class MaskPlayer(PortedSystem):
         is_there = (camera.name, frame) in self._scene.images
         picture = self._scene.read_image(camera.name, frame) if is_there else None
         return picture_to_colour_image(picture)
-
-
-def _value_at(values: Mapping[str, Array], unknown: Array, frame: str) -> Array:
-    """Return the value of a frame, given values by name of the frame; ``unknown`` without one."""
-    return values.get(frame, unknown)
 
 
 _System = TypeVar("_System", bound=System)

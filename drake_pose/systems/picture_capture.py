@@ -59,11 +59,11 @@ class PictureCapture(PortedSystem):
     Args:
         sources: opened sources of pictures, by name of the camera.
         cameras: cameras by name, which give the sizes of the images.
-        period: time between two updates [s]; None: that of the fastest source.
         clock: returns the computer's time [s]; that of the live sources.
         opening_timeout: longest time to wait for the first pictures of live cameras [s].
 
     Attributes:
+        period: time between two updates, that of the fastest source [s].
         live: whether the pictures come by the computer's clock.
         frames: the synchronised frames shown; None before the first ones.
         skipped: number of synchronised frames that were skipped for newer ones.
@@ -77,7 +77,6 @@ class PictureCapture(PortedSystem):
         self,
         sources: Mapping[str, FrameSource],
         cameras: Mapping[str, Camera],
-        period: float | None = None,
         *,
         clock: Callable[[], float] = time.monotonic,
         opening_timeout: float = 8.0,
@@ -88,10 +87,8 @@ class PictureCapture(PortedSystem):
                 raise UnknownNameError("camera", name, cameras, "the calibration")
         self._sources = dict(sources)
         self.live = any(one.specification.live for one in sources.values())
-        if period is None:
-            rates = [rate for one in sources.values() if (rate := one.rate_hz) is not None]
-            period = 1.0 / max(rates, default=USUAL_RATE_HZ)
-        self.period = period
+        rates = [rate for one in sources.values() if (rate := one.rate_hz) is not None]
+        self.period = 1.0 / max(rates, default=USUAL_RATE_HZ)
         require_period("capture", self.period)
         tolerance = (0.9 if self.live else 0.5) * self.period
         self._synchroniser: Synchroniser[TimedPicture] = Synchroniser(

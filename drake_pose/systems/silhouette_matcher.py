@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
@@ -122,11 +121,7 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
         self.add_input("root_position", 3)
         q = search.tree.model.default_positions
         self.declare_belief(MatcherState(q, np.eye(4), None, self._first_memory), period)
-        self._declare_outputs(search.tree.model.plant)
-
-    def _declare_outputs(self, plant: MultibodyPlant) -> None:
-        """Declare the output ports; ``plant`` is the model's."""
-        nq = plant.num_positions()
+        plant, nq = search.tree.model.plant, len(q)
         self.add_belief_output("estimated_positions", nq, lambda known: known.q)
         self.add_belief_output("error", 1, lambda known: _statistics(known.estimate)[2:3])
         self.add_belief_output(

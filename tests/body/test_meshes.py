@@ -9,14 +9,9 @@ import trimesh
 from pydrake.geometry import Box, Cylinder, Ellipsoid, ReadObjToTriangleSurfaceMesh
 
 from drake_pose.body import TriangleMesh, load_model
-from drake_pose.body.meshes import (
-    is_watertight,
-    read_mesh_file,
-    shape_mesh,
-    write_obj,
-)
+from drake_pose.body.meshes import is_watertight, read_mesh_file, shape_mesh, write_obj
 from drake_pose.errors import ModelError
-from tests.body.models import write
+from tests.body.models import link, urdf, write
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], dtype=float)
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
@@ -76,10 +71,8 @@ def test_every_variant_of_stl_is_read(tmp_path, data):
 )
 def test_damaged_stl_files_are_refused_by_link_and_file(tmp_path, data):
     (tmp_path / "t.stl").write_bytes(data)
-    text = (
-        '<robot name="r"><link name="hand"><visual><geometry><mesh filename="t.stl"/></geometry>'
-        "</visual></link></robot>"
-    )
+    mesh = '<visual><geometry><mesh filename="t.stl"/></geometry></visual>'
+    text = urdf(link("hand", mesh))
     with pytest.raises(ModelError, match=r"'hand'.*t\.stl") as caught:
         load_model(write(tmp_path, text), check=False)
     assert "charset" not in str(caught.value)

@@ -185,7 +185,7 @@ def test_models_of_directives_are_sanitised(tmp_path):
 )
 def test_refusals_of_directives_name_the_file(tmp_path, text, named):
     sphere = '<visual><geometry><sphere radius="-1"/></geometry></visual>'
-    write(tmp_path, f'<robot name="r"><link name="a">{sphere}</link></robot>', "bad.urdf")
+    write(tmp_path, urdf_file(urdf_link("a", sphere)), "bad.urdf")
     path = write(tmp_path, text, "all.dmd.yaml")
     with pytest.raises(ModelError) as caught:
         load_model(path, check=False)

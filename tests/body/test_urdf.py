@@ -291,8 +291,7 @@ def test_implausible_sizes_and_limits_give_warnings(tmp_path, scale, upper, expe
     box = f'<visual><geometry><box size="{sides}"/></geometry></visual>'
     at = {"axis": "0 0 1", "limits": f'lower="0" upper="{upper}"', "origin": 'xyz="0 0 0"'}
     turn = joint("turn", "revolute", "a", "b", **at)
-    path = tmp_path / "r.urdf"
-    path.write_text(f'<robot name="r">{link("a", box)}{link("b", box)}{turn}</robot>')
+    path = write(tmp_path, urdf(link("a", box), link("b", box), turn))
     warnings = describe_model(path).warnings
     assert len(warnings) == len(expected)
     assert all(text in warning for text, warning in zip(expected, warnings, strict=True))

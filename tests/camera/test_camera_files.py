@@ -106,12 +106,8 @@ def test_bad_files_are_refused(tmp_path, text, message):
 def test_unreadable_and_unwritable_files_are_refused(tmp_path):
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x80")
     (tmp_path / "large.yaml").write_text("# " + "x" * (1 << 21))
-    files = {
-        "missing.yaml": "missing",
-        ".": "folder",
-        "binary.yaml": "mapping",
-        "large.yaml": "larger",
-    }
+    files = {"missing.yaml": "missing", ".": "folder"}
+    files |= {"binary.yaml": "mapping", "large.yaml": "larger"}
     for name, reason in files.items():
         with pytest.raises(CameraError, match=reason) as caught:
             load_cameras(tmp_path / name)
@@ -303,11 +299,8 @@ def test_mujoco_projects_to_the_same_pixels(tmp_path):
 
 
 def test_cameras_without_a_counterpart_are_refused():
-    for export in (
-        ros_camera_info,
-        lambda one: mujoco_cameras([one]),
-        lambda one: dump_scenario([one]),
-    ):
+    exports = ros_camera_info, lambda one: mujoco_cameras([one]), lambda one: dump_scenario([one])
+    for export in exports:
         with pytest.raises(CameraError, match=r"'flat'.*parallel"):
             export(PARALLEL)
     outside = PinholeCamera("off", 10, 10, 5.0, 5.0, -3.0, 5.0, np.eye(4))

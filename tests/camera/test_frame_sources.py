@@ -249,13 +249,9 @@ class TestDevice:
 
 
 VIDEO = {"kind": "video", "location": "a"}
+FOLDER = {"kind": "folder", "rate_hz": 10}
 ENTRIES = {
-    name: {
-        "kind": "folder",
-        "rate_hz": 10,
-        "location": f"images/{name}",
-        "background": f"empty/{name}",
-    }
+    name: FOLDER | {"location": f"images/{name}", "background": f"empty/{name}"}
     for name in ("camera_1", "camera_0")
 }
 

@@ -212,7 +212,10 @@ class _Capture:
         least = fits[0].closeness - tracker.settings.alternative_margin if fits else 0.0
         found = [(one, tracker) for one in fits if one.closeness > least]
         if self._has_shape:
-            found = [self._with_shape(frame, fit.values) for fit, _ in found]
+            for k, (fit, _) in enumerate(found):
+                shape, shaped = self._fit_shape([frame], [fit.values])
+                refined = shaped.search.refine(shape.poses[0], seen)
+                found[k] = shaped.search.improve_limbs(refined, seen), shaped
         ranked = {id(one[0]): one for one in found}
         distinct = tracker.search.distinct(fit for fit, _ in found)
         found = [ranked[id(fit)] for fit in distinct]
@@ -222,13 +225,6 @@ class _Capture:
             if fit.closeness > distinct[0].closeness - tracker.settings.ambiguity_margin
         )
         return found
-
-    def _with_shape(self, frame: int, values: Array) -> tuple[PoseFit, PersonPoseTracker]:
-        """Refine a frame's pose and search its limbs, with the shape fitted at `values` (m,)."""
-        seen = self._see(frame)
-        shape, shaped = self._fit_shape([frame], [values])
-        refined = shaped.search.refine(shape.poses[0], seen)
-        return shaped.search.improve_limbs(refined, seen), shaped
 
     def follow_all(
         self,

@@ -10,6 +10,7 @@ from drake_pose.body import ArticulatedModel
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import circle_of_cameras
 from drake_pose.systems.cameras import build_camera_rig
+from tests.person.persons_in_view import posed
 from tests.written_files import write_mask
 
 SIZE = (240, 180)
@@ -18,22 +19,16 @@ RATE_HZ = 15.0
 
 def standing(person: ArticulatedModel, ahead: float = 0.0, arm_deg: float = 30.0) -> np.ndarray:
     """Return positions (nq,) of a person who stands ahead of the middle [m] with raised arms."""
-    q = np.zeros(len(person.position_names))
-    q[person.position_index("position_x")] = ahead
-    q[person.position_index("position_z")] = 1.55
-    q[person.position_index("left_upper_arm_z")] = np.radians(arm_deg)
-    q[person.position_index("right_upper_arm_z")] = -np.radians(30.0)
-    for side in ("left", "right"):
-        # A pose whose silhouettes distinguish front and back.
-        q[person.position_index(f"{side}_forearm_x")] = np.radians(-70.0)
-    return q
+    # The forearms' silhouettes distinguish front and back.
+    return posed(
+        person, ahead, left_upper_arm_z=arm_deg, right_upper_arm_z=-30.0, left_forearm_x=-70.0,
+        right_forearm_x=-70.0,
+    )  # fmt: skip
 
 
 def absent(person: ArticulatedModel) -> np.ndarray:
     """Return positions (nq,) out of view, 9 m below the ground."""
-    q = standing(person)
-    q[person.position_index("position_z")] = -9.0
-    return q
+    return posed(person, z=-9.0)
 
 
 def write_studio(

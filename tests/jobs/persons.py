@@ -9,6 +9,7 @@ from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import circle_of_cameras
 from tests.jobs.scenes import write_masks
+from tests.person.persons_in_view import posed
 
 
 @dataclass(frozen=True)
@@ -35,11 +36,7 @@ def record_person(
     save_cameras(folder / "cameras.yaml", cameras)
     rate = "frame_rate_hz: 30\n" if sequence else ""
     (folder / "scene.yaml").write_text(f"sequence: {str(sequence).lower()}\n{rate}")
-    truth = np.zeros((frames, len(person.position_names)))
-    truth[:, person.position_index("position_z")] = 1.55
-    truth[:, person.position_index("left_upper_arm_z")] = np.radians(
-        30.0 + 10.0 * np.arange(frames)
-    )
-    truth[:, person.position_index("right_upper_arm_z")] = np.radians(-30.0)
+    arms = [(30.0 + 10.0 * k, -30.0) for k in range(frames)]
+    truth = np.array([posed(person, left_upper_arm_z=a, right_upper_arm_z=b) for a, b in arms])
     write_masks(folder, person, cameras.values(), truth)
     return PersonScene(folder, person, truth)

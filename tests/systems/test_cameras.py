@@ -10,16 +10,14 @@ from drake_pose.camera.models import circle_of_cameras, look_at
 from drake_pose.errors import CameraError, UnknownNameError
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.systems.cameras import build_camera_rig
+from tests.person.persons_in_view import posed
 
 SIZE = (160, 120)
 
 
 @pytest.fixture(scope="module")
 def standing(person):
-    q = np.array(person.default_positions)
-    q[person.position_index("position_z")] = 1.5
-    q[person.position_index("left_upper_arm_z")] = 1.3
-    return q
+    return posed(person, z=1.5, left_upper_arm_z=75)
 
 
 def test_masks_equal_the_label_renderers(person, standing, tmp_path):

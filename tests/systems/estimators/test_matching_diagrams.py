@@ -24,9 +24,9 @@ from drake_pose.systems.diagrams import (
     build_simulated_matching,
 )
 from drake_pose.systems.silhouette_matcher import STATISTICS, SilhouetteMatcher, SilhouetteTracker
+from tests.jobs.scenes import write_masks
 from tests.search.bodies import box_link, front_camera, joint, load_body, swinging_chain
 from tests.systems.bench import Bench
-from tests.written_files import write_mask
 
 PERIOD = 0.1
 TRUTH = np.radians([[30.0, -60.0, 0.0], [-30.0, 60.0, 90.0], [60.0, 30.0, -30.0]])
@@ -102,10 +102,7 @@ def write_scene(folder, model, camera, poses):
     folder.mkdir()
     save_cameras(folder / "cameras.yaml", {camera.name: camera})
     (folder / "scene.yaml").write_text("sequence: true\nframe_rate_hz: 30\n")
-    renderer = LabelRenderer(model, camera)
-    (folder / "masks" / camera.name).mkdir(parents=True)
-    for k, q in enumerate(poses):
-        write_mask(folder / "masks" / camera.name / f"{k:04d}.png", renderer.mask(q))
+    write_masks(folder, model, [camera], poses)
     return load_scene(folder)
 
 

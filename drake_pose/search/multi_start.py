@@ -347,7 +347,7 @@ class _MultiStartRun:
                 coarsen(view, settings.beam_pixels) for view in unexplained[: settings.beam_views]
             ]
             by_areas = self._search.beam.best_poses(
-                views, self._root_position, settings.beam_starts, time_limit=left
+                views, self._root_position, settings.beam_starts, overlap=0.7, time_limit=left
             )
             values = [self._kinematics.flatten(one) for one in by_areas]
             others = refine_best(self._fit, values, self._passes, self._proceed)

@@ -52,7 +52,11 @@ class NeighbourhoodSettings:
     refined: int = 2  # Number of placements that get the second passes.
     noise: float = 0.03  # Pixel noise: poses whose J exceeds another's by less are as good.
     first_excess: float = 0.15  # Greatest excess over the current J after the first passes.
+    repaired_excess: float = 0.35  # Mirrored poses up to this excess have their parts placed anew,
+    repair_tries: int = 6  # with this number of tries.
     whole_excess: float = 0.01  # Poses up to this excess are refined with all parts moving.
+    # Alternative poses up to this above their limit are refined with all parts moving.
+    alternative_excess: float = 0.015
     least_decrease: float = 0.003  # A smaller decrease of J is no improvement.
     same_error: float = 0.1  # Errors of a part are equal if they differ by a smaller fraction.
     least_error: float = 0.001  # Parts with less error are not placed anew [fraction of the area].
@@ -426,12 +430,15 @@ class NeighbourhoodSearch:
     Args:
         problem: the silhouettes and the body.
         search: the parts of the body.
+        reflections: whether, in a single view, parts are mirrored with left and right exchanged.
     """
 
-    def __init__(self, problem: RefinementProblem, search: PartSearch) -> None:
+    def __init__(
+        self, problem: RefinementProblem, search: PartSearch, *, reflections: bool = True
+    ) -> None:
         self.problem, self.search = problem, search
         # In several views a part mirrored in the depth of one is visible in another.
-        mirrored = search.reflections if len(problem.views) == 1 else ()
+        mirrored = search.reflections if reflections and len(problem.views) == 1 else ()
         self._parts = (*search.parts, *mirrored)
         self._freedoms = [
             problem.body.freedom(None if part.exchanged else (*part.nodes, *part.held))
@@ -452,6 +459,7 @@ class NeighbourhoodSearch:
         deadline: float = np.inf,
         *,
         everywhere: bool = False,
+        tries: int | None = None,
     ) -> tuple[np.ndarray, float]:
         """Place parts of a refined pose anew while J decreases.
 
@@ -460,6 +468,7 @@ class NeighbourhoodSearch:
             enough: the search ends when J is at most this [pixel].
             deadline: time.perf_counter() at which the search ends [s].
             everywhere: whether each part is tried at least once, even without an error near it.
+            tries: greatest number of tries; None: no limit.
 
         Returns parameters (m + 4,) of the best pose, and its J [pixel].
         """
@@ -467,7 +476,8 @@ class NeighbourhoodSearch:
         rounds = settings.rounds * (2 if everywhere else 1)
         same = settings.least_decrease * self.problem.border_length
         least = settings.least_error * self.problem.area
-        while J > enough and time.perf_counter() < deadline:
+        last = np.inf if tries is None else int(self._tried.sum()) + tries
+        while J > enough and self._tried.sum() < last and time.perf_counter() < deadline:
             errors = self._errors_near(parameters, J)
             # A part is tried again only if the error near it has changed since its last try.
             due = ((errors >= least) | everywhere) & (self._tried < rounds)
@@ -495,11 +505,13 @@ class NeighbourhoodSearch:
         ``parameters``: (m + 4,) the best pose, as in ``RefinementBody``. ``limit``: greatest J
         [pixel]. ``same``: poses are equal if no parameter differs by more [rad or m].
         """
-        problem, J = self.problem, float(self.problem.J(parameters))
+        problem, settings, J = self.problem, self._settings, float(self.problem.J(parameters))
         # Until now reflections were tried at other poses, or not at all.
         for k in range(len(self.search.parts), len(self._parts)):
             self._try(parameters, J, k, False)
         known, kept = [parameters], []
+        spare = settings.alternative_excess * problem.border_length
+        everything = problem.body.freedom()
 
         def is_known(pose: np.ndarray, poses: Sequence[np.ndarray]) -> bool:
             # Poses that differ by full turns are equal.
@@ -511,8 +523,11 @@ class NeighbourhoodSearch:
             start[freedom.columns] = values
             if is_known(start, known):
                 continue
-            refined, _, _ = descend(problem, start, freedom, self._settings.final)
+            refined, _, _ = descend(problem, start, freedom, settings.final)
             J = float(problem.J(refined))
+            if limit < J <= limit + spare and not is_known(refined, known):
+                refined, _, _ = descend(problem, refined, everything, settings.final)
+                J = float(problem.J(refined))
             if J <= limit and not is_known(refined, known):
                 kept.append((J, refined))
                 known.append(refined)
@@ -549,6 +564,12 @@ class NeighbourhoodSearch:
         for start in starts:
             if part.exchanged:
                 refined, cost, _ = descend(problem, start, freedom, settings.mirrored)
+                if near < cost <= J + settings.repaired_excess * length:
+                    # Joint limits may prevent some nodes from being mirrored. They are placed anew,
+                    # so that the mirrored body is not rejected because of them.
+                    refined, _, _ = descend(problem, refined, freedom, settings.whole)
+                    repair = NeighbourhoodSearch(problem, self.search, reflections=False)
+                    refined, cost = repair.improve(refined, near, tries=settings.repair_tries)
             else:
                 refined, cost, _ = descend(problem, start, freedom, settings.placed, fixed_borders)
             if cost <= J + settings.first_excess * length:

@@ -150,6 +150,8 @@ def test_a_misplaced_part_is_corrected(body, search):
     assert J == problem.J(found) < 0.25 * problem.J(wrong)
     again, _ = NeighbourhoodSearch(problem, search).improve(wrong, 0.0)
     np.testing.assert_array_equal(found, again)
+    once, _ = NeighbourhoodSearch(problem, search).improve(wrong, 0.0, tries=0)
+    np.testing.assert_array_equal(once, wrong)
 
 
 def test_slack_leaves_fewer_wrong_pixels_than_least_squares(body):

@@ -5,6 +5,7 @@ import io
 import math
 from collections.abc import Sequence
 from importlib.resources import files
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -39,7 +40,13 @@ def make_report(
     """
     frames, records, joined = list(estimate.records), estimate.records.values(), scene.sequence
     found = ["found" if record.found else "not-found" for record in records]
-    use = {name: _picture_use(scene, estimate, name) for name in scene.cameras}
+    use: dict[str, list[str]] = {name: [] for name in scene.cameras}
+    for (camera, states), record in product(use.items(), records):
+        # A mask is used if it was compared with the body, a picture without mask if a pose was
+        # found.
+        has_mask, has_image = ((camera, record.frame) in x for x in (scene.masks, scene.images))
+        is_used = camera in record.ious or (has_image and not has_mask and record.found)
+        states.append("used" if is_used else "left-out" if has_mask or has_image else "no-picture")
     errors = [np.nan if one.E_total is None else 100.0 * one.E_total for one in records]
     ious = [
         (name, np.array([100.0 * record.ious.get(name, np.nan) for record in records]))
@@ -270,8 +277,8 @@ def _ends(*values: Array) -> tuple[float, float]:
 def _camera_row(estimate: SceneEstimate, camera: str, states: Sequence[str]) -> dict[str, Any]:
     """Return a row of the table of cameras: number of pictures, of those used, IoU, warnings.
 
-    ``estimate``: the estimate. ``camera``: the camera's name. ``states``: (frames,) result of
-    `_picture_use`.
+    ``estimate``: the estimate. ``camera``: the camera's name. ``states``: (frames,) "used",
+    "left-out" or "no-picture".
     """
     records = estimate.records
     ious = {f: one.ious[camera] for f, one in records.items() if camera in one.ious}
@@ -285,19 +292,6 @@ def _camera_row(estimate: SceneEstimate, camera: str, states: Sequence[str]) -> 
         "worst": worst,
         "warnings": _warnings_of(estimate, camera),
     }
-
-
-def _picture_use(scene: Scene, estimate: SceneEstimate, camera: str) -> list[str]:
-    """Return "used", "left-out" or "no-picture" for a camera in each frame of an estimate.
-
-    A mask is used if it was compared with the body, a picture without mask if a pose was found.
-    """
-    states = []
-    for frame, record in estimate.records.items():
-        has_mask, has_image = (camera, frame) in scene.masks, (camera, frame) in scene.images
-        is_used = camera in record.ious or (has_image and not has_mask and record.found)
-        states.append("used" if is_used else "left-out" if has_mask or has_image else "no-picture")
-    return states
 
 
 def _pick_pictures(

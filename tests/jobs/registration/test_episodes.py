@@ -210,10 +210,6 @@ def test_an_episode_becomes_a_calibrated_scene(episode, out):
     given = sorted((out / "overlay_as_given" / "camera").glob("*.png"))
     assert [one.stem for one in given] == sorted({in_order[0], in_order[len(in_order) // 2]})
     require_overlay_as_given(cv2.imread(str(given[0])))
-    page = (out / "report.html").read_text()
-    assert "from pictures and joint positions" in page
-    assert f"Offset {1e3 * summary['time_offset_s']:.1f} ms" in page
-    assert "pixels, as given" in page
     anew = RegistrationSettings(cameras=("camera",))
     again = register_scene(out, painted.path, out / "joint_angles.csv", settings=anew)
     error = pose_error(again.registered["camera"].camera.X_WC, painted.camera.X_WC)
@@ -227,7 +223,6 @@ def test_audit_of_an_episode_finds_wrong_clock_and_camera(episode, tmp_path):
     (clock,) = summary["findings"]
     assert clock["cause"] == "clock"
     assert clock["shift_ms"] == pytest.approx(1e3 * LATE, abs=5.0)
-    assert f"{1e3 * LATE:.0f}"[0] in clock["text"]
     assert summary["agreeing_count"] == summary["frame_count"] == len(painted.times)
     moved = painted.camera.X_WC.copy()
     moved[:3, 3] += [0.15, -0.1, 0.05]

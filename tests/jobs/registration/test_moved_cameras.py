@@ -164,12 +164,3 @@ def test_audits_and_their_batch_name_a_refused_camera(half_wrong, tmp_path):
     assert ("both", "refused", "back") in named
     rows = read_rows(tmp_path / "all/episodes.csv")
     assert [(row["scene"], row["camera"]) for row in rows] == [("both", "camera")]
-
-
-@pytest.mark.slow
-def test_an_episode_without_an_accepted_camera_is_refused(half_wrong, tmp_path):
-    scene, painted = half_wrong
-    out = tmp_path / "out"
-    words = ["register", scene, "--model", painted.path, "--out", out, "--camera", "back"]
-    assert "error: camera 'back': no pose" in run_to_end(*words, status=1).stderr
-    assert not out.exists()

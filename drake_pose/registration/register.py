@@ -396,7 +396,12 @@ def positions_from_bounds(frames: PosedFrames, R_CW: Array) -> Array:
     R_CW: (n, 3, 3) the world's rotations in the camera.
     """
     bodies = [np.einsum("nij,pj->npi", R_CW, points) for points in frames.points]
-    bounds, shown = zip(*[_mask_bounds(frame.mask) for frame in frames.frames], strict=True)
+    bounds, shown = [], []  # Least u, v, then greatest u, v of each mask; which are off the border.
+    for frame in frames.frames:
+        height, width = frame.mask.shape
+        v, u = np.flatnonzero(frame.mask.any(axis=1)), np.flatnonzero(frame.mask.any(axis=0))
+        bounds.append(np.array([[u[0] - 0.5, v[0] - 0.5], [u[-1] + 0.5, v[-1] + 0.5]]))
+        shown.append(np.array([[u[0] > 1, v[0] > 1], [u[-1] < width - 2, v[-1] < height - 2]]))
     middles = R_CW @ frames.middle
     # Initial guess as if all of the body were at the same depth.
     f, c = frames.intrinsics
@@ -432,7 +437,7 @@ def add_bound_equations(
     Args:
         frames: the camera's frames, for its intrinsics and the body's size.
         p_C: (n, points, 3) the body's points in the camera at each position [m].
-        bound: the silhouette's bounds (2, 2), and which of them count, see `_mask_bounds`.
+        bound: the silhouette's least u, v, then greatest u, v (2, 2), and which of them count.
         robust: whether large distances are down-weighted.
         H, g: (n, 3, 3) and (n, 3) sums over frames, which the equations are added to.
     """
@@ -453,15 +458,6 @@ def add_bound_equations(
             weight = (1.0 + (off / (0.5 * frames.size)) ** 2) ** -2
         H += weight[:, None, None] * J[:, :, None] * J[:, None, :]
         g += (weight * off)[:, None] * J
-
-
-def _mask_bounds(mask: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
-    """Return least u, v, then greatest u, v (2, 2) of a mask, and which are off the border."""
-    v, u = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    bounds = np.array([[u[0] - 0.5, v[0] - 0.5], [u[-1] + 0.5, v[-1] + 0.5]])
-    height, width = mask.shape
-    inside = np.array([[u[0] > 1, v[0] > 1], [u[-1] < width - 2, v[-1] < height - 2]])
-    return bounds, inside
 
 
 def overlap_areas(frames: PosedFrames, X_CW: Array, side: float) -> Array:

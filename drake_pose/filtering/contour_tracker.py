@@ -56,8 +56,8 @@ class TrackingSettings:
         standstill: a frame's iteration ends when the pose changes by less [rad, m].
         first_rounds: factor on ``rounds`` in the first two frames with masks, when rates are
             unknown.
-        start_deviation: standard deviation at the start of angles [rad], of the root's position and
-            other lengths [m], and of the log scale.
+        start_angle, start_length, start_log_scale: standard deviations at the start of angles
+            [rad], of the root's position and other lengths [m], and of the log scale.
         lost_distance: a track is lost if the distance of its contour from the edges is larger
             [pixel].
         lost_inlier_ratio: a track is lost if a smaller fraction of its contour has an edge nearby.
@@ -83,7 +83,9 @@ class TrackingSettings:
     rest_time: float | None = None
     standstill: float = 1e-3
     first_rounds: int = 4
-    start_deviation: float = 0.2
+    start_angle: float = 0.2
+    start_length: float = 0.03
+    start_log_scale: float = 0.1
     lost_distance: float = 12.0
     lost_inlier_ratio: float = 0.6
     lost_colour_distance: float = 1.5
@@ -153,12 +155,20 @@ class ContourTracker:
         self._period = period
 
     def acceleration(self, name: str) -> float:
-        """Return the acceleration's standard deviation of ``name``, in its unit or 1 per s^2."""
+        """Return the standard deviation of an element's acceleration [unit/s^2]."""
         settings = self.settings
+        return self._of_kind(
+            name,
+            settings.log_scale_acceleration,
+            settings.angle_acceleration,
+            settings.length_acceleration,
+        )
+
+    def _of_kind(self, name: str, log_scale: float, angle: float, length: float) -> float:
+        """Return ``log_scale``, ``angle`` or ``length``, whichever the element ``name`` is."""
         if name == LOG_SCALE:
-            return settings.log_scale_acceleration
-        is_angle = self.observation.is_angle(name)
-        return settings.angle_acceleration if is_angle else settings.length_acceleration
+            return log_scale
+        return angle if self.observation.is_angle(name) else length
 
     def start(self, x: Array) -> Track:
         """Return the track that starts at x (n,) with ``start_belief``, truncated by the limits."""
@@ -170,7 +180,9 @@ class ContourTracker:
         # Standard deviation of a rate [unit/step] that accelerates during ``memory``.
         picked_up = self.settings.memory * self._period
         rates = [picked_up * self.acceleration(name) for name in moving]
-        deviations = [*[self.settings.start_deviation] * len(moving), *rates]
+        settings = self.settings
+        kinds = (settings.start_log_scale, settings.start_angle, settings.start_length)
+        deviations = [*(self._of_kind(name, *kinds) for name in moving), *rates]
         return Belief(x, np.diag(np.square(deviations)))
 
     def follow(

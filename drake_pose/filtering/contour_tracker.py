@@ -171,11 +171,7 @@ class ContourTracker:
         return angle if self.observation.is_angle(name) else length
 
     def start(self, x: Array) -> Track:
-        """Return the track that starts at x (n,) with ``start_belief``, truncated by the limits."""
-        return Track(self.filter.start(self.start_belief(x)), None, False)
-
-    def start_belief(self, x: Array) -> Belief:
-        """Return the initial belief with mean x (n,), before limits and measurements."""
+        """Return the track that starts at the mean x (n,), truncated by the limits."""
         moving = self.observation.layout.moving
         # Standard deviation of a rate [unit/step] that accelerates during ``memory``.
         picked_up = self.settings.memory * self._period
@@ -183,7 +179,8 @@ class ContourTracker:
         settings = self.settings
         kinds = (settings.start_log_scale, settings.start_angle, settings.start_length)
         deviations = [*(self._of_kind(name, *kinds) for name in moving), *rates]
-        return Belief(x, np.diag(np.square(deviations)))
+        belief = Belief(x, np.diag(np.square(deviations)))
+        return Track(self.filter.start(belief), None, False)
 
     def follow(
         self,
@@ -488,7 +485,8 @@ class MatchAndTrack:
             track = self.tracker.start(self._state(start, last, frame))
         else:
             assert last_track is not None
-            track = self._follow(last_track, frame, False, ignore_evidence=True)
+            none = [None] * len(frame.masks)
+            track = self.tracker.follow(last_track, none, False, frame.root_position)
         result = replace(self._result(track, frame), found=False)
         return TrackerState(track, last.reference, matches, unexplained, retries), result
 
@@ -540,13 +538,8 @@ class MatchAndTrack:
             return x
         return frame.observation.unwrapped(x, last.track.state.best.mean)
 
-    def _follow(
-        self, track: Track, frame: _GivenFrame, first: bool, ignore_evidence: bool = False
-    ) -> Track:
-        """Return the track after a frame; ``first``: it begins; ``ignore_evidence``: predict."""
-        if ignore_evidence:
-            masks = [None] * len(frame.masks)
-            return self.tracker.follow(track, masks, first, frame.root_position)
+    def _follow(self, track: Track, frame: _GivenFrame, first: bool) -> Track:
+        """Return the track after a frame; ``first``: it begins in this frame."""
         return self.tracker.follow(track, frame.masks, first, frame.root_position, frame.pictures)
 
     def _is_lost(

@@ -310,7 +310,11 @@ class DateResult:
         estimates = {}
         for method, track in self._tracks.items():
             estimates[method] = track.step(images)
-            self.errors[method].append(self._joint_errors(estimates[method], q))
+            places = [
+                self._landmarks.positions(self._kinematics.poses(one[studio.skeleton.order]))
+                for one in (estimates[method], q)
+            ]
+            self.errors[method].append(1e3 * np.linalg.norm(places[0] - places[1], axis=1))
             if isinstance(track, PaperTrack):
                 true = [studio.skeleton.limb_points(q, name)[1] for name in LIMBS]
                 error = 1e3 * np.linalg.norm(track.middle_joints() - true, axis=1)
@@ -330,14 +334,6 @@ class DateResult:
         """Return MotionSample's limbs (4, 3, 2) [pixel] of a person at q (nq,)."""
         camera, skeleton = self.studio.cameras[SHOWN_CAMERA], self.studio.skeleton
         return np.array([camera.project(skeleton.limb_points(q, name))[0] for name in LIMBS])
-
-    def _joint_errors(self, found: Array, q: Array) -> Array:
-        """Return the errors (k,) [mm] of k joint centres, at found and true positions q (nq,)."""
-        order = self.studio.skeleton.order
-        places = [
-            self._landmarks.positions(self._kinematics.poses(one[order])) for one in (found, q)
-        ]
-        return np.asarray(1e3 * np.linalg.norm(places[0] - places[1], axis=1))
 
     @property
     def motions(self) -> tuple[str, ...]:

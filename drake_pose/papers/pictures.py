@@ -124,7 +124,7 @@ def save_hands(result: HandsResult, folder: Path) -> None:
     """
     for case, (track, *_) in result.trials.items():
         figure = Figure(figsize=(13.0, 7.0), layout="tight")
-        grid, states = figure.subplots(2, 3), track.sequence.states
+        grid, states = figure.subplots(2, 3), track.truths
         for axes, frame in zip(grid[0], (7, 23, 39), strict=True):
             if frame in track.kept:
                 _draw_silhouette(axes, track.kept[frame])

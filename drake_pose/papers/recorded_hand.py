@@ -27,7 +27,6 @@ from drake_pose.jobs.estimate.inputs import EstimateInputs, read_inputs
 from drake_pose.papers.shimada_sequences import (
     experiment_settings,
     run_frames,
-    summarise_hypotheses,
 )
 from drake_pose.papers.tables import Count, figure_table, uncounted
 from drake_pose.search import View
@@ -125,29 +124,29 @@ def run_sequence(
     shown = np.linspace(0, frames, 3, endpoint=False).astype(int).tolist()
     advance = count(f"frames of {folder.name}", frames)
     run = run_frames(parts, period, frames, shown, advance)
-    means = np.array([state.best.mean for state in run.states])
-    mirrored, rejected = summarise_hypotheses(run.states)
+    means = run.means
     lengths = means[-1][layout.indices(layout.constant)].tolist()
     figures: dict[str, object] = {
         "frames": frames,
         "silhouette_difference": float(np.median(run.differences)),
         "badly_matched": int(np.count_nonzero(run.differences > _WELL_MATCHED)),
         "lost": int(np.count_nonzero(run.differences > _UNMATCHED)),
-        "mirrored": mirrored,
-        "rejected_by_an_inequality": rejected,
+        "mirrored": run.mirrored,
+        "rejected_by_an_inequality": run.rejected,
         "ms_per_update": float(np.median(run.milliseconds)),
         "lengths": dict(zip(layout.constant, lengths, strict=True)),
     }
     truth = _truth(folder, inputs, hand)
     if names := [name for name in hand.flexions if name in truth]:
         moved = layout.indices(names)
-        deviations = np.array([state.best.deviations() for state in run.states])
         errors = np.abs(
             np.degrees(means[:, moved]) - np.column_stack([truth[name] for name in names])
         )
         figures["flexion_error_median"] = float(np.median(errors))
         figures["flexion_error_mean"] = float(np.mean(errors))
-        figures["inside_2sigma"] = float(np.mean(errors < 2.0 * np.degrees(deviations[:, moved])))
+        figures["inside_2sigma"] = float(
+            np.mean(errors < 2.0 * np.degrees(run.deviations[:, moved]))
+        )
     return RecordedHand(folder.name, figures, observation, means, run.kept)
 
 

@@ -42,7 +42,6 @@ from drake_pose.papers.shimada_sequences import (
     experiment_settings,
     make_sequence,
     run_frames,
-    track_of,
 )
 from drake_pose.papers.tables import Count, figure_table, uncounted
 from drake_pose.systems.bodies import held_positions
@@ -202,7 +201,7 @@ def _filter_sequence(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
         if t:
             belief = hand_filter.predict_belief(belief)
         belief = update(belief, make_measurement(hand_filter.observation, y), 1, truth).belief
-    return track_of(sequence, states, times)._replace(bound=belief.mean)
+    return HandTrack(states, np.array(times), sequence.states, belief.mean)
 
 
 def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> HandTrack:
@@ -228,9 +227,8 @@ def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
     silhouette = HandSilhouette(hand_filter, width, height, center)
     parts = build_hand_estimation(model, camera, silhouette, sequence.guess, positions, period)
     # Keep three frames for the pictures.
-    run = run_frames(parts, period, FRAMES, (7, 23, 39), lambda _done: None)
-    track = track_of(sequence, run.states, run.milliseconds)
-    return track._replace(differences=run.differences, kept=run.kept)
+    track = run_frames(parts, period, FRAMES, (7, 23, 39), lambda _done: None)
+    return replace(track, truths=sequence.states)
 
 
 def _figures(tracks: Sequence[HandTrack]) -> dict[str, float | int]:
@@ -239,7 +237,7 @@ def _figures(tracks: Sequence[HandTrack]) -> dict[str, float | int]:
     The NEES of the six lengths is 6 on average if the filter's covariance is consistent.
     """
     lengths_of, angles_of = HAND_STATE.indices(LENGTHS), HAND_STATE.indices((*SPREADS, *FLEXIONS))
-    truths = np.array([track.sequence.states for track in tracks])
+    truths = np.array([track.truths for track in tracks])
     means = np.array([track.means for track in tracks])
     errors = (means - truths)[:, -1]
     lengths = PIXELS_PER_METRE * np.mean(np.abs(errors[:, lengths_of]), axis=1)
@@ -248,7 +246,9 @@ def _figures(tracks: Sequence[HandTrack]) -> dict[str, float | int]:
     nees = np.array(
         [
             off
-            @ np.linalg.pinv(track.covariance[np.ix_(lengths_of, lengths_of)], hermitian=True)
+            @ np.linalg.pinv(
+                track.states[-1].best.covariance[np.ix_(lengths_of, lengths_of)], hermitian=True
+            )
             @ off
             for track, off in zip(tracks, errors[:, lengths_of], strict=True)
         ]

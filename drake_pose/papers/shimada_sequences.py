@@ -6,9 +6,9 @@
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from types import MappingProxyType
-from typing import NamedTuple, cast
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import cast
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
@@ -185,65 +185,43 @@ def _product(a: Array, b: Array) -> Array:
     return np.hstack([w * s - np.sum(v * u, axis=1, keepdims=True), vector])
 
 
-class HandTrack(NamedTuple):
-    """Beliefs of a filter after each frame of a sequence.
+@dataclass(frozen=True, eq=False)
+class HandTrack:
+    """Beliefs of a filter after each frame of a sequence."""
 
-    Attributes:
-        sequence: true states and measurements.
-        means, deviations: (frames, n) of the best hypothesis.
-        covariance: (n, n) of the last one.
-        milliseconds: (frames,) processor time of prediction, update and, with pictures, of the
-            measurement, but not of rendering; nan after a failure.
-        mirrored, rejected: number of hypotheses made by mirroring, and rejected by an inequality.
-        bound: (n,) final mean of a filter that linearises at the truth and has no limits; () with
-            pictures.
-        differences: (frames,) fraction by which silhouette and matched pose differ; () without
-            pictures.
-        kept: masks (H, W) of some frames, by index.
-    """
-
-    sequence: SyntheticSequence
-    means: Array
-    deviations: Array
-    covariance: Array
+    states: Sequence[FilterState]  # After each frame.
+    # (frames,) processor time of prediction, update and, with pictures, of the measurement, but not
+    # of rendering; nan after a failure.
     milliseconds: Array
-    mirrored: int
-    rejected: int
-    bound: Array = np.zeros(0)
-    differences: Array = np.zeros(0)
-    kept: Mapping[int, Mask] = MappingProxyType({})
+    # (frames, n) true states; () for a recorded sequence.
+    truths: Array = field(default_factory=lambda: np.zeros(0))
+    # (n,) final mean of a filter that linearises at the truth and has no limits; () with pictures.
+    bound: Array = field(default_factory=lambda: np.zeros(0))
+    # (frames,) fraction by which silhouette and matched pose differ; () without pictures.
+    differences: Array = field(default_factory=lambda: np.zeros(0))
+    kept: Mapping[int, Mask] = field(default_factory=dict)  # Masks (H, W) of some frames, by index.
 
+    @cached_property
+    def means(self) -> Array:
+        """Means (frames, n) of the best hypothesis."""
+        return np.array([state.best.mean for state in self.states])
 
-def summarise_hypotheses(states: Sequence[FilterState]) -> tuple[int, int]:
-    """Return the numbers of hypotheses that were mirrored, and rejected by an inequality."""
-    ends = [end.reason for state in states for end in state.rejections]
-    return len(ends) + len(states[-1].hypotheses) - 1, ends.count("constraint")
+    @cached_property
+    def deviations(self) -> Array:
+        """Standard deviations (frames, n) of the best hypothesis."""
+        return np.array([state.best.deviations() for state in self.states])
 
+    @property
+    def rejected(self) -> int:
+        """Number of hypotheses rejected by an inequality."""
+        reasons = [end.reason for state in self.states for end in state.rejections]
+        return reasons.count("constraint")
 
-def track_of(
-    sequence: SyntheticSequence, states: Sequence[FilterState], milliseconds: Sequence[float]
-) -> HandTrack:
-    """Return the track of a filter from its state after each frame, and each frame's time [ms]."""
-    best = [state.best for state in states]
-    mirrored, rejected = summarise_hypotheses(states)
-    return HandTrack(
-        sequence,
-        np.array([one.mean for one in best]),
-        np.array([one.deviations() for one in best]),
-        best[-1].covariance,
-        np.array(milliseconds),
-        mirrored,
-        rejected,
-    )
-
-
-class FilteredFrames(NamedTuple):
-    """What a diagram of hand sensor and filter gave in each frame."""
-
-    states: list[FilterState]
-    milliseconds: list[float]  # Processor time of measurement, prediction and update.
-    differences: Array  # (frames,) fraction by which silhouette and matched pose differ.
-    kept: dict[int, Mask]  # Masks (H, W) of some frames, by index.
+    @property
+    def mirrored(self) -> int:
+        """Number of hypotheses made by mirroring."""
+        ends = sum(len(state.rejections) for state in self.states)
+        return ends + len(self.states[-1].hypotheses) - 1
 
 
 def run_frames(
@@ -252,7 +230,7 @@ def run_frames(
     frames: int,
     kept_frames: Sequence[int],
     advance: Advance,
-) -> FilteredFrames:
+) -> HandTrack:
     """Run a diagram of ``build_hand_estimation`` or of recorded masks frame by frame.
 
     Args:
@@ -278,7 +256,7 @@ def run_frames(
         states.append(ekf.filter_state(ekf_context))
         milliseconds.append(1e3 * (time.thread_time() - begin))
         advance(t + 1)
-    return FilteredFrames(states, milliseconds, np.array(differences), kept)
+    return HandTrack(states, np.array(milliseconds), differences=np.array(differences), kept=kept)
 
 
 def experiment_settings(truncation: str = "joint", iterations: int = 20) -> FilterSettings:

@@ -1,6 +1,5 @@
 """Progress counts and tables shared by all experiments."""
 
-import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -42,13 +41,8 @@ def figure_table(
         table.add_column(escape(name), justify="right")
     for key, (label, form) in rows.items():
         if any(key in one for one in columns.values()):
-            cells = (_cell(one.get(key), form) for one in columns.values())
+            values = [one.get(key) for one in columns.values()]
+            # Only nan differs from itself.
+            cells = ("-" if one is None or one != one else form.format(one) for one in values)
             table.add_row(escape(label), *cells)
     return table
-
-
-def _cell(value: Any, form: str) -> str:
-    """Format a figure; "-" if it is None or nan."""
-    if value is None or (isinstance(value, float) and math.isnan(value)):
-        return "-"
-    return form.format(value)

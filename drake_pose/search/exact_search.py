@@ -73,14 +73,11 @@ class ExactSearch:
 
     Args:
         grids: beam searches on grids of 20 and of 15 degrees, which the settings' stages refer to.
-        settings: parameters of the search; None: the defaults.
     """
 
-    def __init__(
-        self, grids: Sequence[BeamSearch], settings: ExactSearchSettings | None = None
-    ) -> None:
-        self._settings = settings or ExactSearchSettings()
-        self._grids = [grids[k].with_stages(stage) for k, stage in self._settings.stages]
+    def __init__(self, grids: Sequence[BeamSearch]) -> None:
+        self.settings = ExactSearchSettings()
+        self._grids = [grids[k].with_stages(stage) for k, stage in self.settings.stages]
         self.body = RefinementBody(grids[0].tree)
         self._parts = PartSearch(self.body, grids[0].sampled.values)
 
@@ -97,7 +94,7 @@ class ExactSearch:
         Returns:
             The pose; None if J of all poses of some grid is hopelessly large, or the time is up.
         """
-        settings, length, reached = self._settings, problem.border_length, None
+        settings, length, reached = self.settings, problem.border_length, None
         for grid in self._grids:
             left = deadline - time.perf_counter()
             if left <= 0.0:
@@ -129,7 +126,7 @@ class ExactSearch:
         start = min((parameters for parameters, _, _ in coarse), key=problem.J)
         first_J = float(problem.J(start))
         size = float(np.sqrt(problem.area / len(problem.views)))
-        hopeless = max(self._settings.hopeless, self._settings.hopeless_fraction * size)
+        hopeless = max(self.settings.hopeless, self.settings.hopeless_fraction * size)
         if first_J > hopeless * length:
             return None
         reached = self.refine(problem, start, deadline)
@@ -169,22 +166,21 @@ class ExactSearch:
 
         ``reached``: from ``find`` or ``refine``. ``tree``: with its root where the body is.
         """
-        settings, others = self._settings, []
+        settings, others = self.settings, []
         while True:
             limit = reached.J + NeighbourhoodSettings.noise * problem.border_length
             others = reached.neighbourhood.others(reached.parameters, limit, settings.same)
             if not others or problem.J(others[0]) >= reached.J:
                 break
             reached = self._end(problem, reached, others[0])
-        return reached, find_intervals(problem, others, reached.parameters, tree, settings)
+        return reached, find_intervals(problem, others, reached.parameters, tree)
 
 
 def find_intervals(
     problem: RefinementProblem,
     others: Sequence[np.ndarray],
     parameters: np.ndarray,
-    tree: PoseTree | None = None,
-    settings: ExactSearchSettings | None = None,
+    tree: PoseTree,
 ) -> PoseSet:
     """Return the pose set of exact silhouettes: modes, and an interval for each value.
 
@@ -201,12 +197,11 @@ def find_intervals(
         problem: the silhouettes and the body.
         others: alternative poses (m + 4,) that are as good, best first.
         parameters: (m + 4,) the best pose, refined, as in ``RefinementBody``.
-        tree: the pose tree, with its root where the body is; None: the body's.
-        settings: parameters of the intervals; None: the defaults.
+        tree: the pose tree, with its root where the body is.
 
     Returns the set, with the best pose as the representative of the first mode.
     """
-    settings = settings or ExactSearchSettings()
+    settings = ExactSearchSettings()
     body, kinematics = problem.body, problem.body.kinematics
     count = len(kinematics.names)
     free = body.freedom()
@@ -245,4 +240,4 @@ def find_intervals(
         modes.append(FittedPose(poses[0], 0.0, *ends, len(poses)))
         Js.append(float(problem.J(first)))
     tolerance = NeighbourhoodSettings.noise * problem.border_length
-    return describe_modes(kinematics, tree or body.tree, modes, Js, tolerance, fits)
+    return describe_modes(kinematics, tree, modes, Js, tolerance, fits)

@@ -189,11 +189,11 @@ class PaperRun:
         covers. Returns the candidate list; None if no pose satisfies (4).
         """
         parent = self.nodes[node].parent
-        X_WN = self.scoring.candidate_poses(
-            node, np.eye(4) if parent < 0 else self._adopted()[1][parent]
-        )
+        sampled = self.scoring.sampled
+        X_WP = np.eye(4) if parent < 0 else self._adopted()[1][parent]
+        X_WN = X_WP @ sampled.X_PN[node]
         samples = np.arange(len(X_WN))
-        if self.scoring.sampled.tree.source(node) != node:
+        if sampled.tree.source(node) != node:
             samples = self._adopted()[0][[parent]]
             X_WN = X_WN[samples]
         outside, covered = self.scoring.candidate_areas(node, samples, X_WN, uncovered)

@@ -31,7 +31,7 @@ from drake_pose.fit.surfaces import simplify_outlines, simplify_surfaces
 from drake_pose.search.beam_search import TOLERANT_STAGES, BeamSearch, BeamSearchSettings
 from drake_pose.search.coarse_search import CoarsePoses, CoarseSearch
 from drake_pose.search.estimates import PoseEstimate, View, require_views
-from drake_pose.search.exact_search import ExactPose, ExactSearch, ExactSearchSettings
+from drake_pose.search.exact_search import ExactPose, ExactSearch
 from drake_pose.search.partial_poses import coarsen
 from drake_pose.search.refinement import RefinementProblem
 from drake_pose.search.sampled_body import SampledBody
@@ -102,7 +102,7 @@ class MultiStartSearch:
         self, tree: PoseTree, time_limit: float | None = None, *, exact_masks: bool = False
     ) -> None:
         self.tree, self.exact_masks = tree, exact_masks
-        self.settings, self.exact_settings = MultiStartSettings(), ExactSearchSettings()
+        self.settings = MultiStartSettings()
         self._time_limit, self._alternatives = time_limit, True
         self._grid = BeamSearch(tree, BeamSearchSettings(interval=self.settings.interval))
         self._body = self._grid.body
@@ -123,7 +123,7 @@ class MultiStartSearch:
     @cached_property
     def exact(self) -> ExactSearch:
         """The search in exact masks."""
-        return ExactSearch((self.beam, self._grid), self.exact_settings)
+        return ExactSearch((self.beam, self._grid))
 
     def without_alternatives(self) -> "MultiStartSearch":
         """Return the same search without alternative poses and without a pose set."""
@@ -244,14 +244,15 @@ class _MultiStartRun:
             rounds: number of rounds of the search for alternative poses.
             with_set: whether the pose set is computed.
         """
-        tree, exact, settings = (
-            self._kinematics.tree,
-            self._search.exact,
-            self._search.exact_settings,
-        )
+        tree, exact, settings = self._kinematics.tree, self._search.exact, self._settings
         problem, found, poses = self._problem, None, list[FittedPose]()
-        exactly = settings.exact * problem.border_length
-        pool = self._begin()
+        exactly = exact.settings.exact * problem.border_length
+        # The coarse search is kept for ``_alternatives_to``.
+        self._coarse = CoarseSearch(self._body, self._clean.views, None if self._proceed() else 1)
+        starts = self._coarse.choose_distinct(
+            self._coarse.find(), settings.starts, settings.separation
+        )
+        pool = refine_best(self._fit, self._values(starts), self._passes, self._proceed)
         first_J = self._J(pool[0].values)
         searched = self._looks_exact(pool[0].values)
         if searched:
@@ -292,25 +293,13 @@ class _MultiStartRun:
         values of the best pose by robust costs [rad or m]. Returns the better pose; None if J of
         neither is below ``settings.plausible``, or if J at the values as they are is smaller.
         """
-        exact, settings, J = self._search.exact, self._search.exact_settings, self._J(values)
+        exact, J = self._search.exact, self._J(values)
         length = self._problem.border_length
         if self._proceed():
             other = exact.refine(self._problem, self._parameters(values), self._deadline)
             found = min((one for one in (found, other) if one), key=lambda one: one.J)
-        explained = found is not None and found.J < min(J, settings.plausible * length)
+        explained = found is not None and found.J < min(J, exact.settings.plausible * length)
         return found if explained else None
-
-    def _begin(self) -> list[FittedPose]:
-        """Return the poses of the coarse search, refined but for the final stage, best first.
-
-        The coarse search is kept for ``_alternatives_to``.
-        """
-        settings = self._settings
-        self._coarse = CoarseSearch(self._body, self._clean.views, None if self._proceed() else 1)
-        starts = self._coarse.choose_distinct(
-            self._coarse.find(), settings.starts, settings.separation
-        )
-        return refine_best(self._fit, self._values(starts), self._passes, self._proceed)
 
     def _looks_exact(self, values: np.ndarray) -> bool:
         """Return whether masks may be exact: their border is the body's at ``values`` (m,)."""
@@ -328,7 +317,7 @@ class _MultiStartRun:
                 borders.append((inside > 0) & (cv2.erode(inside, kernel) == 0))
             met += int(np.count_nonzero(borders[0] & borders[1]))
             length += int(np.count_nonzero(borders[0]))
-        return met >= self._search.exact_settings.coinciding * length
+        return met >= self._search.exact.settings.coinciding * length
 
     def _search_robustly(self, pool: list[FittedPose], rounds: int) -> list[FittedPose]:
         """Return the best poses by robust costs, refined to the end, best first.

@@ -25,7 +25,7 @@ from drake_pose.body import PoseTree
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.search.beam_search import BeamSearch, BeamSearchSettings, Stage, grow
-from drake_pose.search.estimates import PoseEstimate, View
+from drake_pose.search.estimates import PoseEstimate, View, require_views
 from drake_pose.search.partial_poses import PoseStore, SilhouetteBits, coarsen
 from drake_pose.search.parts import NeighbourhoodSearch, PartSearch
 from drake_pose.search.refinement import (
@@ -228,8 +228,7 @@ class RootPlacementSearch:
 
         Raises SettingsError: if there is no view, or a scale cannot be searched with these cameras.
         """
-        if not views:
-            raise SettingsError("a match needs at least one view, but none was given")
+        require_views(views)
         begin = time.perf_counter()
         limit = self.settings.time_limit
         deadline = math.inf if limit is None else begin + limit

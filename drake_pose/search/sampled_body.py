@@ -178,10 +178,6 @@ class Scoring:
         self.silhouette_area = float(sum(int(view.mask.sum()) for view in self.views))
         self.X_CW = [np.asarray(view.camera.X_CW) for view in self.views]
 
-    def candidate_poses(self, node: int, X_WP: np.ndarray) -> np.ndarray:
-        """Return X_WN (n, 4, 4) of a node at all its samples, with its parent at X_WP (4, 4)."""
-        return X_WP @ self.sampled.X_PN[node]
-
     def candidate_areas(
         self, node: int, samples: np.ndarray, X_WN: np.ndarray, regions: Regions
     ) -> tuple[np.ndarray, np.ndarray]:

@@ -114,10 +114,11 @@ def test_lengths_converge_with_drakes_pictures(tmp_path):
         assert figures["angle_rmse"] < 3.0
         assert figures["silhouette_difference"] < 0.045
         assert figures["mirrored"] > 0
-        trial = result.trials[key][0]
-        drawn, means = trial.sequence, trial.means
+        trial, generator = result.trials[key][0], np.random.default_rng([5, 0, int(CASES[key])])
+        drawn = make_sequence(CASES[key], "lines", HandObservation(), generator)
+        np.testing.assert_array_equal(trial.truths, drawn.states)
         first = np.abs(drawn.guess.mean - drawn.states[0])[LENGTH].mean()
-        assert np.abs(means[-1] - drawn.states[-1])[LENGTH].mean() < 0.2 * first
+        assert np.abs(trial.means[-1] - drawn.states[-1])[LENGTH].mean() < 0.2 * first
     save_hands(result, tmp_path)
     assert {file.stem for file in tmp_path.iterdir()} == set(CASES)
 
@@ -127,7 +128,7 @@ def test_each_case_converges_to_its_true_lengths_inside_table_1(result):
     rows = experiment_filter()[0].inequalities
     for key, r_13 in CASES.items():
         trials = result.trials[key]
-        truths = [trial.sequence.states[-1] for trial in trials]
+        truths = [trial.truths[-1] for trial in trials]
         assert truths[0][HAND_STATE.index("length_13")] == r_13 / 1000
         ends = [trial.means[-1] for trial in trials]
         errors = 1000 * np.mean(np.abs(np.subtract(ends, truths)[:, LENGTH]), axis=1)

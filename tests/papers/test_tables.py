@@ -1,10 +1,8 @@
 import io
 import math
 
-import pytest
 from rich.console import Console
 
-from drake_pose.errors import SettingsError, require_at_least, require_choice
 from drake_pose.papers.tables import figure_table
 
 
@@ -20,11 +18,3 @@ def test_table_shows_figures_side_by_side():
         assert word in text
     assert "nowhere" not in text
     assert [list(one.cells) for one in table.columns[1:]] == [["-", "-"], ["4", "25.0%"]]
-
-
-def test_bad_counts_and_choices_are_named():
-    require_at_least(1, runs=1)
-    with pytest.raises(SettingsError, match="images must be 1 or more, not 0"):
-        require_at_least(1, runs=1, images=0)
-    with pytest.raises(SettingsError, match="angle must be one of a, b, not 'c'"):
-        require_choice("angle", "c", ("a", "b"))

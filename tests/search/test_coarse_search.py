@@ -10,14 +10,9 @@ from drake_pose.search import BeamSearchSettings, View
 from drake_pose.search.coarse_search import CoarseSearch, fill_cover, score_samples, spread_points
 from drake_pose.search.sampled_body import SampledBody
 from drake_pose.silhouette.pictures.masks import signed_distances
-from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_pose, draw_view, split
+from tests.search.arms import arm_cameras, damaged_views, draw_pose, draw_view, split
 
 INTERVAL = np.radians(15.0)
-
-
-@pytest.fixture(scope="module")
-def tree(tmp_path_factory):
-    return arm_tree(tmp_path_factory.mktemp("arm"))
 
 
 @pytest.fixture(scope="module")

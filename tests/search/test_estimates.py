@@ -48,8 +48,13 @@ def test_invalid_masks_are_refused(mask, reason):
 
 
 @pytest.fixture(scope="module")
-def tree(tmp_path_factory):
-    return crane(tmp_path_factory.mktemp("crane")).pose_tree()
+def model(tmp_path_factory):
+    return crane(tmp_path_factory.mktemp("crane"))
+
+
+@pytest.fixture(scope="module")
+def tree(model):
+    return model.pose_tree()
 
 
 @pytest.mark.parametrize("around", [0.0, TURN, -2.0 * TURN])
@@ -151,11 +156,6 @@ def test_covariance_gives_student_intervals_within_limits(tree):
     lower, upper = kinematics.local_limits(np.array([0.5, 0.2]))
     np.testing.assert_allclose([joint.low for joint in wide.joints], lower)
     np.testing.assert_allclose([joint.high for joint in wide.joints], upper)
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory):
-    return crane(tmp_path_factory.mktemp("crane"))
 
 
 @pytest.mark.parametrize("truth", [(178.0, 331.5), (-181.0, -28.5), (-100.0, 190.0)])

@@ -11,7 +11,6 @@ from drake_pose.silhouette.scoring import draw_mask
 from drake_pose.workers import use_workers
 from tests.search.arms import (
     arm_cameras,
-    arm_tree,
     damaged_views,
     draw_pose,
     draw_view,
@@ -19,11 +18,6 @@ from tests.search.arms import (
     split,
 )
 from tests.search.bodies import front_camera, swinging_chain
-
-
-@pytest.fixture(scope="module")
-def tree(tmp_path_factory):
-    return arm_tree(tmp_path_factory.mktemp("arm"))
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +131,7 @@ def test_exact_search_accepts_exact_masks_and_gives_up_on_others(chain):
     problem = RefinementProblem(chain.exact.body, [view])
     found = chain.exact.find(problem, None, np.inf)
     assert problem.J(found.parameters) == found.J <= found.first_J
-    assert found.J <= chain.exact_settings.exact * problem.border_length
+    assert found.J <= chain.exact.settings.exact * problem.border_length
     assert chain.exact.find(problem, None, 0.0) is None, "the time is up"
     moved = np.roll(view.mask, 60, axis=1)
     other = RefinementProblem(chain.exact.body, [View(view.camera, moved)])

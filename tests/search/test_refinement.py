@@ -262,7 +262,7 @@ def test_intervals_of_exact_masks_contain_the_true_values(body, search):
         neighbourhood.improve(refined, 0.0, everywhere=True)
         others = neighbourhood.others(refined, 2.0 * problem.J(refined) + 40.0, 0.1)
         others = [pose for pose in others if problem.J(pose) <= problem.J(refined) + 20.0]
-        intervals = find_intervals(problem, others, refined)
+        intervals = find_intervals(problem, others, refined, body.tree)
         assert len(intervals.joints) == len(true) - 4
         first = np.concatenate(intervals.modes[0].node_values)
         np.testing.assert_allclose(first, refined[:-4], atol=1e-12)

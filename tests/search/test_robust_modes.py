@@ -19,7 +19,7 @@ from drake_pose.search.self_motions import Flip, flips
 from drake_pose.search.views_fit import FittedPose, RobustModes, RobustSettings, distinct
 from drake_pose.silhouette.outline import TreeSurfaces
 from tests.body.models import joint, link, urdf, write
-from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_view, is_held, split
+from tests.search.arms import arm_cameras, damaged_views, draw_view, is_held, split
 
 TRUTH = np.array([0.6, 0.7, -0.7, 0.9, 0.3])
 FINE = tuple(AnnealingStage(scale, 0.0125, 8) for scale in (0.025, 0.0125))
@@ -32,8 +32,8 @@ def find(kinematics, views, values, settings=None):
 
 
 @pytest.fixture(scope="module")
-def kinematics(tmp_path_factory):
-    return TreeKinematics(arm_tree(tmp_path_factory.mktemp("arm")))
+def kinematics(tree):
+    return TreeKinematics(tree)
 
 
 def test_intervals_contain_the_true_values_and_widen_with_damage(kinematics):
@@ -108,26 +108,23 @@ def test_distinct_keeps_the_best_of_equal_poses():
     assert [pose.cost for pose in distinct(poses, 1)] == [1]
 
 
-VALUES = np.array([0.6, 0.7, -0.7, 0.9, 0.3])
-
-
 def poses(kinematics, values):
     """Return X_WN (nodes, 4, 4) by the pose tree instead of the compiled kinematics."""
     return kinematics.tree.node_poses(split(kinematics.tree, values))
 
 
 def test_flips_keep_the_pose_of_the_last_link(kinematics):
-    found = flips(kinematics, VALUES)
-    before = poses(kinematics, VALUES)
+    found = flips(kinematics, TRUTH)
+    before = poses(kinematics, TRUTH)
     assert found
     for flip in found:
         after = poses(kinematics, flip.values)
         np.testing.assert_allclose(after[-1], before[-1], atol=1e-9)
-        assert np.abs(flip.values - VALUES).max() > 0.1
+        assert np.abs(flip.values - TRUTH).max() > 0.1
         assert ((flip.values >= kinematics.lower) & (flip.values <= kinematics.upper)).all()
-        np.testing.assert_array_equal(flip.values[~flip.changed], VALUES[~flip.changed])
+        np.testing.assert_array_equal(flip.values[~flip.changed], TRUTH[~flip.changed])
     # Turret and roll turn by half a turn, the shoulder changes its sign.
-    expected = VALUES + np.pi * np.array([-1, 0, 1, 0, 0])
+    expected = TRUTH + np.pi * np.array([-1, 0, 1, 0, 0])
     expected[1] *= -1
     best = min(found, key=lambda flip: np.abs(flip.values - expected).max())
     np.testing.assert_allclose(best.values, expected, atol=1e-9)
@@ -136,9 +133,9 @@ def test_flips_keep_the_pose_of_the_last_link(kinematics):
 
 
 def test_flipping_twice_returns_to_the_start(kinematics):
-    for flip in flips(kinematics, VALUES):
+    for flip in flips(kinematics, TRUTH):
         back = [again.values for again in flips(kinematics, flip.values)]
-        assert min(np.abs(values - VALUES).max() for values in back) < 1e-9
+        assert min(np.abs(values - TRUTH).max() for values in back) < 1e-9
 
 
 def test_flips_outside_the_limits_are_left_out(kinematics):

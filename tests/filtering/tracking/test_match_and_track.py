@@ -229,16 +229,10 @@ def test_tracking_by_colours_alone_starts_from_given_positions(body):
 def test_histograms_are_learned_in_the_first_frame_also_from_a_searched_pose(body):
     """The second frame has no mask, and the body has moved by several pixels."""
     moved = np.array([[0.2, 0.9, -0.6], [0.32, 0.8, -0.7]])
-    pose = PoseEstimate(
-        True,
-        moved[0],
-        np.eye(4),
-        tuple(body.pose_tree().values_from_positions(moved[0])),
-        0.0,
-        1.0,
-        "end",
-    )
-    search = KnownPoses(body.pose_tree(), [])
+    tree = body.pose_tree()
+    values = tree.values_from_positions(moved[0])
+    pose = PoseEstimate.of_values(tree, values, 0.0, 1.0, stopped_by="end")
+    search = KnownPoses(tree, [])
     search.match = lambda views, root_position=None: pose
     follower, state = MatchAndTrack(search, [CAMERA], PERIOD), TrackerState()
     renderer = LabelRenderer(body, CAMERA)
@@ -272,8 +266,8 @@ def test_unexplained_frames_are_predicted_near_the_truth(body, fraction):
         J, area = follower.tracker.observation.difference(
             follower.tracker.observation.state(q), [(CAMERA, view.mask) for view in views]
         )
-        values = tuple(search.tree.values_from_positions(q, np.eye(4)))
-        return PoseEstimate(True, q, np.eye(4), values, float(J), float(area), "end")
+        values = search.tree.values_from_positions(q)
+        return PoseEstimate.of_values(search.tree, values, float(J), float(area), stopped_by="end")
 
     search.match = match
     follower, state = MatchAndTrack(search, [CAMERA], PERIOD), TrackerState()
@@ -322,10 +316,9 @@ def test_a_search_that_reached_its_time_limit_is_repeated(body):
     def match(views, root_position=None):
         asked.append(len(asked))
         first = len(asked) == 1
-        at = q + (0.5 if first else 0.0)
-        values = tuple(tree.values_from_positions(at, np.eye(4)))
+        values = tree.values_from_positions(q + (0.5 if first else 0.0))
         J, stopped_by = (40.0, "time_limit") if first else (0.0, "end")
-        return PoseEstimate(True, at, np.eye(4), values, J, 100.0, stopped_by)
+        return PoseEstimate.of_values(tree, values, J, 100.0, stopped_by=stopped_by)
 
     search.match = match
     follower, state = MatchAndTrack(search, [CAMERA], PERIOD), TrackerState()

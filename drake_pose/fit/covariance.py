@@ -298,7 +298,7 @@ def estimate_sizes(
         P (n, n) projects the values out: P = V^-1 - V^-1 X H^-1 X^T V^-1, with V the covariance.
         """
         L = np.linalg.cholesky((np.exp(2.0 * t) @ stacked).reshape(n, n))
-        inverse = symmetric(dpotri(L.T)[0].T)
+        inverse = symmetric(dpotri(L.T)[0].T) if n else L  # LAPACK refuses empty matrices.
         VX = inverse @ residuals.X
         H = residuals.X.T @ VX + prior_information
         P = inverse - VX @ np.linalg.solve(H, VX.T)
@@ -381,10 +381,12 @@ def nuisance_covariance(
     no nuisances.
 
     Args:
-        residuals: the residuals, with at least one group of nuisances.
+        residuals: the residuals; without nuisances the covariance is 0.
         sizes: sizes of the errors and nuisances, see ``estimate_sizes``.
         is_angle: (m,) which values are angles; the others are lengths.
     """
+    if not residuals.nuisances:
+        return np.zeros((len(is_angle), len(is_angle))), residuals
     white = sizes.noise**2 + sizes.repeated**2
     A = np.concatenate(residuals.nuisances, axis=1)
     variances = np.repeat(np.square(sizes.nuisances), [Z.shape[1] for Z in residuals.nuisances])

@@ -108,7 +108,7 @@ def test_nuisances_widen_the_intervals_of_dependent_values(size):
     assert np.median(widths) < 4.0
 
 
-def test_unobservable_values_have_the_prior_deviation():
+def test_unobservable_values_have_the_prior_deviation(capfd):
     empty = Distances(
         np.zeros(0),
         np.zeros((0, 3)),
@@ -118,10 +118,14 @@ def test_unobservable_values_have_the_prior_deviation():
         np.zeros(0, dtype=np.intp),
     )
     sizes = estimate_sizes(empty, ANGLES)
+    by_nuisances, without = nuisance_covariance(empty, sizes, ANGLES)
+    assert not by_nuisances.any()
+    assert without is empty
     for is_angle, widest in ((ANGLES, 2.0 * np.pi), (~ANGLES, 10.0)):
         deviations = np.sqrt(np.diag(values_covariance(empty, sizes, ALL, is_angle)))
         assert deviations[0] == pytest.approx(widest / np.sqrt(12.0))
         assert deviations[1] < 0.01
+    assert capfd.readouterr() == ("", "")
 
 
 def test_moving_parts_have_no_repeated_noise():

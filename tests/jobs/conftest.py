@@ -1,7 +1,5 @@
 """Fixtures for tests of several jobs."""
 
-from pathlib import Path
-
 import pytest
 
 from drake_pose.jobs.cluster import open_cluster
@@ -18,6 +16,6 @@ def cluster():
 
 
 @pytest.fixture
-def out(tmp_path: Path) -> Path:
+def out(tmp_path):
     """The result folder of a job."""
     return tmp_path / "out"

@@ -1,7 +1,6 @@
 """Batches of audits: errors by scene, and finished audits are kept."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from tests.jobs.scenes import read_rows
 
 
 @pytest.mark.slow
-def test_errors_are_listed_by_scene_and_finished_audits_are_kept(tmp_path: Path, out: Path) -> None:
+def test_errors_are_listed_by_scene_and_finished_audits_are_kept(tmp_path, out):
     """A correct scene, one with a frame whose elbow reading is wrong, one without joints."""
     for name in ("first", "second"):
         (tmp_path / name).mkdir()

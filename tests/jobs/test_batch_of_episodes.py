@@ -40,6 +40,10 @@ def totals(place, turn_deg=0.0, sd=0.001):
     }  # fmt: skip
 
 
+def rows_of(table):
+    return list(csv.DictReader(io.StringIO(table.text)))
+
+
 def test_a_significant_difference_to_earlier_episodes_is_a_move(tmp_path):
     episodes = {
         "first": totals([1.0, 0.0, 0.5]),
@@ -50,8 +54,7 @@ def test_a_significant_difference_to_earlier_episodes_is_a_move(tmp_path):
         "again": totals([1.0, 0.02, 0.5], 1.0),
     }
     found = episodes_table(episodes, is_drawn=True)
-    text, cameras = found.text, found.files
-    rows = list(csv.DictReader(io.StringIO(text)))
+    cameras, rows = found.files, rows_of(found)
     assert tuple(rows[0]) == COLUMNS
     assert [row["moved"] for row in rows] == ["", "no", "yes", "no"]
     assert float(rows[2]["moved_deg"]) == pytest.approx(1.0)
@@ -63,9 +66,7 @@ def test_a_significant_difference_to_earlier_episodes_is_a_move(tmp_path):
     before = load_cameras(tmp_path / "before.yaml")["left"]
     np.testing.assert_allclose(before.X_WC[:3, 3], [1.0005, -0.0005, 0.5])
     assert [row["pose"] for row in rows] == ["1", "1", "2", "2"]
-    assert found.moves[0].startswith(
-        "camera 'left' moved by 1.00 degrees and 20.5 mm before episode"
-    )
+    assert found.moves[0].startswith("camera 'left' moved by 1.00 degrees and 20.5 mm before")
     assert found.moves[1:] == (
         "camera 'left', pose 1: first, same", "camera 'left', pose 2: bumped, again"
     )  # fmt: skip
@@ -80,7 +81,7 @@ def test_a_camera_that_is_put_back_shares_its_earlier_pose():
     places = np.array([[1.0, 0.0, 0.5]] * 8 + [[1.0, 0.02, 0.5]] * 8 + [[1.0, 0.0, 0.5]] * 8)
     noisy = places + rng.normal(0.0, 0.001, places.shape)
     found = episodes_table({f"e{k:02d}": totals(list(one)) for k, one in enumerate(noisy)})
-    rows = list(csv.DictReader(io.StringIO(found.text)))
+    rows = rows_of(found)
     assert [row["pose"] for row in rows] == ["1"] * 8 + ["2"] * 8 + ["1"] * 8
     assert [row["scene"] for row in rows if row["moved"] == "yes"] == ["e08", "e16"]
     assert any("moved back to pose 1" in one and "e16" in one for one in found.moves)
@@ -115,8 +116,7 @@ def test_combined_pose_is_the_information_weighted_mean():
     # A slow drift of insignificant steps is a move as well.
     far = 5.0 * 0.001
     drifting = {str(k): totals([k * far, 0.0, 0.0], sd=0.002) for k in range(9)}
-    text = episodes_table(drifting).text
-    moved = [row["moved"] for row in csv.DictReader(io.StringIO(text))]
+    moved = [row["moved"] for row in rows_of(episodes_table(drifting))]
     assert 0 < moved.count("yes") < 5
     # The second camera has not moved and has one pose in all files.
     episodes = {str(k): totals([float(k), 0.0, 0.0]) for k in range(2)}

@@ -1,5 +1,4 @@
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from tests.cli import run_command
 from tests.jobs.scenes import read_rows
 
 
-def test_demo(tmp_path: Path) -> None:
+def test_demo(tmp_path):
     out = tmp_path / "demo"
     result = run_command(["demo", "--out", str(out)])
     assert result.exit_code == 0, result.output
@@ -48,9 +47,7 @@ def test_demo(tmp_path: Path) -> None:
         assert kept <= {path.name for path in folder.iterdir()}
 
 
-def test_an_earlier_demonstration_is_replaced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_earlier_demonstration_is_replaced(tmp_path, monkeypatch):
     (tmp_path / "overlay" / "front").mkdir(parents=True)
     (tmp_path / "overlay" / "front" / "0010.png").touch()
     (tmp_path / "summary.json").write_text(json.dumps({"scene": str(stored_scene("human"))}))

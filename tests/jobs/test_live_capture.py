@@ -9,7 +9,7 @@ from drake_pose.files.settings import LiveSettings
 from drake_pose.jobs.live import capture_live, load_live_scene, run_live, take_empty_room
 from tests.cli import run_command
 from tests.jobs.live_scenes import RATE_HZ, absent, standing, write_studio
-from tests.jobs.scenes import read_rows as rows_of
+from tests.jobs.scenes import read_rows
 
 FRAMES = 12
 GAP, HOLE = range(5, 10), 11
@@ -41,7 +41,7 @@ def captured(studio, person, tmp_path_factory):
 def test_person_is_captured_frame_by_frame(captured, person):
     out, result, _ = captured
     assert not result[1]
-    rows = rows_of(out / "poses.csv")
+    rows = read_rows(out / "poses.csv")
     assert [row["frame"] for row in rows] == [f"{k:06d}" for k in SHOWN]
     assert rows[0]["error"] == "", "nobody was there"
     found = [np.degrees(float(row["left_upper_arm_z"])) for row in rows[1:]]
@@ -49,7 +49,7 @@ def test_person_is_captured_frame_by_frame(captured, person):
     # Three small pictures do not always determine an arm.
     assert np.median(off) < 3.0
     assert np.sort(off)[-2] < 9.0
-    times = [float(row["time"]) for row in rows_of(out / "timestamps.csv")]
+    times = [float(row["time"]) for row in read_rows(out / "timestamps.csv")]
     np.testing.assert_allclose(times, np.array(SHOWN) / RATE_HZ, atol=1e-6)
     assert result[0].summary["frame_rate_hz"] == pytest.approx(RATE_HZ)
     assert {"joint_centres.csv", "joint_centres.trc", "positions.mot"} <= {
@@ -60,10 +60,10 @@ def test_person_is_captured_frame_by_frame(captured, person):
 
 def test_intervals_of_positions_are_written(captured, person):
     out, _, _ = captured
-    rows = rows_of(out / "joints.csv")
+    rows = read_rows(out / "joints.csv")
     frames = [row["frame"] for row in rows if row["joint"] == "left_upper_arm_z"]
     assert frames == [f"{k:06d}" for k in SHOWN[1:]], "nobody was there at first"
-    poses = {row["frame"]: row for row in rows_of(out / "poses.csv")}
+    poses = {row["frame"]: row for row in read_rows(out / "poses.csv")}
     widths = {}
     for row in rows:
         is_angle = person.position_kinds[person.position_index(row["joint"])] == "angle"
@@ -100,7 +100,7 @@ def test_ctrl_c_keeps_all_frames(studio, person, tmp_path):
         scene, tmp_path / "out", person.path, settings, replay=False, on_frame=interrupt
     )
     assert interrupted
-    assert len(rows_of(tmp_path / "out" / "poses.csv")) == 6
+    assert len(read_rows(tmp_path / "out" / "poses.csv")) == 6
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["complete"]
     assert (tmp_path / "out" / "joint_centres.trc").is_file()
 

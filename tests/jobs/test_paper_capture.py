@@ -1,6 +1,5 @@
 """The method of Date et al. on recorded colour pictures, from the command line."""
 
-import csv
 import json
 
 import numpy as np
@@ -11,6 +10,7 @@ from drake_pose.jobs.live import capture_live, load_live_scene
 from drake_pose.person.date.skeleton import registered_positions
 from tests.cli import run_command
 from tests.jobs.live_scenes import standing, write_studio
+from tests.jobs.scenes import read_rows
 
 PLACE = (0.12, -0.1, 1.55)
 HEADING = 0.3
@@ -47,8 +47,7 @@ def test_person_is_tracked_from_the_registered_pose(studio, person, skeleton, pa
     summary = json.loads(done.stdout)
     assert summary["method"] == "paper_capture"
     assert "before the registered pose" in done.stderr
-    with (out / "poses.csv").open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
+    rows = read_rows(out / "poses.csv")
     assert len(rows) == len(path)
     assert [row["error"] == "" for row in rows[:4]] == [True] * 4
     assert all(row["error"] != "" for row in rows[5:])

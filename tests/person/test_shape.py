@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from drake_pose.body import ArticulatedModel
 from drake_pose.fit.surfaces import with_radius_scales
 from drake_pose.person.pose_tracker import (
     PersonShape,
@@ -12,7 +11,7 @@ from drake_pose.person.pose_tracker import (
 )
 
 
-def test_tracker_has_the_known_lengths_and_radius_scales(shaped_person: ArticulatedModel) -> None:
+def test_tracker_has_the_known_lengths_and_radius_scales(shaped_person):
     tree = shaped_person.pose_tree()
     held = shape_values(tree)
     assert held.any()

@@ -8,7 +8,6 @@ from drake_pose.errors import SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.person.views import edge_spacing, see_silhouette
-from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.systems.cameras import build_camera_rig
 from drake_pose.systems.person import PersonTracker, build_silhouette_capture
 from tests.person.persons_in_view import posed, see, stepping
@@ -28,33 +27,18 @@ def tracker(person):
     return PersonPoseTracker(ContourFit(person.pose_tree()))
 
 
-@pytest.fixture(scope="module")
-def renderers(person, cameras):
-    return {name: LabelRenderer(person, camera) for name, camera in cameras.items()}
+def views(cameras, masks):
+    """Return the tracker's inputs from masks by camera; a camera may lack one."""
+    seen = {name: see_silhouette(mask, edge_spacing(cameras[name])) for name, mask in masks.items()}
+    return {f"silhouette_{name}": seen.get(name) for name in cameras}
 
 
-@pytest.fixture(scope="module")
-def views(cameras):
-    """Return a function that makes the tracker's inputs from masks by camera."""
-
-    def views(masks):
-        return {
-            f"silhouette_{name}": None
-            if name not in masks
-            else see_silhouette(masks[name], edge_spacing(camera))
-            for name, camera in cameras.items()
-        }
-
-    return views
-
-
-def test_a_moving_person_is_tracked(person, cameras):
+def test_a_moving_person_is_tracked(person, cameras, tracker):
     start = posed(person, left_upper_arm_z=40, right_upper_arm_z=-40)
     end = posed(
         person, left_upper_arm_z=53, right_upper_arm_z=-40, left_thigh_x=-13, left_shin_x=13
     )
     path = PiecewisePolynomial.FirstOrderHold([0.0, 0.1], np.column_stack([start, end]))
-    tracker = PersonPoseTracker(ContourFit(person.pose_tree()))
     rig = build_camera_rig(person, cameras, path).diagram
     capture = build_silhouette_capture(tracker, cameras, {}, 1 / 30, source=rig)
     diagram = capture.diagram
@@ -70,15 +54,13 @@ def test_a_moving_person_is_tracked(person, cameras):
 
 
 @pytest.mark.slow
-def test_a_lost_person_keeps_the_last_positions_and_is_found_again(
-    person, cameras, tracker, renderers, views
-):
+def test_a_lost_person_keeps_the_last_positions_and_is_found_again(person, cameras, tracker):
     run = Bench(PersonTracker(tracker, list(cameras.values()), 0.1))
 
     def show(x, time, blind=()):
-        q = posed(person, x=x)
-        masks = {name: one.mask(q) for name, one in renderers.items() if name not in blind}
-        run.advance(run.context.get_time() + 0.1, **views(masks), time=[time])
+        shown = {name: one for name, one in cameras.items() if name not in blind}
+        masks = see(person, shown, [posed(person, x=x)])[0]
+        run.advance(run.context.get_time() + 0.1, **views(cameras, masks), time=[time])
         names = ("estimated_positions", "last_positions", "inlier_ratio", "visible")
         return [run[name] for name in names]
 
@@ -117,7 +99,7 @@ def alone(person, cameras, poses):
 
 
 @pytest.fixture(scope="module")
-def watch(cameras, tracker, views):
+def watch(cameras, tracker):
     """Return a function that maps masks (T,) to outputs (T, n) by port."""
     names = ("estimated_positions", "others", "deviations", "visible")
 
@@ -125,7 +107,7 @@ def watch(cameras, tracker, views):
         run = Bench(PersonTracker(tracker, list(cameras.values()), 0.1, with_deviations=True))
         found = []
         for k, masks in enumerate(frames):
-            run.advance(0.1 * k + 0.05, **views(masks), time=[0.1 * k])
+            run.advance(0.1 * k + 0.05, **views(cameras, masks), time=[0.1 * k])
             found.append([run[name] for name in names])
         return dict(zip(names, map(np.array, zip(*found, strict=True)), strict=True))
 
@@ -141,10 +123,10 @@ class Walking(PersonPoseTracker):
         return TrackState(last.values + step, step, 0.9, 0.9)
 
 
-def test_motion_continues_through_skipped_frames(person, cameras, views, alone):
+def test_motion_continues_through_skipped_frames(person, cameras, alone):
     """For at most three frames; pictures with the same time stamp, or NaN, are not new."""
     tracker = Walking(ContourFit(person.pose_tree()))
-    tracker.expected, seen = [], views(alone[0])
+    tracker.expected, seen = [], views(cameras, alone[0])
     run = Bench(PersonTracker(tracker, cameras, 0.1))
     first = tracker.values(posed(person))
     run.system.set_person(run.context, TrackState(first, np.full(len(first), 0.02), 0.9, 0.9))

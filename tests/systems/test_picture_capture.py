@@ -50,6 +50,11 @@ class Recording(FrameSource):
         return TimedPicture(time, f"{k}", picture)
 
 
+def recordings(*times):
+    """Return a recording for each of the first cameras."""
+    return {name: Recording(name, own) for name, own in zip(CAMERAS, times, strict=False)}
+
+
 def play(capture, names, end=10.0):
     """Return the time and each camera's picture for each update with new frames."""
     simulator = Simulator(capture)
@@ -67,10 +72,7 @@ def play(capture, names, end=10.0):
 
 def test_all_recorded_frames_are_shown_and_the_end_terminates():
     times = [7.0 + PERIOD * k for k in range(5)]
-    sources = {
-        "camera_0": Recording("camera_0", times),
-        "camera_1": Recording("camera_1", [time + 0.02 for time in times]),
-    }
+    sources = recordings(times, [time + 0.02 for time in times])
     capture = PictureCapture(sources, CAMERAS)
     assert capture.period == pytest.approx(PERIOD)
     assert not capture.live
@@ -85,10 +87,7 @@ def test_all_recorded_frames_are_shown_and_the_end_terminates():
 
 
 def test_images_equal_the_sources():
-    sources = {
-        "camera_0": Recording("camera_0", [0.0]),
-        "camera_1": Recording("camera_1", [0.0], masks=True),
-    }
+    sources = recordings([0.0]) | {"camera_1": Recording("camera_1", [0.0], masks=True)}
     run = Bench(PictureCapture(sources, CAMERAS)).advance(0.5 * PERIOD)
     assert (run["color_image_camera_0"].data == (0, 100, 200, 255)).all()
     mask = label_image_to_mask(run["label_image_camera_1"])
@@ -98,15 +97,12 @@ def test_images_equal_the_sources():
 
 def test_a_camera_that_stops_and_returns_loses_only_its_own_pictures():
     times = [PERIOD * k for k in range(20)]
-    sources = {
-        "camera_0": Recording("camera_0", times),
-        "camera_1": Recording("camera_1", [time for time in times if not 0.45 < time < 1.45]),
-    }
-    capture = PictureCapture(sources, CAMERAS)
+    rest = [time for time in times if not 0.45 < time < 1.45]
+    capture = PictureCapture(recordings(times, rest), CAMERAS)
     _, found = play(capture, ["color_image_camera_0", "color_image_camera_1"])
     assert [row[1] for row in found] == list(range(20))
     there = [row[0] for row in found if row[2] is not None]
-    assert there == pytest.approx([time for time in times if not 0.45 < time < 1.45])
+    assert there == pytest.approx(rest)
     stopped, returned = capture.take_reports()
     assert "'camera_1' stopped at 0.40 s" in stopped
     assert "'camera_1' returned at 1.50 s" in returned
@@ -114,7 +110,7 @@ def test_a_camera_that_stops_and_returns_loses_only_its_own_pictures():
 
 
 def test_live_capture_shows_only_the_newest_frames():
-    sources = {name: Recording(name, [PERIOD * k for k in range(9)]) for name in CAMERAS}
+    sources = recordings(*[[PERIOD * k for k in range(9)]] * 3)
     # Read twice before time 0, then at each update.
     clock = iter([100.0, 100.0, 100.0, 100.0, 100.35, 100.36, 101.0, 101.1]).__next__
     capture = PictureCapture(sources, CAMERAS, clock=clock)
@@ -148,10 +144,7 @@ class Device(Recording):
 @pytest.mark.parametrize("silent", [3, 1000])
 def test_live_cameras_may_open_slowly_or_never(silent):
     clock = {"now": 50.0}
-    sources = {
-        "camera_0": Device("camera_0", clock, 0),
-        "camera_1": Device("camera_1", clock, silent),
-    }
+    sources = {f"camera_{k}": Device(f"camera_{k}", clock, n) for k, n in enumerate((0, silent))}
     capture = PictureCapture(sources, CAMERAS, clock=lambda: clock["now"])
     simulator = Simulator(capture)
     times = []

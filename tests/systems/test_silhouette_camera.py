@@ -1,7 +1,5 @@
 """SilhouetteCamera, compared with Drake's RgbdSensor in the same diagram."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from pydrake.geometry import (
@@ -39,7 +37,7 @@ def camera_at(eye: tuple[float, float, float], target: tuple[float, float, float
 
 
 @pytest.mark.parametrize("name", ["arm", "man"])
-def test_labels_equal_an_rgbd_sensors(name: str, tmp_path: Path) -> None:
+def test_labels_equal_an_rgbd_sensors(name, tmp_path):
     if name == "arm":
         model, camera = arm_model(tmp_path), camera_at((2.0, 0.3, 0.6), (0.0, 0.0, 0.6))
     else:
@@ -53,7 +51,7 @@ def test_labels_equal_an_rgbd_sensors(name: str, tmp_path: Path) -> None:
     assert figures.ours < figures.drakes
 
 
-def test_labels_of_a_parallel_camera_equal_the_label_renderers() -> None:
+def test_labels_of_a_parallel_camera_equal_the_label_renderers():
     model = load_model(bundled_model("man"), check=False)
     camera = ParallelCamera("side", 240, 240, 110.0, 119.5, 119.5, look_at([0, 3, 0], [0, 0, 0]))
     system = SilhouetteCamera(model.plant, model.scene_graph, camera)
@@ -96,7 +94,7 @@ def two_balls() -> tuple[MultibodyPlant, SceneGraph, DiagramBuilder]:
     return plant, scene_graph, builder
 
 
-def test_a_camera_moves_with_its_parent_body() -> None:
+def test_a_camera_moves_with_its_parent_body():
     plant, scene_graph, builder = two_balls()
     scene_graph.AddRenderer("vtk", MakeRenderEngineVtk(RenderEngineVtkParams()))
     carrier = plant.GetBodyByName("carrier")
@@ -123,7 +121,7 @@ def test_a_camera_moves_with_its_parent_body() -> None:
     assert system.GetOutputPort("image_time").Eval(ours) == [0.25]
 
 
-def test_geometry_that_cannot_be_drawn_is_refused() -> None:
+def test_geometry_that_cannot_be_drawn_is_refused():
     camera = camera_at((2.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     plant, scene_graph, _ = two_balls()
     with pytest.raises(ModelError, match="registered"):
@@ -141,7 +139,7 @@ def test_geometry_that_cannot_be_drawn_is_refused() -> None:
         SilhouetteCamera(plant, scene_graph, camera)
 
 
-def test_poses_that_are_not_finite_are_refused() -> None:
+def test_poses_that_are_not_finite_are_refused():
     plant, scene_graph, _ = two_balls()
     system = SilhouetteCamera(plant, scene_graph, camera_at((2.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
     context = system.CreateDefaultContext()

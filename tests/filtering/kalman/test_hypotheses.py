@@ -111,7 +111,6 @@ def test_offsets_do_not_change_in_a_step_of_the_motion(hand):
     A, U = HAND_STATE.transition(), f.predict(f.start(sequence.guess)).hypotheses[0].free.covariance
     n = len(HAND_STATE)
     moved = repeated.after_step(Linear(np.zeros(n), np.zeros(n), A), U)
-    n = len(HAND_STATE)
     np.testing.assert_allclose(moved.state().mean, A @ guess.mean)
     np.testing.assert_allclose(moved.state().covariance, A @ guess.covariance @ A.T + U)
     np.testing.assert_allclose(moved.belief.mean[n:], repeated.belief.mean[n:])
@@ -121,10 +120,6 @@ def test_offsets_do_not_change_in_a_step_of_the_motion(hand):
 def at(place, log_weight, deviation=1.0):
     belief = Belief(np.array([place, 0.0]), np.diag([deviation**2, 1.0]))
     return Hypothesis(belief, belief, log_weight, log_weight - 2.0)
-
-
-def total(hypotheses):
-    return sum(one.weight for one in hypotheses)
 
 
 def gains(hypotheses):
@@ -147,7 +142,7 @@ def test_close_hypotheses_merge_and_add_their_weights():
     kept, rejected = merge_duplicates(some, 0.3, 7)
     assert [one.belief.mean[0] for one in kept] == [0.0, 0.65]
     assert [(one.step, one.reason) for one in rejected] == [(7, "twin")] * 2
-    assert total(kept) == pytest.approx(1.0)
+    assert sum(one.weight for one in kept) == pytest.approx(1.0)
     assert kept[0].weight == pytest.approx(some[0].weight + some[1].weight)
     np.testing.assert_allclose(gains(kept), -2.0)
     # Distances of 0.2 and 0.4 standard deviations, for any standard deviation.
@@ -162,4 +157,4 @@ def test_the_heaviest_hypotheses_are_kept_up_to_the_cap(cap):
     means = [one.belief.mean[0] for one in kept]
     assert means == [0.0, 1.0, 2.0, 3.0, 4.0][:cap]
     assert [(one.step, one.reason) for one in rejected] == [(3, "cap")] * (5 - len(means))
-    assert total(kept) == pytest.approx(1.0)
+    assert sum(one.weight for one in kept) == pytest.approx(1.0)

@@ -35,6 +35,10 @@ def make(observation=END, rows=FREE, motion=STEP, **settings):
     return TruncatedFilter(LAYOUT, observation, rows, motion, FilterSettings(**settings))
 
 
+def begin(*observation, **motion):
+    return make(*observation, **motion).start(START)
+
+
 def follow(f, measured, start=START):
     state, beliefs = f.start(start), []
     for t, y in enumerate(measured):
@@ -269,21 +273,16 @@ def wrong_slope(x):
     ("act", "words"),
     [
         (
-            lambda: make(FunctionObservation(("u", "v"), 0.05, end_of, wrong_slope)).start(START),
+            lambda: begin(FunctionObservation(("u", "v"), 0.05, end_of, wrong_slope)),
             r"the observation: the Jacobian of 'v' by 'length' is -0\.56.*differences give 0\.56",
         ),
         (
-            lambda: make(motion=FunctionMotion(np.sin, STEP.noise, 0.1, lambda x: np.eye(3))).start(
-                START
-            ),
+            lambda: begin(motion=FunctionMotion(np.sin, STEP.noise, 0.1, lambda x: np.eye(3))),
             "the motion: the Jacobian of 'angle' by 'angle' is 1, differences give 0.82",
         ),
+        (lambda: begin(FunctionObservation(("u",), 0.05, end_of)), r"observation gives .* \(2,\)"),
         (
-            lambda: make(FunctionObservation(("u",), 0.05, end_of)).start(START),
-            r"the observation gives values \(2,\)",
-        ),
-        (
-            lambda: make(motion=FunctionMotion(lambda x: x[:2], STEP.noise, 0.1)).start(START),
+            lambda: begin(motion=FunctionMotion(lambda x: x[:2], STEP.noise, 0.1)),
             r"the motion gives values \(2,\)",
         ),
         (lambda: FunctionObservation(("u", "v"), [0.1, 0.0], end_of), "positive"),
@@ -291,23 +290,13 @@ def wrong_slope(x):
         (lambda: FunctionObservation(("u", "v"), 0.1, end_of, angles=["w"]), "'w'"),
         (lambda: TruncatedFilter(LAYOUT, END, FREE, STEP.noise), "ndarray has no noise"),
         (lambda: TruncatedFilter(LAYOUT, end_of, FREE, STEP), "function has no names"),
-        (
-            lambda: TruncatedFilter(LAYOUT, END, FREE, STEP, {"iterations": 3}),
-            "settings are FilterSettings, not dict",
-        ),
-        (
-            lambda: make(motion=LinearMotion(np.eye(2), STEP.noise, 0.1)),
-            r"the motion's transition: expected \(3, 3\)",
-        ),
-        (
-            lambda: make(motion=LinearMotion(np.eye(3), np.eye(2), 0.1)),
-            r"the motion's noise: expected \(3, 3\)",
-        ),
+        (lambda: TruncatedFilter(LAYOUT, END, FREE, STEP, {}), "FilterSettings, not dict"),
+        (lambda: make(motion=LinearMotion(np.eye(2), STEP.noise, 0.1)), "transition: expected"),
+        (lambda: make(motion=LinearMotion(np.eye(3), np.eye(2), 0.1)), "noise: expected"),
         (lambda: TruncatedFilter(("angle",), END, FREE, STEP), "StateLayout, not tuple"),
         (lambda: TruncatedFilter(LAYOUT, END, [], STEP), "Inequalities, not list"),
         (lambda: make().start((START.mean, START.covariance)), "a Belief, not tuple"),
         (lambda: make().start(Belief(np.zeros(2), np.eye(2))), "3 elements"),
-        (lambda: make().update(make().start(START), np.zeros(3)), "has 2 measurements"),
         (lambda: FunctionObservation("uv", 0.05, end_of), "different names, not 'uv'"),
         (lambda: make(linearisation="straight"), "spread, tangent"),
         (lambda: make(persistence=-1.0), "persistence"),

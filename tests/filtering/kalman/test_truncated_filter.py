@@ -12,6 +12,7 @@ from drake_pose.filtering.update import make_measurement, update
 
 ONE_TURN = from_bounds(["angle"], [0], [1])
 BEYOND_IT = two_sided(["angle"], "stop", [1.0], 2.0, np.inf)
+NAN = np.full((3, 3), np.nan)
 LAYOUT = StateLayout(("angle",), ("length",))
 NAMES = LAYOUT.names  # angle, rate_angle, length
 
@@ -239,15 +240,8 @@ def test_transition_and_process_noise_of_constant_velocity():
         (lambda: make_belief([0, 0], [[1, 0.5], [0, 1]]), "symmetric"),
         (lambda: make_belief([0, 0], np.eye(3)), "fit"),
         (lambda: make_belief([0, 0], [[1, 2], [2, 1]]), "indefinite"),
-        (
-            lambda: make_filter().start(Belief(np.zeros(3), 0 * np.eye(3) * np.nan)),
-            "'angle' is NaN",
-        ),
-        (lambda: make_filter().start(Belief(np.zeros(2), np.eye(2))), "3"),
-        (
-            lambda: make_filter().start(Belief(np.ones(3), np.diag([1.0, 1, -1]))),
-            "'length' contributes",
-        ),
+        (lambda: make_filter().start(Belief(np.zeros(3), NAN)), "'angle' is NaN"),
+        (lambda: make_filter().start(Belief(np.ones(3), np.diag([1.0, 1, -1]))), "'length'"),
         (lambda: make_filter(truncation="x"), "truncation"),
         (lambda: make_filter(iterations=0), "iterations"),
         (lambda: make_filter(novelty=1.0), "novelty"),

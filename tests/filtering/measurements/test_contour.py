@@ -11,7 +11,7 @@ from drake_pose.filtering.contour_observation import (
 )
 from drake_pose.filtering.inequalities import from_model
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from tests.body.models import LIMB_URDF, joint, link, urdf, write, write_limb
+from tests.body.models import LIMB_URDF, write_limb
 from tests.jobs.scenes import camera
 from tests.search.arms import crane
 from tests.search.bodies import front_camera, near_camera
@@ -36,11 +36,8 @@ def test_measurements_lead_to_the_pose_that_drake_rendered(body):
     truth = np.array([0.2, 0.9, -0.6])
     x_true = observation.state(truth)
     masks = [LabelRenderer(body, camera).mask(truth)]
-    x, measured = descend(
-        observation,
-        observation.gather_evidence(masks),
-        x_true + np.r_[0.12, -0.15, 0.1, np.zeros(3)],
-    )
+    start = x_true + np.r_[0.12, -0.15, 0.1, np.zeros(3)]
+    x, measured = descend(observation, observation.gather_evidence(masks), start)
     q, X_WB = observation.positions(x)
     # Segments have 12 to 24 pixels: a quarter of a pixel is a degree.
     np.testing.assert_allclose(q, truth, atol=np.radians(2.5))
@@ -55,10 +52,7 @@ def test_known_and_estimated_root_positions_agree(body):
     home, shift = np.array([0.0, 0.05, 0.04]), np.array([0.0, 0.03, -0.02])
     tree, there = body.pose_tree("trunk", root_position=home), home + shift
     camera = front_camera(200, shift=0.2)
-    held, moves = (
-        ContourObservation(tree, [camera]),
-        ContourObservation(tree, [camera], root_moves=True),
-    )
+    held, moves = (ContourObservation(tree, [camera], root_moves=one) for one in (False, True))
     q = np.array([0.2, 0.9, -0.6])
     x = moves.state(q)
     at_home = moves.draw(x, camera)
@@ -89,38 +83,15 @@ def test_jacobian_equals_finite_differences_of_the_contour(body, monkeypatch):
 
 
 def test_frames_without_evidence_and_invalid_arguments(body):
-    camera = front_camera(100)
-    observation = ContourObservation(body.pose_tree(), [camera])
+    observation = ContourObservation(body.pose_tree(), [front_camera(100)])
     x = observation.state(np.zeros(3))
-    assert observation.measure(observation.gather_evidence([None]), x) is None
-    assert (
-        observation.measure(observation.gather_evidence([np.zeros((100, 100), dtype=bool)]), x)
-        is None
-    )
-    with pytest.raises(SettingsError, match="1 masks expected"):
-        observation.gather_evidence([])
-    with pytest.raises(SettingsError, match="50 x 50"):
-        observation.gather_evidence([np.zeros((50, 50), dtype=bool)])
+    for mask in (None, np.zeros((100, 100), dtype=bool)):
+        assert observation.measure(observation.gather_evidence([mask]), x) is None
+    for masks, word in (([], "1 masks expected"), ([np.zeros((50, 50), bool)], "50 x 50")):
+        with pytest.raises(SettingsError, match=word):
+            observation.gather_evidence(masks)
     with pytest.raises(SettingsError, match="one camera"):
         ContourObservation(body.pose_tree(), [])
-
-
-def test_limits_are_inequalities_except_of_angles_that_turn_around(tmp_path):
-    angles = {"arm_turn": (4.0, 6.0), "slant": (-np.pi, np.pi), "bend": (-0.4, 0.1)}
-    parts = [link("base"), *(link(f"to_{name}") for name in angles)]
-    for name, (lower, upper) in angles.items():
-        limits = f'lower="{lower}" upper="{upper}"'
-        parts.append(joint(name, "revolute", "base", f"to_{name}", limits=limits))
-    model = load_model(write(tmp_path, urdf(*parts)), check=False)
-    tree = model.pose_tree(root_position=np.zeros(3))
-    rows = ContourObservation(tree, [front_camera(200)]).inequalities()
-    for name, (lower, upper) in angles.items():
-        phi = rows.phi[:, rows.columns.index(name)]
-        bounds = {row: b for row, b, one in zip(rows.rows, rows.b, phi, strict=True) if one}
-        if name == "slant":
-            assert not bounds
-        else:
-            assert sorted(bounds.values()) == pytest.approx(sorted([upper, -lower]))
 
 
 def test_skin_is_drawn_with_angles_wrapped_into_the_limits(tmp_path):
@@ -137,14 +108,9 @@ def test_skin_is_drawn_with_angles_wrapped_into_the_limits(tmp_path):
         )
 
 
-@pytest.fixture
-def model(tmp_path):
-    return crane(tmp_path)
-
-
-def test_unwrapped_angles_are_in_the_turns_of_the_track(model):
+def test_unwrapped_angles_are_in_the_turns_of_the_track(tmp_path):
     """A search returns angles within half a turn; the track is two turns further."""
-    observation = ContourObservation(model.pose_tree(), [camera("front")])
+    observation = ContourObservation(crane(tmp_path).pose_tree(), [camera("front")])
     names = observation.layout.names
     swing, luff = names.index("swing"), names.index("luff")
     last = observation.state(np.array([13.0, 3.0]))
@@ -157,16 +123,17 @@ def test_unwrapped_angles_are_in_the_turns_of_the_track(model):
     np.testing.assert_allclose(near[[swing, luff]], [13.1, 3.1])
 
 
-def test_angles_that_turn_around_are_not_truncated(model, tmp_path):
+def test_angles_that_turn_around_are_not_truncated(tmp_path):
     """The filter keeps the limits of other joints."""
+    model = crane(tmp_path)
     assert from_model(model).rows == ("luff >= -6.28319", "luff <= 6.28319")
     observation = ContourObservation(model.pose_tree(), [camera("front")])
     with pytest.warns(UserWarning, match="no joint has a limit"):
         assert not len(observation.inequalities())
-    wide = crane(tmp_path, 'lower="-1e16" upper="1e16"')
-    assert not len(from_model(wide))
-    full = crane(tmp_path, f'lower="{-np.pi}" upper="{np.pi}"')
-    assert not len(from_model(full))
-    narrow = crane(tmp_path, 'lower="-1" upper="2"')
-    observation = ContourObservation(narrow.pose_tree(), [camera("front")])
-    assert observation.inequalities().rows == ("luff >= -1", "luff <= 2")
+    for lower, upper in ((-1e16, 1e16), (-np.pi, np.pi)):
+        assert not len(from_model(crane(tmp_path, f'lower="{lower}" upper="{upper}"')))
+    for lower, upper in ((-1, 2), (4, 6), (-0.4, 0.1)):
+        narrow = crane(tmp_path, f'lower="{lower}" upper="{upper}"')
+        rows = ContourObservation(narrow.pose_tree(), [camera("front")]).inequalities()
+        assert rows.rows == (f"luff >= {lower}", f"luff <= {upper}")
+        np.testing.assert_allclose(sorted(rows.b), sorted([upper, -lower]))

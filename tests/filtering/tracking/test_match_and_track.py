@@ -210,11 +210,10 @@ def test_a_track_does_not_lag_in_its_second_frame(person, shift, angle):
 def test_tracking_by_colours_alone_starts_from_given_positions(body):
     """Without a search. A covered lens loses the track, which recovers afterwards."""
     q, search = np.array([0.2, 0.9, -0.6]), KnownPoses(body.pose_tree(), [])
-    mask = LabelRenderer(body, CAMERA).mask(q)
-    lit = np.where(mask[..., None], (230, 130, 40), (60, 140, 60)).astype(np.uint8)
+    seen = lit(LabelRenderer(body, CAMERA).mask(q))
     follower, state = MatchAndTrack(search, [CAMERA], PERIOD), TrackerState()
     found = []
-    for picture, start in ((lit, None), (lit, q), (lit, None), (0 * lit, None), (lit, q)):
+    for picture, start in ((seen, None), (seen, q), (seen, None), (0 * seen, None), (seen, q)):
         state, pose = follower.next(state, [], None, {"front": picture}, start)
         found.append(pose.found)
         if pose.found:
@@ -238,12 +237,16 @@ def test_histograms_are_learned_in_the_first_frame_also_from_a_searched_pose(bod
     renderer = LabelRenderer(body, CAMERA)
     for q, has_mask in zip(moved, (True, False), strict=True):
         mask = renderer.mask(q)
-        lit = np.where(mask[..., None], (230, 130, 40), (60, 140, 60)).astype(np.uint8)
         views = [View(CAMERA, mask)] if has_mask else []
-        state, found = follower.next(state, views, None, {"front": lit})
+        state, found = follower.next(state, views, None, {"front": lit(mask)})
         assert found.found
         assert found.stopped_by == ("end" if has_mask else TRACKED)
         np.testing.assert_allclose(found.q, q, atol=np.radians(3.0))
+
+
+def lit(mask):
+    """Return a picture of an orange body before green."""
+    return np.where(mask[..., None], (230, 130, 40), (60, 140, 60)).astype(np.uint8)
 
 
 def hidden(mask, fraction):

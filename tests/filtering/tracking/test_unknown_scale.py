@@ -226,7 +226,7 @@ def test_a_root_that_does_not_turn_freely_is_refused(body):
             tilted(observation, np.zeros(len(observation.layout)), (0.1, 0.1))
 
 
-def test_intervals_of_a_sequence_are_within_limits_or_a_turn() -> None:
+def test_intervals_of_a_sequence_are_within_limits_or_a_turn():
     """1.96 x 1.6 deviations; a value is determined by less than half of its limits or of a turn."""
     kinematics = SimpleNamespace(
         names=("free", "bend", "slide"), covers_full_turn=np.array([True, False, False]),

@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -47,7 +46,7 @@ def view_errors(inputs: EstimateInputs, views: list[View], values: np.ndarray) -
 
 
 @pytest.mark.slow
-def test_estimates_of_a_real_arm_lie_in_their_intervals(shared_data: Path) -> None:
+def test_estimates_of_a_real_arm_lie_in_their_intervals(shared_data):
     scene = shared_data / "arm_two_views"
     inputs = read_inputs(scene, scene / "med7" / "med7.urdf", EstimateSettings(), None)
     all_held, errors = [], []
@@ -57,22 +56,14 @@ def test_estimates_of_a_real_arm_lie_in_their_intervals(shared_data: Path) -> No
             for camera in inputs.scene.cameras.values()
             if (camera.name, frame) in inputs.scene.masks
         ]
-        assert inputs.truth is not None
         truth = inputs.truth.of(frame)
-        assert truth is not None
         result = inputs.search.match(views)
         found = np.concatenate(result.node_values)
         excess = view_errors(inputs, views, found) - view_errors(inputs, views, truth)
         assert (excess <= 0.03).all(), (frame, excess)
         answer = result.pose_set
-        assert answer is not None
-        held = max(
-            (
-                [joint.holds(float(one)) for joint, one in zip(mode.joints, truth, strict=True)]
-                for mode in answer.modes
-            ),
-            key=sum,
-        )
+        modes = [zip(mode.joints, truth, strict=True) for mode in answer.modes]
+        held = max(([joint.holds(float(one)) for joint, one in mode] for mode in modes), key=sum)
         assert all(held[BASE]), (frame, held)
         # These masks do not determine the flange's angle.
         assert not answer.determined[-1], frame

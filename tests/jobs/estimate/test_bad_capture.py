@@ -67,16 +67,14 @@ class Walk:
 
 
 @pytest.fixture(scope="module")
-def walk() -> Walk:
+def walk():
     person = load_model(bundled_model("person"), check=False)
     cameras = circle_of_cameras(4, size=(160, 120), face_camera=False)
     truth = np.array([stepping(person, 0.15 * k, -0.2 + 0.04 * k, 0.1) for k in range(FRAMES)])
     return Walk(person, cameras, see(person, cameras, truth), truth)
 
 
-def test_each_damaged_file_is_named_and_others_are_used(
-    walk: Walk, tmp_path: Path, out: Path
-) -> None:
+def test_each_damaged_file_is_named_and_others_are_used(walk, tmp_path, out):
     scene = walk.write(tmp_path / "scene")
     masks = scene / "masks"
     shutil.copytree(masks / "camera_0", masks / "camera_7")
@@ -100,9 +98,7 @@ def test_each_damaged_file_is_named_and_others_are_used(
     assert np.abs(found - walk.places()).max() < 0.03
 
 
-def test_a_person_who_leaves_and_returns_elsewhere_is_found_again(
-    walk: Walk, tmp_path: Path, out: Path
-) -> None:
+def test_a_person_who_leaves_and_returns_elsewhere_is_found_again(walk, tmp_path, out):
     """First nobody, then a person, for a while before one camera only, then elsewhere."""
     truth = walk.truth.copy()
     truth[6:] = [stepping(walk.person, 2.0 + 0.1 * k, 0.4, -0.4) for k in range(FRAMES - 6)]
@@ -162,9 +158,7 @@ COLOURS = np.dstack([np.tile(np.arange(160, dtype=np.uint8), (120, 1)), *np.zero
         (lambda _: COLOURS, ("none of 8 masks", "two")),
     ],
 )
-def test_recordings_with_impossible_cameras_are_refused(
-    spoiled, parts, walk: Walk, tmp_path: Path, out: Path
-) -> None:
+def test_recordings_with_impossible_cameras_are_refused(spoiled, parts, walk, tmp_path, out):
     scene = replace(walk, masks=walk.masks[:2]).write(tmp_path / "scene")
     if spoiled.__name__ != "<lambda>":
         cameras = yaml.safe_load((scene / "cameras.yaml").read_text())

@@ -58,10 +58,7 @@ SPOILT_SCENES = [
     (placed(3, 0, 0, turned=[-1, 1, 1, 1]), ("camera 'front'", "reflection")),
     (placed(-3, 0, 0.3), ("camera 'front'", "behind")),
     (placed(0, 0, 0), ("camera 'front'", "inside the body")),
-    (
-        camera(focal_x=1e5, focal_y=1e5),
-        ("camera 'front'", "larger than the picture", "focal length"),
-    ),
+    (camera(focal_x=1e5, focal_y=1e5), ("camera 'front'", "larger than the", "focal length")),
     (camera(focal_x=1e12, focal_y=1e12), ("camera 'front'", "larger than the picture")),
     (lambda folder: shutil.rmtree(folder / "masks"), ("masks",)),
     (mask(b"PNG"), ("0000.png", "not a PNG")),
@@ -77,15 +74,12 @@ SPOILT_SCENES = [
         ("masks/front", r"'\udcfc.png' is not UTF-8 text"),
     ),
     (file("joint_angles.csv", "frame,lift\n0,20\n2,60\n"), ("'lift', frame 2", "in degrees")),
-    (
-        file("joint_angles.csv", "frame,lift\n0,1e308\n"),
-        ("'lift', frame 0", "too large for a joint position"),
-    ),
+    (file("joint_angles.csv", "frame,lift\n0,1e308\n"), ("'lift', frame 0", "too large for")),
 ]
 
 
 @pytest.mark.parametrize(("spoil", "parts"), SPOILT_SCENES)
-def test_scene(spoil, parts, own_scene: TinyScene) -> None:
+def test_scene(spoil, parts, own_scene):
     spoil(own_scene.folder)
     assert_refused(run(own_scene), *parts)
     assert not (own_scene.folder.parent / "out").exists()
@@ -110,7 +104,7 @@ NO_FILES = {
 
 @pytest.mark.parametrize("place", ["masks/front/0000.png", "cameras.yaml", "joint_angles.csv"])
 @pytest.mark.parametrize("kind", NO_FILES)
-def test_devices_and_sockets_are_never_opened(kind: str, place: str, own_scene: TinyScene) -> None:
+def test_devices_and_sockets_are_never_opened(kind, place, own_scene):
     for other in own_scene.folder.glob("masks/*/000[12].png"):
         other.unlink()
     path = own_scene.folder / place
@@ -134,7 +128,7 @@ SPOILT_MODELS = [
 
 
 @pytest.mark.parametrize(("text", "parts"), SPOILT_MODELS)
-def test_model(text, parts, own_scene: TinyScene, tmp_path: Path) -> None:
+def test_model(text, parts, own_scene, tmp_path):
     path = tmp_path / "spoilt.urdf"
     path.write_text(text)
     assert_refused(run(own_scene, model=path), *parts)
@@ -144,7 +138,7 @@ def test_model(text, parts, own_scene: TinyScene, tmp_path: Path) -> None:
         assert_refused(run(own_scene, model=path), "jib.obj")
 
 
-def test_model_file(own_scene: TinyScene, tmp_path: Path) -> None:
+def test_model_file(own_scene, tmp_path):
     (tmp_path / "folder.urdf").mkdir()
     (tmp_path / "model.step").write_text("solid")
     os.mkfifo(tmp_path / "pipe.urdf")
@@ -167,7 +161,7 @@ def test_model_file(own_scene: TinyScene, tmp_path: Path) -> None:
         ("--root jib", ("root 'jib'",)),
     ],
 )
-def test_unknown_names_are_refused(options, parts, own_scene: TinyScene) -> None:
+def test_unknown_names_are_refused(options, parts, own_scene):
     centres = own_scene.folder / "centres.csv"
     centres.write_text("frame,joint,x,y,z\n0,hook,0,0,1\n1,hook,0,0,1\n")
     assert_refused(run(own_scene, *options.format(centres).split()), *parts)
@@ -186,11 +180,11 @@ def test_unknown_names_are_refused(options, parts, own_scene: TinyScene) -> None
         ("--time-limit -1", "time_limit"),
     ],
 )
-def test_wrong_usage(options: str, part: str, tiny_scene: TinyScene) -> None:
+def test_wrong_usage(options, part, tiny_scene):
     assert_refused(run(tiny_scene, *options.split()), part, status=2)
 
 
-def test_rotation_without_a_root(own_scene: TinyScene, tmp_path: Path) -> None:
+def test_rotation_without_a_root(own_scene, tmp_path):
     path = tmp_path / "swivel.urdf"
     limits = '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
     bolt = '<joint name="bolt" type="fixed"><parent link="world"/><child link="base"/>'
@@ -199,12 +193,12 @@ def test_rotation_without_a_root(own_scene: TinyScene, tmp_path: Path) -> None:
     assert_refused(result, "swivel.urdf", "base, boom, jib")
 
 
-def test_missing_options_are_usage_errors() -> None:
+def test_missing_options_are_usage_errors():
     assert_refused(run_command(["estimate", "scene"]), "--model", status=2)
     assert_refused(run_command(["judge"]), "judge", status=2)
 
 
-def test_output_folder_with_other_files_is_refused(own_scene: TinyScene) -> None:
+def test_output_folder_with_other_files_is_refused(own_scene):
     out = own_scene.folder.parent / "out"
     out.mkdir()
     (out / "mine.txt").write_text("mine")
@@ -215,9 +209,7 @@ def test_output_folder_with_other_files_is_refused(own_scene: TinyScene) -> None
     assert_refused(run(own_scene, "--out", below), "mine.txt", "is a file")
 
 
-def test_expected_errors_are_one_line_and_bugs_keep_their_traceback(
-    own_scene: TinyScene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_expected_errors_are_one_line_and_bugs_keep_their_traceback(own_scene, monkeypatch):
     ends: list[BaseException] = []
 
     def fail(*_: object, **__: object) -> None:
@@ -235,13 +227,13 @@ def test_expected_errors_are_one_line_and_bugs_keep_their_traceback(
         run(own_scene)
 
 
-def test_time_limit_of_zero_is_reported(own_scene: TinyScene) -> None:
+def test_time_limit_of_zero_is_reported(own_scene):
     result = run(own_scene, "--time-limit", "0")
     assert result.exit_code == 0, result.output
     assert "stopped by the time limit" in result.stderr
 
 
-def test_salt_noise(own_scene: TinyScene) -> None:
+def test_salt_noise(own_scene):
     path = own_scene.folder / "masks" / "front" / "0000.png"
     picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     picture[np.random.default_rng(6).random(picture.shape) < 0.1] = 255

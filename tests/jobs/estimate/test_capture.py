@@ -24,20 +24,20 @@ FILES = {
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> PersonScene:
+def recording(tmp_path_factory):
     """A recording; shared, do not change it."""
     return record_person(tmp_path_factory.mktemp("person") / "scene", FRAMES)
 
 
 @pytest.fixture
-def own_recording(recording: PersonScene, tmp_path: Path) -> PersonScene:
+def own_recording(recording, tmp_path):
     """A copy that may be changed."""
     shutil.copytree(recording.folder, tmp_path / "scene")
     return PersonScene(tmp_path / "scene", recording.person, recording.truth)
 
 
 @pytest.fixture
-def known(recording: PersonScene, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def known(recording, monkeypatch):
     """Replace the capture, which takes seconds, by the truth; return the numbers of frames."""
     counts: list[int] = []
 
@@ -49,20 +49,16 @@ def known(recording: PersonScene, monkeypatch: pytest.MonkeyPatch) -> list[int]:
         for k in range(count):
             on_frame(k)
         captured = PersonCapture(
-            q=q,
-            inlier_ratios=np.ones(count),
-            shape=None,
-            outlines=ContourFit(tree).outlines,
-            tree=tree,
-            deviations=np.full_like(q, 0.01),
-        )
+            q=q, inlier_ratios=np.ones(count), shape=None, outlines=ContourFit(tree).outlines,
+            tree=tree, deviations=np.full_like(q, 0.01),
+        )  # fmt: skip
         return CheckedCapture(captured, ViewFaults(), (), None, read)
 
     monkeypatch.setattr("drake_pose.jobs.estimate.person.capture_checked", capture)
     return counts
 
 
-def test_stages_are_reported(recording: PersonScene, known: list[int]) -> None:
+def test_stages_are_reported(recording, known):
     stages: list[tuple[str, int]] = []
     estimate_scene(
         recording.folder, recording.person.path, replay=False,
@@ -72,9 +68,7 @@ def test_stages_are_reported(recording: PersonScene, known: list[int]) -> None:
     assert stages == [(name, k) for name in names for k in range(1, 1 + FRAMES)]
 
 
-def test_estimate_chooses_the_method_person_and_says_so(
-    recording: PersonScene, known: list[int], out: Path
-) -> None:
+def test_estimate_chooses_the_method_person_and_says_so(recording, known, out):
     result, summary = run_estimate(recording, out)
     assert "fitted to all silhouettes" in result.stdout
     assert known == [FRAMES]
@@ -95,9 +89,7 @@ def test_estimate_chooses_the_method_person_and_says_so(
     assert float(joints["0001", "left_forearm_x"]["high"]) == 0.0
 
 
-def test_an_equally_good_pose_is_written_and_named_in_a_warning(
-    recording: PersonScene, known: list[int], out: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_equally_good_pose_is_written_and_named_in_a_warning(recording, known, out, monkeypatch):
     follow = person.capture_checked
 
     def doubtful(*given):
@@ -113,26 +105,18 @@ def test_an_equally_good_pose_is_written_and_named_in_a_warning(
     assert "frame 0001" in warning
     assert "left_wrist" in warning
     assert "right" not in warning
-    rows = {
-        row["mode"]: row
-        for row in read_rows(out / "modes.csv")
-        if row["joint"] == "left_upper_arm_z"
-    }
-    assert {key: float(row["value"]) for key, row in rows.items()} == pytest.approx(
-        {"1": 40.0, "2": 100.0}, abs=1e-3
+    modes, joints = (
+        [row for row in read_rows(out / file) if row["joint"] == "left_upper_arm_z"]
+        for file in ("modes.csv", "joints.csv")
     )
-    row = next(
-        row
-        for row in read_rows(out / "joints.csv")
-        if (row["frame"], row["joint"]) == ("0001", "left_upper_arm_z")
-    )
+    found = {row["mode"]: float(row["value"]) for row in modes}
+    assert found == pytest.approx({"1": 40.0, "2": 100.0}, abs=1e-3)
+    (row,) = (row for row in joints if row["frame"] == "0001")
     assert float(row["low"]) < 40.0 < 100.0 < float(row["high"])
     assert row["modes"] == "2"
 
 
-def test_capture_selects_cameras_and_frames_as_estimate_does(
-    known: list[int], tmp_path: Path, out: Path
-) -> None:
+def test_capture_selects_cameras_and_frames_as_estimate_does(known, tmp_path, out):
     scene = record_person(tmp_path / "scene", FRAMES, sequence=False)
     some = ("--frame", "0:1", "--camera", "camera_0", "--camera", "camera_2", "--no-overlay")
     _, summary = run_estimate(scene, out, *some)
@@ -142,9 +126,7 @@ def test_capture_selects_cameras_and_frames_as_estimate_does(
     assert len(read_rows(out / "joint_centres.csv")) == 2 * 14
 
 
-def test_capture_is_a_sequence_unless_the_scene_says_otherwise(
-    own_recording: PersonScene, known: list[int], tmp_path: Path
-) -> None:
+def test_capture_is_a_sequence_unless_the_scene_says_otherwise(own_recording, known, tmp_path):
     own_recording.folder.joinpath("scene.yaml").unlink()
     for said in ("motion", "stills"):
         out = tmp_path / said
@@ -153,9 +135,7 @@ def test_capture_is_a_sequence_unless_the_scene_says_otherwise(
         own_recording.folder.joinpath("scene.yaml").write_text("sequence: false\n")
 
 
-def test_capture_uses_the_bundled_person(
-    recording: PersonScene, out: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_capture_uses_the_bundled_person(recording, out, monkeypatch):
     asked = {}
 
     def note(scene, model, out, settings, **options):
@@ -169,13 +149,10 @@ def test_capture_uses_the_bundled_person(
     assert asked["overlay"] is False
 
 
-def interrupt(*_: object) -> None:
-    raise KeyboardInterrupt
+def test_an_interrupted_capture_is_incomplete_and_resumes_without_loss(recording, known, out):
+    def interrupt(*_):
+        raise KeyboardInterrupt
 
-
-def test_an_interrupted_capture_is_incomplete_and_resumes_without_loss(
-    recording: PersonScene, known: list[int], out: Path
-) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("drake_pose.jobs.estimate.person.capture_checked", interrupt)
         result, summary = run_estimate(recording, out, "--frame", "0", status=1)
@@ -205,9 +182,7 @@ def test_an_interrupted_capture_is_incomplete_and_resumes_without_loss(
     ],
     ids=["method", "one camera", "hold", "root"],
 )
-def test_options_of_the_search_choose_the_search(
-    recording: PersonScene, settings: EstimateSettings, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_options_of_the_search_choose_the_search(recording, settings, monkeypatch):
     class Searched(Exception):
         """Replaces the search."""
 
@@ -219,7 +194,7 @@ def test_options_of_the_search_choose_the_search(
         estimate_scene(recording.folder, recording.person.path, None, settings)
 
 
-def test_pictures_with_few_masks_are_refused(own_recording: PersonScene) -> None:
+def test_pictures_with_few_masks_are_refused(own_recording):
     folder = own_recording.folder
     for mask in sorted(folder.glob("masks/*/*.png")):
         picture = folder / "images" / mask.parent.name / mask.name
@@ -232,9 +207,7 @@ def test_pictures_with_few_masks_are_refused(own_recording: PersonScene) -> None
             estimate_scene(folder, own_recording.person.path, None, settings)
 
 
-def test_scenes_and_options_unfit_for_the_method_person_are_refused(
-    recording: PersonScene, out: Path
-) -> None:
+def test_scenes_and_options_unfit_for_the_method_person_are_refused(recording, out):
     for name, value in {"hold": {"head_y": 1.0}, "start": Path("start.csv")}.items():
         with pytest.raises(SettingsError, match=f"leave {name} out"):
             EstimateSettings(method="person", **{name: value})

@@ -175,10 +175,7 @@ def test_frames_in_which_the_body_is_lost_have_no_pose(recording, tmp_path, out)
     lost = [one for one in found.records.values() if not one.found]
     assert [row.frame for row in lost] == ["0003", "0004"]
     assert np.isnan([row.q for row in lost]).all()
-    assert (
-        "frame 0003-0004 (2 of 8): no pose was found; check masks and pictures"
-        in found.summary["warnings"]
-    )
+    assert any("frame 0003-0004 (2 of 8)" in text for text in found.summary["warnings"])
     assert found.summary["compared_count"] == 1
     rows = (out / "poses.csv").read_text().splitlines()[1:]
     assert [k for k, row in enumerate(rows) if ",,,," in row] == [3, 4]

@@ -35,7 +35,7 @@ def written(path: Path, text: str) -> Path:
     return path
 
 
-def test_joint_centres_compare_frames_as_numbers(tmp_path: Path) -> None:
+def test_joint_centres_compare_frames_as_numbers(tmp_path):
     path = written(tmp_path / "centres.csv", CENTRES)
     positions = read_joint_centres(path, "ankle", ["0000", "0007"])
     assert positions["0000"].tolist() == [1, 2, 3]
@@ -55,7 +55,7 @@ def test_joint_centres_compare_frames_as_numbers(tmp_path: Path) -> None:
         ("frame,joint,x,y,z\n0,ankle,1,2,3\n00,ankle,1,2,3\n", "line 3: frame '00' .* twice"),
     ],
 )
-def test_damaged_joint_centres(tmp_path: Path, text: str, message: str) -> None:
+def test_damaged_joint_centres(tmp_path, text, message):
     path = written(tmp_path / "centres.csv", text)
     with pytest.raises(SceneError, match=rf"centres\.csv.*{message}"):
         read_joint_centres(path, "ankle", ["0000"])
@@ -64,46 +64,35 @@ def test_damaged_joint_centres(tmp_path: Path, text: str, message: str) -> None:
         read_joint_centres(path, "elbow", ["0000"])
 
 
-def test_measured_positions_are_read_by_frame(tmp_path: Path) -> None:
+def test_measured_positions_are_read_by_frame(tmp_path):
     path = written(tmp_path / "angles.csv", "frame,b,a\n3,0.5,-1\n")
     truth = read_measured_positions(path, ["a", "b", "c"])
     assert truth.names == ("b", "a")
-    values = truth.of("0003")
-    assert values is not None
-    assert values.tolist() == [0.5, -1.0]
+    assert truth.of("0003").tolist() == [0.5, -1.0]
     assert truth.of("0004") is None
     assert truth.of("still") is None
     # Too long for a number: compared as a name.
-    assert (
-        read_measured_positions(written(path, f"frame,b\n{'9' * 5000},0\n"), ["b"]).of("9") is None
-    )
-    path = written(tmp_path / "angles.csv", "frame,b,d\n3,0.5,-1\n")
+    long = written(path, f"frame,b\n{'9' * 5000},0\n")
+    assert read_measured_positions(long, ["b"]).of("9") is None
     with pytest.raises(UnknownNameError, match=r"angles.csv.*'d'.*a, b, c"):
-        read_measured_positions(path, ["a", "b", "c"])
+        read_measured_positions(written(path, "frame,b,d\n3,0.5,-1\n"), ["a", "b", "c"])
 
 
 @pytest.mark.parametrize(("sign", "name"), [(";", "semicolons"), ("\t", "tabs")])
-def test_tables_with_other_separators_are_refused_by_name(
-    tmp_path: Path, sign: str, name: str
-) -> None:
-    file = tmp_path / "joint_angles.csv"
-    file.write_text(f"frame{sign}A1\n0000{sign}0,5\n")
+def test_tables_with_other_separators_are_refused_by_name(tmp_path, sign, name):
+    file = written(tmp_path / "joint_angles.csv", f"frame{sign}A1\n0000{sign}0,5\n")
     with pytest.raises(SceneError, match=f"{name}; save the table with commas"):
         read_csv(file, SceneError)
 
 
-def limited() -> SimpleNamespace:
-    """An angle of -1 to 2 rad, a length of 0.1 to 0.3 m, and an angle without limits."""
-    names = ("bend", "reach", "turn")
-    return SimpleNamespace(
-        lower=np.array([-1.0, 0.1, -np.inf]), upper=np.array([2.0, 0.3, np.inf]),
-        position_kinds=("angle", "length", "angle"), position_index=names.index,
-    )  # fmt: skip
-
-
 def units_of(name: str, *values: float) -> tuple[str, ...]:
+    """Of an angle of -1 to 2 rad, a length of 0.1 to 0.3 m, or an angle without limits."""
+    limited = SimpleNamespace(
+        lower=np.array([-1.0, 0.1, -np.inf]), upper=np.array([2.0, 0.3, np.inf]),
+        position_kinds=("angle", "length", "angle"), position_index=("bend", "reach", "turn").index,
+    )  # fmt: skip
     known = {f"{k}": np.array([value]) for k, value in enumerate(values)}
-    return check_units(Path("t.csv"), limited(), [name], known)
+    return check_units(Path("t.csv"), limited, [name], known)
 
 
 @pytest.mark.parametrize(
@@ -123,7 +112,7 @@ def units_of(name: str, *values: float) -> tuple[str, ...]:
         ("bend", (0.0, 300.0), "300 rad lies outside"),
     ],
 )  # fmt: skip
-def test_positions_outside_their_limits_are_told(name, values, told) -> None:
+def test_positions_outside_their_limits_are_told(name, values, told):
     found = units_of(name, *values)
     assert len(found) == (told is not None)
     assert all(f"t.csv: column '{name}', " in text and told in text for text in found)
@@ -138,15 +127,14 @@ def test_positions_outside_their_limits_are_told(name, values, told) -> None:
         ("turn", (-2e6,), "too large for a joint position"),
     ],
 )
-def test_columns_in_other_units_are_refused(name, values, told) -> None:
+def test_columns_in_other_units_are_refused(name, values, told):
     with pytest.raises(SceneError, match=told):
         units_of(name, *values)
 
 
-def test_a_table_of_estimates_is_read_with_its_base(tmp_path: Path) -> None:
+def test_a_table_of_estimates_is_read_with_its_base(tmp_path):
     """Rows without a pose are skipped; the base is apart from the positions."""
-    base = ",".join(BASE_COLUMNS)
-    fit = ",".join(FIT_COLUMNS)
+    base, fit = ",".join(BASE_COLUMNS), ",".join(FIT_COLUMNS)
     numbers = ",".join(str(k) for k in range(7))
     text = f"frame,a,b,{base},{fit}\n0,1,2,{numbers},0.1,3\n1,,,{',' * 6},,3\n"
     found = read_measured_positions(written(tmp_path / "poses.csv", text), ("a", "b", "c"))
@@ -162,18 +150,14 @@ def test_a_table_of_estimates_is_read_with_its_base(tmp_path: Path) -> None:
     assert (plain.names, plain.bases, [*plain.values]) == (("a",), {}, [0])
     alone = read_measured_positions(written(tmp_path / "q.csv", "frame,b\n3,4\n"), ("a", "b"))
     assert (alone.names, alone.is_estimate) == (("b",), False)
-    for bad, told in (
-        ("frame\n", "first line"),
-        ("time,a\n", "first line"),
-        ("frame,a,a\n", "twice"),
-    ):
+    for bad, told in (("frame\n", "first line"), ("time,a\n", "first"), ("frame,a,a\n", "twice")):
         with pytest.raises(SceneError, match=told):
             read_measured_positions(written(tmp_path / "bad.csv", bad), ("a",))
     assert has_times(written(tmp_path / "t.csv", "time,a\n0,1\n"))
     assert not has_times(tmp_path / "q.csv")
 
 
-def test_a_folder_is_an_episode_unless_it_has_masks(tmp_path: Path, monkeypatch) -> None:
+def test_a_folder_is_an_episode_unless_it_has_masks(tmp_path, monkeypatch):
     monkeypatch.setattr("drake_pose.jobs.estimate.measurements.recording_format", lambda _: "droid")
     settings = SimpleNamespace(episode=None)
     assert is_episode(tmp_path, settings)
@@ -190,7 +174,7 @@ def test_a_folder_is_an_episode_unless_it_has_masks(tmp_path: Path, monkeypatch)
     assert "camera 'b' has no X_WC" in told[0]
 
 
-def test_a_table_with_times_is_read_at_the_times_of_the_pictures(tmp_path: Path) -> None:
+def test_a_table_with_times_is_read_at_the_times_of_the_pictures(tmp_path):
     """In degrees and by similar names; times by rate, by time stamps and of a video."""
     filmed, film, start = write_pictures(tmp_path / "a", moving(8)), tmp_path / "b", tmp_path / "c"
     rows = [f"{0.05 * k},{k},{-2 * k}" for k in range(40)]

@@ -30,9 +30,7 @@ def start(scene: TinyScene, out: Path, settings: dict[str, str]) -> subprocess.P
     )
 
 
-def test_result_is_independent_of_locale_time_zone_and_threads(
-    tiny_scene: TinyScene, tmp_path: Path, out: Path
-) -> None:
+def test_result_is_independent_of_locale_time_zone_and_threads(tiny_scene, tmp_path, out):
     far = tmp_path / "Größe 模型 mit Leerzeichen"
     shutil.copytree(tiny_scene.folder, far / "scene")
     model = Path(shutil.copyfile(tiny_scene.model, far / "Kran ü.urdf"))

@@ -43,7 +43,7 @@ def positions(out: Path) -> dict[str, np.ndarray]:
     return {row["frame"]: np.array([float(row[name]) for name in NAMES]) for row in rows}
 
 
-def test_result_folder(tiny_scene: TinyScene, out: Path) -> None:
+def test_result_folder(tiny_scene, out):
     run_estimate(tiny_scene, out)
     assert sorted(path.name for path in out.iterdir()) == [
         "joints.csv", "modes.csv", "overlay", "poses.csv", "replay.html", "report.html",
@@ -62,7 +62,7 @@ def test_result_folder(tiny_scene: TinyScene, out: Path) -> None:
     assert 'src="http' not in page
 
 
-def test_summary(tiny_scene: TinyScene, out: Path) -> None:
+def test_summary(tiny_scene, out):
     options = ["--json", "--no-replay", "--hold", "lift=20"]
     result, summary = run_estimate(tiny_scene, out, "--method", "paper", "--frame", "0:1", *options)
     assert summary == json.loads(result.stdout)
@@ -83,7 +83,7 @@ def test_summary(tiny_scene: TinyScene, out: Path) -> None:
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-7)
 
 
-def test_error_and_overlay_agree_with_drakes_renderer(tiny_scene: TinyScene, out: Path) -> None:
+def test_error_and_overlay_agree_with_drakes_renderer(tiny_scene, out):
     settings = EstimateSettings(method="paper", hold={"luff": -90.0})
     result = estimate_scene(tiny_scene.folder, tiny_scene.model, out, settings, replay=False)
     scene = load_scene(tiny_scene.folder)
@@ -104,7 +104,7 @@ def test_error_and_overlay_agree_with_drakes_renderer(tiny_scene: TinyScene, out
             assert 0.9 * scale * share < painted <= scale * share
 
 
-def test_nothing_is_written_without_a_folder(tiny_scene: TinyScene) -> None:
+def test_nothing_is_written_without_a_folder(tiny_scene):
     heard = []
     result = estimate_scene(
         tiny_scene.folder,
@@ -118,7 +118,7 @@ def test_nothing_is_written_without_a_folder(tiny_scene: TinyScene) -> None:
     assert heard == [(0, 1, ""), (1, 1, "0001")]
 
 
-def test_several_cameras_are_used_together(tmp_path: Path) -> None:
+def test_several_cameras_are_used_together(tmp_path):
     scene = write_scene(tmp_path / "scene", [(20.0, -40.0)], ["front", "side"])
     for options, names in (
         (("--method", "paper"), ["front", "side"]),
@@ -130,7 +130,7 @@ def test_several_cameras_are_used_together(tmp_path: Path) -> None:
         assert sorted(path.name for path in (out / "overlay").iterdir()) == names
 
 
-def test_estimates_are_compared_with_measured_positions_of_the_scene(own_scene: TinyScene) -> None:
+def test_estimates_are_compared_with_measured_positions_of_the_scene(own_scene):
     write_truth(own_scene)
     folder = own_scene.folder.parent
     held = ["--hold", "lift=27", "--frame", "0", "--no-replay"]
@@ -149,22 +149,14 @@ def test_estimates_are_compared_with_measured_positions_of_the_scene(own_scene: 
     assert "has no row of an estimated frame" in summary["warnings"][0]
 
 
-def jib_positions(scene: TinyScene) -> dict[str, np.ndarray]:
-    """Return the position of the jib's origin by frame, from a separate plant [m]."""
-    plant = MultibodyPlant(0.0)
-    Parser(plant).AddModels(str(scene.model))
+def test_another_root_with_a_position_for_each_frame(own_scene):
+    plant, rows = MultibodyPlant(0.0), {}
+    Parser(plant).AddModels(str(own_scene.model))
     plant.Finalize()
-    context = plant.CreateDefaultContext()
-    positions = {}
-    for frame, q in scene.truth.items():
+    context, jib = plant.CreateDefaultContext(), plant.GetBodyByName("jib")
+    for frame, q in own_scene.truth.items():
         plant.SetPositions(context, q)
-        jib = plant.GetBodyByName("jib")
-        positions[frame] = plant.EvalBodyPoseInWorld(context, jib).translation()
-    return positions
-
-
-def test_another_root_with_a_position_for_each_frame(own_scene: TinyScene) -> None:
-    rows = {frame: ["hook", *p_WJ] for frame, p_WJ in jib_positions(own_scene).items()}
+        rows[frame] = ["hook", *plant.EvalBodyPoseInWorld(context, jib).translation()]
     centres = write_joints(own_scene.folder / "centres.csv", ["joint", "x", "y", "z"], rows)
     out = own_scene.folder.parent / "out"
     root = ["--root", "jib", "--root-position", f"{centres}:hook", "--root-rotation", "x=-180:180"]
@@ -176,7 +168,7 @@ def test_another_root_with_a_position_for_each_frame(own_scene: TinyScene) -> No
         assert abs(float(row["base_qw"])) == pytest.approx(1.0)
 
 
-def test_a_frame_without_a_pose(own_scene: TinyScene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frame_without_a_pose(own_scene, monkeypatch):
     out = own_scene.folder.parent / "out"
     strict = partial(PaperSearchSettings, outside_limit=0.0)
     monkeypatch.setattr("drake_pose.jobs.estimate.inputs.PaperSearchSettings", strict)
@@ -196,7 +188,7 @@ def test_a_frame_without_a_pose(own_scene: TinyScene, monkeypatch: pytest.Monkey
     assert (out / "overlay" / "front" / "0000.png").is_file()
 
 
-def test_intervals_and_modes_are_written_and_kept_on_resume(own_scene: TinyScene) -> None:
+def test_intervals_and_modes_are_written_and_kept_on_resume(own_scene):
     """One camera, angles between the samples: some mode's intervals contain the truth."""
     scene = write_scene(own_scene.folder.parent / "between", [(13.0, -47.0), (-31.0, -22.0)])
     out = own_scene.folder.parent / "out"
@@ -225,9 +217,7 @@ def test_intervals_and_modes_are_written_and_kept_on_resume(own_scene: TinyScene
         assert answer == pytest.approx(value, abs=1e-3)
 
 
-def test_constraints_that_are_not_enforced_are_warned_of(
-    tiny_scene: TinyScene, tmp_path: Path, out: Path
-) -> None:
+def test_constraints_that_are_not_enforced_are_warned_of(tiny_scene, tmp_path, out):
     text = URDF.replace('<joint name="bolt" type="fixed">', '<joint name="bolt" type="prismatic">')
     joint = text.index('<joint name="luff"')
     end = text.index("</joint>", joint)
@@ -246,7 +236,7 @@ def test_constraints_that_are_not_enforced_are_warned_of(
 
 
 @pytest.fixture
-def bare_scene(own_scene: TinyScene) -> TinyScene:
+def bare_scene(own_scene):
     """A scene of masks without cameras.yaml."""
     (own_scene.folder / "cameras.yaml").unlink()
     for path in (own_scene.folder / "masks" / "front").iterdir():
@@ -262,7 +252,7 @@ def run(scene: TinyScene, out: Path, *more: str) -> tuple[np.ndarray, dict]:
     return np.array([float(row[name]) for name in NAMES]), summary["frames"]["0000"]
 
 
-def test_masks_without_cameras_give_pose_and_scale(bare_scene: TinyScene, out: Path) -> None:
+def test_masks_without_cameras_give_pose_and_scale(bare_scene, out):
     """A parallel camera approximates the pinhole camera that drew the masks."""
     q, record = run(bare_scene, out)
     np.testing.assert_allclose(q, bare_scene.truth["0000"], atol=np.radians(6.0))
@@ -280,16 +270,14 @@ def test_masks_without_cameras_give_pose_and_scale(bare_scene: TinyScene, out: P
         assert [joint["low"], joint["high"]] == pytest.approx(ends)
 
 
-def test_an_unknown_root_position_is_estimated(tiny_scene: TinyScene, out: Path) -> None:
+def test_an_unknown_root_position_is_estimated(tiny_scene, out):
     q, record = run(tiny_scene, out, "--root-position", "unknown")
     np.testing.assert_allclose(q, tiny_scene.truth["0000"], atol=np.radians(6.0))
     assert record["E_total"] < 0.03
     assert record["camera_scale"] is None
 
 
-def test_options_that_need_a_known_root_are_refused(
-    tiny_scene: TinyScene, bare_scene: TinyScene
-) -> None:
+def test_options_that_need_a_known_root_are_refused(tiny_scene, bare_scene):
     settings = EstimateSettings(method="paper")
     for scene, more in ((bare_scene, None), (tiny_scene, "unknown")):
         with pytest.raises(SettingsError, match="method beam"):
@@ -300,7 +288,7 @@ BOOM = LINK.format(name="boom", z=0.25, size="0.1 0.12 0.5")
 
 
 @pytest.fixture
-def far(tmp_path: Path, tiny_scene: TinyScene) -> tuple[Path, Path]:
+def far(tmp_path, tiny_scene):
     """A model whose boom is a mesh of a package elsewhere, and the package's folder."""
     folder = tmp_path / "far away" / "crane parts"
     folder.mkdir(parents=True)
@@ -313,9 +301,7 @@ def far(tmp_path: Path, tiny_scene: TinyScene) -> tuple[Path, Path]:
     return model, folder
 
 
-def test_a_missing_package_is_named_and_must_stay_the_same_on_resume(
-    out: Path, tiny_scene: TinyScene, far: tuple[Path, Path]
-) -> None:
+def test_a_missing_package_is_named_and_must_stay_the_same_on_resume(out, tiny_scene, far):
     model, folder = far
     scene = replace(tiny_scene, model=model)
     words = [*scene.estimate(out), "--no-replay", "--no-overlay"]

@@ -29,10 +29,10 @@ def stance(heading_deg=0.0, ahead=0.0, left=0.0, feet_ahead=None, nod_deg=0.0):
 REST = stance()
 
 
-def commands(stances):
+def commands(stances, rest=REST):
     last, found = (0, 0), []
     for one in stances:
-        last = recognise_command(one, REST, last)
+        last = recognise_command(one, rest, last)
         found.append(last)
     return found
 
@@ -61,11 +61,7 @@ def test_made_gestures_are_recognised(skeleton):
         stance_of(skeleton.head_rotation(q)[:, 0], head, feet)
         for q, head, feet in zip(motion.q, features[:, 0], features[:, 3:], strict=True)
     ]
-    last, told = (0, 0), []
-    for one in stances:
-        last = recognise_command(one, stances[23], last)
-        told.append(last)
-    names = np.array(motion.names)
+    told, names = commands(stances, stances[23]), np.array(motion.names)
     assert list(dict.fromkeys(motion.names)) == [REGISTERED, *COMMANDS]
     asked = [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)]
     for name, command in zip([REGISTERED, *COMMANDS], asked, strict=True):

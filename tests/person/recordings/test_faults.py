@@ -80,47 +80,39 @@ def make_stage(count: int) -> Stage:
 
 
 @pytest.fixture(scope="module")
-def four() -> Stage:
+def four():
     return make_stage(4)
 
 
 @pytest.fixture(scope="module")
-def nine() -> Stage:
+def nine():
     return make_stage(9)
-
-
-MOVES = {
-    "3 degrees": (3.0, (0.0, 0.0, 0.0)),
-    "10 degrees": (-10.0, (0.0, 0.0, 0.0)),
-    "5 cm": (0.0, (0.0, 0.0, 0.05)),
-    "20 cm": (0.0, (0.2, 0.0, 0.0)),
-}
 
 
 class TestMovedCamera:
     @pytest.mark.parametrize("stage", ["four", "nine"])
     @pytest.mark.slow
-    def test_sound_rig_has_no_fault(self, stage: str, request: pytest.FixtureRequest) -> None:
+    def test_sound_rig_has_no_fault(self, stage, request):
         found = request.getfixturevalue(stage)
         assert found.find(found.masks) is None
 
-    @pytest.mark.parametrize("name", MOVES)
-    def test_moved_camera_is_found_among_four(self, name: str, four: Stage) -> None:
-        fault = four.find(four.seen_by_moved("camera_1", *MOVES[name]))
-        assert fault is not None
+    @pytest.mark.parametrize(
+        ("turn", "shift"), [(3, (0, 0, 0)), (-10, (0, 0, 0)), (0, (0, 0, 0.05)), (0, (0.2, 0, 0))]
+    )
+    def test_moved_camera_is_found_among_four(self, turn, shift, four):
+        fault = four.find(four.seen_by_moved("camera_1", turn, shift))
         assert (fault.name, fault.is_explained) == ("camera_1", True)
 
-    def test_with_three_cameras_the_moved_one_stays_ambiguous(self, four: Stage) -> None:
+    def test_with_three_cameras_the_moved_one_stays_ambiguous(self, four):
         def three(masks: Masks) -> Masks:
             return [{n: m for n, m in own.items() if n != "camera_3"} for own in masks]
 
         fault = four.find(three(four.seen_by_moved("camera_1", 6.0, (0.0, 0.0, 0.0))))
-        assert fault is not None
         assert "camera_1" in (fault.name, *fault.alternatives)
         assert not fault.is_explained
         assert four.find(three(four.masks)) is None
 
-    def test_camera_with_poor_masks_is_not_reported_as_moved(self, nine: Stage) -> None:
+    def test_camera_with_poor_masks_is_not_reported_as_moved(self, nine):
         """Frames lack the upper or lower half of the person in turn: no motion explains that."""
         masks = [dict(own) for own in nine.masks]
         for k, own in enumerate(masks):
@@ -132,7 +124,7 @@ class TestMovedCamera:
         fault = nine.find(masks)
         assert fault is None or (fault.name, fault.is_explained) == ("camera_2", False)
 
-    def test_motion_of_an_unmoved_camera_is_zero(self, four: Stage) -> None:
+    def test_motion_of_an_unmoved_camera_is_zero(self, four):
         frames = four.frames(four.masks)
         camera = four.cameras["camera_0"]
         edges = [frame.edges["camera_0"] for frame in frames]
@@ -141,7 +133,7 @@ class TestMovedCamera:
         assert motion.pixels < 0.5
         np.testing.assert_allclose(motion.X_WC[:3, 3], camera.X_WC[:3, 3], atol=0.05)
 
-    def test_rolled_camera_turns_its_pictures_the_opposite_way(self, four: Stage) -> None:
+    def test_rolled_camera_turns_its_pictures_the_opposite_way(self, four):
         camera, view = four.cameras["camera_0"], four.frames(four.masks)[0]
         X_WC = camera.X_WC.copy()
         X_WC[:3, :3] = X_WC[:3, :3] @ Rotation.from_euler("z", 0.1).as_matrix()
@@ -154,7 +146,7 @@ class TestMovedCamera:
         assert motion.turn == pytest.approx(-0.1)
         assert motion.inlier_ratio_after < motion.inlier_ratio_before
 
-    def test_first_frame_after_the_motion(self) -> None:
+    def test_first_frame_after_the_motion(self):
         good, bad = [0.9, 0.95, 0.9], [0.2, 0.1, 0.3]
         assert first_moved_frame([*good, *bad], [*bad, *good]) == 3
         assert first_moved_frame(bad, good) == 0
@@ -164,7 +156,7 @@ class TestMovedCamera:
 
 class TestRig:
     @pytest.mark.slow
-    def test_sound_rig_has_no_fault(self, four: Stage, nine: Stage) -> None:
+    def test_sound_rig_has_no_fault(self, four, nine):
         assert find_rig_fault(four.cameras, four.masks[:2]) is None
         assert find_rig_fault(nine.cameras, nine.masks[:1]) is None
 
@@ -175,32 +167,30 @@ class TestRig:
             pytest.param(tuple(f"camera_{k}" for k in range(4)), marks=pytest.mark.slow),
         ],
     )
-    def test_mirrored_pictures_are_named(self, names: tuple[str, ...], four: Stage) -> None:
+    def test_mirrored_pictures_are_named(self, names, four):
         good = four.masks[2:]
         spoilt = [{n: m[:, ::-1] if n in names else m for n, m in own.items()} for own in good]
         fault = find_rig_fault(four.cameras, spoilt)
-        assert fault is not None
         assert (fault.mirrored, fault.exchanged) == (names, ())
         for own, right in zip(spoilt, good, strict=True):
             np.testing.assert_equal(fault.undo(own), right)
 
     @pytest.mark.slow
-    def test_exchanged_cameras_are_named(self, four: Stage) -> None:
+    def test_exchanged_cameras_are_named(self, four):
         one, two = "camera_1", "camera_2"
         spoilt = [{**own, one: own[two], two: own[one]} for own in four.masks[:2]]
         fault = find_rig_fault(four.cameras, spoilt)
-        assert fault is not None
         assert (fault.mirrored, fault.exchanged) == ((), (one, two))
         np.testing.assert_equal(fault.undo(spoilt[0]), four.masks[0])
 
     @pytest.mark.slow
-    def test_moved_camera_is_not_taken_for_a_mirrored_one(self, four: Stage) -> None:
+    def test_moved_camera_is_not_taken_for_a_mirrored_one(self, four):
         fault = find_rig_fault(four.cameras, four.seen_by_moved("camera_2", 10.0, (0, 0, 0))[:2])
         assert fault is None or (fault.mirrored, fault.exchanged) == ((), ())
 
 
 class TestOthers:
-    def test_two_persons_are_located(self, nine: Stage) -> None:
+    def test_two_persons_are_located(self, nine):
         poses = [nine.poses[0], stepping(nine.person, 1.0, 0.5, 1.2)]
         both = see(nine.person, nine.cameras, np.array(poses))
         masks = [one | other for one, other in zip(*(own.values() for own in both), strict=True)]
@@ -210,7 +200,7 @@ class TestOthers:
         np.testing.assert_allclose(places[0][:2], poses[0][:2], atol=0.2)
         np.testing.assert_allclose(places[1][:2], [0.5, 1.2], atol=0.2)
 
-    def test_other_person_is_cut_out(self, nine: Stage) -> None:
+    def test_other_person_is_cut_out(self, nine):
         other = see(nine.person, nine.cameras, np.array([stepping(nine.person, 1.0, 0.5, 1.2)]))[0]
         alone, place = nine.masks[0], np.array([-0.2, 0.1, 0.9])
         both = {name: mask | other[name] for name, mask in alone.items()}
@@ -227,7 +217,7 @@ class TestOthers:
                 np.testing.assert_array_equal(view.region, alone[name])
                 np.testing.assert_array_equal(view.edge.uv, find_edge_points(alone[name], 2.0).uv)
 
-    def test_one_person_keeps_all_fragments(self, four: Stage) -> None:
+    def test_one_person_keeps_all_fragments(self, four):
         masks = {name: mask.copy() for name, mask in four.masks[0].items()}
         rows = np.flatnonzero(masks["camera_0"].any(axis=1))
         masks["camera_0"][int(rows.mean()) : int(rows.mean()) + 5] = False
@@ -237,7 +227,7 @@ class TestOthers:
         empty = {name: np.zeros((120, 160), dtype=bool) for name in four.cameras}
         assert keep_person(four.cameras, empty)[1] is None
 
-    def test_figures_of_large_pictures_are_cut_whole(self) -> None:
+    def test_figures_of_large_pictures_are_cut_whole(self):
         mask = np.zeros((960, 1280), dtype=bool)
         mask[100:500, 101:303] = True
         alone = mask.copy()
@@ -247,7 +237,7 @@ class TestOthers:
         np.testing.assert_allclose(small.middle, [705.5, 299.5], atol=4.0)
         np.testing.assert_array_equal(cut_figures(mask, [small]), alone)
 
-    def test_frames_of_a_hidden_or_absent_person(self, four: Stage) -> None:
+    def test_frames_of_a_hidden_or_absent_person(self, four):
         """Seen, hidden from all cameras but one, absent, and seen again."""
         masks = [dict(four.masks[min(k, 3)]) for k in range(5)]
         for name in four.cameras:
@@ -261,7 +251,7 @@ class TestOthers:
         assert (faults.blind, faults.others) == ({}, {})
         assert 1.3 < recording.height < 2.1
 
-    def test_unassigned_figure_is_a_strangers_if_nearer_to_another_or_large_and_far(self) -> None:
+    def test_unassigned_figure_is_a_strangers_if_nearer_to_another_or_large_and_far(self):
         camera = circle_of_cameras(2, size=(160, 120), face_camera=False)["camera_0"]
         me = np.array([0.0, 0.0, 1.0])
         him, between, away = (me + by * camera.X_WC[:3, 0] for by in (0.9, 0.4, -0.8))
@@ -284,7 +274,7 @@ class TestOthers:
         assert not is_strangers(away, "large", {}, [])
 
     @pytest.mark.parametrize("side", [None, 0, 1, 2, 3], ids=lambda k: f"side {k}")
-    def test_figure_is_merged_if_its_box_contains_a_hidden_person(self, side: int | None) -> None:
+    def test_figure_is_merged_if_its_box_contains_a_hidden_person(self, side):
         """The hidden person's middle is inside the box, or a pixel outside one of its sides."""
         camera = circle_of_cameras(2, size=(160, 120), face_camera=False)["camera_0"]
         me = Person(np.array([0.0, 0.0, 1.0]), {0: 0}, 100.0)
@@ -298,13 +288,13 @@ class TestOthers:
         assert found == {"0": ((), side is None)}
 
     @pytest.mark.parametrize(("gap", "far"), [(1, 0.39), (1, 0.41), (3, 0.39), (3, 0.41)])
-    def test_track_continues_within_a_step_also_after_a_gap(self, gap: int, far: float) -> None:
+    def test_track_continues_within_a_step_also_after_a_gap(self, gap, far):
         first, then = (Person(np.array([x, 0.0, 1.0]), {}, 100.0) for x in (0.0, far))
         tracks = find_tracks([[], [first], *[[]] * (gap - 1), [then]])
         alone = [{1: first}, {gap + 1: then}]
         assert tracks == ([{1: first, gap + 1: then}] if far < 0.4 else alone)
 
-    def test_followed_person_is_seen_longest_and_may_return(self) -> None:
+    def test_followed_person_is_seen_longest_and_may_return(self):
         def person(x: float, area: float = 100.0) -> Person:
             return Person(np.array([x, 0.0, 1.0]), {0: 0}, area)
 
@@ -324,20 +314,20 @@ class TestOthers:
         each = follow_one(frames, np.zeros(3), False)
         assert each == [me[0], me[1], None, him[1], me[2], me[3], None]
 
-    def test_middle_of_view_of_cameras_around_a_target_is_the_target(self) -> None:
+    def test_middle_of_view_of_cameras_around_a_target_is_the_target(self):
         target = (0.3, -0.2, 1.1)
         cameras = circle_of_cameras(5, target=target, size=(161, 120), face_camera=False)
         np.testing.assert_allclose(middle_of_view(list(cameras.values())), target, atol=1e-6)
 
     @pytest.mark.parametrize(("side", "counts"), [(10, True), (7, False)])
-    def test_specks_are_no_figures(self, side: int, counts: bool) -> None:
+    def test_specks_are_no_figures(self, side, counts):
         """The limit is 2e-4 of the picture, here 61 pixels."""
         mask = np.zeros((239, 1285), dtype=bool)
         mask[50 : 50 + side, 60 : 60 + side] = True
         found = find_figures(mask)
         assert [one.area for one in found] == [float(side**2)] * counts
 
-    def test_separate_person_stands_apart_and_is_large(self) -> None:
+    def test_separate_person_stands_apart_and_is_large(self):
         def person(x: float, area: float, z: float = 1.0) -> Person:
             return Person(np.array([x, 0.0, z]), {}, area)
 
@@ -351,20 +341,14 @@ class TestOthers:
 
 
 class TestRecord:
-    def test_masks_and_cameras_that_show_no_person_are_refused(self, four: Stage) -> None:
+    def test_masks_and_cameras_that_show_no_person_are_refused(self, four):
         nothing = {name: np.zeros((120, 160), bool) for name in four.cameras}
         inverted = {name: ~mask for name, mask in four.masks[0].items()}
-        small = {
-            name: camera.with_pose(
-                np.block(
-                    [
-                        [camera.X_WC[:3, :3], 0.01 * camera.X_WC[:3, 3:]],
-                        [np.zeros((1, 3)), np.ones((1, 1))],
-                    ]
-                )
-            )
-            for name, camera in four.cameras.items()
-        }
+        small = {}
+        for name, camera in four.cameras.items():
+            X_WC = camera.X_WC * np.array([1.0, 1.0, 1.0, 0.01])
+            X_WC[3, 3] = 1.0
+            small[name] = camera.with_pose(X_WC)
         for cameras, masks, error, words in (
             (four.cameras, nothing, SettingsError, "two cameras see no person in any of 1 frames"),
             (four.cameras, inverted, MaskError, "in 100 % of the masks"),

@@ -1,5 +1,3 @@
-import csv
-
 import numpy as np
 import pytest
 
@@ -13,6 +11,7 @@ from drake_pose.person.capture import capture_person
 from drake_pose.person.pose_tracker import NOISE, fit_shape, shape_values
 from drake_pose.silhouette.pictures.scenes import load_scene
 from drake_pose.silhouette.scoring import draw_mask
+from tests.jobs.scenes import read_rows
 from tests.person.persons_in_view import SIDES, stepping
 
 PAIRS = {"thigh": -0.03, "shin": 0.03, "upper_arm": 0.025, "forearm": -0.02}
@@ -26,12 +25,10 @@ def joint_errors(person, scene, frames, positions):
     for frame, q in zip(frames, positions, strict=True):
         found = landmark_positions(person, landmarks, q)
         places |= {(int(frame), name): p for name, p in zip(landmarks, found, strict=True)}
-    with (scene.path / "joint_centres.csv").open() as stream:
-        truth = [row for row in csv.DictReader(stream) if row["joint"] != "head_top"]
     return [
         1e3 * np.linalg.norm(places[key] - [float(row[axis]) for axis in "xyz"])
-        for row in truth
-        if (key := (int(row["frame"]), row["joint"])) in places
+        for row in read_rows(scene.path / "joint_centres.csv")
+        if (key := (int(row["frame"]), row["joint"])) in places and key[1] != "head_top"
     ]
 
 

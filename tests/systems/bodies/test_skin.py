@@ -1,7 +1,5 @@
 """Skin in diagrams: sensors and Meshcat show it bent, and the matcher finds the pose."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from pydrake.geometry import Meshcat, MeshcatParams, Rgba
@@ -9,7 +7,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from drake_pose.body import ArticulatedModel, ModelSkin
+from drake_pose.body import ModelSkin
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.search import PaperSearch, PaperSearchSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
@@ -19,7 +17,7 @@ from tests.body.models import load_limb
 
 
 @pytest.fixture
-def limb(tmp_path: Path) -> ArticulatedModel:
+def limb(tmp_path):
     return load_limb(tmp_path)
 
 
@@ -45,7 +43,7 @@ class _Recorder:
 
 
 @pytest.mark.parametrize("recorded", [False, True])
-def test_meshcat_is_sent_the_bent_bands(limb: ArticulatedModel, recorded: bool) -> None:
+def test_meshcat_is_sent_the_bent_bands(limb, recorded):
     recorder = _Recorder()
     skin = ModelSkin(limb)
     drawer = MeshcatSkin(recorder, skin, 5, "body/skin", is_recorded=recorded)
@@ -69,7 +67,7 @@ def test_meshcat_is_sent_the_bent_bands(limb: ArticulatedModel, recorded: bool) 
         assert seen == {("body/skin/0", False), ("body/skin/1", True)}
 
 
-def test_a_simulated_camera_sees_the_skin(limb: ArticulatedModel) -> None:
+def test_a_simulated_camera_sees_the_skin(limb):
     """The matcher, whose bodies have skin, finds the true pose with E_total near 0."""
     search = PaperSearch(
         limb.pose_tree(), PaperSearchSettings(interval=0.6, outside_limit=3.0, candidate_limit=20)
@@ -95,7 +93,7 @@ def test_a_simulated_camera_sees_the_skin(limb: ArticulatedModel) -> None:
         assert meshcat.HasPath(f"visualizer/{name}")
 
 
-def test_models_without_skin_add_no_system(tmp_path: Path) -> None:
+def test_models_without_skin_add_no_system(tmp_path):
     plain = load_limb(tmp_path, "")
     builder = DiagramBuilder()
     source = builder.AddSystem(ConstantVectorSource(np.zeros(5)))

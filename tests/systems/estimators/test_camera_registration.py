@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.analysis import Simulator
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_pose.body import ArticulatedModel, load_model
+from drake_pose.body import load_model
 from drake_pose.errors import MaskError, SettingsError
 from drake_pose.registration.online_registration import OnlineRegistration, pose_difference
 from drake_pose.registration.register import RegistrationBody
@@ -28,19 +28,19 @@ CAMERA = looking_at(np.array([1.6, 0.4, 0.5]), np.array([0.0, 0.0, 0.4]), 0.1)
 
 
 @pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> ArticulatedModel:
+def model(tmp_path_factory):
     path: Path = tmp_path_factory.mktemp("arm") / "arm.urdf"
     path.write_text(arm_urdf())
     return load_model(path)
 
 
 @pytest.fixture(scope="module")
-def online(model: ArticulatedModel) -> OnlineRegistration:
+def online(model):
     return OnlineRegistration(RegistrationBody(model.pose_tree()), CAMERA.with_pose(np.eye(4)))
 
 
 class TestCameraRegistration:
-    def test_no_pose_at_first(self, online: OnlineRegistration) -> None:
+    def test_no_pose_at_first(self, online):
         run = Bench(CameraRegistration(online, PERIOD))
         assert run["status"] == [0.0]
         assert np.isnan(run["X_WC"].translation()).all()
@@ -50,7 +50,7 @@ class TestCameraRegistration:
         assert np.isnan(named["mean_iou"])
         assert run.system.registered_camera(run.context) is None
 
-    def test_ignores_missing_images_and_positions(self, online: OnlineRegistration) -> None:
+    def test_ignores_missing_images_and_positions(self, online):
         system = CameraRegistration(online, PERIOD)
         run = Bench(system).update(measured_positions=np.full(5, np.nan))
         mask = np.zeros((480, 640), dtype=bool)
@@ -66,7 +66,7 @@ class TestCameraRegistration:
         run.context.SetStateAndParametersFrom(system.CreateDefaultContext())
         assert system.belief(run.context).keyframes == ()
 
-    def test_uses_the_labels_of_a_model_made_of_a_plant(self, online) -> None:
+    def test_uses_the_labels_of_a_model_made_of_a_plant(self, online):
         """A ground that fills the image does not belong to the robot."""
         labels = np.full((480, 640, 1), 9, np.int16)
         labels[100:200, 100:200] = 5
@@ -85,15 +85,13 @@ class TestCameraRegistration:
                 measured_positions=np.zeros(5), label_image=image
             )
 
-    def test_refuses_a_period_of_zero(self, online: OnlineRegistration) -> None:
+    def test_refuses_a_period_of_zero(self, online):
         with pytest.raises(SettingsError, match="period"):
             CameraRegistration(online, 0.0)
 
 
 @pytest.mark.slow
-def test_a_camera_is_found_and_found_again_after_it_was_moved(
-    model: ArticulatedModel, online: OnlineRegistration
-) -> None:
+def test_a_camera_is_found_and_found_again_after_it_was_moved(model, online):
     rng = np.random.default_rng(5)
     kinematics = online.body.kinematics
     count = 13

@@ -162,14 +162,6 @@ def test_a_contexts_parameters_set_the_filter():
 
 def test_the_period_is_the_motions():
     assert Bench(TruncatedEkf(swinging(0.02), ABOUT)).advance(0.1)["statistics"][0] == 5
-    with pytest.raises(SettingsError, match=r"the motion's period is 0\.1 s, not 0\.5"):
-        TruncatedEkf(swinging(), ABOUT, 0.5)
-    with pytest.raises(SettingsError, match="per step"):
-        TruncatedEkf(experiment_filter()[0], ABOUT)
-    with pytest.raises(SettingsError, match="a TruncatedFilter, not StateLayout"):
-        TruncatedEkf(LAYOUT, ABOUT)
-    with pytest.raises(SettingsError, match="3 elements"):
-        TruncatedEkf(swinging(), Belief(np.zeros(2), np.eye(2)))
 
 
 def pendulum(time_step):
@@ -205,13 +197,18 @@ def test_plant_motion_integrates_the_differential_equation(time_step):
 
 
 def test_invalid_settings_are_refused(sequence):
-    f, _ = experiment_filter()
-    with pytest.raises(SettingsError, match="period"):
-        TruncatedEkf(f, sequence.guess, 0.0)
-    with pytest.raises(SettingsError, match="patience"):
-        TruncatedEkf(f, sequence.guess, 0.1, patience=0)
-    with pytest.raises(SettingsError, match="NaN"):
-        TruncatedEkf(f, Belief(np.full(37, np.nan), np.eye(37)), 0.1)
+    (f, _), rod = experiment_filter(), swinging()
+    for given, word in (
+        ((f, sequence.guess, 0.0), "period"),
+        ((f, sequence.guess, 0.1, 0), "patience"),
+        ((f, Belief(np.full(37, np.nan), np.eye(37)), 0.1), "NaN"),
+        ((f, ABOUT), "per step"),
+        ((rod, ABOUT, 0.5), r"the motion's period is 0\.1 s, not 0\.5"),
+        ((LAYOUT, ABOUT), "a TruncatedFilter, not StateLayout"),
+        ((rod, Belief(np.zeros(2), np.eye(2))), "3 elements"),
+    ):
+        with pytest.raises(SettingsError, match=word):
+            TruncatedEkf(*given)
 
 
 def test_time_running_backwards_is_refused(sequence):

@@ -13,7 +13,6 @@ from drake_pose.body import ArticulatedModel
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import MaskError
-from drake_pose.jobs.registration.words import describe_error
 from drake_pose.registration.diagnosis import (
     DIAGNOSIS,
     _Cause,
@@ -90,18 +89,12 @@ def test_a_frame_is_explained_relative_to_its_cameras_best(ratio: float) -> None
     np.testing.assert_array_equal(found, [True, True, ratio in (0.51, 0.76), False])
 
 
-@pytest.mark.parametrize(
-    ("offset", "sd", "is_half"),
-    [
-        ((0.5, 0.5), 0.05, True),
-        ((-0.7, -0.3), 0.05, True),
-        ((0.5, -0.5), 0.05, False),
-        ((0.5, 0.8), 0.05, False),
-        ((0.5, 0.5), 0.3, False),
-    ],
-)
-def test_half_a_pixel_along_both_axes_is_reported_if_significant(offset, sd, is_half) -> None:
-    assert is_half_pixel(np.array(offset), sd**2 * np.eye(2)) == is_half
+def test_half_a_pixel_along_both_axes_is_reported_if_significant() -> None:
+    for u, v, sd, is_half in (
+        (0.5, 0.5, 0.05, True), (-0.7, -0.3, 0.05, True), (0.5, -0.5, 0.05, False),
+        (0.5, 0.8, 0.05, False), (0.5, 0.5, 0.3, False),
+    ):  # fmt: skip
+        assert is_half_pixel(np.array([u, v]), sd**2 * np.eye(2)) == is_half
 
 
 Frames = Sequence[tuple[np.ndarray, np.ndarray, Sequence[PinholeCamera]]]
@@ -168,9 +161,9 @@ def joint_off(poses: np.ndarray, joint: int, frames: slice, degrees: float) -> n
 
 
 class TestAuditFrames:
-    def test_correct_frames_give_no_finding_and_the_minimum_detectable_offset_gives_one(
+    def test_correct_frames_and_the_minimum_detectable_offset(
         self, model, body, poses, cameras, right
-    ) -> None:
+    ):
         found = diagnose_frames(*right(1))
         assert (found.outliers, found.common) == ((), ())
         least = found.minimum_detectable
@@ -224,9 +217,6 @@ class TestAuditFrames:
         (first, *_) = found.common
         assert (first.kind, first.name) == ("focal", "focal lengths")
         assert first.shift == pytest.approx(-0.04, abs=0.006)
-        size = f"{-100.0 * first.shift:.1f} +- {100.0 * first.shift_sd:.1f}"
-        assert describe_error(first, "off").startswith("the focal lengths")
-        assert describe_error(first, "off").endswith(f"are {size} percent too long")
         aside = [replace(one, center_x=one.center_x + 5.0) for one in cameras]
         found = audit(model, body, poses, poses, cameras, aside)
         assert [one.kind for one in found.common] == ["center"]
@@ -234,16 +224,16 @@ class TestAuditFrames:
 
 
 def test_masks_of_wrong_size_and_empty_masks_are_refused(body, poses, cameras) -> None:
-    mask, surfaces = np.ones((480, 640), bool), (body.medium, body.full)
-    frame = MultiViewFrame("0007", poses[0], {"left": mask[:100]})
-    with pytest.raises(MaskError, match=r"'left', frame '0007'.*640 x 480"):
-        PerFrameFit(body.kinematics, surfaces, cameras[:1], [frame])
-    good = MultiViewFrame("0000", poses[0], {"left": mask})
+    mask, given = np.ones((480, 640), bool), (body.kinematics, (body.medium, body.full))
+    frame, good, empty = (
+        MultiViewFrame(name, poses[0], {"left": one})
+        for name, one in (("0007", mask[:100]), ("0000", mask), ("0000", ~mask))
+    )
+    for frames, said in (([frame], r"'left', frame '0007'.*640 x 480"), ([empty], "no mask")):
+        with pytest.raises(MaskError, match=said):
+            PerFrameFit(*given, cameras[:1], frames)
     with pytest.raises(MaskError, match="frame '0007'"):
-        PerFrameFit(body.kinematics, surfaces, cameras[:1], [good]).fit(frame)
-    empty = MultiViewFrame("0000", poses[0], {"left": ~mask})
-    with pytest.raises(MaskError, match="no mask shows the body"):
-        PerFrameFit(body.kinematics, surfaces, cameras[:1], [empty])
+        PerFrameFit(*given, cameras[:1], [good]).fit(frame)
 
 
 def information(scale: float = 1.0, freedom: float = 50.0, seed: int = 3) -> _Information:
@@ -262,8 +252,8 @@ def information(scale: float = 1.0, freedom: float = 50.0, seed: int = 3) -> _In
     )
 
 
-def cause(name: str, *columns: int, rank: float = 1.0, kind: str = "joint") -> _Cause:
-    return _Cause(kind, name, np.eye(5)[:, [*columns]], np.ones(len(columns)), rank)
+def cause(name: str, *columns: int, rank: float = 1.0) -> _Cause:
+    return _Cause("joint", name, np.eye(5)[:, [*columns]], np.ones(len(columns)), rank)
 
 
 def residual_of(x: np.ndarray, seed: int = 5) -> _Residual:
@@ -324,13 +314,8 @@ def test_causes_are_estimated_by_least_squares() -> None:
 
 def test_sufficient_causes_leave_little_and_the_simplest_comes_first() -> None:
     residual = residual_of(np.array([0.0, 0.0, 2.0, 0.0, 0.0]))
-    tests = [
-        residual.test(one)
-        for one in (
-            cause("camera", 0, 1, 2, rank=6.0), cause("right", 2), cause("other", 2, 3),
-            cause("wrong", 0),
-        )
-    ]  # fmt: skip
+    causes = cause("camera", 0, 1, 2, rank=6.0), cause("right", 2), cause("other", 2, 3)
+    tests = [residual.test(one) for one in (*causes, cause("wrong", 0))]
     found = [one.name for one in residual.sufficient(tests, 1e-9)]
     gains = {one.name: one.gain for one in tests}
     assert gains["right"] > gains["other"]
@@ -355,16 +340,10 @@ def test_causes_are_named_one_after_another_while_significant() -> None:
     # Bonferroni's correction for their number: a p-value between a fifth of the level and it.
     alone = residual_of(np.zeros(5))
     for factor, count in ((0.5, 1), (0.1, 1), (0.5, 5), (0.1, 5)):
-        T = chi2_of(factor * DIAGNOSIS.significance)
-        N = np.diag(np.diag(alone.N))
-        r = np.zeros(5)
-        r[0] = np.sqrt(T * N[0, 0])
+        N, r = np.diag(np.diag(alone.N)), np.zeros(5)
+        r[0] = np.sqrt(chi2.isf(factor * DIAGNOSIS.significance, 1) * N[0, 0])
         one = _Residual(alone.info._replace(freedom=1e9), N, r, N)
         assert len(_name(one, causes[:count], 0.0)[1]) == (factor * count <= 1.0)
-
-
-def chi2_of(p_value: float) -> float:
-    return float(chi2.isf(p_value, 1))
 
 
 def test_minimum_detectable_offsets_are_detected_in_95_of_100_cases() -> None:

@@ -148,9 +148,7 @@ def test_a_log_without_meaning_is_searched_in_each_frame(body, frames, j) -> Non
     assert LargeErrorSearch(body, CAMERAS, frames).find((), NAMES) is None
 
 
-def test_positions_beyond_limits_are_not_searched_in_each_frame(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> None:
+def test_positions_beyond_limits_are_not_searched_in_each_frame(tmp_path_factory):
     """A bar looks the same after half a turn, which is out of its limits."""
     bar = '<visual><geometry><box size="0.7 0.1 0.1"/></geometry></visual>'
     limits = f'lower="{np.pi - 1.2}" upper="{np.pi + 1.2}"'

@@ -43,9 +43,7 @@ def test_an_offset_about_a_fixed_axis_looks_like_a_rotation_of_the_camera(episod
 
 @pytest.mark.slow
 @pytest.mark.parametrize("names", [NAMES[1:], NAMES], ids=["others", "all"])
-def test_camera_and_large_offsets_are_found_within_their_deviations(
-    episode, recording, names: tuple[str, ...]
-) -> None:
+def test_camera_and_large_offsets_are_found_within_their_deviations(episode, recording, names):
     """All boxes move with the first joint: its offset is the same as a turn of the camera."""
     nowhere = episode.camera.with_pose(np.eye(4))
     wrong = recording(values_at=lambda by: episode.values_at(episode.times + by) - OFF)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body import ArticulatedModel
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, SettingsError
 from drake_pose.registration.online_registration import (
@@ -115,7 +114,7 @@ def names(state: OnlineState) -> set[str]:
 class TestKeyframes:
     def test_the_camera_is_searched_with_enough_keyframes_and_the_newest_are_kept(
         self, online, search
-    ) -> None:
+    ):
         frames = [frame("here", t) for t in TURNS]
         state, statuses = follow(online, OnlineState(), frames[:3])
         assert statuses == [NOT_REGISTERED] * 3
@@ -223,9 +222,7 @@ def bumped(camera: PinholeCamera, degrees: float, metres: float) -> PinholeCamer
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("degrees", "metres"), [(0.4, 0.006), (6.0, 0.08)])
-def test_a_bumped_camera_is_registered_again(
-    model: ArticulatedModel, body: RegistrationBody, degrees: float, metres: float
-) -> None:
+def test_a_bumped_camera_is_registered_again(model, body, degrees, metres):
     """With Drake's masks of a moving arm, and small and large bumps."""
     rng, kinematics = np.random.default_rng(11), body.kinematics
     before = camera_at(1.6)

@@ -14,6 +14,7 @@ from drake_pose.errors import RegistrationError
 from drake_pose.fit.background import COLOURS, KnownBackground, foreground_picture
 from drake_pose.fit.explain_kernel import Explained
 from drake_pose.fit.problem import TIME_OFFSET
+from drake_pose.registration.hand_eye import motion
 from drake_pose.registration.picture_acceptance import (
     PictureRegistration,
     PictureStart,
@@ -53,7 +54,6 @@ from tests.registration.arm_pictures import errors
 from tests.registration.episodes import LATE, PaintedEpisode
 
 LEVEL_FRAMES = 6
-NO_SCORES = np.zeros((0, 2))
 
 
 @pytest.fixture(scope="module")
@@ -287,15 +287,17 @@ def test_small_nodes_are_left_out_of_small_pictures(episode) -> None:
     assert shown[0] == (radii >= 0.25 * radii.max()).tolist()
 
 
+def near(camera, degrees):
+    """Return a camera that is rotated a little about the arm."""
+    turn = np.radians(degrees) * np.array([0.5, -0.6, 0.6, 0.0, 0.0, 0.0])
+    return camera.with_pose(motion(turn) @ camera.X_WC)
+
+
 @pytest.fixture(scope="module")
 def registered(episode, recording) -> PictureRegistration:
     """From a camera rotated by a degree, and a time offset wrong by ten milliseconds."""
-    turn = np.eye(4)
-    turn[:3, :3] = Rotation.from_rotvec(np.radians([0.5, -0.6, 0.6])).as_matrix()
-    near = episode.camera.with_pose(turn @ episode.camera.X_WC)
-    start = PictureStart(
-        near, range(0, 16, 3), TimeOffset(LATE - 0.01, np.inf, NO_SCORES), (), 0.05
-    )
+    clock = TimeOffset(LATE - 0.01, np.inf, np.zeros((0, 2)))
+    start = PictureStart(near(episode.camera, 1.0), range(0, 16, 3), clock, (), 0.05)
     return fit_pictures(episode.body, start, recording(), 0.0, ())
 
 
@@ -337,9 +339,7 @@ def test_time_offset_and_camera_are_fitted_within_their_deviations(registered, e
         (0.76, 0.11, 0.20, r"p-value"),
     ],
 )
-def test_poses_are_accepted_by_two_numbers_together(
-    registered, ratio: float, explained: float, by_chance: float, why: str | None
-) -> None:
+def test_poses_are_accepted_by_two_numbers_together(registered, ratio, explained, by_chance, why):
     fit = replace(registered.fit, explained=explained)
     vars(fit)["ratios"] = ratio + 0.1 * np.cos(np.pi * np.arange(len(registered.frames)))
     start = PictureStart.of(replace(registered, by_chance=by_chance))
@@ -367,18 +367,10 @@ def test_pictures_are_evaluated_with_the_registered_camera(registered, episode) 
         np.testing.assert_allclose(frame.values, expected[frame.name], atol=0.01)
         assert frame.foreground is None
     # Pictures that should not show the body are skipped.
-    away = np.eye(4)
-    away[:3, :3] = np.diag([-1.0, 1.0, -1.0])
-    behind = registered.found.camera.with_pose(registered.found.camera.X_WC @ away)
+    away = registered.found.camera.X_WC @ np.diag([-1.0, 1.0, -1.0, 1.0])
+    behind = registered.found.camera.with_pose(away)
     nothing = evaluate_pictures(episode.body, one, replace(registered.found, camera=behind))
     assert nothing == ((), (), ())
-
-
-def near(camera, degrees=2.0):
-    """Return a camera that is rotated a little about the arm."""
-    X = np.eye(4)
-    X[:3, :3] = Rotation.from_rotvec(np.radians(degrees) * np.array([0.5, -0.6, 0.6])).as_matrix()
-    return camera.with_pose(X @ camera.X_WC)
 
 
 def test_chosen_frames_are_the_most_dissimilar(episode):
@@ -408,8 +400,8 @@ def test_drift_and_focal_length_are_fitted(episode, recording):
     assert drift == pytest.approx(0.005, abs=0.002)
     assert 0.0 < deviation < 0.004
     # A wrong focal length is corrected.
-    wide = replace(episode.camera, focal_x=1.04 * episode.camera.focal_x,
-                   focal_y=1.04 * episode.camera.focal_y)  # fmt: skip
+    focal = 1.04 * episode.camera.focal_x
+    wide = replace(episode.camera, focal_x=focal, focal_y=focal)
     values = episode.values_at(episode.times + LATE - 0.015)
     again = search(values).fit(near(wide, 0.5), (TIME_OFFSET,), focal=True)
     assert again.camera.focal_x == pytest.approx(episode.camera.focal_x, rel=0.02)
@@ -468,17 +460,14 @@ def test_drift_is_corrected(episode, recording):
 
 
 @pytest.mark.slow
-def test_mirrored_pictures_are_reported(episode, recording):
-    mirrored = recording(read=lambda k: np.ascontiguousarray(episode.pictures[k][:, ::-1]))
-    with pytest.raises(RegistrationError, match="its pictures are mirrored"):
-        register_pictures(episode.body, episode.camera, mirrored)
-
-
-@pytest.mark.slow
-def test_joints_of_another_episode_are_refused(episode, recording):
-    other = recording(values_at=lambda offset: -0.7 * episode.values_at(2.0 * episode.times))
-    with pytest.raises(RegistrationError, match="no pose explains its pictures"):
-        register_pictures(episode.body, episode.camera, other)
+@pytest.mark.parametrize("said", ["its pictures are mirrored", "no pose explains its pictures"])
+def test_mirrored_pictures_and_joints_of_another_episode_are_refused(episode, recording, said):
+    if "mirrored" in said:
+        wrong = recording(read=lambda k: np.ascontiguousarray(episode.pictures[k][:, ::-1]))
+    else:
+        wrong = recording(values_at=lambda offset: -0.7 * episode.values_at(2.0 * episode.times))
+    with pytest.raises(RegistrationError, match=said):
+        register_pictures(episode.body, episode.camera, wrong)
 
 
 def test_p_value_is_even_at_chance_and_falls_with_what_is_explained():
@@ -518,12 +507,9 @@ def test_the_margin_of_inlier_ratios_holds_its_level():
 
 
 def test_the_rotation_between_poses_is_that_of_their_relative_rotation():
+    X, axis = motion(np.array([0.4, -1.0, 0.2, 0, 0, 0])), np.array([1.0, 2.0, -2.0, 0, 0, 0]) / 3.0
     for angle in (0.0, 0.3, 3.0):
-        X, Y = np.eye(4), np.eye(4)
-        X[:3, :3] = Rotation.from_rotvec([0.4, -1.0, 0.2]).as_matrix()
-        axis = np.array([1.0, 2.0, -2.0]) / 3.0
-        Y[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix() @ X[:3, :3]
-        assert rotation_between(X, Y) == pytest.approx(angle, abs=1e-7)
+        assert rotation_between(X, motion(angle * axis) @ X) == pytest.approx(angle, abs=1e-7)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -543,14 +529,10 @@ def test_mirrored_pictures_are_distinguished_at_the_opposite_pose(episode, recor
     assert margin > 1.96 if mirrored else margin < -3.0
 
 
-@pytest.mark.parametrize(
-    ("size", "ratios"),
-    [((640, 480), [1.0]), ((1280, 720), [1.0]), ((224, 224), [1.0, 4 / 3, 16 / 9])],
-)
-def test_pictures_of_unusual_proportions_may_be_squeezed(episode, size, ratios):
-    given = replace(episode.camera, width=size[0], height=size[1])
-    cameras = squeezed_cameras(given)
-    assert [one.focal_y / one.focal_x for one in cameras] == pytest.approx(ratios)
+def test_pictures_of_unusual_proportions_may_be_squeezed(episode):
+    for *size, ratios in ((640, 480, [1]), (1280, 720, [1]), (224, 224, [1, 4 / 3, 16 / 9])):
+        cameras = squeezed_cameras(replace(episode.camera, width=size[0], height=size[1]))
+        assert [one.focal_y / one.focal_x for one in cameras] == pytest.approx(ratios)
 
 
 @pytest.mark.slow
@@ -561,10 +543,7 @@ def test_unknown_lens_of_squeezed_pictures_is_found(episode, recording):
     def read(k: int) -> np.ndarray:
         return cv2.resize(episode.pictures[k], (side, side), interpolation=cv2.INTER_AREA)
 
-    guess = replace(
-        camera, width=side, height=side, focal_x=0.65 * side, focal_y=0.65 * side,
-        center_x=0.5 * (side - 1), center_y=0.5 * (side - 1),
-    )  # fmt: skip
+    guess = replace(camera.resized(side, side), focal_x=0.65 * side, focal_y=0.65 * side)
     found = register_pictures(
         episode.body, guess, recording(read=read), focal=0.5, guessed_lens=True
     ).found
@@ -577,18 +556,12 @@ def test_unknown_lens_of_squeezed_pictures_is_found(episode, recording):
 
 def test_poses_are_ranked_by_what_they_explain_and_by_their_contours() -> None:
     """A wrong pose may explain more."""
-    right, poor, wide, blind = (
-        RoughPose(None, None, explained, ratios)
-        for explained, ratios in (
-            (0.10, {"a": 0.6, "b": 0.8}),
-            (0.05, {"a": 0.2, "b": 0.4}),
-            (0.40, {"a": 0.1, "b": 0.3}),
-            (0.00, {"a": 0.1}),
-        )
-    )
+    right = RoughPose(None, None, 0.10, {"a": 0.6, "b": 0.8})
+    poor = RoughPose(None, None, 0.05, {"a": 0.2, "b": 0.4})
+    wide = RoughPose(None, None, 0.40, {"a": 0.1, "b": 0.3})
+    blind = RoughPose(None, None, 0.00, {"a": 0.1})
     assert right.agreement == pytest.approx(0.8)
-    ranked = best_first([blind, poor, right, wide])
-    assert ranked == [right, wide, poor, blind]
+    assert best_first([blind, poor, right, wide]) == [right, wide, poor, blind]
 
 
 def test_pictures_are_segmented_up_to_a_distance_from_the_body() -> None:

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body import ArticulatedModel
 from drake_pose.errors import RegistrationError
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import (
@@ -29,9 +28,7 @@ class TestCameraSearch:
             *(pytest.param(p, marks=pytest.mark.slow) for p in list(PLACES)[:2]),
         ],
     )
-    def test_finds_a_camera_anywhere(
-        self, model: ArticulatedModel, body: RegistrationBody, place: str
-    ) -> None:
+    def test_finds_a_camera_anywhere(self, model, body, place):
         where, roll = PLACES[place]
         camera = looking_at(where, np.array([0.0, 0.0, 0.4]), roll)
         found = CameraSearch(body).register(
@@ -45,9 +42,7 @@ class TestCameraSearch:
         assert shift < 4.0 * np.sqrt(3.0) * found.translation_sd < 0.01
         assert all(frame.iou > 0.99 for frame in found.frames)
 
-    def test_a_wrong_frame_is_an_outlier(
-        self, model: ArticulatedModel, body: RegistrationBody
-    ) -> None:
+    def test_a_wrong_frame_is_an_outlier(self, model, body):
         camera = looking_at(np.array([1.6, 0.4, 0.5]), np.array([0.0, 0.0, 0.4]), 0.1)
         frames = see(model, body, camera, 5, 2)
         frames[3] = PosedFrame("0003", -frames[3].values, frames[3].mask)

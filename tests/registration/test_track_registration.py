@@ -155,9 +155,7 @@ def test_focal_length_and_offsets_are_found_where_they_are_asked_for(scene: Scen
 
 
 @pytest.mark.parametrize(("offset", "named"), [(0.06, ("middle",)), (0.0, ())])
-def test_offsets_that_explain_much_better_are_named(
-    scene: Scene, offset: float, named: tuple[str, ...]
-) -> None:
+def test_offsets_that_explain_much_better_are_named(scene, offset, named):
     scene.see(np.array([LATE, 0.0, 0.0, offset]))
     scene.start()
     found = scene.register()

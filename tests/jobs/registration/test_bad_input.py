@@ -142,9 +142,7 @@ class TestNoPoseExplains:
         ],
         ids=["mirrored", "focal length", "one row off", "something else"],
     )
-    def test_nothing_is_written(
-        self, spoil: Spoil, part: str, own_arm: ArmScene, out: Path
-    ) -> None:
+    def test_nothing_is_written(self, spoil, part, own_arm, out):
         spoil(own_arm)
         result = run(own_arm, out)
         assert_refused(result, "camera 'left': no pose explains its masks", part)

@@ -67,9 +67,7 @@ def test_the_camera_is_found_on_its_link(own_base: ArmScene, out: Path) -> None:
 @pytest.mark.parametrize(
     ("looks", "links", "alike"), [(BRACKET, LINKS, 1), (BRACKET, SIX, 1), (BOX, LINKS, 4)]
 )
-def test_camera_and_target_are_found(
-    looks: str, links: tuple, alike: int, tmp_path: Path, out: Path
-) -> None:
+def test_camera_and_target_are_found(looks, links, alike, tmp_path, out):
     """A box looks the same after half a turn about each of its axes."""
     scene = write_hand_scene(tmp_path, looks, links, seed=2)
     found = run_json(*scene.register(out))
@@ -125,9 +123,7 @@ def test_pictures_that_do_not_show_the_target_are_refused(tmp_path: Path, out: P
 
 
 @pytest.mark.slow
-def test_joint_offsets_with_camera_and_target(
-    bracket: TargetScene, tmp_path: Path, out: Path
-) -> None:
+def test_joint_offsets_with_camera_and_target(bracket, tmp_path, out):
     scene = replace(bracket, arm=bracket.arm.copy(tmp_path))
     scene.arm.add_to("elbow_turn", -np.radians(2.0))
     given = ["--zeros", "elbow_turn", "--zeros", "turret_turn"]
@@ -153,17 +149,13 @@ def test_joint_offsets_with_camera_and_target(
         ("target", "--zeros target_turn_x", "no joint 'target_turn_x'"),
     ],
 )
-def test_wrong_names_and_too_few_frames_are_refused(
-    seen, more, said, own_base: ArmScene, bracket: TargetScene, out: Path
-):
+def test_wrong_names_and_too_few_frames_are_refused(seen, more, said, own_base, bracket, out):
     words = own_base.register(out) if seen == "base" else bracket.register(out)
     assert_refused(run_command([*words, *more.split()]), said)
     assert not out.exists()
 
 
-def test_other_bases_hands_and_targets_are_refused(
-    bracket: TargetScene, arm_scene: ArmScene, tmp_path: Path, out: Path
-) -> None:
+def test_other_bases_hands_and_targets_are_refused(bracket, arm_scene, tmp_path, out):
     stiff = write_hand_scene(tmp_path, links=SIX, seed=5, count=5, moving=5)
     jointed = replace(bracket, target=bracket.arm.model)
     for words, parts in (

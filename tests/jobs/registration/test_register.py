@@ -22,14 +22,12 @@ from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.cli import Result, assert_refused, run_command, run_json, run_to_end
 from tests.files.test_report_page import require_plain_page
 from tests.jobs.registration.arm_scenes import ArmScene, pose_errors
-from tests.jobs.scenes import TinyScene, write_truth
+from tests.jobs.scenes import write_truth
 from tests.search.arms import arm_tree
 
 
 @pytest.fixture(scope="module")
-def registered(
-    arm_scene: ArmScene, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, dict[str, Any], Result]:
+def registered(arm_scene, tmp_path_factory) -> tuple[Path, dict[str, Any], Result]:
     """The camera without X_WC, registered by the command: folder, JSON, and its output."""
     out = tmp_path_factory.mktemp("registered") / "out"
     result = run_to_end(*arm_scene.register(out), "--json")
@@ -154,9 +152,7 @@ def test_link_scale_shifts_the_next_joint(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_offsets_and_scales_are_estimated_and_written_to_a_urdf(
-    own_arm: ArmScene, tmp_path: Path, out: Path
-) -> None:
+def test_offsets_and_scales_are_estimated_and_written_to_a_urdf(own_arm, tmp_path, out):
     """Drake poses the corrected robot at the readings like the true robot at the true positions."""
     rows = own_arm.add_to("elbow_turn", -np.radians(3.0))
     short = tmp_path / "short.urdf"
@@ -190,18 +186,14 @@ def test_offsets_and_scales_are_estimated_and_written_to_a_urdf(
     np.testing.assert_allclose(found["hand"][:3, 3], right["hand"][:3, 3] + moved, atol=1e-9)
 
 
-def test_too_few_frames_are_refused_before_the_search(
-    own_arm: ArmScene, out: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_too_few_frames_are_refused_before_the_search(own_arm, out, monkeypatch):
     monkeypatch.setattr(CameraSearch, "register", None)
     words = own_arm.register(out)
     assert_refused(run_command([*words, "--zeros", "all", "--frame", "0000"]), "more frames")
     assert not out.exists()
 
 
-def test_several_poses_are_warned_of_with_the_joint_to_move(
-    tiny_scene: TinyScene, tmp_path: Path, out: Path
-) -> None:
+def test_several_poses_are_warned_of_with_the_joint_to_move(tiny_scene, tmp_path, out):
     """A planar arm looks the same from two places."""
     joints = write_truth(tiny_scene, tmp_path / "joints.csv")
     arm = ArmScene(tiny_scene.folder, tiny_scene.model, joints, {})

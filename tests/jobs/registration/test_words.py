@@ -52,26 +52,23 @@ from tests.search.arms import arm_cameras, arm_urdf
 DEGREE = np.radians(1.0)
 
 
-def off(kind: str, name: str = "a", *sizes: float, **more: Any) -> Finding:
-    """Return a finding with an angle, shift, and their standard deviations."""
-    return Finding(kind, name, *(*sizes, 0.0, 0.0, 0.0, 0.0)[:4], 0.0, 0.0, **more)
-
-
 @pytest.mark.parametrize(
-    ("kind", "angle", "shift", "below", "above"),
+    ("kind", "angle", "size", "below", "above"),
     [
         # The correction is to be added, so a positive one means too low, too short or too early.
-        ("clock", 0.0, 0.03, "30 +- 4 ms earlier", "30 +- 4 ms later"),
-        ("rate", 0.0, 0.03, "3.00 +- 0.40 percent slower", "3.00 +- 0.40 percent faster"),
-        ("focal", 0.0, 0.03, "3.0 +- 0.4 percent too long", "3.0 +- 0.4 percent too short"),
-        ("joint", 0.0, 0.03, "30.0 +- 4.0 mm too high", "30.0 +- 4.0 mm too low"),
-        ("joint", 2 * DEGREE, 0.0, "2.00 +- 1.00 degrees too high", "2.00 +- 1.00 degrees too low"),
+        ("clock", 0.0, "30 +- 4 ms", "earlier", "later"),
+        ("rate", 0.0, "3.00 +- 0.40 percent", "slower", "faster"),
+        ("focal", 0.0, "3.0 +- 0.4 percent", "long", "short"),
+        ("joint", 0.0, "30.0 +- 4.0 mm", "high", "low"),
+        ("joint", 2 * DEGREE, "2.00 +- 1.00 degrees", "high", "low"),
     ],
 )
-def test_the_sign_of_an_error_is_told(kind, angle, shift, below, above) -> None:
-    deviations = DEGREE if angle else 0.0, 0.004
-    assert above in describe_error(off(kind, "a", angle, shift, *deviations))
-    assert below in describe_error(off(kind, "a", -angle, -shift, *deviations))
+def test_size_and_sign_of_an_error_are_told(kind, angle, size, below, above) -> None:
+    deviations = (DEGREE, 0.0) if angle else (0.0, 0.004)
+    for sign, word in ((1.0, above), (-1.0, below)):
+        shift = 0.0 if angle else sign * 0.03
+        one = Finding(kind, "a", sign * angle, shift, *deviations, 0.0, 0.0)
+        assert re.search(rf"{re.escape(size)} .*{word}", describe_error(one))
 
 
 def registered(*agreeing: float, E: float = 0.1, **more: Any) -> RegisteredCamera:
@@ -85,47 +82,35 @@ def registered(*agreeing: float, E: float = 0.1, **more: Any) -> RegisteredCamer
 
 def test_poses_that_explain_little_are_told_why() -> None:
     assert explain_misfit(registered(0.6, 0.71, 0.3)) is None
-    assert "64.50 % of the contours fit" in (explain_misfit(registered(0.6, 0.69, 0.3)) or "")
-    wrong = explain_misfit(registered(0.9, 0.9, E=5.0))
-    assert wrong is not None
-    assert wrong.startswith("body and silhouettes differ by 500.00 % of the silhouettes' area")
-    assert explain_misfit(registered(0.9, -0.9, -0.9)) == (
-        "no two of its 3 frames agree on one; at best frame '0' fits alone"
-    )
+    assert "64.50 %" in (explain_misfit(registered(0.6, 0.69, 0.3)) or "")
+    assert "500.00 %" in (explain_misfit(registered(0.9, 0.9, E=5.0)) or "")
+    assert "frame '0' fits alone" in (explain_misfit(registered(0.9, -0.9, -0.9)) or "")
     assert explain_misfit(registered(0.9)) is None
 
 
 def test_outliers_are_named_and_refused_where_they_are_many() -> None:
     assert outlier_warnings(registered(0.9, 0.9)) == []
     (text,) = outlier_warnings(registered(0.9, 0.9, 0.9, -0.2, -0.2))
-    assert "'left': 2 of 5 frames are outliers and did not count: 3-4;" in text
-    assert "Were camera or base moved after frame '2'?" in text
+    assert re.search(r"'left': 2 of 5 .* 3-4; .* moved after frame '2'", text)
     assert "FEWER" not in text
-    (text,) = outlier_warnings(registered(0.9, -0.2, 0.9, -0.2, 0.9))
-    assert "moved after" not in text
+    assert "moved" not in outlier_warnings(registered(0.9, -0.2, 0.9, -0.2, 0.9))[0]
     half = registered(0.9, 0.9, -0.2, -0.2)
     with pytest.raises(RegistrationError, match=r"2 of 4: 2-3\. Were .*, 0-1, agree by chance"):
         outlier_warnings(half)
     (text,) = outlier_warnings(half, from_pictures=True)
-    assert "FEWER THAN HALF OF THE FRAMES AGREE, 2 of 4: 0-1;" in text
+    assert re.search("FEWER.* 2 of 4: 0-1;", text)
     lost = lost_frames_warning("c", ["1", "2", "4"], [*"01234"], "gripper")
-    assert lost.startswith(
-        "camera 'c': the gripper is not visible where it should be in frames 1-2, 4:"
-    )
+    assert re.search("'c'.* gripper .* 1-2, 4:", lost)
 
 
 @pytest.mark.parametrize(
     ("left", "right", "said"),
     [
         # 1: an inlier, 0: an outlier, 2: an inlier that fits worse.
-        (
-            "1000",
-            "101",
-            ["frames 1 are outliers in all cameras", "frames 2 are outliers in camera"],
-        ),
-        ("11101", "11111", ["frames 3 are outliers in camera 'left'.* positions are right"]),
+        ("1000", "101", ["frames 1 .* all cameras", "frames 2 .* in camera"]),
+        ("11101", "11111", ["frames 3 .*'left'.* are right"]),
         ("11101", "11121", ["check their joint positions"]),
-        ("11100", "00011", ["no common frame: 'left' on 0-2, 'right' on 3-4"]),
+        ("11100", "00011", ["no common frame: 'left' .*0-2, 'right' .*3-4"]),
         ("11100", "00111", [".*"]),
         ("1000", "", []),
     ],
@@ -173,7 +158,6 @@ def test_a_given_camera_is_compared_by_its_covariance(body: RegistrationBody) ->
     X_WC = given.X_WC.copy()
     X_WC[:3, 3] += [0.003, 0.0, 0.004]
     found = replace(registered(0.9, 0.9), camera=given.with_pose(X_WC))
-    found = replace(found, covariance=1e-6 * np.eye(6))
     values = np.array([[0.1, 0.2, 0.3, 0.4, 0.5], [0.5, 0.0, 0.0, 0.3, 0.1]])
     for alone in (True, False):
         one = compare_camera(body, given, found, values, alone)
@@ -194,7 +178,7 @@ def test_a_given_camera_is_compared_by_its_covariance(body: RegistrationBody) ->
     away[:3, 3] *= 1e3
     far = compare_camera(body, given.with_pose(away), found, values, True)
     assert far.pixels <= np.hypot(320, 240)
-    assert "its X_WC seems to be in millimetres" in far.text.replace("given in", "in")
+    assert "in millimetres" in far.text
     assert far.alternatives == ()
 
 
@@ -210,9 +194,7 @@ def test_a_given_camera_is_compared_by_its_covariance(body: RegistrationBody) ->
         (0.125, 0.001, 0.05, 0.002, ["rate"]),
     ],
 )
-def test_clocks_are_compared_at_the_first_picture(
-    body: RegistrationBody, value, sd, drift, drift_sd, kinds
-) -> None:
+def test_clocks_are_compared_at_the_first_picture(body, value, sd, drift, drift_sd, kinds):
     times = 10.0 + np.arange(6.0)
 
     def values_at(offset: float) -> np.ndarray:
@@ -235,30 +217,19 @@ def test_clocks_are_compared_at_the_first_picture(
         assert (one.shift, one.shift_sd) == pytest.approx((size, deviation))
         assert one.p_value == pytest.approx(chi2.sf(size**2 / (deviation**2 + floor**2), 1))
         assert one.pixels > 0.3
-    untold = SimpleNamespace(**{**vars(result), "time_offset": None})
-    assert compare_clock(body, untold, recording) == []
-
-
-def tracked(**more: Any) -> Any:
-    """Return the registration of a camera on a link from a standing scene."""
-    frames = tuple(
-        FrameMisfit(f"{k}", np.nan, np.nan, ratio, True) for k, ratio in enumerate((0.9, 0.2, 0.6))
-    )
-    found = replace(registered(0.9), frames=frames)
-    seen = Sightings(
-        np.array([0, 1, 1]), np.array([0, 0, 1]), np.array([[5.0, 6.0], [20, 9], [9, 20]])
-    )
-    given = {
-        "found": found, "time_offset": TimeOffset(0.05, 0.01, np.zeros((0, 2))),
-        "focal_deviation": 0.0, "offsets": (), "likely": (), "explained": 0.7, "chance": 0.2,
-        "seen": seen, "inliers": np.array([True, True, False]),
-        "pictures": {f"{k}": np.zeros((30, 40, 3), np.uint8) for k in range(3)},
-    }  # fmt: skip
-    return SimpleNamespace(**(given | more))
+    result.time_offset = None
+    assert compare_clock(body, result, recording) == []
 
 
 def test_points_are_drawn_in_the_worst_pictures(tmp_path: Any) -> None:
-    draw_tracks(tmp_path, tracked())
+    seen = Sightings(
+        np.array([0, 1, 1]), np.array([0, 0, 1]), np.array([[5.0, 6.0], [20, 9], [9, 20]])
+    )
+    tracked = SimpleNamespace(
+        found=registered(0.9, 0.2, 0.6), seen=seen, inliers=np.array([True, True, False]),
+        pictures={f"{k}": np.zeros((30, 40, 3), np.uint8) for k in range(3)},
+    )  # fmt: skip
+    draw_tracks(tmp_path, tracked)
     pictures = {
         path.stem: cv2.imread(str(path))[..., ::-1] for path in tmp_path.glob("overlay/left/*.png")
     }
@@ -269,7 +240,7 @@ def test_points_are_drawn_in_the_worst_pictures(tmp_path: Any) -> None:
         assert np.abs(ring.astype(int) - colour).max() < 60
         assert not pictures[name][uv[1], uv[0]].any()
     assert not pictures["2"].any()
-    draw_tracks(tmp_path / "few", tracked(), most=1)
+    draw_tracks(tmp_path / "few", tracked, most=1)
     assert [path.stem for path in (tmp_path / "few").glob("overlay/left/*.png")] == ["1"]
 
 
@@ -326,12 +297,10 @@ def test_several_poses_name_the_joint_that_tells_them_apart_best(body: Registrat
             sizes[name, f"{np.degrees(values[k]):.0f}"] = 2.0 * (a ^ b).sum() / (a.sum() + b.sum())
     (name, degrees), size = max(sizes.items(), key=lambda item: item[1])
     (text,) = mode_warnings(body, found, [frame])
-    said = (
-        rf"'eye': 1 other poses .* joint '{name}' moves: at {degrees} degrees, .* '7', .* by (.*) %"
-    )
+    said = rf"'eye': 1 .* joint '{name}' moves: at {degrees} degrees, .* '7', .* by (.*) %"
     assert float(re.search(said, text).group(1)) == pytest.approx(100.0 * size, abs=2.0)
     assert size > 0.3
-    assert mode_warnings(body, found, [])[0].endswith("; add frames with other joint positions")
+    assert "add frames" in mode_warnings(body, found, [])[0]
     assert mode_warnings(body, replace(found, alternatives=np.zeros((0, 4, 4))), [frame]) == []
 
 

@@ -145,25 +145,24 @@ def test_palm_edges_are_its_outermost_points():
         assert (points[12:] @ M[:2, 0]).max() == pytest.approx((pixels @ M[:2, 0]).max())
 
 
-def test_segments_along_the_optical_axis_have_no_line():
+def hand_at(quaternion, flexions):
     x = np.zeros(len(HAND_STATE))
-    x[2] = 1.0
-    x[28:34] = 0.04
+    x[2:6], x[8:14] = quaternion, flexions
+    x[28:34] = 0.06, 0.04, 0.035, 0.06, 0.04, 0.035
     x[34:] = 0.06, 0.08, 0.02
+    return x
+
+
+def test_segments_along_the_optical_axis_have_no_line():
     # Rotated by 90 degrees about the image's vertical: the hand points along the optical axis.
-    x[2:6] = np.sqrt(0.5), 0, np.sqrt(0.5), 0
-    h, _ = OBSERVATION.predict(x)
+    h, _ = OBSERVATION.predict(hand_at([np.sqrt(0.5), 0, np.sqrt(0.5), 0], 0.0))
     assert np.isnan(h[18:30]).all()
     assert np.isfinite(h[:18]).all()
 
 
 def test_mirrored_state_projects_alike_and_changes_one_angle():
-    x = np.zeros(len(HAND_STATE))
     # The image plane is perpendicular to the flexion plane: flexion moves fingers in depth.
-    x[2:6] = np.sqrt(0.5), np.sqrt(0.5), 0, 0
-    x[8:14] = 0.3, 0.2, 0.2, 0.3, 0.2, 0.2
-    x[28:34] = 0.06, 0.04, 0.035, 0.06, 0.04, 0.035
-    x[34:] = 0.06, 0.08, 0.02
+    x = hand_at([np.sqrt(0.5), np.sqrt(0.5), 0, 0], [0.3, 0.2, 0.2, 0.3, 0.2, 0.2])
     belief = Belief(x, np.diag(np.full(len(x), 0.5**2)))
     mirrored = HandObservation(mirror_slope=0.9).mirrors(belief)
     assert mirrored

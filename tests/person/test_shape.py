@@ -3,12 +3,7 @@
 import numpy as np
 
 from drake_pose.fit.surfaces import with_radius_scales
-from drake_pose.person.pose_tracker import (
-    PersonShape,
-    shape_parts,
-    shape_values,
-    tracker_of_person,
-)
+from drake_pose.person.pose_tracker import PersonShape, shape_parts, shape_values, tracker_of_person
 
 
 def test_tracker_has_the_known_lengths_and_radius_scales(shaped_person):

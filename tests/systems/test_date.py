@@ -18,10 +18,7 @@ from drake_pose.person.date.pose import estimate_pose
 from drake_pose.person.date.skeleton import LIMBS
 from drake_pose.silhouette.pictures.label_renderer import mask_to_label_image
 from drake_pose.silhouette.segmentation import learn_background, person_region
-from drake_pose.systems.cameras import (
-    build_camera_rig,
-    picture_to_colour_image,
-)
+from drake_pose.systems.cameras import build_camera_rig, picture_to_colour_image
 from drake_pose.systems.date import (
     CaptureSetup,
     FeatureFinder,
@@ -39,13 +36,9 @@ PERIOD = 0.1
 @pytest.fixture(scope="module")
 def setup(studio):
     return CaptureSetup(
-        studio.calibrated,
-        studio.ring,
-        studio.cameras[FACE_CAMERA],
-        studio.templates,
-        studio.registered,
-        studio.backgrounds,
-    )
+        studio.calibrated, studio.ring, studio.cameras[FACE_CAMERA], studio.templates,
+        studio.registered, studio.backgrounds,
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -60,20 +53,12 @@ def film(studio):
     return path, [{n: studio.picture(q, n) for n in studio.cameras} for q in path]
 
 
-class Run(Bench):
-    """The diagram in a context of its own, run frame by frame."""
-
-    def __init__(self, capture):
-        super().__init__(capture.diagram)
-        self.simulator, self.frames = Simulator(capture.diagram, self.context), 0
-
-    def step(self, pictures):
-        if self.frames:
-            self.simulator.AdvanceTo(PERIOD * self.frames)
-        self.frames += 1
-        self.give(**{f"color_image_{n}": picture_to_colour_image(p) for n, p in pictures.items()})
-        self.simulator.AdvancePendingEvents()
-        return self["estimated_positions"]
+def show(run, pictures):
+    """Return the diagram's estimate after an update with pictures, half a period later."""
+    time = run.context.get_time()
+    images = {f"color_image_{n}": picture_to_colour_image(p) for n, p in pictures.items()}
+    run.advance(time + PERIOD if time else 0.5 * PERIOD, **images)
+    return run["estimated_positions"]
 
 
 class Core:
@@ -115,7 +100,7 @@ class TestPaperCapture:
     def test_diagram_equals_the_plain_functions_and_is_near_the_truth(self, setup, film):
         capture = build_paper_capture(setup, period=PERIOD)
         assert list(capture.stages) == ["region", "skin", "recognition", "features", "face"]
-        run, core = Run(capture), Core(setup)
+        run, core = Bench(capture.diagram), Core(setup)
         path, pictures = film
         last = len(pictures)
         # At the end the registered pose is shown again, which replaces the estimate.
@@ -127,7 +112,7 @@ class TestPaperCapture:
             if k in (4, 5):
                 # Two cameras stop and return.
                 shots["camera_2"] = shots[FACE_CAMERA] = None
-            np.testing.assert_array_equal(run.step(shots), core.step(shots))
+            np.testing.assert_array_equal(show(run, shots), core.step(shots))
             for stage in capture.stages:
                 capture.evaluate(run.context, stage)
             np.testing.assert_array_equal(run["last_features"], core.features.ravel())
@@ -141,26 +126,26 @@ class TestPaperCapture:
     def test_an_unknown_person_gives_nan_and_missing_images_keep_the_pose(
         self, studio, setup, film
     ):
-        run = Run(build_paper_capture(setup, period=PERIOD))
+        run = Bench(build_paper_capture(setup, period=PERIOD).diagram)
         _, pictures = film
-        assert np.isnan(run.step(pictures[-1])).all()
-        known = run.step(pictures[0])
-        silent = run.step(dict.fromkeys(studio.cameras))
+        assert np.isnan(show(run, pictures[-1])).all()
+        known = show(run, pictures[0])
+        silent = show(run, dict.fromkeys(studio.cameras))
         # Head, hands and feet do not move.
         np.testing.assert_allclose(silent[:3], known[:3], atol=1e-3)
         assert not run["last_support"].any()
 
     def test_images_that_are_not_fresh_are_ignored(self, setup, film):
         _, pictures = film
-        run = Run(build_paper_capture(setup, period=PERIOD))
+        run = Bench(build_paper_capture(setup, period=PERIOD).diagram)
         estimator = run.system.GetSubsystemByName("pose")
-        known = run.step(pictures[0])
+        known = show(run, pictures[0])
         fresh = estimator.GetInputPort("fresh")
         own = estimator.GetMyMutableContextFromRoot(run.context)
         fresh.FixValue(own, [0.0])
-        np.testing.assert_array_equal(run.step(pictures[-1]), known)
+        np.testing.assert_array_equal(show(run, pictures[-1]), known)
         fresh.FixValue(own, [1.0])
-        assert np.abs(run.step(pictures[2]) - known).max() > 0.05
+        assert np.abs(show(run, pictures[2]) - known).max() > 0.05
 
     def test_a_simulated_rig_is_captured(self, studio):
         registered = studio.registered

@@ -3,7 +3,6 @@ import math
 import numpy as np
 import pytest
 from pydrake.geometry import Role
-from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_pose.body import bundled_model, load_model
@@ -32,8 +31,7 @@ def run(person, stances):
     """Return the walker's pose and the command after each stance of 1 s."""
     walker, found = Bench(Walker(person, PERIOD)), []
     for k, q in enumerate(stances):
-        walker.give(positions=q)
-        walker.advance(k + 1 - 0.5 * PERIOD)
+        walker.advance(k + 1 - 0.5 * PERIOD, positions=q)
         found.append([walker["walker_pose"], walker["command"]])
     return found
 
@@ -41,15 +39,12 @@ def run(person, stances):
 def test_on_spot_requires_steps_for_a_command(person):
     """Neither standing ahead nor steps at the rest position alone are a command."""
     walker = Bench(Walker(person, PERIOD, on_spot=True))
-    simulator = Simulator(walker.system, walker.context)
     frames = [(0.0, 0.0), *[(0.3, 0.0)] * 20, *[(0.3, s) for s in SPOT], *[(0.0, s) for s in SPOT]]
     found = []
     for k, (ahead, lifted) in enumerate(frames):
         side, bend = "left" if lifted > 0 else "right", math.degrees(abs(lifted))
         lift = {f"{side}_thigh_x": -bend, f"{side}_shin_x": 2 * bend}
-        walker.give(positions=standing(person, ahead, **lift))
-        simulator.AdvanceTo(k * PERIOD)
-        simulator.AdvancePendingEvents()
+        walker.advance((k + 0.5) * PERIOD, positions=standing(person, ahead, **lift))
         found.append(walker["command"][1])
     assert not any(found[:21])
     assert found[20 + len(SPOT)] == 1
@@ -111,12 +106,8 @@ def test_obstacles_equal_the_drawn_objects_and_the_start_is_free(garden):
 
 
 def test_the_view_is_from_behind_and_above_inside_the_walls():
-    rng = np.random.default_rng(1)
-    for x, y, heading in rng.uniform(-1.0, 1.0, (200, 3)) * (
-        WALK.half_size,
-        WALK.half_size,
-        math.pi,
-    ):
+    ranges = WALK.half_size, WALK.half_size, math.pi
+    for x, y, heading in np.random.default_rng(1).uniform(-1.0, 1.0, (200, 3)) * ranges:
         eye, target = view_from_behind(np.array([x, y, heading]))
         assert np.abs(eye[:2]).max() < WALK.half_size
         assert eye[2] > target[2] > 0.5

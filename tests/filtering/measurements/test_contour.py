@@ -4,11 +4,7 @@ import pytest
 from drake_pose.body import load_model
 from drake_pose.errors import SettingsError
 from drake_pose.filtering import contour_observation
-from drake_pose.filtering.contour_observation import (
-    ROOT_SHIFT,
-    ContourObservation,
-    ContourSettings,
-)
+from drake_pose.filtering.contour_observation import ROOT_SHIFT, ContourObservation, ContourSettings
 from drake_pose.filtering.inequalities import from_model
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.body.models import LIMB_URDF, write_limb

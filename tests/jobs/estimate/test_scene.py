@@ -120,12 +120,9 @@ def test_nothing_is_written_without_a_folder(tiny_scene):
 
 def test_several_cameras_are_used_together(tmp_path):
     scene = write_scene(tmp_path / "scene", [(20.0, -40.0)], ["front", "side"])
-    for options, names in (
-        (("--method", "paper"), ["front", "side"]),
-        (("--method", "paper", "--camera", "side"), ["side"]),
-    ):
+    for options, names in (((), ["front", "side"]), (("--camera", "side"), ["side"])):
         out = tmp_path / str(len(names))
-        _, summary = run_estimate(scene, out, *options, "--no-replay")
+        _, summary = run_estimate(scene, out, "--method", "paper", *options, "--no-replay")
         assert len(summary["frames"]["0000"]["outside_limit"]) == len(names)
         assert sorted(path.name for path in (out / "overlay").iterdir()) == names
 
@@ -174,11 +171,9 @@ def test_a_frame_without_a_pose(own_scene, monkeypatch):
     monkeypatch.setattr("drake_pose.jobs.estimate.inputs.PaperSearchSettings", strict)
     options = ["--method", "paper", "--no-replay", "--hold", "lift=-90"]
     lost, summary = run_estimate(own_scene, out, *options, status=1)
-    assert lost.stderr.count("no pose was found; check masks and pictures\n") == 1
-    assert "frame 0000-0002 (3 of 3): no pose was found" in lost.stderr
-    assert summary["warnings"] == [
-        "frame 0000-0002 (3 of 3): no pose was found; check masks and pictures"
-    ]
+    (warning,) = summary["warnings"]
+    assert "frame 0000-0002 (3 of 3): no pose was found" in warning
+    assert lost.stderr.count(warning) == 1
     assert "no pose was found in any frame" in lost.stderr
     rows = read_rows(out / "poses.csv")
     assert [row["frame"] for row in rows] == ["0000", "0001", "0002"]

@@ -15,15 +15,13 @@ from drake_pose.systems.bodies import MeshcatSkin, add_meshcat_skin
 from drake_pose.systems.diagrams import build_simulated_matching
 from tests.body.models import load_limb
 
+X_WC = np.array([[0, 0, -1, 4.0], [1, 0, 0, 0], [0, -1, 0, 0.1], [0, 0, 0, 1.0]])
+CAMERA = ParallelCamera("front", 200, 200, 180.0, 100.2, 100.1, X_WC)
+
 
 @pytest.fixture
 def limb(tmp_path):
     return load_limb(tmp_path)
-
-
-def camera() -> ParallelCamera:
-    X_WC = np.array([[0, 0, -1, 4.0], [1, 0, 0, 0], [0, -1, 0, 0.1], [0, 0, 0, 1.0]])
-    return ParallelCamera("front", 200, 200, 180.0, 100.2, 100.1, X_WC)
 
 
 class _Recorder:
@@ -74,13 +72,13 @@ def test_a_simulated_camera_sees_the_skin(limb):
     )
     truth = np.array([0.6, -1.2, 0.6, 0.0, -0.6])
     meshcat = Meshcat(MeshcatParams(host="localhost", port=0))
-    built = build_simulated_matching(search, [camera()], truth, 0.1, meshcat)
+    built = build_simulated_matching(search, [CAMERA], truth, 0.1, meshcat)
     simulator = Simulator(built.diagram)
     simulator.AdvanceTo(0.15)
     context = simulator.get_context()
     sensor = built.diagram.GetSubsystemByName("camera_front")
     image = sensor.label_image_output_port().Eval(sensor.GetMyContextFromRoot(context))
-    reference = LabelRenderer(limb, camera()).segments(truth)
+    reference = LabelRenderer(limb, CAMERA).segments(truth)
     seen = image.data[..., 0]
     assert np.count_nonzero((seen < 32000) != (reference >= 0)) <= 3
     assert set(np.unique(seen[seen < 32000])) <= set(np.unique(reference))

@@ -22,6 +22,7 @@ from tests.search.bodies import front_camera
 from tests.systems.bench import Bench
 
 PERIOD = 1 / 30
+CAMERA = front_camera(200, shift=0.2)
 
 
 @pytest.fixture(scope="module")
@@ -38,32 +39,11 @@ def motion():
     return centre + swing
 
 
-def played(truth):
-    """Return a trajectory that holds each row of positions for a frame."""
-    breaks = PERIOD * (np.arange(len(truth) + 1) - 0.3)
-    return PiecewisePolynomial.ZeroOrderHold(breaks, np.vstack([truth, truth[-1:]]).T)
-
-
-def track_errors(built, truth):
-    """Return errors and deviations (T, n) of tracked positions, and TRACK by name (T,)."""
-    simulator = Simulator(built.diagram)
-    root, rows = simulator.get_mutable_context(), []
-    for k in range(len(truth)):
-        simulator.AdvanceTo((k + 0.5) * PERIOD)
-        own = Bench(built.matcher, built.matcher.GetMyContextFromRoot(root))
-        rows.append([own[n] for n in ("estimated_positions", "position_deviations", "track")])
-        assert built.was_tracked(root) == (own["track"][0] == 1.0)
-        np.testing.assert_array_equal(built.estimate(root).q, own["estimated_positions"])
-    positions, deviations, tracks = (np.array(one) for one in zip(*rows, strict=True))
-    return positions - truth, deviations, dict(zip(TRACK, tracks.T, strict=True))
-
-
 def test_velocities_and_body_poses_equal_the_plants(body, search):
-    camera = front_camera(200, shift=0.2)
     # With the default memory, rates are too small in steady motion.
     settings = TrackingSettings(memory=5.0)
-    run = Bench(SilhouetteTracker(search, [camera], PERIOD, tracking=settings))
-    renderer = LabelRenderer(body, camera)
+    run = Bench(SilhouetteTracker(search, [CAMERA], PERIOD, tracking=settings))
+    renderer = LabelRenderer(body, CAMERA)
     np.testing.assert_array_equal(run["estimated_state"][:3], body.default_positions)
     assert np.isnan(run["estimated_state"][3:]).all()
     speed = np.array([0.9, -0.6, 0.75])  # [rad/s]
@@ -76,19 +56,18 @@ def test_velocities_and_body_poses_equal_the_plants(body, search):
     for pose, expected in zip(poses, renderer.link_poses(found), strict=True):
         np.testing.assert_allclose(pose.GetAsMatrix4(), expected, atol=1e-12)
     # The port of the estimated body poses connects to a camera.
-    seen = Bench(SilhouetteCamera(body.plant, body.scene_graph, camera)).give(body_poses=poses)
+    seen = Bench(SilhouetteCamera(body.plant, body.scene_graph, CAMERA)).give(body_poses=poses)
     mask = label_image_to_mask(seen["label_image"])
     assert np.count_nonzero(mask != renderer.mask(found)) <= 0.002 * mask.sum()
 
 
 def test_contexts_have_their_own_labels_and_settings(body, search):
     """Parameters changed in a context, compared with systems constructed with them."""
-    camera = front_camera(200, shift=0.2)
-    renderer = LabelRenderer(body, camera)
+    renderer = LabelRenderer(body, CAMERA)
     stiff = TrackingSettings(angle_acceleration=2.0)
-    system = SilhouetteTracker(search, [camera], PERIOD)
+    system = SilhouetteTracker(search, [CAMERA], PERIOD)
     ways = [
-        (SilhouetteTracker(search, [camera], PERIOD, tracking=one, labels=labels), one, labels)
+        (SilhouetteTracker(search, [CAMERA], PERIOD, tracking=one, labels=labels), one, labels)
         for one, labels in ((stiff, None), (TrackingSettings(), {7}))
     ]
     ends = []
@@ -116,10 +95,9 @@ def test_contexts_have_their_own_labels_and_settings(body, search):
 
 def test_a_copied_context_continues_as_the_original(body, search):
     """All state of the tracker is in the context."""
-    camera = front_camera(200, shift=0.2)
-    renderer = LabelRenderer(body, camera)
+    renderer = LabelRenderer(body, CAMERA)
     images = [mask_to_label_image(renderer.mask(q)) for q in motion()[:6]]
-    run = Bench(SilhouetteTracker(search, [camera], PERIOD))
+    run = Bench(SilhouetteTracker(search, [CAMERA], PERIOD))
     assert np.isnan(run["position_deviations"]).all()
     for image in images[:3]:
         run.update(label_image=image)
@@ -132,9 +110,8 @@ def test_a_copied_context_continues_as_the_original(body, search):
 
 
 def test_a_covered_lens_loses_the_track_until_positions_are_measured(body, search):
-    camera = front_camera(200, shift=0.2)
-    run = Bench(SilhouetteTracker(search, [camera], PERIOD, color_cameras=["front"]))
-    mask, truth = LabelRenderer(body, camera).mask(motion()[0]), motion()[0]
+    run = Bench(SilhouetteTracker(search, [CAMERA], PERIOD, color_cameras=["front"]))
+    mask, truth = LabelRenderer(body, CAMERA).mask(motion()[0]), motion()[0]
     picture = np.where(mask[..., None], (230, 130, 40), (60, 140, 60)).astype(np.uint8)
     lit, dark = picture_to_colour_image(picture), picture_to_colour_image(0 * picture)
     found = []
@@ -147,9 +124,8 @@ def test_a_covered_lens_loses_the_track_until_positions_are_measured(body, searc
 
 
 def test_measured_positions_that_do_not_fit_the_masks_are_rejected(body, search):
-    camera = front_camera(200, shift=0.2)
-    run, truth = Bench(SilhouetteTracker(search, [camera], PERIOD)), motion()[0]
-    image = mask_to_label_image(LabelRenderer(body, camera).mask(truth))
+    run, truth = Bench(SilhouetteTracker(search, [CAMERA], PERIOD)), motion()[0]
+    image = mask_to_label_image(LabelRenderer(body, CAMERA).mask(truth))
     run.update(label_image=image, measured_positions=truth + 1.5)
     assert run["error"][0] < 0.1
     assert run["track"][TRACK.index("matches")] == 1
@@ -166,11 +142,23 @@ def test_mimic_joints_are_tracked_together(tmp_path):
     fingers = 0.04 + 0.03 * np.sin(2 * np.pi * t)
     truth = np.column_stack([0.3 * t, -0.5 + 0.2 * t, fingers, fingers])
     search = PaperSearch(model.pose_tree(), PaperSearchSettings(interval=math.radians(10)))
+    breaks = PERIOD * (np.arange(len(truth) + 1) - 0.3)
+    path = PiecewisePolynomial.ZeroOrderHold(breaks, np.vstack([truth, truth[-1:]]).T)
     built = build_simulated_matching(
-        search, arm_cameras(), played(truth), PERIOD, tracking=TrackingSettings()
+        search, arm_cameras(), path, PERIOD, tracking=TrackingSettings()
     )
-    errors, deviations, track = track_errors(built, truth)
-    np.testing.assert_array_equal(track["tracked"][1:], 1.0)
+    simulator = Simulator(built.diagram)
+    root, rows = simulator.get_mutable_context(), []
+    for k in range(len(truth)):
+        simulator.AdvanceTo((k + 0.5) * PERIOD)
+        own = Bench(built.matcher, built.matcher.GetMyContextFromRoot(root))
+        rows.append([own["estimated_positions"], own["position_deviations"]])
+        was_tracked = own["track"][TRACK.index("tracked")] == 1.0
+        assert k == 0 or was_tracked
+        assert built.was_tracked(root) == was_tracked
+        np.testing.assert_array_equal(built.estimate(root).q, own["estimated_positions"])
+    found, deviations = np.swapaxes(rows, 0, 1)
+    errors = found - truth
     np.testing.assert_array_equal(errors[:, 2], errors[:, 3])
     np.testing.assert_array_equal(deviations[:, 2], deviations[:, 3])
     # Half a pixel is 3.5 mm.

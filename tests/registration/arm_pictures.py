@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 
 from drake_pose.body import ArticulatedModel
-from drake_pose.camera.models import PinholeCamera
+from drake_pose.camera.models import PinholeCamera, look_at
+from drake_pose.registration.hand_eye import motion
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
@@ -15,14 +16,7 @@ PLACE, MIDDLE = np.array([1.6, 0.4, 0.5]), np.array([0.0, 0.0, 0.4])
 
 def looking_at(place: np.ndarray, middle: np.ndarray, roll: float) -> PinholeCamera:
     """Return a camera at a place (3,) that looks at a point (3,), rolled about its axis [rad]."""
-    z = (middle - place) / np.linalg.norm(middle - place)
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    x /= np.linalg.norm(x)
-    y = np.cross(z, x)
-    X_WC = np.eye(4)
-    c, s = np.cos(roll), np.sin(roll)
-    X_WC[:3, :3] = np.column_stack([c * x + s * y, c * y - s * x, z])
-    X_WC[:3, 3] = place
+    X_WC = look_at(place, middle) @ motion(np.array([0.0, 0.0, roll, 0.0, 0.0, 0.0]))
     return PinholeCamera("eye", 640, 480, 600.0, 600.0, 319.5, 239.5, X_WC)
 
 

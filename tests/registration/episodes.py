@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from drake_pose.body import ArticulatedModel
-from drake_pose.camera.models import PinholeCamera
+from drake_pose.camera.models import PinholeCamera, look_at
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.benchmarks.registration import load_arm, write_box_arm
@@ -48,13 +48,9 @@ def painted_episode(
     path = write_box_arm(folder / "boxes.urdf")
     body = load_arm(path)
     width, height = size
-    forward = np.array([-0.85, 0.35, -0.25])
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0.1, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    X_WC = np.eye(4)
-    X_WC[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
-    X_WC[:3, 3] = np.array([0.0, 0.0, 0.45]) - 1.6 * forward
+    middle, forward = np.array([0.0, 0.0, 0.45]), np.array([-0.85, 0.35, -0.25])
+    eye = middle - 1.6 * forward / np.linalg.norm(forward)
+    X_WC = look_at(eye, middle, up=(0.1, 0.0, 1.0))
     focal = 0.95 * width
     camera = PinholeCamera(
         "camera", width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), X_WC

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
 from scipy.spatial.transform import Rotation
 
 from drake_pose.body import load_model
-from drake_pose.camera.camera_files import dump_cameras
+from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.jobs.registration.arm_scenes import ArmScene
@@ -128,9 +127,8 @@ def write_hand_scene(
             mask = LabelRenderer(thing, placed).mask(q_seen)
             write_mask(masks / f"{len(rows):04d}.png", mask)
             rows.append([len(rows), *q])
-    content = yaml.safe_load(dump_cameras([camera]))
-    del content["wrist"]["X_WC"]
-    (arm.folder / "cameras.yaml").write_text(yaml.safe_dump(content))
+    save_cameras(arm.folder / "cameras.yaml", [camera])
+    arm.edit_cameras("wrist", X_WC=None)
     arm.write_rows([["frame", *(f"{one[0]}_turn" for one in links)], *rows])
     return TargetScene(arm, target, X_WT)
 

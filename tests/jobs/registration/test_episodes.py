@@ -38,13 +38,7 @@ def episode(tmp_path_factory):
     return folder / "scene", painted
 
 
-def read(
-    scene: Path,
-    painted: Any,
-    joints: Path | None = None,
-    cameras: Path | None = None,
-    **settings: Any,
-) -> RegistrationInputs:
+def read(scene, painted, joints=None, cameras=None, **settings: Any) -> RegistrationInputs:
     return read_inputs(scene, painted.path, joints, cameras, RegistrationSettings(**settings))
 
 
@@ -142,16 +136,11 @@ def test_given_poses_of_cameras_are_known(episode, tmp_path):
     [
         (lambda scene: (scene / "joint_angles.csv").unlink(), "holds no joint positions"),
         (
-            lambda scene: save_cameras(
-                scene / "cameras.yaml",
-                [load_cameras(scene / "cameras.yaml")["camera"].resized(320, 240)],
-            ),
+            lambda scene: edit_camera(scene / "cameras.yaml", "camera", width=320, height=240),
             "320 x 240 pixels .*but its pictures 160 x 120",
         ),
         (
-            lambda scene: write_log(
-                scene / "joint_angles.csv", [0.0, 1.0], np.zeros((2, 5)), [f"a{k}" for k in "vwxyz"]
-            ),
+            lambda scene: write_log(scene / "joint_angles.csv", [0, 1], np.zeros((2, 5)), "vwxyz"),
             "no column of the joint log is a joint",
         ),
     ],

@@ -54,10 +54,9 @@ def test_columns_are_sorted_into_the_tree_s_order(tmp_path: Path) -> None:
 
 
 def test_columns_of_followers_are_compared(tmp_path: Path) -> None:
-    mimic = '<mimic joint="lead" multiplier="-1"/>'
-    parts = [joint("lead", "revolute", "world", "one"),
-             joint("other", "revolute", "world", "two", more=mimic)]  # fmt: skip
-    path = write(tmp_path, urdf(link("world", ""), *map(link, ("one", "two")), *parts))
+    lead, mimic = joint("lead", "revolute", "world", "one"), '<mimic joint="lead" multiplier="-1"/>'
+    other = joint("other", "revolute", "world", "two", more=mimic)
+    path = write(tmp_path, urdf(link("world", ""), link("one"), link("two"), lead, other))
     kinematics = TreeKinematics(load_model(path).pose_tree())
     for value, count in (("-0.4", 0), ("0.4", 1)):
         (tmp_path / "joints.csv").write_text(f"frame,lead,other\n0,0,0\n1,0.4,{value}\n")
@@ -105,10 +104,7 @@ def test_moving_base_becomes_joints(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            "frame,swing,rail\n0,2,0\n1,-70,0.5\n",
-            "'swing', frame 1: -70 rad.* in degrees; write .* in radians",
-        ),
+        ("frame,swing,rail\n0,2,0\n1,-70,0.5\n", "'swing', frame 1: -70 rad.* in degrees"),
         ("frame,swing,rail\n0,0.5,300\n1,1.5,700\n", "'rail', frame 1: 700 m.* in millimetres"),
         ("frame,swing\n0,0.5\n", "no column for joint rail of slide.urdf.*--hold rail=VALUE"),
         ("frame\n0\n", "first line must be frame"),

@@ -80,13 +80,6 @@ class TestFound:
         register_near(words, out, "cam03", true, 100.0, 2.5, 5.0)
 
 
-def as_estimated(arm: ArmScene, frames: slice = slice(None)) -> None:
-    """Rewrite some rows as an estimate writes them."""
-    header, *rows = arm.rows()
-    rows = [[*row, "0.1", "1.0"] for row in rows[frames]]
-    arm.write_rows([[*header, "error", "seconds"], *rows])
-
-
 class TestRefused:
     def test_nothing_known(self, own_arm: ArmScene, out: Path) -> None:
         own_arm.edit_cameras("right", X_WC=None)
@@ -103,13 +96,12 @@ class TestRefused:
         words = arm_scene.register(out, with_joints=False)
         assert_refused(run_command([*words, *more]), f"{more[0]} needs measured joint positions")
 
-    def test_no_synchronised_frame(self, own_arm: ArmScene, out: Path) -> None:
-        own_arm.write_rows([["frame", *JOINTS, "error", "seconds"], [7, *([0.1] * 5), 0.1, 1.0]])
-        result = run_command(own_arm.register(out))
-        assert_refused(result, "camera 'left' has no mask of a frame in which")
-
-    def test_estimate_without_masks_of_its_cameras(self, own_arm: ArmScene, out: Path) -> None:
-        as_estimated(own_arm)
-        shutil.rmtree(own_arm.folder / "masks" / "right")
-        result = run_command(own_arm.register(out))
-        assert_refused(result, "no camera with an X_WC has a mask of those frames")
+    @pytest.mark.parametrize(
+        ("missing", "said"), [("frame", "'left' has no mask"), ("masks", "no camera with an X_WC")]
+    )
+    def test_estimate_without_masks(self, missing, said, own_arm: ArmScene, out: Path) -> None:
+        rows = [[*JOINTS, "error", "seconds"], [*([0.1] * 5), 0.1, 1.0]]
+        own_arm.write_rows([["frame", *rows[0]], [7 if missing == "frame" else 0, *rows[1]]])
+        if missing == "masks":
+            shutil.rmtree(own_arm.folder / "masks" / "right")
+        assert_refused(run_command(own_arm.register(out)), said)

@@ -190,13 +190,6 @@ class TestAuditFrames:
         assert finding.kind == "base"
         assert finding.shift == pytest.approx(0.01, abs=0.002)
 
-    def test_joint_offset_in_all_frames(self, model, body, poses, cameras) -> None:
-        given = joint_off(poses, 3, slice(None), -2.0)
-        found = audit(model, body, poses, given, cameras[:1])
-        assert found.outliers == ()
-        assert [(one.kind, one.name) for one in found.common] == [("joint", "elbow_turn")]
-        assert np.degrees(found.common[0].angle) == pytest.approx(2.0, abs=0.2)
-
     def test_camera_pose_error_in_all_frames(self, model, body, poses, cameras) -> None:
         for count, by in ((2, [0.0, 0.0, 0.01]), (1, [0.0, 0.01, 0.005])):
             told = [*cameras[: count - 1], moved(cameras[count - 1], by)]

@@ -52,12 +52,10 @@ def run(command: str, episode, out: Path, *more: object) -> dict[str, Any]:
 
 
 def test_episodes_are_recognised(episode, tmp_path):
-    settings = RegistrationSettings()
-    assert is_episode(episode[0], settings)
-    (tmp_path / "images").mkdir()
-    assert is_episode(tmp_path, settings)
-    (tmp_path / "masks").mkdir()
-    assert not is_episode(tmp_path, settings)
+    assert is_episode(episode[0], RegistrationSettings())
+    for name, expected in (("images", True), ("masks", False)):
+        (tmp_path / name).mkdir()
+        assert is_episode(tmp_path, RegistrationSettings()) == expected
 
 
 def test_starts_of_a_sequence_come_from_its_joint_log(episode, tmp_path):
@@ -166,15 +164,6 @@ def test_missing_masks_or_pictures_are_refused(episode, tmp_path):
         audit_scene(tmp_path, painted.path)
 
 
-def require_overlay_as_given(picture: np.ndarray) -> None:
-    """Require that the contours of the given and the registered camera coincide."""
-    found, given = ((picture == rgb[::-1]).all(axis=2) for rgb in (EXCESS_RGB, MISSING_RGB))
-    legend = slice(-38, None)
-    assert found[legend].any()
-    near = cv2.dilate(found[:-38].astype(np.uint8), np.ones((25, 25)))
-    assert near[given[:-38]].mean() > 0.95
-
-
 @pytest.mark.slow
 def test_an_episode_becomes_a_calibrated_scene(episode, out):
     _, painted = episode
@@ -198,7 +187,12 @@ def test_an_episode_becomes_a_calibrated_scene(episode, out):
     in_order = sorted(errors, key=lambda frame: -errors[frame])
     given = sorted((out / "overlay_as_given" / "camera").glob("*.png"))
     assert [one.stem for one in given] == sorted({in_order[0], in_order[len(in_order) // 2]})
-    require_overlay_as_given(cv2.imread(str(given[0])))
+    picture = cv2.imread(str(given[0]))[..., ::-1]
+    found, was = ((picture == rgb).all(axis=2) for rgb in (EXCESS_RGB, MISSING_RGB))
+    # Above the legend.
+    near = cv2.dilate(found[:-38].astype(np.uint8), np.ones((25, 25)))
+    assert found[-38:].any()
+    assert near[was[:-38]].mean() > 0.95
     anew = RegistrationSettings(cameras=("camera",))
     again = register_scene(out, painted.path, out / "joint_angles.csv", settings=anew)
     error = pose_error(again.registered["camera"].camera.X_WC, painted.camera.X_WC)

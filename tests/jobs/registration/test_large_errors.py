@@ -15,6 +15,7 @@ from drake_pose.camera.models import Camera
 from drake_pose.errors import MaskError
 from drake_pose.jobs.registration.audit import SceneAudit, audit_scene
 from drake_pose.jobs.registration.diagnosis import last_before_change
+from drake_pose.registration.hand_eye import motion
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import read_mask
 from tests.jobs.registration.arm_scenes import ArmScene, write_arm_scene
@@ -94,19 +95,17 @@ def test_large_joint_offset_is_measured(scene, joint, degrees) -> None:
 def test_wrong_sign_is_found(scene, joint) -> None:
     change(scene, joint, lambda q: -q)
     result = audit(scene)
-    assert told(result) == [("sign", joint)]
-    assert f"'{joint}' is logged with the other sign" in result.summary["findings"][0]["text"]
-    assert result.summary["agreeing_count"] == 0
+    assert (told(result), result.summary["agreeing_count"]) == ([("sign", joint)], 0)
+    assert "other sign" in result.summary["findings"][0]["text"]
 
 
 def test_constant_column_is_a_wrong_log(scene) -> None:
     off = change(scene, "hand_turn", lambda _: 0.0)
     result = audit(scene)
-    assert told(result) == [("log", "hand_turn")]
+    assert (told(result), result.summary["agreeing_count"]) == ([("log", "hand_turn")], 0)
     one = result.summary["findings"][0]
-    assert "link 'hand' is not where the log says" in one["text"]
+    assert "link 'hand'" in one["text"]
     assert one["angle_deg"] == pytest.approx(off.max(), abs=4.0)
-    assert result.summary["agreeing_count"] == 0
 
 
 def test_two_large_errors_are_separated(scene) -> None:
@@ -167,11 +166,10 @@ def test_shifted_principal_points_are_measured(scene) -> None:
 
 def test_exchanged_columns_are_recognised(scene) -> None:
     header, *rows = scene.rows()
-    a, b = header.index("shoulder_turn"), header.index("hand_turn")
-    header[a], header[b] = header[b], header[a]
-    scene.write_rows([header, *rows])
+    others = {"shoulder_turn": "hand_turn", "hand_turn": "shoulder_turn"}
+    scene.write_rows([[others.get(name, name) for name in header], *rows])
     (one,) = audit(scene).summary["findings"]
-    assert "columns of joints 'shoulder_turn' and 'hand_turn' seem to be exchanged" in one["text"]
+    assert re.search("'shoulder_turn' and 'hand_turn' .* exchanged", one["text"])
 
 
 def test_exchanged_masks_are_exchanged_cameras(scene) -> None:
@@ -243,30 +241,24 @@ def test_masks_with_excess_lack_or_nothing_are_warned_of(scene) -> None:
         spoilt[:side, :side] = True
         return spoilt
 
-    left = read_mask(scene.folder / "masks/left/0006.png")
     masks(scene, with_shadow, "000[0-3]")
-    masks(scene, lambda mask: mask & False, "0006")
-    write_mask(scene.folder / "masks/left/0006.png", left)
-    result = audit(scene)
-    said = "\n".join(result.warnings)
-    assert "'right': the masks of frames 0006 are black" in said
+    masks(scene, np.zeros_like, "0006", "right")
+    said = "\n".join(audit(scene).warnings)
+    assert re.search("'right'.* 0006 are black", said)
     for name in scene.cameras:
-        assert f"'{name}': the masks of frames 0000-0003 show" in said
-    assert "more than the robot" in said
+        assert re.search(f"'{name}'.* 0000-0003 show .*more than the robot", said)
 
 
 def test_masks_without_a_part_are_not_called_black(scene) -> None:
     def without_upper_half(mask: np.ndarray) -> np.ndarray:
-        spoilt, rows = mask.copy(), np.flatnonzero(mask.any(axis=1))
-        spoilt[: int(rows.mean())] = False
-        return spoilt
+        rows = np.flatnonzero(mask.any(axis=1))
+        return mask & (np.arange(len(mask)) >= int(rows.mean()))[:, None]
 
     masks(scene, without_upper_half)
     said = "\n".join(audit(scene).warnings)
     assert "black" not in said
     for name in scene.cameras:
-        assert f"'{name}': the masks of frames " in said
-    assert "of the robot: is something before it" in said
+        assert re.search(f"'{name}': the masks of frames .* of the robot: is something", said)
 
 
 def test_inverted_masks_are_refused(scene) -> None:
@@ -281,9 +273,8 @@ def test_inverted_masks_are_refused(scene) -> None:
 @pytest.mark.parametrize(("by", "which"), [(-1, "next"), (1, "previous")])
 def test_positions_of_another_frame_are_recognised(scene, by: int, which: str) -> None:
     header, *rows = scene.rows()
-    others = rows[by:] + rows[:by]
-    shifted = [[row[0], *other[1:]] for row, other in zip(rows, others, strict=True)]
-    scene.write_rows([header, *shifted])
+    others = zip(rows, rows[by:] + rows[:by], strict=True)
+    scene.write_rows([header, *([row[0], *other[1:]] for row, other in others)])
     texts = [one["text"] for one in audit(scene).summary["findings"]]
     assert any(f"fit with the joint positions of the {which} frame" in text for text in texts)
 
@@ -291,11 +282,8 @@ def test_positions_of_another_frame_are_recognised(scene, by: int, which: str) -
 def test_cameras_far_from_their_given_poses_are_found(scene) -> None:
     """One metre and 30 degrees: no convention, and out of reach of fits of single frames."""
     left, right = scene.cameras.values()
-    X_WC = np.eye(4)
-    X_WC[:3, :3] = Rotation.from_euler("z", 30.0, degrees=True).as_matrix()
-    X_WC = X_WC @ left.X_WC
-    result = audit(scene, [left.with_pose(X_WC), right])
-    (one,) = result.summary["findings"]
+    X_WC = motion(np.radians([0.0, 0.0, 30.0, 0.0, 0.0, 0.0])) @ left.X_WC
+    (one,) = audit(scene, [left.with_pose(X_WC), right]).summary["findings"]
     assert (one["what"], one["name"]) == ("camera", "left")
     assert one["angle_deg"] == pytest.approx(30.0, abs=1.0)
 

@@ -42,13 +42,13 @@ class TestRegister:
         # The camera file is readable for an estimate.
         written = load_scene(arm_scene.folder, load_cameras(out / "cameras.yaml")).cameras
         assert list(written) == ["left", "right"]
-        millimetres, degrees = pose_errors(written["left"].X_WC, arm_scene.cameras["left"].X_WC)
+        true = arm_scene.cameras["left"]
+        millimetres, degrees = pose_errors(written["left"].X_WC, true.X_WC)
         # The robot is two metres from a camera of 320 x 240 pixels.
         assert millimetres < min(8.0, 4.0 * np.sqrt(3.0) * found["translation_sd_mm"])
         assert degrees < min(0.2, 4.0 * np.sqrt(3.0) * found["rotation_sd_deg"])
         np.testing.assert_array_equal(written["right"].X_WC, arm_scene.cameras["right"].X_WC)
-        for name in ("width", "focal_x", "focal_y", "center_x", "center_y", "near"):
-            assert getattr(written["left"], name) == getattr(arm_scene.cameras["left"], name)
+        assert (written["left"].kernel_parameters() == true.kernel_parameters()).all()
 
     def test_summary_and_registration_file(self, registered) -> None:
         out, found, _ = registered
@@ -110,9 +110,7 @@ class TestRecordedArms:
         both = RegistrationSettings(cameras=("left", "right"))
         found = register_scene(scene, model, joints, settings=both)
         for name, reference in load_cameras(scene / "cameras.yaml").items():
-            millimetres, degrees = pose_errors(found.cameras[name].X_WC, reference.X_WC)
-            assert millimetres < 10.0
-            assert degrees < 0.5
+            assert np.less(pose_errors(found.cameras[name].X_WC, reference.X_WC), (10.0, 0.5)).all()
         assert not any(one.outliers for one in found.registered.values())
 
     def test_tool_missing_in_the_model(self, shared_data: Path) -> None:
@@ -135,13 +133,15 @@ class TestRecordedArms:
         assert not out.exists()
 
 
-def body_poses(path: Path, q: np.ndarray, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+def body_poses(path: Path, q: np.ndarray) -> dict[str, np.ndarray]:
     """Return Drake's poses (4, 4) of links by name."""
     plant = load_model(path).plant
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, q)
-    bodies = {name: plant.GetBodyByName(name) for name in names}
-    return {name: one.EvalPoseInWorld(context).GetAsMatrix4() for name, one in bodies.items()}
+    return {
+        name: plant.GetBodyByName(name).EvalPoseInWorld(context).GetAsMatrix4()
+        for name in ("turret", "shoulder", "hand")
+    }
 
 
 def test_link_scale_shifts_the_next_joint(tmp_path: Path) -> None:
@@ -176,9 +176,9 @@ def test_offsets_and_scales_are_estimated_and_written_to_a_urdf(own_arm, tmp_pat
     # Insignificant parameters are not written.
     written = {name: one["value_deg"] for name, one in zeros.items() if one["significant"]}
     shifts = np.radians([written.get(name, 0.0) for name in rows[0][1:]])
-    corrected, names = out / "short_calibrated.urdf", ("turret", "shoulder", "roll", "hand")
+    corrected = out / "short_calibrated.urdf"
     np.testing.assert_allclose(load_model(corrected).lower + shifts, load_model(short).lower)
-    right, found = body_poses(short, read + shifts, names), body_poses(corrected, read, names)
+    right, found = body_poses(short, read + shifts), body_poses(corrected, read)
     longer = {k: 0.01 * one["value_percent"] for k, one in lengths.items() if one["significant"]}
     moved = 0.2 * longer.get("turret", 0.0) * right["turret"][:3, 2]
     moved += 0.34 * longer["shoulder"] * right["shoulder"][:3, 2]

@@ -231,7 +231,9 @@ class SilhouetteTrack(_Track):
     def __init__(self, studio: Studio) -> None:
         tracker = PersonPoseTracker(ContourFit(studio.model.pose_tree()))
         cameras, backgrounds = studio.cameras, studio.backgrounds
-        super().__init__(build_silhouette_capture(tracker, cameras, backgrounds, PERIOD, 60.0))
+        super().__init__(
+            build_silhouette_capture(tracker, cameras, backgrounds, PERIOD, edge_points=60.0)
+        )
         self._tracker = tracker
 
     def step(self, images: Images) -> Array:

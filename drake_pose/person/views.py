@@ -26,7 +26,7 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import Placement
 
 EDGE_POINTS = 120.0
-"""Number of edge points per picture height."""
+"""Number of edge points per picture height by default."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +42,9 @@ def see_silhouette(region: Mask, spacing: float) -> SilhouetteView:
     return SilhouetteView(region, find_edge_points(region, spacing))
 
 
-def edge_spacing(camera: Camera) -> float:
-    """Return the spacing of edge points for a camera [pixel]: height / 120, 2 or more."""
-    return max(2.0, camera.height / EDGE_POINTS)
+def edge_spacing(camera: Camera, edge_points: float = EDGE_POINTS) -> float:
+    """Return the spacing of edge points for a camera [pixel]: height / `edge_points`, 2 or more."""
+    return max(2.0, camera.height / edge_points)
 
 
 def shows_somebody(view: SilhouetteView | None, least: float = 0.15) -> bool:

@@ -29,6 +29,7 @@ from drake_pose.person.date.walking import (
 from drake_pose.person.figures import keep_views
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.person.views import (
+    EDGE_POINTS,
     FrameViews,
     SilhouetteView,
     edge_spacing,
@@ -285,14 +286,20 @@ class SilhouetteSensor(PersonRegion):
 
     Output ports:
         silhouette: a SilhouetteView of the region, or None.
+
+    Args:
+        edge_points: the picture's height divided by the spacing of edge points.
     """
 
-    def __init__(self, camera: Camera, background: Background | None = None) -> None:
+    def __init__(
+        self, camera: Camera, background: Background | None = None, edge_points: float = EDGE_POINTS
+    ) -> None:
         super().__init__(camera, background)
+        spacing = edge_spacing(camera, edge_points)
 
         def view(context: Context) -> SilhouetteView | None:
             seen = self.region.Eval(context)
-            return None if seen is None else see_silhouette(seen, edge_spacing(camera))
+            return None if seen is None else see_silhouette(seen, spacing)
 
         self.silhouette = self.add_output("silhouette", None, view)
 
@@ -302,6 +309,7 @@ def add_silhouette_sensors(
     source: System | None,
     cameras: Mapping[str, Camera],
     backgrounds: Mapping[str, Background],
+    edge_points: float = EDGE_POINTS,
 ) -> dict[str, SilhouetteSensor]:
     """Add a SilhouetteSensor for each camera, and the source of their images; return the sensors.
 
@@ -314,6 +322,7 @@ def add_silhouette_sensors(
             the diagram.
         cameras: cameras by name.
         backgrounds: background models by name of the camera.
+        edge_points: as in SilhouetteSensor.
 
     Raises SettingsError: a camera has neither a background nor a source, or the source lacks an
     output port.
@@ -327,7 +336,7 @@ def add_silhouette_sensors(
         builder.AddNamedSystem("source", source)
     sensors = {}
     for name, camera in cameras.items():
-        sensor = SilhouetteSensor(camera, backgrounds.get(name))
+        sensor = SilhouetteSensor(camera, backgrounds.get(name), edge_points)
         sensors[name] = builder.AddNamedSystem(f"sensor_{name}", sensor)
         wanted = {f"{kind}_{name}": [sensor.GetInputPort(kind)] for kind in sensor.wanted}
         connect_images(builder, source, wanted)
@@ -339,6 +348,7 @@ def build_silhouette_capture(
     cameras: Mapping[str, Camera],
     backgrounds: Mapping[str, Background],
     period: float = 1.0 / 30.0,
+    edge_points: float = EDGE_POINTS,
     source: System | None = None,
     with_deviations: bool = False,
 ) -> StagedDiagram[PersonTracker]:
@@ -353,6 +363,7 @@ def build_silhouette_capture(
         backgrounds: background models by name of the camera; a camera without one needs a source
             with label images.
         period: time between two frames [s].
+        edge_points: as in SilhouetteSensor.
         source: of the images instead of input ports, for example a rig's diagram or a
             PictureCapture; see add_silhouette_sensors. Without an output port ``time``, each update
             has new pictures.
@@ -362,7 +373,7 @@ def build_silhouette_capture(
     not positive.
     """
     builder = DiagramBuilder()
-    sensors = add_silhouette_sensors(builder, source, cameras, backgrounds)
+    sensors = add_silhouette_sensors(builder, source, cameras, backgrounds, edge_points)
     person = PersonTracker(tracker, list(cameras.values()), period, with_deviations)
     builder.AddNamedSystem("person_tracker", person)
     for name, sensor in sensors.items():

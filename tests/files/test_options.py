@@ -130,11 +130,6 @@ def test_classes_need_annotations():
     assert MaskSettings(background=Path("b")).as_json() == {"background": "b"}
 
 
-@pytest.mark.parametrize("value", [None, 1.0, 2.5, 4.0])
-def test_numbers_within_bounds_are_accepted(value):
-    within(1.0, 4.0).validator[0](None, value)
-
-
 @pytest.mark.parametrize(
     ("bounds", "value", "wanted"),
     [
@@ -142,6 +137,8 @@ def test_numbers_within_bounds_are_accepted(value):
         ((1.0,), math.inf, "1 or more"), ((1.0, 4.0), math.nan, "1 to 4"),
     ],
 )  # fmt: skip
-def test_numbers_out_of_bounds_are_refused(bounds, value, wanted):
+def test_only_numbers_out_of_bounds_are_refused(bounds, value, wanted):
+    for accepted in (None, 1.0, 2.5, 4.0):
+        within(1.0, 4.0).validator[0](None, accepted)
     with pytest.raises(ValueError, match=f"It must be {wanted}"):
         within(*bounds).validator[0](None, value)

@@ -122,14 +122,15 @@ def test_page_is_self_contained_and_its_links_exist(result):
         assert link.removeprefix("#") in page.by_id or (result / link).is_file(), link
 
 
-def long_report(frames):
-    """Return a person's estimate with gaps, frames without a pose, and names to be escaped."""
+@pytest.fixture(scope="module")
+def report():
+    """A person's estimate with gaps, frames without a pose, and names to be escaped."""
     model = load_model(bundled_model("person").with_name("person_shape.urdf"), check=False)
     rng = np.random.default_rng(2)
     records, masks = {}, {}
-    walk = np.cumsum(rng.normal(0.0, 0.02, (frames, len(model.position_names))), axis=0)
+    walk = np.cumsum(rng.normal(0.0, 0.02, (1000, len(model.position_names))), axis=0)
     unit = np.where(np.array(model.position_kinds) == "angle", np.degrees(1.0), 1.0)
-    for k in range(frames):
+    for k in range(1000):
         frame = f"{k:04d}"
         found = not 100 <= k < 120
         q = np.clip(walk[k], model.lower, model.upper)
@@ -155,11 +156,6 @@ def long_report(frames):
         summarize(job, records, True, more), None,
     )  # fmt: skip
     return model, scene, estimate
-
-
-@pytest.fixture(scope="module")
-def report():
-    return long_report(1000)
 
 
 def test_page_of_a_thousand_frames_is_small_and_escapes_names(report):
@@ -353,13 +349,6 @@ def test_replay_of_many_triangles_is_small_and_accurate(tmp_path):
     np.testing.assert_allclose(np.linalg.norm(points / [1, 2, 1], axis=1), 0.1, atol=0.003)
 
 
-def found_by(summary, *records, names=("a", "b")):
-    """Return an estimate, and a model with its positions."""
-    frames = {f"{k}": one for k, one in enumerate(records)}
-    estimate = SceneEstimate(names, ("angle",) * 2, frames, summary, None)
-    return SimpleNamespace(position_names=names), estimate
-
-
 def told(*determined, E=0.1, **more):
     joints = {name: {"determined": one} for name, one in zip("ab", determined, strict=False)}
     return FrameRecord("0", np.zeros(2), None, E, 1.0, joints=joints, **more)
@@ -379,4 +368,7 @@ def told(*determined, E=0.1, **more):
     ],
 )  # fmt: skip
 def test_the_answer_counts_frames_and_joints(records, answer):
-    assert report_page.estimate_answer(*found_by({"mean_E_total": 0.1}, *records)) == answer
+    frames = {f"{k}": one for k, one in enumerate(records)}
+    estimate = SceneEstimate(("a", "b"), ("angle",) * 2, frames, {"mean_E_total": 0.1}, None)
+    model = SimpleNamespace(position_names=("a", "b"))
+    assert report_page.estimate_answer(model, estimate) == answer

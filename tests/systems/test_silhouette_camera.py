@@ -144,9 +144,8 @@ def test_poses_that_are_not_finite_are_refused():
     system = SilhouetteCamera(plant, scene_graph, camera_at((2.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
     context = system.CreateDefaultContext()
     port = system.GetInputPort("body_poses")
-    port.FixValue(context, [RigidTransform(), RigidTransform([np.nan, 0.0, 0.0])])
-    with pytest.raises(ModelError, match="'carrier' is not finite"):
-        system.GetOutputPort("label_image").Eval(context)
-    port.FixValue(context, [RigidTransform()])
-    with pytest.raises(ModelError, match="1 poses"):
-        system.GetOutputPort("label_image").Eval(context)
+    world, unknown = RigidTransform(), RigidTransform([np.nan, 0.0, 0.0])
+    for poses, words in (([world, unknown], "'carrier' is not finite"), ([world], "1 poses")):
+        port.FixValue(context, poses)
+        with pytest.raises(ModelError, match=words):
+            system.GetOutputPort("label_image").Eval(context)

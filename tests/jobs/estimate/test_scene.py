@@ -282,9 +282,8 @@ def test_options_that_need_a_known_root_are_refused(tiny_scene, bare_scene):
 BOOM = LINK.format(name="boom", z=0.25, size="0.1 0.12 0.5")
 
 
-@pytest.fixture
-def far(tmp_path, tiny_scene):
-    """A model whose boom is a mesh of a package elsewhere, and the package's folder."""
+def test_a_missing_package_is_named_and_must_stay_the_same_on_resume(out, tiny_scene, tmp_path):
+    """The boom of the model is a mesh of a package elsewhere."""
     folder = tmp_path / "far away" / "crane parts"
     folder.mkdir(parents=True)
     trimesh.creation.box((0.1, 0.12, 0.5)).export(folder / "boom.stl")
@@ -293,11 +292,6 @@ def far(tmp_path, tiny_scene):
     mesh = BOOM.replace('<box size="0.1 0.12 0.5"/>', '<mesh filename="package://parts/boom.stl"/>')
     assert mesh != BOOM
     model.write_text(tiny_scene.model.read_text().replace(BOOM, mesh))
-    return model, folder
-
-
-def test_a_missing_package_is_named_and_must_stay_the_same_on_resume(out, tiny_scene, far):
-    model, folder = far
     scene = replace(tiny_scene, model=model)
     words = [*scene.estimate(out), "--no-replay", "--no-overlay"]
     package = ["--package", f"parts={folder}"]

@@ -189,6 +189,10 @@ class TestRig:
         assert fault is None or (fault.mirrored, fault.exchanged) == ((), ())
 
 
+def someone(x: float, area: float = 100.0, z: float = 1.0) -> Person:
+    return Person(np.array([x, 0.0, z]), {0: 0}, area)
+
+
 class TestOthers:
     def test_two_persons_are_located(self, nine):
         poses = [nine.poses[0], stepping(nine.person, 1.0, 0.5, 1.2)]
@@ -289,17 +293,14 @@ class TestOthers:
 
     @pytest.mark.parametrize(("gap", "far"), [(1, 0.39), (1, 0.41), (3, 0.39), (3, 0.41)])
     def test_track_continues_within_a_step_also_after_a_gap(self, gap, far):
-        first, then = (Person(np.array([x, 0.0, 1.0]), {}, 100.0) for x in (0.0, far))
+        first, then = someone(0.0), someone(far)
         tracks = find_tracks([[], [first], *[[]] * (gap - 1), [then]])
         alone = [{1: first}, {gap + 1: then}]
         assert tracks == ([{1: first, gap + 1: then}] if far < 0.4 else alone)
 
     def test_followed_person_is_seen_longest_and_may_return(self):
-        def person(x: float, area: float = 100.0) -> Person:
-            return Person(np.array([x, 0.0, 1.0]), {0: 0}, area)
-
-        me = [person(0.0), person(0.1), person(3.0), person(3.1)]
-        him = [person(-2.0, 80.0), person(-2.1, 80.0)]
+        me = [someone(0.0), someone(0.1), someone(3.0), someone(3.1)]
+        him = [someone(-2.0, 80.0), someone(-2.1, 80.0)]
         frames = [[me[0]], [him[0], me[1]], [], [him[1]], [me[2]], [me[3]], []]
         found = follow_one(frames, np.zeros(3), True)
         assert [found[k] for k in (0, 1, 4, 5, 6)] == [me[0], me[1], me[2], me[3], None]
@@ -328,16 +329,13 @@ class TestOthers:
         assert [one.area for one in found] == [float(side**2)] * counts
 
     def test_separate_person_stands_apart_and_is_large(self):
-        def person(x: float, area: float, z: float = 1.0) -> Person:
-            return Person(np.array([x, 0.0, z]), {}, area)
-
-        first = person(0.0, 100.0)
-        assert is_separate(person(2.0, 90.0), [first])
-        assert not is_separate(person(2.0, 1.0), [first])
-        assert not is_separate(person(0.1, 90.0), [first])
+        first = someone(0.0)
+        assert is_separate(someone(2.0, 90.0), [first])
+        assert not is_separate(someone(2.0, 1.0), [first])
+        assert not is_separate(someone(0.1, 90.0), [first])
         # A figure above the person belongs to the person.
-        assert not is_separate(person(0.0, 90.0, 3.0), [first])
-        assert not is_separate(person(2.1, 90.0), [first, person(2.0, 100.0)])
+        assert not is_separate(someone(0.0, 90.0, 3.0), [first])
+        assert not is_separate(someone(2.1, 90.0), [first, someone(2.0)])
 
 
 class TestRecord:

@@ -106,14 +106,10 @@ def coverage_sets(data: Path | None) -> Iterator[CoverageSet]:
         yield CoverageSet("real arm, stills", model, lambda _, k: arm, _ARM_JOINTS[1:], draws=1)
     for scene in sorted(data.glob("hand_sequences/*/scene.yaml")):
         model = bundled_model("hand").with_name("right_hand.urdf")
-        make = _existing(scene.parent)
         yield CoverageSet(
-            f"hand, {scene.parent.name}", model, make, _HAND_JOINTS, draws=1, in_degrees=True
-        )
-
-
-def _existing(scene: Path) -> Callable[[Path, int], Path]:
-    return lambda _, k: scene
+            f"hand, {scene.parent.name}", model, lambda _, k, own=scene.parent: own, _HAND_JOINTS,
+            draws=1, in_degrees=True,
+        )  # fmt: skip
 
 
 def _damages() -> Iterator[tuple[str, Damage]]:
@@ -140,11 +136,7 @@ def swinging(
 ) -> Array:
     """Return (frames, n) positions that oscillate inside limits, at full speed from the start.
 
-    Args:
-        lower, upper: (n,) limits.
-        frames: number of frames.
-        rng: random numbers.
-        fastest: maximum velocity of a joint [rad/s or m/s].
+    fastest: maximum velocity of a joint [rad/s or m/s].
     """
     middle, reach = 0.5 * (lower + upper), 0.4 * (upper - lower)
     amplitude = reach * rng.uniform(0.3, 1.0, len(lower))
@@ -209,15 +201,10 @@ def _draw_person(damage: Damage) -> Callable[[Path, int], Path]:
 
 
 def _draw(
-    folder: Path,
-    model: ArticulatedModel,
-    cameras: dict[str, PinholeCamera],
-    q: Array,
-    rng: np.random.Generator,
-    damage: Damage | None = None,
-    cameras_off: float = 0.0,
+    folder: Path, model: ArticulatedModel, cameras: dict[str, PinholeCamera], q: Array,
+    rng: np.random.Generator, damage: Damage | None = None, cameras_off: float = 0.0,
     colours: bool = False,
-) -> Path:
+) -> Path:  # fmt: skip
     """Write a scene of masks by Drake's renderer, optionally of images, and joint_angles.csv."""
     folder.mkdir(parents=True)
     saved_cameras = {

@@ -15,11 +15,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import yaml
 
-from drake_pose.arrays import Array
 from drake_pose.body import ArticulatedModel, load_model
-from drake_pose.camera.camera_files import dump_cameras
+from drake_pose.camera.camera_files import save_cameras
 from drake_pose.errors import RegistrationError
 from drake_pose.files.settings import RegistrationSettings
 from drake_pose.jobs.registration.register import SceneRegistration, register_scene
@@ -27,6 +25,7 @@ from tests.benchmarks.registration import pose_error
 from tests.benchmarks.rooms import LOG_HZ, SimulatedEpisode, simulate
 from tests.benchmarks.tables import print_table
 from tests.camera.recordings import write_pictures
+from tests.jobs.scenes import edit_camera
 from tests.registration.recordings import write_images, write_log
 
 
@@ -156,14 +155,12 @@ def measure_episode(data: Path, name: str, folder: Path, seed: int, kind: Episod
         other = simulate(model, folder, seed + 1000, grey, distance=arm.distance, middle=arm.middle)
         episode = replace(episode, positions=other.positions)
     elif kind.spoilt == "mirrored":
-        episode = replace(episode, pictures=np.ascontiguousarray(episode.pictures[:, :, ::-1]))
+        episode = mirrored(episode)
     elif kind.spoilt == "model":
         after = ([*ARMS] * 2)[[*ARMS].index(name) + 1 :]
         # A Panda with another gripper is the same arm.
         path = data / next(ARMS[k].file for k in after if not ("Panda" in k and "Panda" in name))
-        shown = load_model(path, check=False)
-        episode = replace(episode, positions=as_positions(model, episode.positions, shown))
-        model = shown
+        model, episode = of_another_arm(model, episode, path)
     write_episode(folder, model, episode, kind.log_hz, turned, wrong, kind.codec, kind.crf)
     settings = RegistrationSettings(zeros=("all",) if turned else ())
     start = time.process_time()
@@ -175,16 +172,24 @@ def measure_episode(data: Path, name: str, folder: Path, seed: int, kind: Episod
     return _outcome(found, episode, late, turned, wrong, seconds)
 
 
-def as_positions(model: ArticulatedModel, logged: Array, other: ArticulatedModel) -> Array:
-    """Return positions (n, nq) of a model as those of another one, joint by joint in order."""
+def mirrored(episode: SimulatedEpisode) -> SimulatedEpisode:
+    """Return an episode with mirrored pictures."""
+    return replace(episode, pictures=np.ascontiguousarray(episode.pictures[:, :, ::-1]))
+
+
+def of_another_arm(
+    model: ArticulatedModel, episode: SimulatedEpisode, path: Path
+) -> tuple[ArticulatedModel, SimulatedEpisode]:
+    """Return the arm of another file, and the episode's log as its, joint by joint in order."""
+    other = load_model(path, check=False)
     moving = [
         np.flatnonzero(np.isfinite(one.lower) & (one.upper - one.lower > 0.1))
         for one in (model, other)
     ]
     count = min(len(one) for one in moving)
-    positions = np.tile(other.default_positions, (len(logged), 1))
-    positions[:, moving[1][:count]] = logged[:, moving[0][:count]]
-    return np.clip(positions, other.lower, other.upper)
+    positions = np.tile(other.default_positions, (len(episode.positions), 1))
+    positions[:, moving[1][:count]] = episode.positions[:, moving[0][:count]]
+    return other, replace(episode, positions=np.clip(positions, other.lower, other.upper))
 
 
 def write_episode(
@@ -207,9 +212,8 @@ def write_episode(
     else:
         images = folder / "images" / episode.camera.name
         write_images(images, episode.pictures, episode.times)
-    content = yaml.safe_load(dump_cameras([episode.camera]))
-    del content[episode.camera.name]["X_WC"]
-    (folder / "cameras.yaml").write_text(yaml.safe_dump(content))
+    save_cameras(folder / "cameras.yaml", [episode.camera])
+    edit_camera(folder / "cameras.yaml", episode.camera.name, X_WC=None)
     times = np.arange(episode.log_times[0], episode.log_times[-1], 1.0 / log_hz)
     logged = [np.interp(times, episode.log_times, column) for column in episode.positions.T]
     positions = np.column_stack(logged)
@@ -223,13 +227,9 @@ def write_episode(
 
 
 def _outcome(
-    found: SceneRegistration,
-    episode: SimulatedEpisode,
-    late: float,
-    turned: dict[str, float],
-    wrong: tuple[float, float],
-    seconds: float,
-) -> Outcome:
+    found: SceneRegistration, episode: SimulatedEpisode, late: float, turned: dict[str, float],
+    wrong: tuple[float, float], seconds: float,
+) -> Outcome:  # fmt: skip
     """Return the errors of an episode's camera, clock, joint offsets and outliers."""
     one, summary = found.registered["camera"], found.summary
     error = pose_error(one.camera.X_WC, episode.camera.X_WC)

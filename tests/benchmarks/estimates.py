@@ -30,6 +30,7 @@ from tests.benchmarks.tables import print_table
 from tests.written_files import write_mask
 
 _FRAMES, _RATE_HZ, _IMAGES = 24, 30.0, 20
+_RIGHT_HAND = bundled_model("hand").with_name("right_hand.urdf")
 _ARM_JOINTS = ("A1", "A2", "A3", "A4")
 _FLEXIONS = tuple(
     f"{finger}_{joint}_flexion"
@@ -83,11 +84,7 @@ def works(data: Path | None, folder: Path) -> Iterator[Work]:
     sequence = data / "hand_sequences" / "count"
     if sequence.is_dir():
         frames = EstimateSettings(frames=(f"0000:{_FRAMES - 1:04d}",))
-        yield Work("hand, sequence, no camera known", sequence, _right_hand(), frames, uncounted=1)
-
-
-def _right_hand() -> Path:
-    return bundled_model("hand").with_name("right_hand.urdf")
+        yield Work("hand, sequence, no camera known", sequence, _RIGHT_HAND, frames, uncounted=1)
 
 
 def draw_arm_sequence(arm: Path, out: Path, frames: int = _FRAMES) -> Path:
@@ -162,7 +159,7 @@ def _hand_rows(data: Path) -> Iterator[tuple[str, ...]]:
     """Yield for each sequence: errors of flexions, coverage and widths of intervals [deg]."""
     for scene in sorted(path.parent for path in data.glob("*/scene.yaml")):
         begin = time.process_time()
-        found = estimate_scene(scene, _right_hand(), None, EstimateSettings(), overlay=False)
+        found = estimate_scene(scene, _RIGHT_HAND, None, EstimateSettings(), overlay=False)
         seconds, truth = time.process_time() - begin, _truth(scene)
         off, inside, widths = [], [], []
         for row in found.records.values():

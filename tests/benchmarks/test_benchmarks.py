@@ -112,13 +112,10 @@ def test_no_table_of_figures_is_typed_by_hand():
 
 def test_followers_are_drawn_where_their_model_has_them(tmp_path, monkeypatch):
     monkeypatch.setattr(rooms, "_PICTURES", 2)
-    finger = {"limits": 'lower="0" upper="0.8"'}
-    text = urdf(
-        link("world", ""), *map(link, ("one", "two")),
-        joint("lead", "revolute", "world", "one", **finger),
-        joint("other", "revolute", "world", "two", **finger,
-              more='<mimic joint="lead" multiplier="0.5" offset="0.1"/>'),
-    )  # fmt: skip
+    finger, mimic = 'lower="0" upper="0.8"', '<mimic joint="lead" multiplier="0.5" offset="0.1"/>'
+    lead = joint("lead", "revolute", "world", "one", limits=finger)
+    other = joint("other", "revolute", "world", "two", limits=finger, more=mimic)
+    text = urdf(link("world", ""), link("one"), link("two"), lead, other)
     model = load_model(write(tmp_path, text), check=False)
     drawn = rooms.simulate(model, tmp_path, 1).positions
     lead, other = (drawn[:, model.position_index(name)] for name in ("lead", "other"))

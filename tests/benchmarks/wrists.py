@@ -15,11 +15,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drake_pose.body import load_model
 from drake_pose.errors import RegistrationError
 from drake_pose.files.settings import RegistrationSettings
 from drake_pose.jobs.registration.register import register_scene
-from tests.benchmarks.episodes import as_positions, write_episode
+from tests.benchmarks.episodes import mirrored, of_another_arm, write_episode
 from tests.benchmarks.registration import pose_error
 from tests.benchmarks.rooms import LOG_HZ
 from tests.benchmarks.tables import print_table
@@ -108,16 +107,14 @@ def decide(data: Path, name: str, kind: Kind, seed: int, codec: str) -> Decision
         folder = Path(text)
         model, episode = simulate_wrist(data, folder, one, seed, **kind.room)
         if kind.wrong == "mirrored":
-            episode = replace(episode, pictures=np.ascontiguousarray(episode.pictures[:, :, ::-1]))
+            episode = mirrored(episode)
         elif kind.wrong == "joints":
             _, other = simulate_wrist(data, folder, one, seed + 1000, **kind.room)
             episode = replace(episode, positions=other.positions)
         elif kind.wrong == "model":
             other_name = "panda" if name == "so101" else "so101"
             path, link = data / GRIPPERS[other_name].file, GRIPPERS[other_name].link
-            other_model = load_model(path, check=False)
-            positions = as_positions(model, episode.positions, other_model)
-            model, episode = other_model, replace(episode, positions=positions)
+            model, episode = of_another_arm(model, episode, path)
         elif kind.wrong == "link":
             link = BEFORE[name]
         arm = [*one.arm][1:-1]
@@ -176,12 +173,8 @@ def main() -> None:
     parser.add_argument("--only", default="")
     given = parser.parse_args()
     headings = (
-        "episodes of three arms",
-        "accepted",
-        "mm (sd), degrees (sd)",
-        "inside 95 %",
-        "CPU s",
-    )
+        "episodes of three arms", "accepted", "mm (sd), degrees (sd)", "inside 95 %", "CPU s",
+    )  # fmt: skip
     print_table("Cameras on a wrist", headings, _rows(given.data, given.first, given.only))
 
 

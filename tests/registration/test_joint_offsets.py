@@ -12,6 +12,7 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.jobs.registration.words import likely_offset_warnings
+from drake_pose.registration.hand_eye import motion
 from drake_pose.registration.joint_offsets import (
     _unknown_rotations,
     ambiguous_constants,
@@ -26,7 +27,7 @@ from drake_pose.registration.joint_offsets import (
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import CameraSearch, RegisteredCamera
 from drake_pose.registration.shared_fit import SHARED, SharedFit, SharedValues
-from tests.registration.arm_pictures import MIDDLE, errors, looking_at, see
+from tests.registration.arm_pictures import MIDDLE, PLACE, errors, looking_at, see
 from tests.search.arms import LINKS
 
 NAMES = ("shoulder_turn", "roll_turn", "elbow_turn")
@@ -47,7 +48,7 @@ def known(camera: PinholeCamera) -> RegisteredCamera:
 
 @pytest.fixture(scope="module")
 def camera() -> PinholeCamera:
-    return looking_at(np.array([1.6, 0.4, 0.5]), MIDDLE, 0.1)
+    return looking_at(PLACE, MIDDLE, 0.1)
 
 
 class TestCalibrateJoints:
@@ -238,9 +239,7 @@ def test_an_unknown_first_offset_turns_the_camera_about_its_axis(model, body, ca
     assert not _unknown_rotations(views, [camera], {second}).any()
     (found,) = _unknown_rotations(views, [camera], {first, second})
     by = 1e-6
-    X = camera.X_WC.copy()
-    c, s = np.cos(by), np.sin(by)
-    X[:3] = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ X[:3]
+    X = motion(by * np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])) @ camera.X_WC
     moved = np.append([0.0, 0.0, 1.0], (X[:3, 3] - camera.X_WC[:3, 3]) / by)
     expected = SHARED.constant_deviation**2 * np.outer(moved, moved)
     np.testing.assert_allclose(found, expected, atol=1e-5 * expected.max())

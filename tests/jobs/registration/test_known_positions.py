@@ -15,6 +15,7 @@ from drake_pose.jobs.registration.positions import (
     put_on_base,
     read_known_positions,
 )
+from drake_pose.registration.hand_eye import motion
 from tests.body.models import joint, link, urdf, write
 
 URDF = """<robot name="slide"><link name="world"/>
@@ -79,9 +80,8 @@ def test_moving_base_becomes_joints(tmp_path: Path) -> None:
     model, rng = load_model(tmp_path / "slide.urdf"), np.random.default_rng(3)
     lines, bases = ["frame,rail,swing,base_x,base_y,base_z,base_qw,base_qx,base_qy,base_qz"], []
     for k in range(3):
-        turn = Rotation.from_rotvec(rng.normal(0.0, 1.0, 3))
-        bases.append(np.eye(4))
-        bases[k][:3, :3], bases[k][:3, 3] = turn.as_matrix(), rng.normal(0.0, 1.0, 3)
+        bases.append(motion(rng.normal(0.0, 1.0, 6)))
+        turn = Rotation.from_matrix(bases[k][:3, :3])
         cells = [k, 0.1 * k, 0.5 - k, *bases[k][:3, 3], *turn.as_quat(scalar_first=True)]
         lines.append(",".join(map(str, cells)))
     ends = ["error,seconds", *["0.1,1"] * 3]

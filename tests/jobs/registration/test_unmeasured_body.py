@@ -13,7 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.camera_files import load_cameras
+from drake_pose.registration.hand_eye import motion
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.benchmarks.registration import pose_error
 from tests.cli import assert_refused, run_command, run_json
 from tests.jobs.registration.arm_scenes import JOINTS, ArmScene, pose_errors
 from tests.written_files import write_mask
@@ -30,8 +32,7 @@ def register_near(
     found = yaml.safe_load((out / "registration.yaml").read_text())[name]
     X_WC = load_cameras(out / "cameras.yaml")[name].X_WC
     np.testing.assert_allclose(X_WC, found["X_WC"], atol=1e-9)
-    turn = Rotation.from_matrix(X_WC[:3, :3] @ true[:3, :3].T).as_rotvec()
-    off = np.concatenate([turn, X_WC[:3, 3] - true[:3, 3]])
+    off = pose_error(true, X_WC)
     deviations = np.abs(off / np.sqrt(np.diag(found["covariance"]))).max()
     assert np.all(np.array([*pose_errors(X_WC, true), deviations]) < limits)
     return told
@@ -43,9 +44,7 @@ def write_free_arm(scene: ArmScene, seed: int = 7) -> None:
     rows = [["frame", *JOINTS, *BASE, "error", "seconds"]]
     for k in range(6):
         q = rng.uniform(-1.0, 1.0, len(JOINTS))
-        X_WB = np.eye(4)
-        X_WB[:3, :3] = Rotation.from_rotvec(rng.normal(0.0, 0.5, 3)).as_matrix()
-        X_WB[:3, 3] = rng.normal(0.0, 0.1, 3)
+        X_WB = motion(np.append(rng.normal(0.0, 0.5, 3), rng.normal(0.0, 0.1, 3)))
         for name, camera in scene.cameras.items():
             path = scene.folder / "masks" / name / f"{k:04d}.png"
             write_mask(path, LabelRenderer(model, camera).mask(q, X_WB))

@@ -1,10 +1,13 @@
 import shutil
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from drake_pose.body import bundled_model
+from drake_pose.body import ArticulatedModel, bundled_model, load_model
+from drake_pose.camera.camera_files import save_cameras
+from drake_pose.camera.models import circle_of_cameras
 from drake_pose.errors import ModelError, SceneError, SettingsError
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.fit.contour_fit import ContourFit
@@ -13,8 +16,8 @@ from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.person.capture import CheckedCapture, PersonCapture
 from drake_pose.person.figures import ViewFaults
 from tests.cli import run_to_end
-from tests.jobs.persons import PersonScene, record_person
-from tests.jobs.scenes import read_rows, run_estimate
+from tests.jobs.scenes import read_rows, run_estimate, write_masks
+from tests.person.persons_in_view import posed
 
 FRAMES = 3
 FILES = {
@@ -23,10 +26,38 @@ FILES = {
 }  # fmt: skip
 
 
+@dataclass(frozen=True)
+class PersonScene:
+    """A scene's folder, its model, and the true positions (frames, nq)."""
+
+    folder: Path
+    person: ArticulatedModel
+    truth: np.ndarray
+
+    def estimate(self, out: Path, command: str = "estimate") -> list[str]:
+        """Return the words of an estimate or capture command."""
+        model = str(self.person.path)
+        return [command, str(self.folder), "--model", model, "--out", str(out), "--no-replay"]
+
+
+def record_person(folder: Path, sequence: bool = True) -> PersonScene:
+    """Write a recording of a person who raises an arm."""
+    folder.mkdir(parents=True, exist_ok=True)
+    person = load_model(bundled_model("person"), check=False)
+    cameras = circle_of_cameras(4, size=(160, 120), face_camera=False)
+    save_cameras(folder / "cameras.yaml", cameras)
+    rate = "frame_rate_hz: 30\n" if sequence else ""
+    (folder / "scene.yaml").write_text(f"sequence: {str(sequence).lower()}\n{rate}")
+    arms = [(30.0 + 10.0 * k, -30.0) for k in range(FRAMES)]
+    truth = np.array([posed(person, left_upper_arm_z=a, right_upper_arm_z=b) for a, b in arms])
+    write_masks(folder, person, cameras.values(), truth)
+    return PersonScene(folder, person, truth)
+
+
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     """A recording; shared, do not change it."""
-    return record_person(tmp_path_factory.mktemp("person") / "scene", FRAMES)
+    return record_person(tmp_path_factory.mktemp("person") / "scene")
 
 
 @pytest.fixture
@@ -117,7 +148,7 @@ def test_an_equally_good_pose_is_written_and_named_in_a_warning(recording, known
 
 
 def test_capture_selects_cameras_and_frames_as_estimate_does(known, tmp_path, out):
-    scene = record_person(tmp_path / "scene", FRAMES, sequence=False)
+    scene = record_person(tmp_path / "scene", sequence=False)
     some = ("--frame", "0:1", "--camera", "camera_0", "--camera", "camera_2", "--no-overlay")
     _, summary = run_estimate(scene, out, *some)
     assert list(summary["frames"]) == ["0000", "0001"]

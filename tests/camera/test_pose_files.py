@@ -28,7 +28,6 @@ X_LINK[:3, :3] = X[:3, :3] @ np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0,
 LINK_Q = Rotation.from_matrix(X_LINK[:3, :3]).as_quat().tolist()
 FRAMES = {"robot_base_frame": "base_link", "robot_effector_frame": "tool0"}
 EASY = {"eye_on_hand": False, "tracking_base_frame": "camera_color_optical_frame", **FRAMES}
-BASE = {"parameters": EASY, "transformation": PLACE | Q}
 MOVED = {"translation": PLACE, "rotation": TURN}
 SAME = {"translation": dict.fromkeys("xyz", 0.0), "rotation": dict.fromkeys("xyz", 0.0) | {"w": 1}}
 LAUNCH = """<launch>
@@ -39,8 +38,14 @@ LAUNCH = """<launch>
 """
 
 
-def words(numbers):
-    return " ".join(f"{x:.17g}" for x in numbers)
+def easy(rotation=QUATERNION, **parameters):
+    pose = PLACE | dict(zip(Q, rotation, strict=True))
+    return {"parameters": EASY | parameters, "transformation": pose}
+
+
+def launch(rotation, child, period="", parent="base"):
+    words = " ".join(f"{x:.17g}" for x in [*X[:3, 3], *rotation])
+    return LAUNCH.format(words, parent, child, period)
 
 
 def transform(parent, child, moved):
@@ -64,25 +69,16 @@ def load(path, content, intrinsics, recording=None):
 @pytest.mark.parametrize(
     ("name", "content"),
     [
-        ("easy.yaml", BASE),
+        ("easy.yaml", easy()),
         ("easy.yaml", EASY | {"transformation": PLACE | Q}),
         (
             "easy.calib",
             {"parameters": EASY | {"calibration_type": "eye_on_base"}, "transform": MOVED},
         ),
-        (
-            "easy.yaml",
-            {
-                "parameters": EASY | {"tracking_base_frame": "camera_link"},
-                "transformation": PLACE | dict(zip(Q, LINK_Q, strict=True)),
-            },
-        ),
-        ("pose.launch", LAUNCH.format(words([*X[:3, 3], *QUATERNION]), "base", "cam_optical", "")),
-        ("pose.launch", LAUNCH.format(words([*X[:3, 3], *LINK_Q]), "base", "camera_link", "")),
-        (
-            "pose.launch",
-            LAUNCH.format(words([*X[:3, 3], *SIX[:2:-1]]), "base", "cam_optical", "100"),
-        ),
+        ("easy.yaml", easy(LINK_Q, tracking_base_frame="camera_link")),
+        ("pose.launch", launch(QUATERNION, "cam_optical")),
+        ("pose.launch", launch(LINK_Q, "camera_link")),
+        ("pose.launch", launch(SIX[:2:-1], "cam_optical", "100")),
         (
             "pose.launch.py",
             "Node(package='tf2_ros', executable='static_transform_publisher', arguments=["
@@ -131,10 +127,11 @@ def test_poses_without_intrinsics_are_read(tmp_path, scene, name, content):
 
 
 def test_a_camera_on_the_hand_has_its_link(tmp_path, scene):
-    content = {"parameters": EASY | {"eye_on_hand": True}, "transformation": PLACE | Q}
-    assert load(tmp_path / "easy.yaml", content, scene).links == {"left": "tool0"}
-    launch = LAUNCH.format(words([*X[:3, 3], *QUATERNION]), "tool0", "cam_optical", "")
-    assert load(tmp_path / "pose.launch", launch, scene).links == {"left": "tool0"}
+    for name, content in (
+        ("easy.yaml", easy(eye_on_hand=True)),
+        ("pose.launch", launch(QUATERNION, "cam_optical", parent="tool0")),
+    ):
+        assert load(tmp_path / name, content, scene).links == {"left": "tool0"}
 
 
 def test_files_of_many_episodes_give_the_recordings_own(tmp_path):
@@ -182,7 +179,7 @@ def test_files_of_many_episodes_give_the_recordings_own(tmp_path):
     ("content", "words"),
     [
         ({"left": SIX}, ["has poses (left)", "--intrinsics FILE"]),
-        (BASE, ["camera_color_optical_frame"]),
+        (easy(), ["camera_color_optical_frame"]),
         ({"left": [*SIX[:3], 0.5, 0.5, 0.5, 0.9]}, ["camera 'left'", "length 1.25"]),
         ({"left": {"X_WC": (2.0 * X).tolist()}}, ["a pinhole camera needs width"]),
         ({"left": {"t": SIX[:3], "R": (1.2 * X[:3, :3]).tolist()}}, ["not a rotation"]),
@@ -201,7 +198,7 @@ def test_a_pose_of_no_camera_is_refused(tmp_path):
     entry = {"width": 1280, "height": 720, "fx": 640, "fy": 642, "cx": 639.5, "cy": 359.5}
     intrinsics.write_text(yaml.safe_dump({"left": entry, "right": entry}))
     with pytest.raises(CameraError, match="cameras are left, right: name them alike") as caught:
-        load(tmp_path / "easy.yaml", BASE, intrinsics)
+        load(tmp_path / "easy.yaml", easy(), intrinsics)
     assert "--camera NAME" in str(caught.value)
 
 

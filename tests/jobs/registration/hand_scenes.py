@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -61,13 +61,6 @@ class TargetScene:
     def register(self, out: Path) -> list[str]:
         """Return the command line of a registration of the camera on the flange."""
         return [*self.arm.register(out), "--on", "flange", "--target", str(self.target)]
-
-    def with_looks(self, before: str, after: str, path: Path) -> "TargetScene":
-        """Return the same scene with a text replaced in the target's file."""
-        text = self.target.read_text()
-        assert before in text
-        path.write_text(text.replace(before, after))
-        return replace(self, target=path)
 
 
 def write_hand_scene(

@@ -96,9 +96,8 @@ def read_csv(
 
     Cells are stripped of surrounding spaces.
 
-    Args:
-        error_type: class of the exceptions.
-        whole_lines: ignore text after the last line break, which an interrupted writer left.
+    ``error_type``: class of the exceptions. ``whole_lines``: ignore text after the last line break,
+    which an interrupted writer left.
 
     Raises error_type: the file is unreadable or empty, its columns are not separated by commas, or
     a line has a different number of cells than the header. The message names the file.

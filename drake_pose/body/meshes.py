@@ -416,11 +416,9 @@ def make_drawable(
     STL, DAE and GLB files and OBJ files without normals are replaced by OBJ files with normals in a
     temporary folder. A half space loses its perception role. The world body's geometry is included.
 
-    Args:
-        plant: the plant that registered the geometry.
-        scene_graph: the SceneGraph with the geometry; None: a file that must be replaced is an
-            error.
-        instances: the model instances whose bodies are processed.
+    ``plant``: the plant that registered the geometry. ``scene_graph``: the SceneGraph with the
+    geometry; None: a file that must be replaced is an error. ``instances``: the model instances
+    whose bodies are processed.
 
     Raises ModelError: a mesh file cannot be drawn, or ``scene_graph`` is missing.
     """

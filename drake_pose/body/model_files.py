@@ -299,8 +299,7 @@ class FileFinder:
     A package is searched for, in this order, among the given packages, the bundled one, the folders
     above the file that names it, and the folders of the search-path environment variables.
 
-    Args:
-        package_paths: folders by package name; None: none.
+    ``package_paths``: folders by package name; None: none.
 
     Raises ModelError: a given package folder does not exist.
     """

@@ -174,9 +174,8 @@ def describe_positions(
 ) -> tuple[dict[str, Any], list[str]]:
     """Return names, kinds, limits and couplings of a finalized plant's positions, and warnings.
 
-    Args:
-        given: limits (lower, upper) [rad or m] by position name that replace the plant's limits.
-        where: the model file, for messages.
+    ``given``: limits (lower, upper) [rad or m] by position name that replace the plant's limits.
+    ``where``: the model file, for messages.
 
     Returns the attributes of ``ParsedModel`` that describe positions, by name, and the warnings.
 
@@ -305,11 +304,9 @@ def _search_limits(
     Limits more than four turns apart (a hundred turns for a screw, a kilometre for a slide) count
     as no limits. An angle without limits is searched over one turn about its default.
 
-    Args:
-        index: index of the position in the joint.
-        name: the position's name, for messages.
-        default: the default position [rad or m].
-        given: limits (lower, upper) [rad or m] that replace the joint's; None: the joint's.
+    ``index``: index of the position in the joint. ``name``: the position's name, for messages.
+    ``default``: the default position [rad or m]. ``given``: limits (lower, upper) [rad or m] that
+    replace the joint's; None: the joint's.
 
     Returns the lower and the upper limit [rad or m], whether the position counts as unlimited, and
     a warning ("": none). An unlimited length has infinite limits.

@@ -297,9 +297,8 @@ def check_in_child(
 def _check_cached(read: Reader, path: str, packages: str, limits: str, _digest: str) -> None:
     """Raise ModelError as ``check_in_child``, unless the check passed before.
 
-    Args:
-        packages, limits: mappings as for ``Reader``, as JSON.
-        _digest: keys the cache by file content.
+    ``packages``, ``limits``: mappings as for ``Reader``, as JSON. ``_digest``: keys the cache by
+    file content.
     """
     try:
         try:
@@ -397,10 +396,9 @@ def _run_check(
 ) -> None:
     """Send the result of ``why_unusable`` and the meshes that were read, then exit the fork.
 
-    Args:
-        sender: receives (reason, {file: (vertices, triangles)}).
-        output: descriptor of the file that takes standard output and standard error.
-        read, path, packages, limits: arguments of ``why_unusable``.
+    ``sender``: receives (reason, {file: (vertices, triangles)}). ``output``: descriptor of the file
+    that takes standard output and standard error. ``read``, ``path``, ``packages``, ``limits``:
+    arguments of ``why_unusable``.
     """
     faulthandler.disable()
     for descriptor in (1, 2):

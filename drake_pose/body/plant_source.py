@@ -124,11 +124,9 @@ class PlantSource:
     ) -> tuple[list[ModelInstanceIndex], list[str]]:
         """Copy all bodies and joints, which keeps the meaning of q, and the drawn bodies' geometry.
 
-        Args:
-            plant: a plant that is not finalized.
-            scene_graph: the SceneGraph to register the plant with; None: the plant is registered
-                already or gets no geometry.
-            prefix: put before the names of model instances.
+        ``plant``: a plant that is not finalized. ``scene_graph``: the SceneGraph to register the
+        plant with; None: the plant is registered already or gets no geometry. ``prefix``: put
+        before the names of model instances.
 
         Returns the model instances of the copy, and no warnings.
 

@@ -105,10 +105,9 @@ def place_node(
 ) -> NodePlacement:
     """Return the placement of a node with positions in q, or of a root with a RootRotation.
 
-    Args:
-        positions: indices in q of the node's own positions; ignored if ``rotation`` is given.
-        held: values [rad or m] of positions that are not searched, by index in q.
-        X_PA, rotation, steps, follows: as in ``NodePlacement``.
+    ``positions``: indices in q of the node's own positions; ignored if ``rotation`` is given.
+    ``held``: values [rad or m] of positions that are not searched, by index in q. ``X_PA``,
+    ``rotation``, ``steps``, ``follows``: as in ``NodePlacement``.
     """
     if rotation is not None:
         lower, upper = rotation.lower, rotation.upper
@@ -211,10 +210,8 @@ class PoseTree:
         A value is sampled by ``axis_samples``; a held value has one sample. The last value changes
         fastest.
 
-        Args:
-            node: index of the node.
-            interval: sampling interval of angles [rad].
-            length_interval: sampling interval of lengths [m].
+        ``node``: index of the node. ``interval``: sampling interval of angles [rad].
+        ``length_interval``: sampling interval of lengths [m].
 
         Raises SettingsError: an interval is not positive, or the grid is too large.
         """

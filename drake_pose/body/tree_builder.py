@@ -299,9 +299,8 @@ def _plant_rooted(
 ) -> PoseTree:
     """Return the tree with the plant's own roots, which are attached to the plant's world.
 
-    Args:
-        position: (3,) the root's origin in the world [m]; None: as in the model file.
-        held: values of held positions [rad or m], by index in q.
+    ``position``: (3,) the root's origin in the world [m]; None: as in the model file. ``held``:
+    values of held positions [rad or m], by index in q.
     """
     branches = _attach_followers(model, graph, _branches(graph, 0), held)
     # The world is a branch itself if it has geometry.

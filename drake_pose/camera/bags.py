@@ -193,8 +193,7 @@ def _scan(path: Path) -> tuple[Any, Any, Any, Any, Any, Any]:
 def _encoding(coding: str) -> tuple[int, int | None, bool] | None:
     """Return bytes per pixel, OpenCV's conversion, and whether values have 16 bits; None: unknown.
 
-    Args:
-        coding: name of the encoding in lower case.
+    ``coding``: name of the encoding in lower case.
     """
     coding = _ALIASES.get(coding, coding)
     if coding in _ENCODINGS:
@@ -219,12 +218,10 @@ def _clock_shifts(
     have no stamp, so that the times in the bag are used. Headers of another clock are moved by the
     median difference of the times in the bag.
 
-    Args:
-        pictures, states: rows by topic, and by (topic, names).
-        differs: clocks differ if headers lag behind the times in the bag by this much more or less
-            than those of the joints [s]: more than recorders delay messages.
-        max_fraction: maximum fraction of a stream's messages whose headers may have no stamp; they
-            are left out.
+    ``pictures``, ``states``: rows by topic, and by (topic, names). ``differs``: clocks differ if
+    headers lag behind the times in the bag by this much more or less than those of the joints [s]:
+    more than recorders delay messages. ``max_fraction``: maximum fraction of a stream's messages
+    whose headers may have no stamp; they are left out.
     """
     streams: dict[Any, Sequence[_Row]] = {**states, **pictures}
     lags: dict[Any, float | None] = {}
@@ -284,11 +281,9 @@ def _ordered_times(
 ) -> tuple[Array, Indices]:
     """Return ascending times (k,) [s], and indices (k,) of their rows; other rows are left out.
 
-    Args:
-        rows: the n messages.
-        shift: added to the stamps in the headers [ns]; None: use the times in the bag.
-        what: name of the rows, for messages.
-        warnings: list to which warnings are appended.
+    ``rows``: the n messages. ``shift``: added to the stamps in the headers [ns]; None: use the
+    times in the bag. ``what``: name of the rows, for messages. ``warnings``: list to which warnings
+    are appended.
 
     Raises SceneError: too many rows are out of order, see ``ascending_indices``.
     """

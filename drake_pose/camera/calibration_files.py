@@ -93,13 +93,12 @@ def calibrated_cameras(
     In Kalibr's camchain the first camera is the world. A single camera without a name gets the
     file's.
 
-    Args:
-        content: content of the file, as from ``read_camera_content``.
-        path: the file, for messages and a camera without a name.
-        episode_ids: names by which the recording may be known in DROID's files of many episodes.
+    ``content``: content of the file, as from ``read_camera_content``. ``path``: the file, for
+    messages and a camera without a name. ``episode_ids``: names by which the recording may be known
+    in DROID's files of many episodes.
 
-    Returns:
-        By name, the lens and the pose X_WC (4, 4) [m] of each camera; None: the file has no pose.
+    Returns the lens and the pose X_WC (4, 4) [m] of each camera by name; None: the file has no
+    pose.
 
     Raises CameraError: a field is missing or invalid, OpenCV does not have the lens model, or a
     camera is so far away that lengths cannot be in metres.
@@ -286,12 +285,10 @@ def _lens(
 ) -> Lens:
     """Return a lens from a size [pixel], a camera matrix (3, 3) [pixel] and OpenCV's coefficients.
 
-    Args:
-        size, matrix, distortion: values of the file, not yet checked.
-        fisheye: whether the coefficients are those of OpenCV's fisheye.
-        where: start of error messages.
-        largest_skew: maximum skew that is ignored [f_x]; it amounts to half a pixel at the edge of
-            an image.
+    ``size``, ``matrix``, ``distortion``: values of the file, not yet checked. ``fisheye``: whether
+    the coefficients are those of OpenCV's fisheye. ``where``: start of error messages.
+    ``largest_skew``: maximum skew that is ignored [f_x]; it amounts to half a pixel at the edge of
+    an image.
 
     Raises CameraError: a value is missing or invalid.
     """
@@ -328,12 +325,9 @@ def _pose(
 ) -> Array | None:
     """Return X_WC (4, 4) of p_C = R p_W + T; None if there is neither R nor T.
 
-    Args:
-        content: a camera's entry in the file.
-        rotation, translation: keys of R, a matrix or a rotation vector [rad], and T [m].
-        where: start of error messages.
-        farthest: maximum distance from the world's origin [m]; beyond it lengths are taken to be in
-            millimetres.
+    ``content``: a camera's entry in the file. ``rotation``, ``translation``: keys of R, a matrix or
+    a rotation vector [rad], and T [m]. ``where``: start of error messages. ``farthest``: maximum
+    distance from the world's origin [m]; beyond it lengths are taken to be in millimetres.
     """
     if rotation not in content and translation not in content:
         return None

@@ -135,12 +135,10 @@ def load_camera_file(
 ) -> CameraFile:
     """Read a camera file as load_cameras does, but allow cameras without X_WC.
 
-    Args:
-        distorted: allow cameras with `distortion`, which the caller removes from images; else they
-            are refused.
-        known: called for a file of poses alone, see ``Known``; None: such a file is refused.
-        recording: the recording, which says what episode it is in DROID's files of many; None:
-            unknown.
+    ``distorted``: allow cameras with `distortion`, which the caller removes from images; else they
+    are refused. ``known``: called for a file of poses alone, see ``Known``; None: such a file is
+    refused. ``recording``: the recording, which says what episode it is in DROID's files of many;
+    None: unknown.
 
     Raises CameraError: names the file, the camera and the field at fault.
     """
@@ -255,11 +253,9 @@ def dump_cameras(
 ) -> str:
     """Return the text of a camera file.
 
-    Args:
-        cameras: the cameras, by name or in sequence.
-        links: link of each camera that is mounted on one, by the camera's name, whose X_WC is
-            written as X_LC; None: no camera is.
-        unplaced: names of cameras that are written without a pose.
+    ``cameras``: the cameras, by name or in sequence. ``links``: link of each camera that is mounted
+    on one, by the camera's name, whose X_WC is written as X_LC; None: no camera is. ``unplaced``:
+    names of cameras that are written without a pose.
     """
     content = {camera.name: describe_camera(camera) for camera in camera_tuple(cameras)}
     for name, link in (links or {}).items():

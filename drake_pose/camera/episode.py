@@ -212,11 +212,9 @@ def ascending_indices(
 def _gap_warnings(times: Array, what: str, one: str, gap: float = 1.5) -> list[str]:
     """Return a warning if there are long time steps or fewer than two times, else [].
 
-    Args:
-        times: (n,) ascending times [s].
-        what: what has these times, for messages.
-        one: noun of a single time, "picture" or "row".
-        gap: a step is long if it exceeds the median step by this factor.
+    ``times``: (n,) ascending times [s]. ``what``: what has these times, for messages. ``one``: noun
+    of a single time, "picture" or "row". ``gap``: a step is long if it exceeds the median step by
+    this factor.
     """
     if len(times) < 2:
         return [f"{what}: has one {one} only"]

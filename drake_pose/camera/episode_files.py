@@ -166,11 +166,8 @@ def _image_camera(
     The times of its images are those of the folder's `timestamps.csv`, or else those of the same
     frames in the joint log, or else follow from the frame rate in scene.yaml, or else are nan.
 
-    Args:
-        name: name of the camera.
-        folder: folder of the images.
-        scene: path of the scene.yaml, which may be missing.
-        joints: joint log of the recording; None: none.
+    ``name``: name of the camera. ``folder``: folder of the images. ``scene``: path of the
+    scene.yaml, which may be missing. ``joints``: joint log of the recording; None: none.
 
     Raises SceneError: there is no image, or a file is unusable.
     """
@@ -332,18 +329,14 @@ def open_episode(
 ) -> Episode:
     """Open an episode of any of the formats in `tutorials/file_formats.md`.
 
-    Args:
-        path: folder or file of the recording.
-        joints: CSV table of joint positions to use instead of the recording's own; None: its own,
-            if it has any.
-        episode: number of the episode in a LeRobot data set; None: the only one that is present.
+    ``path``: folder or file of the recording. ``joints``: CSV table of joint positions to use
+    instead of the recording's own; None: its own, if it has any. ``episode``: number of the episode
+    in a LeRobot data set; None: the only one that is present.
 
-    Raises:
-        SceneError: names what was found and expected, what is damaged or missing, or a missing
-            library of the extra `episodes`.
-        UnknownNameError: the data set does not contain the episode.
-        SettingsError: a number was given for a recording with a single episode.
-        CameraError: a camera file is unusable.
+    Raises SceneError: names what was found and expected, what is damaged or missing, or a missing
+    library of the extra `episodes`; UnknownNameError: the data set does not contain the episode;
+    SettingsError: a number was given for a recording with a single episode; CameraError: a camera
+    file is unusable.
     """
     path = Path(path)
     expected = (

@@ -256,9 +256,8 @@ def ros_transforms(
 ) -> str:
     """Return a launch file (XML) of ROS 2 with a static_transform_publisher for each optical frame.
 
-    Args:
-        cameras: the cameras, by name or in sequence.
-        frames: parent frame of each pose X_WC [m], by the camera's name.
+    ``cameras``: the cameras, by name or in sequence. ``frames``: parent frame of each pose X_WC
+    [m], by the camera's name.
     """
     launch = ElementTree.Element("launch")
     for camera in camera_tuple(cameras):
@@ -303,8 +302,7 @@ def mujoco_cameras(cameras: Mapping[str, Camera] | Iterable[Camera]) -> str:
 def _require_pinhole(camera: Camera, what: str) -> PinholeCamera:
     """Return the camera if it is a pinhole, else raise CameraError.
 
-    Args:
-        what: what needs a pinhole, for the message.
+    ``what``: what needs a pinhole, for the message.
     """
     if isinstance(camera, PinholeCamera):
         return camera

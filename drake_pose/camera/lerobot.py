@@ -54,15 +54,12 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
 
     Times are counted from the start of the episode.
 
-    Args:
-        path: folder of the data set.
-        joints: joint log to use instead of the data set's, see `find_states`; None: that, if any.
-        episode: number of the episode; None: the only one that is present.
+    ``path``: folder of the data set. ``joints``: joint log to use instead of the data set's, see
+    `find_states`; None: that, if any. ``episode``: number of the episode; None: the only one that
+    is present.
 
-    Raises:
-        SceneError: files are unreadable or do not match `meta/info.json`, or several episodes are
-            present and none was chosen.
-        UnknownNameError: the episode is not present.
+    Raises SceneError: files are unreadable or do not match `meta/info.json`, or several episodes
+    are present and none was chosen; UnknownNameError: the episode is not present.
     """
     parquet, warnings = import_reader("pyarrow.parquet", path), list[str]()
     try:
@@ -449,10 +446,9 @@ def _from_start(
     The rows' times begin elsewhere, such as 1970, if they end after all videos. The times of videos
     begin with the episode.
 
-    Args:
-        cameras: the cameras; those of stored images have the times ``stamps``.
-        own: the data set's own log, with the times ``stamps``; None: none.
-        given: the user's log; None: none. It is moved, too, if it is from the rows' times.
+    ``cameras``: the cameras; those of stored images have the times ``stamps``. ``own``: the data
+    set's own log, with the times ``stamps``; None: none. ``given``: the user's log; None: none. It
+    is moved, too, if it is from the rows' times.
     """
     stamps = rows.stamps
     period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0

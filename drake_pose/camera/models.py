@@ -366,11 +366,9 @@ def look_at(
 def _camera(name: str, X_WC: Array, field_of_view: float, size: tuple[int, int]) -> PinholeCamera:
     """Return a camera with square pixels and its principal point at the image's centre.
 
-    Args:
-        name: name of the camera.
-        X_WC: (4, 4) pose of the camera in the world.
-        field_of_view: vertical field of view [rad].
-        size: width and height of the images [pixel].
+    ``name``: name of the camera. ``X_WC``: (4, 4) pose of the camera in the world.
+    ``field_of_view``: vertical field of view [rad]. ``size``: width and height of the images
+    [pixel].
     """
     width, height = size
     focal = 0.5 * height / math.tan(0.5 * field_of_view)

@@ -210,9 +210,8 @@ def _decode(
 ) -> Picture:
     """Return a complete PNG or JPEG image as OpenCV decodes it: blue, green, red, or grey values.
 
-    Args:
-        data, path, error_type, only_png: as of `_require_whole`, whose errors are raised.
-        how: OpenCV's reading mode, which determines the shape.
+    ``data``, ``path``, ``error_type``, ``only_png``: as of `_require_whole`, whose errors are
+    raised. ``how``: OpenCV's reading mode, which determines the shape.
     """
     _require_whole(data, path, error_type, only_png=only_png)
     is_deep = how == cv2.IMREAD_COLOR and data[24:25] == b"\x10" and data[:1] != b"\xff"

@@ -38,10 +38,9 @@ def recorded_poses(
 ) -> dict[str, RecordedPose]:
     """Return the poses of the cameras in a file, by name; empty if it is not such a file.
 
-    Args:
-        content: content of the file as plain values, as from ``read_camera_content``.
-        path: the file, for messages and a camera without a name.
-        episode_ids: names by which the recording may be known in a file of many episodes.
+    ``content``: content of the file as plain values, as from ``read_camera_content``. ``path``: the
+    file, for messages and a camera without a name. ``episode_ids``: names by which the recording
+    may be known in a file of many episodes.
 
     Raises CameraError: a rotation is none, or it is unclear which of many episodes is meant.
     """

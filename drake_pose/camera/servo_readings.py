@@ -122,11 +122,9 @@ def find_motors(folder: Path, robot: str, columns: Iterable[str]) -> tuple[Servo
     Files are searched in the data set, its folders `meta` and `calibration`, and then in the folder
     that holds the data set. A leader's file is used only if there is no other.
 
-    Args:
-        folder: the data set.
-        robot: type of the robot.
-        columns: names of the recorded columns. A file must have a motor of one of them, or as many
-            motors as there are columns if these are only numbered.
+    ``folder``: the data set. ``robot``: type of the robot. ``columns``: names of the recorded
+    columns. A file must have a motor of one of them, or as many motors as there are columns if
+    these are only numbered.
 
     Raises SceneError: there are several files, and none is clearly the robot's.
     """
@@ -271,11 +269,9 @@ def _find_encoding(
     Encoders count in whole steps: an encoding is right if readings are whole steps in it alone.
     None: there are no readings, or they are too large for steps.
 
-    Args:
-        joints: the joints; a gripper's readings are not regarded.
-        turn: steps of a full turn.
-        full: maximum magnitude of normalised readings, with the rounding of stored numbers.
-        most: maximum magnitude of degrees, two turns [deg]; larger readings are steps.
+    ``joints``: the joints; a gripper's readings are not regarded. ``turn``: steps of a full turn.
+    ``full``: maximum magnitude of normalised readings, with the rounding of stored numbers.
+    ``most``: maximum magnitude of degrees, two turns [deg]; larger readings are steps.
     """
     body = [joint for joint in joints if joint.is_angle and not joint.is_gripper]
     known_readings = [(joint, joint.readings[np.isfinite(joint.readings)]) for joint in body]
@@ -311,10 +307,9 @@ def _find_encoding(
 def _are_whole(columns: Sequence[Array], near: float = 0.03, least: int = 8) -> bool | None:
     """Return whether the numbers of all columns are whole; None: there are too few to tell.
 
-    Args:
-        columns: numbers (n,) of each column; nan: missing.
-        near: tolerance; numbers stored in 32 bits are exact to a thousandth.
-        least: minimum number of different numbers of a column; a column with fewer is ignored.
+    ``columns``: numbers (n,) of each column; nan: missing. ``near``: tolerance; numbers stored in
+    32 bits are exact to a thousandth. ``least``: minimum number of different numbers of a column; a
+    column with fewer is ignored.
     """
     different = [np.unique(column[np.isfinite(column)]) for column in columns]
     told = [one for one in different if len(one) >= least]

@@ -177,9 +177,8 @@ class DeviceSource(FrameSource):
     Images that are not read in time are lost. A camera that cannot be opened or fails is reported
     once and reopened repeatedly, with growing pauses.
 
-    Args:
-        specification: the source.
-        pauses: initial and maximum pause before reopening [s]; they double until an image arrives.
+    ``specification``: the source. ``pauses``: initial and maximum pause before reopening [s]; they
+    double until an image arrives.
     """
 
     def __init__(

@@ -28,14 +28,11 @@ class Synchroniser(Generic[Item]):
     the group, and not awaited again until it provides an image. An image that arrives after its
     group is dropped, and counted in `late` by camera.
 
-    Args:
-        cameras: names of the cameras.
-        tolerance: maximum time between images of one group [s]; half a period for cameras that are
-            triggered together.
-        timeout: timeout for a camera [s], at least the tolerance.
+    ``cameras``: names of the cameras. ``tolerance``: maximum time between images of one group [s];
+    half a period for cameras that are triggered together. ``timeout``: timeout for a camera [s], at
+    least the tolerance.
 
-    Raises:
-        SettingsError: no camera, a duplicate camera, or invalid times.
+    Raises SettingsError: no camera, a duplicate camera, or invalid times.
     """
 
     def __init__(self, cameras: Iterable[str], tolerance: float, timeout: float) -> None:
@@ -95,8 +92,7 @@ class Synchroniser(Generic[Item]):
 
         None if there is none, or a camera is still awaited.
 
-        Args:
-            now: the time [s]; None: the latest time stamp.
+        ``now``: the time [s]; None: the latest time stamp.
         """
         heads = {name: queue[0][0] for name, queue in self._queues.items() if queue}
         if not heads:

@@ -83,12 +83,11 @@ def claimed(path: Path, resume: bool = False) -> Iterator[None]:
 
     The lock is flock's on the folder itself, so that it ends with the process.
 
-    Args:
-        path: the folder.
-        resume: whether the folder may already hold files; False: it must be new or empty.
+    ``path``: the folder. ``resume``: whether the folder may already hold files; False: it must be
+    new or empty.
 
-    Raises:
-        OutputError: another run is writing there, the folder is not empty, or it cannot be created.
+    Raises OutputError: another run is writing there, the folder is not empty, or it cannot be
+    created.
     """
     require_no_file(path)
     made = [place for place in (path, *path.parents) if not os.path.lexists(place)]

@@ -283,9 +283,8 @@ def record_modes(model: ArticulatedModel, answers: Sequence[tuple[Array, Array]]
 
     They are ``joints`` (the union of the intervals); for several also ``modes`` and ``mode_count``.
 
-    Args:
-        model: the model of the positions.
-        answers: positions and deviations of each pose, as in `record_deviations`, best first.
+    ``model``: the model of the positions. ``answers``: positions and deviations of each pose, as in
+    `record_deviations`, best first.
     """
     of_modes = [record_deviations(model, *one) for one in answers]
     if len(of_modes) < 2:
@@ -342,10 +341,9 @@ def next_summary(begin: float, period: float = 2.0, work_ratio: float = 20.0) ->
 
     These summaries are for jobs that are killed; every other end of a job writes its own.
 
-    Args:
-        begin: time at which writing of the present summary, now finished, began [s].
-        period: minimum time between two summaries [s].
-        work_ratio: minimum ratio of the time between two summaries to the time of writing one.
+    ``begin``: time at which writing of the present summary, now finished, began [s]. ``period``:
+    minimum time between two summaries [s]. ``work_ratio``: minimum ratio of the time between two
+    summaries to the time of writing one.
     """
     now = time.monotonic()
     return now + max(period, work_ratio * (now - begin))

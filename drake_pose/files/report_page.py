@@ -238,14 +238,12 @@ def _bar(
 ) -> list[dict[str, Any]]:
     """Return the rectangles of a bar between a joint's limits, [] if its range is infinite or 0.
 
-    Args:
-        limits, estimate, interval: smallest and largest value in one unit; nan where unknown.
-        is_open: whether the joint is not determined in some frame.
-        least_width: width of a single value [percent of the bar].
+    ``limits``, ``estimate``, ``interval``: smallest and largest value in one unit; nan where
+    unknown. ``is_open``: whether the joint is not determined in some frame. ``least_width``: width
+    of a single value [percent of the bar].
 
-    Returns:
-        For the template, by name: ``kind`` ("open" or "interval", and "estimate"), ``left`` and
-        ``width`` [percent of the bar] of each rectangle.
+    Returns ``kind`` ("open" or "interval", and "estimate"), ``left`` and ``width`` [percent of the
+    bar] of each rectangle, for the template.
     """
     span = limits[1] - limits[0]
     if not (math.isfinite(span) and span > 0.0):
@@ -302,11 +300,8 @@ def _pick_pictures(
     The result is in this order, as `overlay_picture` returns it; of each frame the overlays with
     the lowest IoU are taken.
 
-    Args:
-        folder: the result folder.
-        scene: the scene, with the cameras that were used.
-        estimate: the estimate.
-        most: approximate maximum number of overlays.
+    ``folder``: the result folder. ``scene``: the scene, with the cameras that were used.
+    ``estimate``: the estimate. ``most``: approximate maximum number of overlays.
     """
     records = estimate.records.values()
     known = [record for record in records if record.found] or list(records)
@@ -358,9 +353,8 @@ def overlay_picture(
 def new_plot(height: float = 1.5, left: float = 0.09) -> "tuple[Figure, Axes]":
     """Return an empty plot for a page.
 
-    Args:
-        height: height of the figure [inch].
-        left: space left of the axes, as a fraction of the width.
+    ``height``: height of the figure [inch]. ``left``: space left of the axes, as a fraction of the
+    width.
     """
     from matplotlib.figure import Figure  # Slow to import, and many pages have no plot.
 

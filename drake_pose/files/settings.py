@@ -59,9 +59,8 @@ def say_gone(names: Iterable[str]) -> str | None:
 class FromText:
     """Converter of an option for cyclopts.
 
-    Args:
-        parse: returns the value of the option's text; raises a SettingsError.
-        repeated: whether the option may be repeated: ``parse`` gets the list of its texts.
+    ``parse``: returns the value of the option's text; raises a SettingsError. ``repeated``: whether
+    the option may be repeated: ``parse`` gets the list of its texts.
     """
 
     parse: Callable[[Any], Any]
@@ -85,10 +84,8 @@ def from_text(
 ) -> Parameter:
     """Return the cyclopts parameter of an option whose text ``parse`` converts.
 
-    Args:
-        parse, repeated: as in `FromText`.
-        metavar: form of the text, for the help.
-        name: the option's name; None: that of the settings field.
+    ``parse``, ``repeated``: as in `FromText`. ``metavar``: form of the text, for the help.
+    ``name``: the option's name; None: that of the settings field.
     """
     return Parameter(
         name, converter=FromText(parse, repeated), metavar=metavar, accepts_keys=False,

@@ -150,10 +150,9 @@ class ResultWriter:
     ) -> None:
         """Write each frame, with its overlays, as soon as it is estimated.
 
-        Args:
-            frames: records and overlay contents, in order.
-            asked: names of all frames to be estimated, those that are finished included.
-            on_frame: called before the first and after each frame; None: not called.
+        ``frames``: records and overlay contents, in order. ``asked``: names of all frames to be
+        estimated, those that are finished included. ``on_frame``: called before the first and after
+        each frame; None: not called.
         """
         finished = sum(frame in self.records for frame in asked)
         if on_frame is not None:

@@ -377,11 +377,9 @@ class ContourObservation:
     ) -> ContourEvidence:
         """Return the evidence of a frame; edge points are found once for all its measurements.
 
-        Args:
-            masks: for each of ``cameras`` (H, W) or None.
-            pictures: for each camera (H, W, 3 or 4) or None; used for cameras without a mask. None:
-                no pictures.
-            colours: colour histograms of the body; None: pictures are not used.
+        ``masks``: for each of ``cameras`` (H, W) or None. ``pictures``: for each camera (H, W, 3 or
+        4) or None; used for cameras without a mask. None: no pictures. ``colours``: colour
+        histograms of the body; None: pictures are not used.
 
         Raises SettingsError: the number or size of masks or pictures does not fit the cameras.
         """
@@ -499,11 +497,9 @@ class ContourObservation:
     ) -> ContourMeasurement:
         """Return a comparison at a state as at most n independent measurements of variance 1.
 
-        Args:
-            x: (n,) the state.
-            compared: the comparison of the contours there.
-            distance: root mean square distance of the contours [pixel].
-            parts: ``ContourMeasurement.part_distances``.
+        ``x``: (n,) the state. ``compared``: the comparison of the contours there. ``distance``:
+        root mean square distance of the contours [pixel]. ``parts``:
+        ``ContourMeasurement.part_distances``.
         """
         H, g = normal_equations(compared, len(self._body.names))
         index = self._parameter_index

@@ -118,13 +118,10 @@ class Track:
 class ContourTracker:
     """Tracks a pose tree's state from frame to frame, inside its limits.
 
-    Args:
-        observation: the body and the cameras.
-        period: time between two frames [s].
-        settings: None: TrackingSettings().
+    ``observation``: the body and the cameras. ``period``: time between two frames [s].
+    ``settings``: None: TrackingSettings().
 
-    Raises:
-        SettingsError: the period is not positive.
+    Raises SettingsError: the period is not positive.
     """
 
     def __init__(
@@ -451,10 +448,9 @@ class MatchAndTrack:
 
         If neither explains the masks, return the given start or the prediction, as not found.
 
-        Args:
-            last: the state after the previous frame.
-            tracked: the track and its pose in this frame; None: there was no track.
-            start: (nq,) approximate positions in this frame; None: unknown.
+        ``last``: the state after the previous frame. ``tracked``: the track and its pose in this
+        frame; None: there was no track. ``start``: (nq,) approximate positions in this frame; None:
+        unknown.
         """
         settings, last_track = self.settings, last.track
         unexplained = last.unexplained + 1
@@ -495,9 +491,8 @@ class MatchAndTrack:
     ) -> list[tuple[Track, PoseEstimate]]:
         """Return the pose of a search, tracked in its frame and as it is; empty if not found.
 
-        Args:
-            matched: the search's pose.
-            last: the track before this frame, whose turns the angles take; None: there is none.
+        ``matched``: the search's pose. ``last``: the track before this frame, whose turns the
+        angles take; None: there is none.
         """
         if not matched.found:
             return []

@@ -188,10 +188,8 @@ def palm_rotation(R_CL: Array) -> Array:
 def read_hand(model: ArticulatedModel, palm: str = "palm") -> HandModel:
     """Return the hand of a model such as ``urdf/hand``: the hinges on its palm, and their places.
 
-    Args:
-        model: the model. The palm's link has its origin at the wrist, y along the fingers and z out
-            of the palm.
-        palm: name of the palm's link.
+    ``model``: the model. The palm's link has its origin at the wrist, y along the fingers and z out
+    of the palm. ``palm``: name of the palm's link.
 
     Raises UnknownNameError: the model has no such link; ModelError: a joint on the palm begins no
     finger, fingers have different numbers of segments, or a mesh has no vertices where a thickness

@@ -147,18 +147,14 @@ def _match(
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array, Array]:
     """Assign each edge point to the nearest visible side or tip within the gate [pixel].
 
-    Args:
-        edge: edge points of the silhouette.
-        rough: image of a rough pose with L lines.
-        along, normal: (L, 2) unit vectors along each line and across it.
-        size: (L,) length of each line [pixel].
+    ``edge``: edge points of the silhouette. ``rough``: image of a rough pose with L lines.
+    ``along``, ``normal``: (L, 2) unit vectors along each line and across it. ``size``: (L,) length
+    of each line [pixel].
 
-    Returns:
-        For the n assigned points: feature (n,), the index of a line, or L plus that of a tip; side
-            (n,), 0 or 1 as in ``RoughBody.sides``; slope (n, 2), offset (n,) and weight (n,), where
-            offset = slope @ (the two unknowns of the feature). A line's unknowns are
-            its shift along the normal [pixel] and the tangent of its rotation, a tip's are its
-            displacement [pixel].
+    Returns for the n assigned points: feature (n,), the index of a line, or L plus that of a tip;
+    side (n,), 0 or 1 as in ``RoughBody.sides``; slope (n, 2), offset (n,) and weight (n,), where
+    offset = slope @ (the two unknowns of the feature). A line's unknowns are its shift along the
+    normal [pixel] and the tangent of its rotation, a tip's are its displacement [pixel].
     """
     line, side = np.nonzero(rough.sides)
     sign, uv = 1.0 - 2.0 * side, edge.uv

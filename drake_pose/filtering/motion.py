@@ -44,9 +44,7 @@ class MotionModel(Protocol):
 class LinearMotion:
     """A linear ``MotionModel`` x -> transition x.
 
-    Args:
-        transition: (n, n) state transition matrix A.
-        noise, period: see ``MotionModel``.
+    ``transition``: (n, n) state transition matrix A. ``noise``, ``period``: see ``MotionModel``.
     """
 
     transition: Array
@@ -62,10 +60,9 @@ class LinearMotion:
 class FunctionMotion:
     """A ``MotionModel`` from any function of the state, for example a plant's dynamics.
 
-    Args:
-        function: maps the state x (n,) to the state (n,) one step later.
-        noise, period: see ``MotionModel``.
-        jacobian: maps x (n,) to the function's Jacobian (n, n); None: central differences.
+    ``function``: maps the state x (n,) to the state (n,) one step later. ``noise``, ``period``: see
+    ``MotionModel``. ``jacobian``: maps x (n,) to the function's Jacobian (n, n); None: central
+    differences.
     """
 
     function: Function

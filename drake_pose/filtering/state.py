@@ -24,10 +24,8 @@ from drake_pose.errors import SettingsError, UnknownNameError
 def factor_of(covariance: Array, names: Sequence[str] = (), subject: str = "the belief") -> Array:
     """Return L (n, n) with L L^T = covariance; the covariance may be singular.
 
-    Args:
-        covariance: (n, n), symmetric and positive semidefinite.
-        names: (n) names of the elements, for messages; their indices if empty.
-        subject: begins messages.
+    ``covariance``: (n, n), symmetric and positive semidefinite. ``names``: (n) names of the
+    elements, for messages; their indices if empty. ``subject``: begins messages.
 
     Raises SettingsError: the covariance is indefinite; the message names the element that
     contributes most to the negative eigenvalue.

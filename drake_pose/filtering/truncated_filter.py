@@ -403,14 +403,10 @@ class TruncatedFilter:
     ) -> list[Branch]:
         """Update a predicted hypothesis, linearised at its own mean and at each mirrored one.
 
-        Args:
-            hypothesis: the prediction.
-            measurement: of a new view.
-            step: number of the step.
-            numbers: counts the mirrored hypotheses of this step.
+        ``hypothesis``: the prediction. ``measurement``: of a new view. ``step``: number of the
+        step. ``numbers``: counts the mirrored hypotheses of this step.
 
-        Returns:
-            One branch for the hypothesis, then one for each mirrored state.
+        Returns one branch for the hypothesis, then one for each mirrored state.
         """
         own = replace(hypothesis, repeated=None)
         iterations = self.settings.iterations
@@ -486,11 +482,8 @@ class TruncatedFilter:
     ) -> Hypothesis:
         """Return a hypothesis after its update, weighted by the likelihood and by the limits.
 
-        Args:
-            hypothesis: before the update.
-            free: the updated belief without limits.
-            result: the updated belief inside the limits.
-            log_likelihood: of the measurement.
+        ``hypothesis``: before the update. ``free``: the updated belief without limits. ``result``:
+        the updated belief inside the limits. ``log_likelihood``: of the measurement.
         """
         active = tuple(self.inequalities.rows[k] for k in np.flatnonzero(result.active))
         belief = Belief(result.mean, result.covariance)

@@ -82,11 +82,9 @@ class SceneJob:
 def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
     """Return the scenes of a job file, in order. Its paths are relative to its folder.
 
-    Args:
-        path: YAML file with ``scenes`` (settings by name) and optionally ``defaults`` (settings of
-            all scenes) and ``chunk``. A scene with ``episodes: "0:99"`` becomes one scene for each
-            episode, NAME_000000 and so on.
-        chunk: number of frames in a chunk; None: the file's, else 100.
+    ``path``: YAML file with ``scenes`` (settings by name) and optionally ``defaults`` (settings of
+    all scenes) and ``chunk``. A scene with ``episodes: "0:99"`` becomes one scene for each episode,
+    NAME_000000 and so on. ``chunk``: number of frames in a chunk; None: the file's, else 100.
 
     Raises SettingsError: the message names the file, scene and setting at fault.
     """
@@ -189,11 +187,8 @@ def _scene_job(
 def _convert(value: Any, hint: Any, where: str, base: Path) -> Any:
     """Return a YAML value converted to the type of a settings field.
 
-    Args:
-        value: the value as read.
-        hint: the field's type hint, with its cyclopts parameters.
-        where: file, scene and field, for messages.
-        base: folder of relative paths.
+    ``value``: the value as read. ``hint``: the field's type hint, with its cyclopts parameters.
+    ``where``: file, scene and field, for messages. ``base``: folder of relative paths.
 
     Raises SettingsError: the value cannot be converted.
     """

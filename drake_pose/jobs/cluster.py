@@ -38,11 +38,9 @@ def open_cluster(
 ) -> Iterator[Client]:
     """Open a Dask client and, without ``scheduler``, workers on this machine; yields the client.
 
-    Args:
-        workers: number of worker processes with one thread each, which listen on the loopback
-            address only; None: one for each core.
-        scheduler: address of a Dask scheduler whose workers are used instead; None: no scheduler.
-        timeout: timeout of the connection to a scheduler [s].
+    ``workers``: number of worker processes with one thread each, which listen on the loopback
+    address only; None: one for each core. ``scheduler``: address of a Dask scheduler whose workers
+    are used instead; None: no scheduler. ``timeout``: timeout of the connection to a scheduler [s].
 
     Raises ClusterError: distributed is not installed, or the scheduler cannot be reached.
     """
@@ -153,13 +151,11 @@ def worker_facts(file: Path | None = None) -> tuple[str, str, bool]:
 def require_fit_workers(client: Client, out: Path, timeout: float = 5.0) -> None:
     """Check that all workers have this version of drake_pose and see a folder.
 
-    Args:
-        client: client of the workers.
-        out: the folder, which is created if it does not exist.
-        timeout: time for which a first worker is waited for [s].
+    ``client``: client of the workers. ``out``: the folder, which is created if it does not exist.
+    ``timeout``: time for which a first worker is waited for [s].
 
-    Raises:
-        ClusterError: there is no worker, the folder cannot be written, or a worker fails a check.
+    Raises ClusterError: there is no worker, the folder cannot be written, or a worker fails a
+    check.
     """
     with suppress(asyncio.TimeoutError):
         client.wait_for_workers(1, timeout=timeout)
@@ -239,9 +235,8 @@ def call_in_child(payload: bytes) -> bytes:
 def _answer(requests: Connection, memory_limit: int | None) -> None:
     """Serve the parent's calls until the parent ends.
 
-    Args:
-        requests: gets each ``payload`` of `call_in_child`, and sends the pickled result.
-        memory_limit: limit of this process's data [bytes]; None or 0: unlimited.
+    ``requests``: gets each ``payload`` of `call_in_child`, and sends the pickled result.
+    ``memory_limit``: limit of this process's data [bytes]; None or 0: unlimited.
     """
     # The parent handles Ctrl-C.
     signal.signal(signal.SIGINT, signal.SIG_IGN)

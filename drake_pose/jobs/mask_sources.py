@@ -137,18 +137,15 @@ class Source:
 def open_source(path: Path, camera_file: Path | None, episode: int | None) -> Source:
     """Return a source of masks; pictures and videos are not read yet.
 
-    Args:
-        path: one of: a folder with ``images/<camera>/<frame>.png`` or ``.jpg`` (cameras without
-            such a folder: ``videos/<camera>.mp4``), the same without ``images`` and ``videos``, or,
-            without both, in ``masks``; the pictures of a single camera need no folder of their own;
-            a picture, video or COCO file; an episode of a LeRobot data set, of DROID, or a bag.
-        camera_file: camera file; None: the folder's cameras.yaml, if it exists.
-        episode: number of the episode in a LeRobot data set; None: the only one.
+    ``path``: one of: a folder with ``images/<camera>/<frame>.png`` or ``.jpg`` (cameras without
+    such a folder: ``videos/<camera>.mp4``), the same without ``images`` and ``videos``, or, without
+    both, in ``masks``; the pictures of a single camera need no folder of their own; a picture,
+    video or COCO file; an episode of a LeRobot data set, of DROID, or a bag. ``camera_file``:
+    camera file; None: the folder's cameras.yaml, if it exists. ``episode``: number of the episode
+    in a LeRobot data set; None: the only one.
 
-    Raises:
-        SceneError: the message names what is missing or ambiguous.
-        CameraError: the camera file cannot be used.
-        MaskError: a COCO file cannot be used.
+    Raises SceneError: the message names what is missing or ambiguous; CameraError: the camera file
+    cannot be used; MaskError: a COCO file cannot be used.
     """
     if not path.exists():
         raise SceneError(f"{path}: there is no such folder or file")

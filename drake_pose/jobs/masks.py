@@ -215,10 +215,9 @@ def refuse_mask(mask: Mask, max_fraction: float = 0.98) -> str:
 def doubt_mask(mask: Mask, max_border: float = 0.6, second_patch: float = 0.25) -> list[str]:
     """Return warnings that a mask (H, W), not empty, may show something else than the object.
 
-    Args:
-        mask: the mask.
-        max_border: maximum fraction of the picture's border that an object covers.
-        second_patch: minimum area of a second object, as a fraction of the largest region's area.
+    ``mask``: the mask. ``max_border``: maximum fraction of the picture's border that an object
+    covers. ``second_patch``: minimum area of a second object, as a fraction of the largest region's
+    area.
     """
     warnings = []
     border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()
@@ -255,10 +254,8 @@ def find_masks(
 
     A segmented mask is the region that differs from the camera's background.
 
-    Args:
-        source: the source of the pictures or masks.
-        settings: the segmentation.
-        thresholds: factors of the background's noise for masks to compare with.
+    ``source``: the source of the pictures or masks. ``settings``: the segmentation. ``thresholds``:
+    factors of the background's noise for masks to compare with.
 
     Raises DrakePoseError: the message names the file, camera or frame at fault.
     """
@@ -330,11 +327,9 @@ def _background(
 ) -> tuple[Background, tuple[str, ...]]:
     """Return a camera's background model, and warnings; raise a SceneError if there is no picture.
 
-    Args:
-        source: the source.
-        camera: the camera's name.
-        given: picture, folder of pictures or "median", as in ``MaskSettings.background``.
-        max_count: a median uses between this number and twice as many pictures of a long recording.
+    ``source``: the source. ``camera``: the camera's name. ``given``: picture, folder of pictures or
+    "median", as in ``MaskSettings.background``. ``max_count``: a median uses between this number
+    and twice as many pictures of a long recording.
     """
     if given == "median":
         # Pictures evenly spread over a recording of unknown length.
@@ -374,12 +369,10 @@ def _doubt_median(
 ) -> tuple[str, ...]:
     """Return a warning if the body stays around one place, so that the median may show it.
 
-    Args:
-        room: the background from the median.
-        recording: pictures (H, W, 3) spread over the recording.
-        radius: radius within which the body stays, as a fraction of the square root of its area.
-        stays: fraction of the pictures from which the body stays near one point (simulated arms:
-            0.8 and more; a person walking by: 0.3).
+    ``room``: the background from the median. ``recording``: pictures (H, W, 3) spread over the
+    recording. ``radius``: radius within which the body stays, as a fraction of the square root of
+    its area. ``stays``: fraction of the pictures from which the body stays near one point
+    (simulated arms: 0.8 and more; a person walking by: 0.3).
     """
     masks = [person_region(picture, room) for picture in recording]
     bodies = [mask.astype(np.uint8) for mask in masks if mask.any()]

@@ -84,11 +84,9 @@ def run_sequence(
 
     The default search matches the first frame; the filter follows the others.
 
-    Args:
-        folder: a scene whose frames follow one another. If it has a ``joint_angles.csv``, the true
-            angles are in it: [rad], or [deg] if it has columns that the bundled hand lacks.
-        settings: None: ``experiment_settings()``.
-        count: reports progress.
+    ``folder``: a scene whose frames follow one another. If it has a ``joint_angles.csv``, the true
+    angles are in it: [rad], or [deg] if it has columns that the bundled hand lacks. ``settings``:
+    None: ``experiment_settings()``. ``count``: reports progress.
 
     Raises DrakePoseError: the scene has several cameras, or no hand in it can be matched.
     """

@@ -136,10 +136,9 @@ def first_guess(x: Array, generator: np.random.Generator) -> Belief:
 
     Table 2 does not list the palm's rotation, which gets the joint angles' error and variance.
 
-    Args:
-        x: (n,) the true state in the order of `HAND_STATE`: wrist [pixel], quaternion, its squared
-            norm being the scale, angles [rad] and lengths, then their rates.
-        generator: draws the errors, which are uniform up to table 2's values.
+    ``x``: (n,) the true state in the order of `HAND_STATE`: wrist [pixel], quaternion, its squared
+    norm being the scale, angles [rad] and lengths, then their rates. ``generator``: draws the
+    errors, which are uniform up to table 2's values.
 
     Returns the mean, with scale 1 and rates 0, and a diagonal covariance.
     """

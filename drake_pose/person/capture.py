@@ -199,8 +199,7 @@ class _Capture:
         wrong pose may fit better than the right one. Explanations that fit nearly as well as the
         best one are stored in `alternatives`.
 
-        Args:
-            start: the first fit; None: the best fresh start of a search.
+        ``start``: the first fit; None: the best fresh start of a search.
         """
         seen, tracker = self._see(frame), self.tracker
         if self._has_shape:
@@ -238,10 +237,9 @@ class _Capture:
         to the end, then from there backwards. Otherwise each frame is refined from its known state,
         or searched by itself.
 
-        Args:
-            frames: indices in order; after a gap the person is also searched anew.
-            known: states by frame that are known before; {}: none.
-            finish: called with index, state and views of each frame that is done, if not None.
+        ``frames``: indices in order; after a gap the person is also searched anew. ``known``:
+        states by frame that are known before; {}: none. ``finish``: called with index, state and
+        views of each frame that is done, if not None.
         """
         found: dict[int, TrackState | None] = {}
 
@@ -396,10 +394,8 @@ def capture_checked(
 class _CaptureComparison(CameraComparison):
     """Compares the cameras of a captured recording with each other.
 
-    Args:
-        tree, cameras: as of `capture_person`.
-        recording: the masks.
-        captured: poses of the recording; frames without a pose are not compared.
+    ``tree``, ``cameras``: as of `capture_person`. ``recording``: the masks. ``captured``: poses of
+    the recording; frames without a pose are not compared.
     """
 
     def __init__(

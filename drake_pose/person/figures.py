@@ -52,9 +52,8 @@ def find_figures(
 ) -> tuple[Figure, ...]:
     """Return the figures of a mask (H, W), the largest first, without specks.
 
-    Args:
-        speck: figures below this fraction of the largest one's area are specks.
-        least_fraction: a figure's area must exceed this fraction of the picture's area.
+    ``speck``: figures below this fraction of the largest one's area are specks. ``least_fraction``:
+    a figure's area must exceed this fraction of the picture's area.
     """
     small, step = _coarse(mask)
     left, top, width, height = cv2.boundingRect(small)
@@ -108,9 +107,8 @@ def find_persons(
 ) -> tuple[Person, ...]:
     """Return the persons that two or more cameras see, the best supported first; () if none.
 
-    Args:
-        figures: of each camera's mask, in the order of `cameras`.
-        examined: number of best supported positions that are examined for each further person.
+    ``figures``: of each camera's mask, in the order of `cameras`. ``examined``: number of best
+    supported positions that are examined for each further person.
     """
     if all(len(own) <= 1 for own in figures):
         taken = {k: 0 for k, own in enumerate(figures) if own}
@@ -175,11 +173,9 @@ def _support(
 
     A free figure adds 0.5 to 1 if its ray passes within 0.35 m.
 
-    Args:
-        figures: of each camera's mask.
-        free: indices of the figures of each camera that belong to no person yet.
-        covers: score of a figure whose box only covers the position.
-        misses: score of a camera that sees the position, but no figure there.
+    ``figures``: of each camera's mask. ``free``: indices of the figures of each camera that belong
+    to no person yet. ``covers``: score of a figure whose box only covers the position. ``misses``:
+    score of a camera that sees the position, but no figure there.
 
     Returns (n,) sums of the scores over the cameras whose picture contains the position; (n,
     cameras) index of the nearest free figure, -1 where no ray passes within 0.35 m.
@@ -215,10 +211,9 @@ def is_separate(
 ) -> bool:
     """Return whether a person is large enough, and far enough from others, to be one of its own.
 
-    Args:
-        persons: one or more others that were found already.
-        least_area: least `area` of the person, as a fraction of the others' largest.
-        apart: least horizontal distance from all others [m].
+    ``persons``: one or more others that were found already. ``least_area``: least `area` of the
+    person, as a fraction of the others' largest. ``apart``: least horizontal distance from all
+    others [m].
     """
     if person.area < least_area * max(one.area for one in persons):
         return False
@@ -311,10 +306,9 @@ def keep_person(
 ) -> tuple[dict[str, Mask], Person | None, tuple[str, ...], tuple[str, ...]]:
     """Keep one person in the masks of a frame, and cut out all others.
 
-    Args:
-        cameras, masks: cameras, and masks (H, W) of those that have one, by name.
-        position: (3,) where the person was in the last frame [m]. None: the person with the largest
-            figures is kept, of equal ones the nearer one to the middle of the cameras' view.
+    ``cameras``, ``masks``: cameras, and masks (H, W) of those that have one, by name. ``position``:
+    (3,) where the person was in the last frame [m]. None: the person with the largest figures is
+    kept, of equal ones the nearer one to the middle of the cameras' view.
 
     Returns the masks without other persons, by camera; the person, None where fewer than two
     cameras see anybody, and masks stay as they are; the cameras whose masks others were cut out of;
@@ -364,10 +358,9 @@ def follow_one(
 ) -> list[Person | None]:
     """Choose the person to follow: the one seen longest and largest.
 
-    Args:
-        frames: persons found in each frame.
-        middle: (3,) middle of the cameras' view [m]; of equally large persons the nearer is chosen.
-        is_sequence: whether the frames follow each other; if not, the largest in each is chosen.
+    ``frames``: persons found in each frame. ``middle``: (3,) middle of the cameras' view [m]; of
+    equally large persons the nearer is chosen. ``is_sequence``: whether the frames follow each
+    other; if not, the largest in each is chosen.
 
     Returns the person in each frame: without figures where hidden for a while, None where absent.
     """

@@ -89,12 +89,10 @@ def pose_uncertainty(
     def with_surfaces(variance: float, surface_deviations: Array) -> tuple[Array, Array]:
         """Return log-likelihoods (k,) and informations (k, m, m), for k deviations of surfaces.
 
-        Args:
-            variance: of the contours' distances, relative to the fit's noise.
-            surface_deviations: (k,) standard deviations of the parts' surfaces [m].
+        ``variance``: of the contours' distances, relative to the fit's noise.
+        ``surface_deviations``: (k,) standard deviations of the parts' surfaces [m].
 
-        Returns:
-            Restricted log-likelihoods of the deviations, and the values' information at each.
+        Returns restricted log-likelihoods of the deviations, and the values' information at each.
         """
         H = (jacobians @ A_sum @ np.swapaxes(jacobians, 1, 2)).sum(axis=0) / variance
         # (m, k): information that couples each value with each direction of the parts.
@@ -134,10 +132,9 @@ def pose_uncertainty(
 def _noise(A: Array, b: Array, Q: Array, assumed: float = 4.0) -> float:
     """Estimate the variance of contour distances, relative to the fit's noise.
 
-    Args:
-        A, b: (cameras, nodes, 12, 12) symmetric and (cameras, nodes, 12), as of `Comparison`.
-        Q: (nodes, 12, 12) covariance of each node's fitted affine motion.
-        assumed: weight of the fit's own noise in the estimate [number of distances].
+    ``A``, ``b``: (cameras, nodes, 12, 12) symmetric and (cameras, nodes, 12), as of `Comparison`.
+    ``Q``: (nodes, 12, 12) covariance of each node's fitted affine motion. ``assumed``: weight of
+    the fit's own noise in the estimate [number of distances].
     """
     gain = Q @ A
     # Expected value of `pulls` at unit variance, less the part that the fit has absorbed.
@@ -233,10 +230,9 @@ class PersonPoseTracker:
     ) -> Array:
         """Return standard deviations (nq,) of the plant's positions [rad, m], by one frame alone.
 
-        Args:
-            values: (m,) of a frame's state; the plant's other positions get 0.
-            seen: silhouettes that the frame was fitted to.
-            held_covariance: (h, h) covariance of the held values; None: they are exact.
+        ``values``: (m,) of a frame's state; the plant's other positions get 0. ``seen``:
+        silhouettes that the frame was fitted to. ``held_covariance``: (h, h) covariance of the held
+        values; None: they are exact.
         """
         placement = self.fit.body.place(values)
         compared = seen.compare(self.fit, placement, self.settings.follow[-1])
@@ -432,9 +428,8 @@ def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
 def _sides_information(names: Sequence[str], scale_count: int) -> Array:
     """Return the prior information (n, n) that left and right lengths are alike.
 
-    Args:
-        names: shape joints, the first of the n parameters.
-        scale_count: number of radius scales, which follow and get no information.
+    ``names``: shape joints, the first of the n parameters. ``scale_count``: number of radius
+    scales, which follow and get no information.
     """
     information = np.zeros((len(names) + scale_count, len(names) + scale_count))
     for k, name in enumerate(names):

@@ -157,11 +157,9 @@ def grow(
 class BeamSearch:
     """Estimates poses on a grid of joint values by a beam search.
 
-    Args:
-        tree: the pose tree whose values are searched.
-        settings: the grid and the stages of the search; None: the defaults.
-        examination: parameters of the proof of optimality and of the search for poses as good;
-            None: the best pose alone is returned.
+    ``tree``: the pose tree whose values are searched. ``settings``: the grid and the stages of the
+    search; None: the defaults. ``examination``: parameters of the proof of optimality and of the
+    search for poses as good; None: the best pose alone is returned.
     """
 
     def __init__(
@@ -179,9 +177,8 @@ class BeamSearch:
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
         """Estimate the pose that the views show.
 
-        Args:
-            views: the silhouettes, one per camera.
-            root_position: (3,) the root's position in the world [m]; None: that of the tree.
+        ``views``: the silhouettes, one per camera. ``root_position``: (3,) the root's position in
+        the world [m]; None: that of the tree.
 
         Returns the best pose found; ``stopped_by`` is "exact" (J is within the tolerance), "end" or
         "time_limit".
@@ -442,11 +439,9 @@ class _BeamRun:
         Limbs are the largest subtrees without a fork that are not the whole tree; for a chain, its
         outer half.
 
-        Args:
-            store: the poses of nodes.
-            order: the nodes, in the order in which they are placed.
-            poses: (nodes,) index of each node's pose in the store.
-            J: the objective of these poses at the store's resolution [pixel].
+        ``store``: the poses of nodes. ``order``: the nodes, in the order in which they are placed.
+        ``poses``: (nodes,) index of each node's pose in the store. ``J``: the objective of these
+        poses at the store's resolution [pixel].
 
         Returns (nodes,) index in the store of each node's pose of least J found.
         """

@@ -297,9 +297,8 @@ class PoseEstimate:
     def turned(self, tree: PoseTree, turns: Sequence[np.ndarray]) -> "PoseEstimate":
         """Return the same pose with full turns added to its angles, their intervals and modes.
 
-        Args:
-            tree: the pose tree.
-            turns: for each node (k_i,) what is added: multiples of 2 pi [rad], 0 for lengths.
+        ``tree``: the pose tree. ``turns``: for each node (k_i,) what is added: multiples of 2 pi
+        [rad], 0 for lengths.
         """
 
         def pose(one: PoseMode | PoseEstimate) -> dict[str, Any]:

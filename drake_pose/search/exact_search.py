@@ -71,8 +71,7 @@ class ExactPose(NamedTuple):
 class ExactSearch:
     """Searches poses in exact silhouettes by beam searches and refinement by pixels.
 
-    Args:
-        grids: beam searches on grids of 20 and of 15 degrees, which the settings' stages refer to.
+    ``grids``: beam searches on grids of 20 and of 15 degrees, which the settings' stages refer to.
     """
 
     def __init__(self, grids: Sequence[BeamSearch]) -> None:
@@ -86,13 +85,11 @@ class ExactSearch:
     ) -> ExactPose | None:
         """Return the best pose found.
 
-        Args:
-            problem: the silhouettes and the body.
-            root_position: (3,) the root's position [m]; None: that of the tree.
-            deadline: time.perf_counter() at which the search ends [s].
+        ``problem``: the silhouettes and the body. ``root_position``: (3,) the root's position [m];
+        None: that of the tree. ``deadline``: time.perf_counter() at which the search ends [s].
 
-        Returns:
-            The pose; None if J of all poses of some grid is hopelessly large, or the time is up.
+        Returns the pose; None if J of all poses of some grid is hopelessly large, or the time is
+        up.
         """
         settings, length, reached = self.settings, problem.border_length, None
         for grid in self._grids:

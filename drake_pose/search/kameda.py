@@ -23,15 +23,13 @@ from drake_pose.search.sampled_body import GridSettings, Regions, SampledTree, S
 class PaperSearchSettings(GridSettings):
     """Parameters of Kameda's search (sections 5.1, 5.2 and 6.1 of the paper).
 
-    Args:
-        outside_limit: the threshold r of (4) [pixel]: greatest area of a segment outside the
-            silhouette, in each view. None: start with 12.6 % of the mean projected area of a
-            segment (200 pixels for the paper's body) and double until a pose is found.
-        candidate_limit: K, the number of candidates kept for each node.
-        run_limit: greatest number of runs of step 3; the best pose found until then is returned.
+    ``outside_limit``: the threshold r of (4) [pixel]: greatest area of a segment outside the
+    silhouette, in each view. None: start with 12.6 % of the mean projected area of a segment (200
+    pixels for the paper's body) and double until a pose is found. ``candidate_limit``: K, the
+    number of candidates kept for each node. ``run_limit``: greatest number of runs of step 3; the
+    best pose found until then is returned.
 
-    Raises:
-        SettingsError: if a value is out of its range.
+    Raises SettingsError: if a value is out of its range.
     """
 
     outside_limit: float | None = None
@@ -61,9 +59,8 @@ class NodeList:
 class PaperSearch:
     """Estimates poses on a grid of joint values by the paper's search.
 
-    Args:
-        tree: the pose tree whose values are searched.
-        settings: the grid and the paper's parameters; None: the defaults.
+    ``tree``: the pose tree whose values are searched. ``settings``: the grid and the paper's
+    parameters; None: the defaults.
     """
 
     def __init__(self, tree: PoseTree, settings: PaperSearchSettings | None = None) -> None:

@@ -240,9 +240,8 @@ class _MultiStartRun:
     def search(self, rounds: int, with_set: bool) -> PoseEstimate:
         """Search the pose, by pixels if the masks are exact, else by the robust fit.
 
-        Args:
-            rounds: number of rounds of the search for alternative poses.
-            with_set: whether the pose set is computed.
+        ``rounds``: number of rounds of the search for alternative poses. ``with_set``: whether the
+        pose set is computed.
         """
         tree, exact, settings = self._kinematics.tree, self._search.exact, self._settings
         problem, found, poses = self._problem, None, list[FittedPose]()
@@ -322,9 +321,8 @@ class _MultiStartRun:
     def _search_robustly(self, pool: list[FittedPose], rounds: int) -> list[FittedPose]:
         """Return the best poses by robust costs, refined to the end, best first.
 
-        Args:
-            pool: poses refined by all stages but the final, best first.
-            rounds: number of rounds of the search for alternative poses.
+        ``pool``: poses refined by all stages but the final, best first. ``rounds``: number of
+        rounds of the search for alternative poses.
         """
         settings, turns = self._settings, self._kinematics.covers_full_turn
         pool = self._explore(pool, rounds)
@@ -481,10 +479,9 @@ def without_specks(mask: np.ndarray, largest: int = 6, least: float = 0.02) -> n
     The median over 5 x 5 pixels also removes structures thinner than three pixels, so masks with
     few specks are returned unchanged. So is a mask that the filter would empty.
 
-    Args:
-        mask: (H, W) bool; a filtered mask is a copy.
-        largest: greatest area of a speck: a 4-connected component or hole [pixel].
-        least: least area of all specks for the mask to be filtered, as a fraction of the mask's.
+    ``mask``: (H, W) bool; a filtered mask is a copy. ``largest``: greatest area of a speck: a
+    4-connected component or hole [pixel]. ``least``: least area of all specks for the mask to be
+    filtered, as a fraction of the mask's.
     """
     inside = mask.astype(np.uint8)
     left, top, width, height = cv2.boundingRect(inside)

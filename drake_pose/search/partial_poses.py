@@ -442,9 +442,8 @@ class PoseStore:
 
         Its areas ``beyond`` and ``unreachable`` are 0.
 
-        Args:
-            poses: (nodes,) index of each node's pose in the store; -1: not placed.
-            nodes: the nodes that are removed, with all their descendants.
+        ``poses``: (nodes,) index of each node's pose in the store; -1: not placed. ``nodes``: the
+        nodes that are removed, with all their descendants.
         """
         start = self.start()
         start.poses[0] = poses

@@ -165,10 +165,9 @@ class PartSearch:
         The mirror plane is perpendicular to that axis of the nodes' frames for which most nodes
         have such signs.
 
-        Args:
-            count: number of values at which relative transforms are compared.
-            least: greatest difference of a node's transforms from the mirrored ones, in entries of
-                the matrix [m or 1]; nodes with a greater one are left out.
+        ``count``: number of values at which relative transforms are compared. ``least``: greatest
+        difference of a node's transforms from the mirrored ones, in entries of the matrix [m or 1];
+        nodes with a greater one are left out.
         """
         tree, best = self.body.tree, dict[int, np.ndarray]()
         pairs = {(n, s) for r in self.reflections for n, s in zip(r.nodes, r.sources, strict=True)}
@@ -427,10 +426,8 @@ class PartSearch:
 class NeighbourhoodSearch:
     """Searches around a pose for other placements of parts, and stores alternative poses.
 
-    Args:
-        problem: the silhouettes and the body.
-        search: the parts of the body.
-        reflections: whether, in a single view, parts are mirrored with left and right exchanged.
+    ``problem``: the silhouettes and the body. ``search``: the parts of the body. ``reflections``:
+    whether, in a single view, parts are mirrored with left and right exchanged.
     """
 
     def __init__(
@@ -545,11 +542,9 @@ class NeighbourhoodSearch:
     ) -> tuple[np.ndarray, float]:
         """Mirror a part, and place it anew, and store the alternatives that are nearly as good.
 
-        Args:
-            parameters: (m + 4,) the current pose, as in ``RefinementBody``.
-            J: its objective [pixel].
-            chosen: index of the part.
-            erring: whether there is an error near the part; if not, the part is only mirrored.
+        ``parameters``: (m + 4,) the current pose, as in ``RefinementBody``. ``J``: its objective
+        [pixel]. ``chosen``: index of the part. ``erring``: whether there is an error near the part;
+        if not, the part is only mirrored.
 
         Returns the parameters of the best pose and its J [pixel]; the given parameters and infinity
         if J does not decrease by more than ``least_decrease``.

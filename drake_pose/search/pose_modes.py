@@ -121,14 +121,11 @@ def split_into_modes(
 ) -> list[tuple[float, float, np.ndarray]]:
     """Return the modes of a set of poses, sorted by J and, if equal, by size, largest first.
 
-    Args:
-        graph: the set of poses.
-        labels: for each node (all samples,) the cluster of each sample.
-        most_pairs: above this number of pairs of a state and a mode, the clusters of later nodes
-            are ignored.
+    ``graph``: the set of poses. ``labels``: for each node (all samples,) the cluster of each
+    sample. ``most_pairs``: above this number of pairs of a state and a mode, the clusters of later
+    nodes are ignored.
 
-    Returns:
-        For each mode its least J [pixel], its number of poses, and (nodes,) its clusters.
+    Returns for each mode its least J [pixel], its number of poses, and (nodes,) its clusters.
     """
     states, modes = np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64)
     sizes: np.ndarray = np.ones(1)

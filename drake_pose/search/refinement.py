@@ -118,9 +118,8 @@ class RefinementBody:
     def freedom(self, nodes: Sequence[int] | None = None, extra: Sequence[int] = ()) -> Freedom:
         """Return the parameters that may change: some nodes' values that are not fixed by limits.
 
-        Args:
-            nodes: indices of these nodes; None: all nodes.
-            extra: indices into ROOT_NAMES of further parameters.
+        ``nodes``: indices of these nodes; None: all nodes. ``extra``: indices into ROOT_NAMES of
+        further parameters.
         """
         kinematics = self.kinematics
         chosen = kinematics.upper > kinematics.lower
@@ -136,10 +135,9 @@ class RefinementBody:
     ) -> Placement:
         """Return the body placed at parameters (m + 4,), in arrays that the next call overwrites.
 
-        Args:
-            parameters: (m + 4,) the pose, as in ``RefinementBody``.
-            bent: whether the skin is deformed to the pose; else it keeps its last shape.
-            rooted: whether derivatives by ROOT_NAMES are included even if these are zero.
+        ``parameters``: (m + 4,) the pose, as in ``RefinementBody``. ``bent``: whether the skin is
+        deformed to the pose; else it keeps its last shape. ``rooted``: whether derivatives by
+        ROOT_NAMES are included even if these are zero.
         """
         rooted = rooted or bool(parameters[-4:].any())
         values = parameters if rooted else parameters[:-4]

@@ -77,10 +77,9 @@ def root_rotates_freely(tree: PoseTree) -> bool:
 def place_body(body: SampledBody, positions: np.ndarray, chosen: np.ndarray) -> SampledBody:
     """Return a body whose root has samples at combinations of positions and its r rotations.
 
-    Args:
-        body: the body, whose root has r samples, its rotations.
-        positions: (n, 3) positions of the root in the world [m].
-        chosen: (m,) the new samples: i is rotation i % r at position i // r.
+    ``body``: the body, whose root has r samples, its rotations. ``positions``: (n, 3) positions of
+    the root in the world [m]. ``chosen``: (m,) the new samples: i is rotation i % r at position i
+    // r.
     """
     placed, sampled = copy.copy(body), copy.copy(body.sampled)
     places, turns = np.divmod(chosen, len(sampled.X_PN[0]))
@@ -175,14 +174,12 @@ class _PlacedPose:
 class RootPlacementSearch:
     """Estimates poses with unknown root position, or unknown scale of a parallel camera.
 
-    Args:
-        tree: the pose tree; its root position is not used.
-        settings: the grids and the time limit; the stages are not used. None: the defaults.
-        scale_unknown: whether the ``pixels_per_metre`` of the one parallel camera is unknown.
+    ``tree``: the pose tree; its root position is not used. ``settings``: the grids and the time
+    limit; the stages are not used. None: the defaults. ``scale_unknown``: whether the
+    ``pixels_per_metre`` of the one parallel camera is unknown.
 
-    Raises:
-        SettingsError: if the tree has several roots.
-        ModelError: if the model's joints do not let the root be anywhere.
+    Raises SettingsError: if the tree has several roots; ModelError: if the model's joints do not
+    let the root be anywhere.
     """
 
     def __init__(
@@ -218,10 +215,8 @@ class RootPlacementSearch:
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
         """Estimate the pose that the views show, and its root position.
 
-        Args:
-            views: the silhouettes, one per camera.
-            root_position: (3,) the root's position in the world [m], if it is known; None: it is
-                estimated.
+        ``views``: the silhouettes, one per camera. ``root_position``: (3,) the root's position in
+        the world [m], if it is known; None: it is estimated.
 
         Returns the best pose found, with ``root_position`` and ``scale``; ``stopped_by`` is "end"
         or "time_limit".
@@ -334,10 +329,9 @@ class RootPlacementSearch:
     def _improve(self, starts: Sequence[_PlacedPose], moves: bool, deadline: float) -> _PlacedPose:
         """Return the best pose reached from some starts.
 
-        Args:
-            starts: the starts, best first; at least one.
-            moves: whether the root's position is refined, too.
-            deadline: time.perf_counter() after which no further refinement is begun [s].
+        ``starts``: the starts, best first; at least one. ``moves``: whether the root's position is
+        refined, too. ``deadline``: time.perf_counter() after which no further refinement is begun
+        [s].
         """
 
         def before(step: Callable[[_PlacedPose], Any], one: _PlacedPose) -> Any:

@@ -37,12 +37,10 @@ Regions = list[tuple[np.ndarray, np.ndarray]]
 class GridSettings:
     """Sampling intervals of a pose tree's values.
 
-    Args:
-        interval: sampling interval of every angle [rad]; the paper's is 20 degrees.
-        length_interval: sampling interval of every prismatic position [m].
+    ``interval``: sampling interval of every angle [rad]; the paper's is 20 degrees.
+    ``length_interval``: sampling interval of every prismatic position [m].
 
-    Raises:
-        SettingsError: if a value is out of its range.
+    Raises SettingsError: if a value is out of its range.
     """
 
     interval: float = math.radians(20.0)
@@ -448,13 +446,11 @@ class SampledBody:
 def _fixed_points(X_PN: np.ndarray, ball: np.ndarray) -> np.ndarray:
     """Return points (n, 3) in frame N that have the same position in the parent's frame P [m].
 
-    Args:
-        X_PN: (samples, 4, 4) poses of the node in its parent at all samples.
-        ball: (4,) centre and radius of the node's bounding ball in frame N [m].
+    ``X_PN``: (samples, 4, 4) poses of the node in its parent at all samples. ``ball``: (4,) centre
+    and radius of the node's bounding ball in frame N [m].
 
-    Returns:
-        If the rotations have one common axis, 61 points of it over the ball's diameter; otherwise
-        one fixed point; (0, 3) if no point is fixed.
+    Returns 61 points of the axis over the ball's diameter if the rotations have a common one;
+    otherwise one fixed point; (0, 3) if no point is fixed.
     """
     A = (X_PN[:, :3, :3] - X_PN[0, :3, :3]).reshape(-1, 3)
     b = (X_PN[0, :3, 3] - X_PN[:, :3, 3]).reshape(-1)

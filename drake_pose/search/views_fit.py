@@ -313,10 +313,8 @@ class RobustModes:
     part missing in a mask, cancel. A value with a wide interval is moved step by step, with the
     other values fitted, until the increase of the cost is significant (profile likelihood).
 
-    Args:
-        fit: the robust fit to the match's views.
-        proceed: returns whether there is time left.
-        settings: parameters of modes and intervals; None: the defaults.
+    ``fit``: the robust fit to the match's views. ``proceed``: returns whether there is time left.
+    ``settings``: parameters of modes and intervals; None: the defaults.
     """
 
     def __init__(
@@ -330,9 +328,8 @@ class RobustModes:
     def find(self, poses: Sequence[FittedPose], J: Callable[[np.ndarray], float]) -> PoseSet:
         """Return the set of poses that fit as well as the best of some, flipped poses included.
 
-        Args:
-            poses: fitted poses; the first is the answer and the representative of the first mode.
-            J: returns the objective J at values (m,) [pixel].
+        ``poses``: fitted poses; the first is the answer and the representative of the first mode.
+        ``J``: returns the objective J at values (m,) [pixel].
         """
         stage = self._settings.comparison
         costs = map_ordered(lambda pose: self._fit.tile_costs(pose.values, stage), poses)

@@ -179,9 +179,8 @@ class VisualHull:
     def radii(self, p_N: np.ndarray, shrink: float = 0.97) -> np.ndarray:
         """Return radii (n,) [m] of the largest balls inside the hull around points; 0 outside it.
 
-        Args:
-            p_N: (n, 3) the points in frame N [m].
-            shrink: factor that allows for the hull's extent between the viewing directions.
+        ``p_N``: (n, 3) the points in frame N [m]. ``shrink``: factor that allows for the hull's
+        extent between the viewing directions.
         """
         if not self._views:
             return np.zeros(len(p_N))

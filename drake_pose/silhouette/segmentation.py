@@ -148,10 +148,9 @@ def person_region(picture: Picture, background: Background, min_fraction: float 
 def _differs(picture: Picture, mean: Picture, tolerance: Picture) -> NDArray[Any]:
     """Return (H, W) uint8, non-zero where a channel differs from the mean by more than tolerance.
 
-    Args:
-        picture: (H, W, 3 or 4) uint8; a fourth channel is ignored.
-        mean: (H, W, 3) uint8 mean colour of the background [grey levels].
-        tolerance: (H, W, 3) uint8 largest difference of the background's colours [grey levels].
+    ``picture``: (H, W, 3 or 4) uint8; a fourth channel is ignored. ``mean``: (H, W, 3) uint8 mean
+    colour of the background [grey levels]. ``tolerance``: (H, W, 3) uint8 largest difference of the
+    background's colours [grey levels].
     """
     colours = cv2.cvtColor(picture, cv2.COLOR_RGBA2RGB) if picture.shape[2] == 4 else picture
     exceeds = cv2.compare(cv2.absdiff(colours, mean), tolerance, cv2.CMP_GT)

@@ -233,11 +233,9 @@ class FeatureFinder(PortedSystem):
         features (15): as ``last_features``, and equal to them where nothing was measured [m].
         support (5): number of 3-D points that gave each feature; 0: not measured.
 
-    Args:
-        cameras: in the order of the input ports.
+    ``cameras``: in the order of the input ports.
 
-    Raises:
-        SettingsError: there are fewer than two cameras, or two have the same name.
+    Raises SettingsError: there are fewer than two cameras, or two have the same name.
     """
 
     def __init__(self, cameras: Sequence[Camera]) -> None:
@@ -286,9 +284,8 @@ class FaceDirectionFinder(PortedSystem):
         face_direction (2): turn to the person's left and nod downwards, relative to facing the
             camera [rad]; NaN if no face is visible or an input is missing.
 
-    Args:
-        templates: templates of the person's face.
-        farthest: largest distance of a face from the eigenspace [grey levels].
+    ``templates``: templates of the person's face. ``farthest``: largest distance of a face from the
+    eigenspace [grey levels].
     """
 
     def __init__(self, camera: Camera, templates: FaceTemplates, farthest: float) -> None:
@@ -325,10 +322,9 @@ class PoseRecogniser(PortedSystem):
             recognised.
         similarity (1): of the contours; 0 if not recognised.
 
-    Args:
-        registered: the registered pose of the person of ``skeleton``.
-        cameras: in the order of the input ports, as in the registered pose.
-        threshold: smallest similarity at which the pose is recognised.
+    ``registered``: the registered pose of the person of ``skeleton``. ``cameras``: in the order of
+    the input ports, as in the registered pose. ``threshold``: smallest similarity at which the pose
+    is recognised.
     """
 
     def __init__(
@@ -387,11 +383,9 @@ class PaperPoseEstimator(MemorySystem):
         limb_points (36): root, middle joint and end of left arm, right arm, left leg and right leg
             [m]; NaN if the pose was recognised, because no limb was searched.
 
-    Args:
-        period: time between two frames [s].
+    ``period``: time between two frames [s].
 
-    Raises:
-        SettingsError: the period is not positive.
+    Raises SettingsError: the period is not positive.
     """
 
     def __init__(self, setup: CaptureSetup, period: float) -> None:
@@ -465,14 +459,12 @@ def build_paper_capture(
     allows them ``face_direction``, ``recognised_positions`` and ``similarity``, and if the source
     has it ``time``. The source's input ports are exported under their names.
 
-    Args:
-        setup: constants of the capture. Without a registered pose, the person is never found.
-        source: has an output port ``color_image_<camera>`` for each camera, for example a rig's
-            diagram (``build_camera_rig``), recorded pictures or live cameras. A camera without a
-            background in the setup also needs ``label_image_<camera>``. A source without new
-            pictures in each period has the output port ``fresh``. None: the images are inputs of
-            the diagram.
-        period: time between two frames [s].
+    ``setup``: constants of the capture. Without a registered pose, the person is never found.
+    ``source``: has an output port ``color_image_<camera>`` for each camera, for example a rig's
+    diagram (``build_camera_rig``), recorded pictures or live cameras. A camera without a background
+    in the setup also needs ``label_image_<camera>``. A source without new pictures in each period
+    has the output port ``fresh``. None: the images are inputs of the diagram. ``period``: time
+    between two frames [s].
 
     Raises SettingsError: the source lacks an output port, or the period is not positive.
     """

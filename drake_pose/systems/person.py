@@ -212,9 +212,8 @@ class PersonTracker(MemorySystem):
         Others are cut out if there is no last state, while tracking is in trouble, and if
         ``is_watching``; in other frames only if the person is not followed well with them.
 
-        Args:
-            last: the person's last state; None: no person was found yet.
-            separated: all views of the frame.
+        ``last``: the person's last state; None: no person was found yet. ``separated``: all views
+        of the frame.
         """
         is_separated = last is None or last.troubled_frames != 0 or is_watching
         if is_separated:
@@ -256,10 +255,9 @@ class _SeparatedViews(NamedTuple):
 def _person(known: Mapping[str, Array], elapsed: float, longest: float = 3.0) -> TrackState | None:
     """Return the person's state from state vectors; None if no person was found yet.
 
-    Args:
-        known: state vectors of a PersonTracker by name.
-        elapsed: time since the last frame [s], to which the motion is scaled; 0: not scaled.
-        longest: the motion is scaled by at most this number of frames.
+    ``known``: state vectors of a PersonTracker by name. ``elapsed``: time since the last frame [s],
+    to which the motion is scaled; 0: not scaled. ``longest``: the motion is scaled by at most this
+    number of frames.
     """
     inlier_ratio, usual_ratio, troubled_frames, period = (
         float(known[name][0])
@@ -287,8 +285,7 @@ class SilhouetteSensor(PersonRegion):
     Output ports:
         silhouette: a SilhouetteView of the region, or None.
 
-    Args:
-        edge_points: the picture's height divided by the spacing of edge points.
+    ``edge_points``: the picture's height divided by the spacing of edge points.
     """
 
     def __init__(
@@ -463,10 +460,9 @@ class Walker(MemorySystem):
     ) -> tuple[int, int]:
         """Return the command (turn, walk), each -1, 0 or 1, of a visible person; update ``known``.
 
-        Args:
-            q: (nq,) the person's positions [rad or m].
-            known: state vectors by name; the person's stance and steps are overwritten.
-            around: larger turns of the face between two frames are errors [rad].
+        ``q``: (nq,) the person's positions [rad or m]. ``known``: state vectors by name; the
+        person's stance and steps are overwritten. ``around``: larger turns of the face between two
+        frames are errors [rad].
         """
         self._plant.SetPositions(self._plant_context, q)
         X_WH, *X_WF = [part.EvalPoseInWorld(self._plant_context) for part in self._parts]
@@ -510,8 +506,7 @@ def garden_obstacles() -> Array:
 def view_from_behind(pose: Array) -> tuple[Array, Array]:
     """Return eye and target (3,) [m] of a view from behind and above a walker.
 
-    Args:
-        pose: (3,) the walker's x, y [m] and heading [rad].
+    ``pose``: (3,) the walker's x, y [m] and heading [rad].
     """
     forward = np.array([math.cos(pose[2]), math.sin(pose[2]), 0.0])
     ground = np.array([pose[0], pose[1], 0.0])

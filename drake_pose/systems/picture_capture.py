@@ -339,10 +339,9 @@ def connect_images(
 ) -> None:
     """Connect input ports to a source's output ports by name, or export them from the diagram.
 
-    Args:
-        builder: the diagram that contains the input ports and the source.
-        source: source of images; None: the input ports become inputs of the diagram.
-        wanted: input ports by the name of the source's output port, or of the diagram's input.
+    ``builder``: the diagram that contains the input ports and the source. ``source``: source of
+    images; None: the input ports become inputs of the diagram. ``wanted``: input ports by the name
+    of the source's output port, or of the diagram's input.
 
     Raises SettingsError: the source lacks an output port.
     """

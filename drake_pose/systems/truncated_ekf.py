@@ -331,8 +331,7 @@ class HandSensor(PortedSystem):
         rough_state (n): see ``HandMeasurement``.
         difference (1): see ``HandMeasurement``.
 
-    Args:
-        silhouette: makes the measurements; its filter is the ``TruncatedEkf``'s.
+    ``silhouette``: makes the measurements; its filter is the ``TruncatedEkf``'s.
     """
 
     def __init__(self, silhouette: HandSilhouette) -> None:

@@ -106,9 +106,8 @@ class _BodyFit:
 
         If no pose is found in the first frame, the inputs are returned with {} and None.
 
-        Args:
-            search: search for the pose in the first frame.
-            min_frames: minimum length of a sequence to which the shape is fitted.
+        ``search``: search for the pose in the first frame. ``min_frames``: minimum length of a
+        sequence to which the shape is fitted.
         """
         begin = time.perf_counter()
         first = search.match([View(self._camera, self._masks[0])])
@@ -157,9 +156,8 @@ class _BodyFit:
 
         The result is the best fit; its estimates have the others as alternative poses.
 
-        Args:
-            tracker: tracker of the body with the file's shape.
-            starts: alternative tracks through all masks, best first.
+        ``tracker``: tracker of the body with the file's shape. ``starts``: alternative tracks
+        through all masks, best first.
         """
         explanations = fit_sequence(
             tracker, self._masks, [start.states for start in starts], self._period
@@ -210,12 +208,10 @@ class _BodyFit:
 
         They are the given ones if no link is missing. Inputs, settings and summary are updated.
 
-        Args:
-            search: search for all links.
-            first: its estimate in the first frame.
-            shown: a leaf at the root may be missing if a smaller fraction of its area is in the
-                mask and outside of all other links.
-            better_by: links are left out if that reduces E_total below this multiple.
+        ``search``: search for all links. ``first``: its estimate in the first frame. ``shown``: a
+        leaf at the root may be missing if a smaller fraction of its area is in the mask and outside
+        of all other links. ``better_by``: links are left out if that reduces E_total below this
+        multiple.
         """
         if self._settings.unseen:
             return search, first

@@ -306,11 +306,9 @@ def cameras_of(
     Also return the names of all cameras with a known, static pose X_WC, and how the camera file was
     read where it does not say so itself.
 
-    Args:
-        episode: the episode.
-        camera_path: camera file; None: the episode's cameras.yaml. Without either, cameras have the
-            poses that were recorded with the episode.
-        settings: names of the cameras; all if none are given.
+    ``episode``: the episode. ``camera_path``: camera file; None: the episode's cameras.yaml.
+    Without either, cameras have the poses that were recorded with the episode. ``settings``: names
+    of the cameras; all if none are given.
 
     Raises UnknownNameError: a camera does not exist; CameraError: the file cannot be used, or is
     for pictures of another size.
@@ -497,11 +495,8 @@ def _synchronised_pictures(
     Pictures without a synchronised one have no entry. Without times pictures of the same name are
     synchronised.
 
-    Args:
-        first: the first camera.
-        kept: (k,) indices of its pictures.
-        other: the other camera.
-        tolerance: maximum difference of times, as a fraction of the first camera's period.
+    ``first``: the first camera. ``kept``: (k,) indices of its pictures. ``other``: the other
+    camera. ``tolerance``: maximum difference of times, as a fraction of the first camera's period.
     """
     if np.isnan(first.times).any() or np.isnan(other.times).any():
         own = {frame_key(name): k for k, name in enumerate(frames_of(other))}

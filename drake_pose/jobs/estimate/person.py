@@ -201,9 +201,8 @@ def describe_views(views: ViewFaults, frames: Sequence[str]) -> tuple[str, ...]:
 def describe_fit(inlier_ratios: Sequence[float], usual_from: float = 0.6) -> tuple[str, ...]:
     """Return a warning if the contours fit badly in the frames with a pose.
 
-    Args:
-        inlier_ratios: (frames,) inlier ratio of the contours; 0 without a pose.
-        usual_from: minimum inlier ratio if the masks show the person.
+    ``inlier_ratios``: (frames,) inlier ratio of the contours; 0 without a pose. ``usual_from``:
+    minimum inlier ratio if the masks show the person.
     """
     usual = float(np.median([ratio for ratio in inlier_ratios if ratio > 0.0] or [1.0]))
     if usual > usual_from:

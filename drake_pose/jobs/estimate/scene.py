@@ -311,10 +311,7 @@ def check_track(
     If the worst tracked frame fits clearly worse than the best searched frame, it is searched as
     well; there is a warning if the search fits clearly better than the track.
 
-    Args:
-        inputs: the inputs.
-        search: the search.
-        records: estimates by frame.
+    ``inputs``: the inputs. ``search``: the search. ``records``: estimates by frame.
     """
     searched, tracked = list[float](), dict[str, float]()
     for frame, one in records.items():

@@ -75,12 +75,10 @@ def recognise_command(stance: Array, rest: Array, last: tuple[int, int]) -> tupl
 def count_steps(lift: float, steps: Array, seconds: float) -> Array:
     """Count the steps of walking on the spot; a foot that stays lifted is one step.
 
-    Args:
-        lift: height of the left foot above the right one [m]; nan: not seen.
-        steps: (3,) foot lifted last (1 left, -1 right, 0 none), time since then [s], and number of
-            steps with alternating feet since the last pause; zeros at first. Two steps are walking
-            on the spot.
-        seconds: time since the last frame [s].
+    ``lift``: height of the left foot above the right one [m]; nan: not seen. ``steps``: (3,) foot
+    lifted last (1 left, -1 right, 0 none), time since then [s], and number of steps with
+    alternating feet since the last pause; zeros at first. Two steps are walking on the spot.
+    ``seconds``: time since the last frame [s].
 
     Returns (3,) the new steps.
     """

@@ -219,11 +219,9 @@ def read_mask_of(
 ) -> Mask:
     """Return a camera's mask (H, W) of a frame.
 
-    Args:
-        camera, frame: their names.
-        may_be_empty: whether a mask without the body is accepted.
-        most, most_of_edge: a mask is inverted if the body fills more than these fractions of both
-            the picture and its edge.
+    ``camera``, ``frame``: their names. ``may_be_empty``: whether a mask without the body is
+    accepted. ``most``, ``most_of_edge``: a mask is inverted if the body fills more than these
+    fractions of both the picture and its edge.
 
     Raises MaskError: the mask cannot be read, is empty and must not be, or is inverted.
     """

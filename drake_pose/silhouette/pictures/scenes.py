@@ -353,11 +353,9 @@ def common_rate(
 def select_frames(known: Sequence[str], wanted: Sequence[str], where: str) -> tuple[str, ...]:
     """Return the names of the wanted frames in the scene's order.
 
-    Args:
-        known: names of all frames, in the scene's order.
-        wanted: names, or ranges ``FIRST:LAST`` with both ends included; empty: all frames. A number
-            stands for the frame with that number, with or without leading zeros.
-        where: the scene, for messages.
+    ``known``: names of all frames, in the scene's order. ``wanted``: names, or ranges
+    ``FIRST:LAST`` with both ends included; empty: all frames. A number stands for the frame with
+    that number, with or without leading zeros. ``where``: the scene, for messages.
 
     Raises UnknownNameError: there is no such frame; SettingsError: a range ends before it begins.
     """
@@ -456,12 +454,10 @@ def find_images(
 
     A video's frames are named 000000, 000001 and so on, or like the known frame of that number.
 
-    Args:
-        cameras: names of the cameras.
-        frames: names of known frames, for frames of videos; empty: none.
+    ``cameras``: names of the cameras. ``frames``: names of known frames, for frames of videos;
+    empty: none.
 
-    Returns:
-        Picture or video files by (camera, frame).
+    Returns picture or video files by (camera, frame).
 
     Raises SceneError: a folder or video cannot be read.
     """

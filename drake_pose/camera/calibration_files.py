@@ -16,12 +16,7 @@ import numpy as np
 
 from drake_pose.arrays import Array
 from drake_pose.camera.models import Lens, check_number, check_pose, check_side, inverse_pose
-from drake_pose.camera.pose_files import (
-    episode_entry,
-    finite_numbers,
-    read_launch,
-    recorded_poses,
-)
+from drake_pose.camera.pose_files import episode_entry, finite_numbers, read_launch, recorded_poses
 from drake_pose.errors import CameraError
 from drake_pose.input_files import read_regular, read_yaml
 

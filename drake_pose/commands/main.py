@@ -20,8 +20,7 @@ from rich.text import Text
 from drake_pose.commands.common import UsageError, say
 from drake_pose.commands.estimate import batch, capture, demo, empty_room, estimate
 from drake_pose.commands.papers import date, kameda, shimada
-from drake_pose.commands.prepare import check, masks
-from drake_pose.commands.register import audit, register
+from drake_pose.commands.register import audit, check, masks, register
 from drake_pose.errors import DrakePoseError, SettingsError, messages_for
 from drake_pose.files.settings import say_gone
 from drake_pose.version import VERSION

@@ -139,27 +139,28 @@ def shimada(
     warnings = []
     with _experiment(out) as count:
         from drake_pose.papers import shimada as hands
+        from drake_pose.papers import shimada_sequences as sequences
         from drake_pose.papers.pictures import save_hands, save_hypotheses, save_recorded_hand
-        from drake_pose.papers.shimada_sequences import experiment_settings
 
         if sequence:
-            from drake_pose.papers.recorded_hand import recorded_table, run_sequence
-
-            settings = experiment_settings(truncation or "joint", iterations or 20)
-            followed = [run_sequence(folder, settings, count) for folder in sequence]
+            settings = sequences.experiment_settings(truncation or "joint", iterations or 20)
+            followed = [sequences.run_sequence(folder, settings, count) for folder in sequence]
             figures: dict[str, Any] = {one.name: one.figures for one in followed}
-            table, warnings = recorded_table(followed), [one.warning() for one in followed]
+            table, warnings = (
+                sequences.recorded_table(followed),
+                [one.warning() for one in followed],
+            )
             if out is not None:
                 for one in followed:
                     save_recorded_hand(one, out)
         elif hypotheses:
-            settings = experiment_settings(truncation or "sequential", iterations or 1)
+            settings = sequences.experiment_settings(truncation or "sequential", iterations or 1)
             found = hands.run_hypotheses_experiment(runs or 50, seed, settings, count)
             figures, table = found.as_json(), found.table()
             if out is not None and not save_hypotheses(found, out):
                 warnings = ["no wrong hypothesis was rejected by an inequality: nothing to draw"]
         else:
-            settings = experiment_settings(truncation or "joint", iterations or 20)
+            settings = sequences.experiment_settings(truncation or "joint", iterations or 20)
             observed = hands.PICTURES if pictures else "lines"
             number = runs or (10 if pictures else 50)
             result = hands.run_experiment(number, seed, settings, observed, count)

@@ -22,13 +22,7 @@ from cyclopts import Parameter
 from drake_pose.body import landmarks_file, load_model
 from drake_pose.camera.camera_files import intrinsics_of, load_cameras
 from drake_pose.camera.episode_files import open_episode
-from drake_pose.errors import (
-    DrakePoseError,
-    OutputError,
-    SettingsError,
-    for_caller,
-    messages_for,
-)
+from drake_pose.errors import DrakePoseError, OutputError, SettingsError, for_caller, messages_for
 from drake_pose.files.folder import OVERLAY, POSES, read_summary, write_file, write_summary
 from drake_pose.files.records import FrameRecord, describe_job, file_digest, mask_digests, summarize
 from drake_pose.files.settings import (

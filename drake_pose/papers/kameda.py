@@ -20,12 +20,7 @@ from drake_pose.errors import require_at_least
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.demo import demo_settings, stored_scene
 from drake_pose.jobs.estimate.scene import estimate_scene
-from drake_pose.papers.tables import (
-    Count,
-    Figures,
-    figure_table,
-    uncounted,
-)
+from drake_pose.papers.tables import Count, Figures, figure_table, uncounted
 from drake_pose.search import (
     BeamSearch,
     BeamSearchSettings,

@@ -28,9 +28,8 @@ from drake_pose.filtering.hand import FLEXIONS, HAND_STATE, SPREADS, HandObserva
 from drake_pose.filtering.hand_model import QUATERNION
 from drake_pose.papers.date import TITLES, DateResult
 from drake_pose.papers.kameda import RandomPose, RandomPoses, experiment_camera
-from drake_pose.papers.recorded_hand import RecordedHand
 from drake_pose.papers.shimada import PIXELS_PER_METRE, HandsResult, HypothesesResult
-from drake_pose.papers.shimada_sequences import FRAMES
+from drake_pose.papers.shimada_sequences import FRAMES, RecordedHand
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 _TWO_FINGERS = HandObservation(pixels_per_metre=PIXELS_PER_METRE)

@@ -447,11 +447,7 @@ class PersonRecording:
     """
 
     def __init__(
-        self,
-        cameras: Mapping[str, Camera],
-        read: ReadFrame,
-        count: int,
-        is_sequence: bool,
+        self, cameras: Mapping[str, Camera], read: ReadFrame, count: int, is_sequence: bool
     ) -> None:
         self._read, self._count = read, count
         self._left_out: dict[str, int] = {}

@@ -22,14 +22,7 @@ from drake_pose.body import PoseTree
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
 from drake_pose.errors import ModelError
-from drake_pose.fit.contour_fit import (
-    Comparison,
-    ContourFit,
-    Noise,
-    Prior,
-    pack_views,
-    symmetric,
-)
+from drake_pose.fit.contour_fit import Comparison, ContourFit, Noise, Prior, pack_views, symmetric
 from drake_pose.fit.covariance import surface_deformations
 from drake_pose.fit.evidence import NO_EDGE, EdgePoints, Observation, pack_evidence
 from drake_pose.fit.levenberg_marquardt import AnnealingStage

@@ -174,10 +174,7 @@ class ExactSearch:
 
 
 def find_intervals(
-    problem: RefinementProblem,
-    others: Sequence[np.ndarray],
-    parameters: np.ndarray,
-    tree: PoseTree,
+    problem: RefinementProblem, others: Sequence[np.ndarray], parameters: np.ndarray, tree: PoseTree
 ) -> PoseSet:
     """Return the pose set of exact silhouettes: modes, and an interval for each value.
 

@@ -22,13 +22,7 @@ import numpy as np
 from drake_pose.body import PoseTree
 from drake_pose.fit.surfaces import simplify_rigid_parts
 from drake_pose.search.estimates import View
-from drake_pose.search.refinement import (
-    Freedom,
-    Pass,
-    RefinementBody,
-    RefinementProblem,
-    descend,
-)
+from drake_pose.search.refinement import Freedom, Pass, RefinementBody, RefinementProblem, descend
 from drake_pose.silhouette.outline import pack
 from drake_pose.silhouette.scoring import prefix_sums
 from drake_pose.silhouette.span_kernel import score

@@ -4,12 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from drake import lcmt_robot_state
-from pydrake.geometry import (
-    GeometryConfigurationVector,
-    Meshcat,
-    Rgba,
-    SceneGraph,
-)
+from pydrake.geometry import GeometryConfigurationVector, Meshcat, Rgba, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem, OutputPort

@@ -449,9 +449,7 @@ class PaperPoseEstimator(MemorySystem):
 
 
 def build_paper_capture(
-    setup: CaptureSetup,
-    source: System | None = None,
-    period: float = 1.0 / 30.0,
+    setup: CaptureSetup, source: System | None = None, period: float = 1.0 / 30.0
 ) -> StagedDiagram[PaperPoseEstimator]:
     """Build a diagram that captures a person: images, the paper's stages, and the pose.
 

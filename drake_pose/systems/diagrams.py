@@ -97,10 +97,7 @@ class CameraRegistration(BeliefSystem[OnlineState]):
     """
 
     def __init__(
-        self,
-        registration: OnlineRegistration,
-        period: float,
-        max_coverage: float = 0.6,
+        self, registration: OnlineRegistration, period: float, max_coverage: float = 0.6
     ) -> None:
         super().__init__()
         require_period("registration", period)

@@ -8,7 +8,6 @@ import pytest
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.hand import HAND_STATE, LENGTHS, MEASURED, HandObservation
 from drake_pose.papers.pictures import save_hands, save_hypotheses
-from drake_pose.papers.recorded_hand import run_sequence
 from drake_pose.papers.shimada import (
     CASES,
     OBLIQUENESS,
@@ -22,6 +21,7 @@ from drake_pose.papers.shimada_sequences import (
     FRAMES,
     experiment_settings,
     make_sequence,
+    run_sequence,
     true_states,
 )
 from tests.cli import run_command

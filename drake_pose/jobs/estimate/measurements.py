@@ -33,11 +33,7 @@ from drake_pose.camera.models import intrinsics_warnings
 from drake_pose.camera.picture_files import VIDEOS, frame_key
 from drake_pose.camera.servo_readings import Column, Servos, read_motors
 from drake_pose.camera.sources import TIME_STAMPS
-from drake_pose.errors import (
-    SceneError,
-    UnknownNameError,
-    require_at_least,
-)
+from drake_pose.errors import SceneError, UnknownNameError, require_at_least
 from drake_pose.files.records import BASE_COLUMNS, FIT_COLUMNS
 from drake_pose.files.settings import EpisodeSettings
 from drake_pose.input_files import read_csv, read_number

@@ -302,9 +302,7 @@ def _match_again(
 
 
 def check_track(
-    inputs: EstimateInputs,
-    search: PoseSearch,
-    records: Mapping[str, FrameRecord],
+    inputs: EstimateInputs, search: PoseSearch, records: Mapping[str, FrameRecord]
 ) -> list[str]:
     """Return a warning if the track follows a wrong pose, otherwise [].
 

@@ -202,17 +202,12 @@ class Batch:
                 self.out, "findings.csv", csv_text([("scene", "what", "name", "text"), *rows])
             )
         found = {name: one.totals for name, one in self.scenes.items()}
-        table = episodes_table(found, is_drawn=not self.waiting)
-        self.moves = table.moves
-        if table.files:
-            write_file(self.out, "episodes.csv", table.text)
-            for name, text in table.files.items():
-                write_file(self.out, name, text)
-            for path in self.out.glob("cameras_*.yaml"):
-                if path.name not in table.files:
-                    path.unlink()
-        if table.picture:
-            write_file(self.out, "episodes.png", table.picture)
+        files, self.moves = episodes_table(found, is_drawn=not self.waiting)
+        for name, content in files.items():
+            write_file(self.out, name, content)
+        for path in self.out.glob("cameras_*.yaml") if files else ():
+            if path.name not in files:
+                path.unlink()
 
     def plan(self) -> None:
         """Queue all scenes' tasks that have no result yet; scenes that cannot be read fail.

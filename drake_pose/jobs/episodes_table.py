@@ -2,7 +2,6 @@
 
 import io
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -33,23 +32,14 @@ episodes that share it; p_value: probability of a distance as large from this po
 camera_file: file with the cameras' poses, combined from all episodes that share them."""
 
 
-@dataclass(frozen=True, eq=False)
-class EpisodesTable:
-    """The cameras of all audited episodes."""
-
-    text: str  # Of episodes.csv.
-    files: Mapping[str, str]  # Texts of camera files (YAML) by name; {} without audited episodes.
-    # Sentences, for each camera which episodes share a pose and since when it has moved.
-    moves: tuple[str, ...]
-    # Of episodes.png, displacement and joint offsets over the episodes (PNG); b"": there are fewer
-    # than two episodes.
-    picture: bytes
-
-
 def episodes_table(
     episodes: Mapping[str, Mapping[str, Any]], is_drawn: bool = False
-) -> EpisodesTable:
-    """Return the table of audited episodes, with the poses that they share.
+) -> tuple[dict[str, str | bytes], tuple[str, ...]]:
+    """Return files about audited episodes by name, and which cameras moved.
+
+    The files are episodes.csv, camera files, and of two episodes or more episodes.png, displacement
+    and joint offsets over the episodes; {} without audited episodes. Sentences say for each camera
+    which episodes share a pose and since when it has moved.
 
     An episode shares the pose of the episode before unless it differs significantly from all
     episodes with that pose combined; else the most likely of the poses before; else it has a new
@@ -87,16 +77,16 @@ def episodes_table(
                  one["time_offset_s"], one["time_offset_sd_s"], joints, *move,
                  f"cameras_{len(files)}.yaml"]
             )  # fmt: skip
-    texts = {
-        f"cameras_{k}.yaml": yaml.safe_dump({name: one.entry() for name, one in file.items()})
-        for k, file in enumerate(files, 1)
-        if rows
-    }
-    picture = b""
+    if not rows:
+        return {}, ()
+    made: dict[str, str | bytes] = {"episodes.csv": csv_text([COLUMNS, *rows])}
+    for k, file in enumerate(files, 1):
+        entries = {name: one.entry() for name, one in file.items()}
+        made[f"cameras_{k}.yaml"] = yaml.safe_dump(entries)
     if is_drawn and len({row[0] for row in rows}) > 1:
         moved = {row[0] for row in rows if row[COLUMNS.index("moved")] == "yes"}
-        picture = _draw(episodes, moved)
-    return EpisodesTable(csv_text([COLUMNS, *rows]), texts, _describe_moves(rows), picture)
+        made["episodes.png"] = _draw(episodes, moved)
+    return made, _describe_moves(rows)
 
 
 def _shared_pose(

@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -255,13 +255,10 @@ class SilhouetteTrack(_Track):
         person.set_person(person.GetMyMutableContextFromRoot(self.context), state)
 
 
-class MotionSample(NamedTuple):
-    """The middle frame of a motion in the shown camera, for pictures."""
-
-    picture: Picture  # (H, W, 3) input of the camera.
-    limbs: Array  # (4, 3, 2) true root, middle joint and end of LIMBS [pixel].
-    # By method, the same of the estimate, and its silhouette (H, W).
-    captured: Mapping[str, tuple[Array, Mask]]
+MotionSample = tuple[Picture, Array, Mapping[str, tuple[Array, Mask]]]
+"""The middle frame of a motion in the shown camera, for pictures: the picture (H, W, 3); (4, 3, 2)
+true root, middle joint and end of LIMBS [pixel]; and by method, the same of the estimate, and its
+silhouette (H, W)."""
 
 
 class DateResult:
@@ -330,7 +327,7 @@ class DateResult:
                 for method, one in estimates.items()
             }
             picture, limbs = pictures[SHOWN_CAMERA], self._limbs_seen(q)
-            self.samples[self.names[k]] = MotionSample(picture, limbs, captured)
+            self.samples[self.names[k]] = picture, limbs, captured
 
     def _limbs_seen(self, q: Array) -> Array:
         """Return MotionSample's limbs (4, 3, 2) [pixel] of a person at q (nq,)."""

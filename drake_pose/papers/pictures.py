@@ -75,11 +75,11 @@ def save_captures(result: DateResult, folder: Path) -> None:
     The true skeleton is blue; the captured person's contour and skeleton are orange.
     """
     rows = []
-    for motion, sample in result.samples.items():
+    for motion, (picture, true_limbs, captured) in result.samples.items():
         row = []
-        for method, (limbs, body) in sample.captured.items():
-            drawn = sample.picture.copy()
-            for ends, colour in ((sample.limbs, MISSING_RGB), (limbs, EXCESS_RGB)):
+        for method, (limbs, body) in captured.items():
+            drawn = picture.copy()
+            for ends, colour in ((true_limbs, MISSING_RGB), (limbs, EXCESS_RGB)):
                 lines = [*np.rint(ends).astype(np.int32)]
                 cv2.polylines(drawn, lines, False, colour, 2, cv2.LINE_AA)
                 # The trunk is drawn from shoulder to shoulder and hip to hip.

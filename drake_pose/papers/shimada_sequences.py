@@ -73,6 +73,24 @@ ACCELERATIONS = {
 """Standard deviations of the accelerations [pixel, 1, rad per frame^2]: theta's part of U (6)."""
 
 
+# Motion of an element [pixel, deg]: middle, reach, swings in the sequence, its phase, the lead of
+# finger 2, and the lag of the last joints [rad].
+_SWINGS = {
+    "wrist_x": (-50, 30, 1.0, 0, 0.0, 0.0),
+    "wrist_y": (0, 20, 1.3, 1, 0.0, 0.0),
+    "spread_1": (-10, 5, 1.0, 5, 0.0, 0.0),
+    "spread_2": (10, 5, 1.4, 5, 0.0, 0.0),
+    "flexion_11": (40, 28, 1.0, 4, 0.0, 0.0),
+    "flexion_12": (38, 28, 1.2, 5, 0.0, 0.0),
+    "flexion_13": (36, 25, 1.2, 5, 0.0, 0.1),
+    "flexion_21": (40, 28, 1.0, 4, 0.5, 0.0),
+    "flexion_22": (38, 28, 1.2, 5, 0.5, 0.0),
+    "flexion_23": (36, 25, 1.2, 5, 0.5, 0.1),
+}
+# Sizes [mm]; with them, lengths r_13 of 35 and 40 satisfy table 1.
+_SIZES = dict(zip((*LENGTHS, *PALM), (62, 41, 0, 60, 40, 38, 70, 80, 22), strict=True))
+
+
 @dataclass(frozen=True, eq=False)
 class SyntheticSequence:
     """A synthetic sequence of 55 frames."""
@@ -96,8 +114,9 @@ def true_states(r_13: float, phase: Array, yaw_middle: float = 0.0) -> Array:
     def put(name: str, values: Array | float) -> None:
         states[:, HAND_STATE.index(name)] = values
 
-    put("wrist_x", -50 + 30 * np.sin(turn + phase[0]))
-    put("wrist_y", 20 * np.sin(1.3 * turn + phase[1]))
+    for name, (middle, reach, speed, shift, late, lag) in _SWINGS.items():
+        swing = middle + reach * np.sin(speed * turn + phase[shift] + late - lag)
+        put(name, swing if name in WRIST else np.radians(swing))
     # Seen from the back, fingers to the right; roll is about the fingers' axis.
     roll = math.radians(65) + math.radians(40) * np.sin(1.1 * turn + phase[2])
     yaw = yaw_middle + math.radians(25) * np.sin(0.9 * turn + phase[3])
@@ -106,18 +125,8 @@ def true_states(r_13: float, phase: Array, yaw_middle: float = 0.0) -> Array:
     quaternions = _product(_about("z", pitch), _product(_about("y", yaw), _about("x", roll)))
     for k, name in enumerate(QUATERNION):
         put(name, np.sqrt(scale) * quaternions[:, k])
-    put("spread_1", np.radians(-10 + 5 * np.sin(turn + phase[5])))
-    put("spread_2", np.radians(10 + 5 * np.sin(1.4 * turn + phase[5])))
-    for i, shift in ((1, 0.0), (2, 0.5)):
-        wave = np.sin(1.2 * turn + phase[5] + shift)
-        put(f"flexion_{i}1", np.radians(40 + 28 * np.sin(turn + phase[4] + shift)))
-        put(f"flexion_{i}2", np.radians(38 + 28 * wave))
-        put(f"flexion_{i}3", np.radians(36 + 25 * np.sin(1.2 * turn + phase[5] + shift - 0.1)))
-    # These lengths satisfy table 1 for r_13 = 35 and 40.
-    for name, length in zip(LENGTHS, (62.0, 41.0, r_13, 60.0, 40.0, 38.0), strict=True):
-        put(name, length / 1000.0)
-    for name, size in zip(PALM, (0.070, 0.080, 0.022), strict=True):
-        put(name, size)
+    for name, size in {**_SIZES, "length_13": r_13}.items():
+        put(name, size / 1000.0)
     moving = len(HAND_STATE.moving)
     states[:, moving : 2 * moving] = np.gradient(states[:, :moving], axis=0)
     return states

@@ -19,7 +19,7 @@ from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.papers.date import SilhouetteTrack, Studio, one_core
 from drake_pose.papers.kameda import experiment_camera
-from drake_pose.person.date.walking import FEWEST_FRAMES, MOTIONS, make_motion
+from drake_pose.person.date.walking import FEWEST_FRAMES, make_motion
 from drake_pose.registration.picture_registration import register_pictures
 from drake_pose.registration.recording import Recording
 from drake_pose.silhouette.outline import outline_from_mesh
@@ -113,7 +113,7 @@ def measure_cost(cameras: int, size: tuple[int, int] = (640, 480), seed: int = 0
     """
     studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]))
     motion = make_motion(studio.skeleton, 4 * FEWEST_FRAMES, seed)
-    begin = motion.names.index(MOTIONS[0])
+    begin = motion.names.index("walk")
     track = SilhouetteTrack(studio)
     track.place(motion.q[begin])
     with one_core():

@@ -4,7 +4,6 @@ import re
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import cv2
@@ -16,7 +15,6 @@ from pydrake.geometry import Meshcat, MeshcatParams
 
 from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.models import ParallelCamera, PinholeCamera, look_at
-from drake_pose.files import report_page
 from drake_pose.files.records import FrameRecord, SceneEstimate, summarize
 from drake_pose.files.replay import make_replay
 from drake_pose.files.report_page import draw_grid, make_report, plot_curves, plot_uri
@@ -347,28 +345,3 @@ def test_replay_of_many_triangles_is_small_and_accurate(tmp_path):
     )
     points = np.frombuffer(ghost, np.float32).reshape(-1, 3) - [0.3, 0.0, 0.0]
     np.testing.assert_allclose(np.linalg.norm(points / [1, 2, 1], axis=1), 0.1, atol=0.003)
-
-
-def told(*determined, E=0.1, **more):
-    joints = {name: {"determined": one} for name, one in zip("ab", determined, strict=False)}
-    return FrameRecord("0", np.zeros(2), None, E, 1.0, joints=joints, **more)
-
-
-@pytest.mark.parametrize(
-    ("records", "answer"),
-    [
-        ((told(E=None),), "No pose was found."),
-        ((told(True, True),), "2 of 2 joints determined; error 10.0 % of the silhouette."),
-        ((told(True, False),), "Pose found; error 10.0 % of the silhouette. 1 of 2 joints "
-         "determined; not: b."),
-        ((told(True, True), told(E=None)), "2 of 2 joints determined in 1 of 2 frames; mean error "
-         "10.0 % of the silhouette."),
-        ((told(True, True), told(True, False)), "Pose found in 2 of 2 frames; mean error 10.0 % of "
-         "the silhouette. 1 of 2 joints determined in all of them; not always: b."),
-    ],
-)  # fmt: skip
-def test_the_answer_counts_frames_and_joints(records, answer):
-    frames = {f"{k}": one for k, one in enumerate(records)}
-    estimate = SceneEstimate(("a", "b"), ("angle",) * 2, frames, {"mean_E_total": 0.1}, None)
-    model = SimpleNamespace(position_names=("a", "b"))
-    assert report_page.estimate_answer(model, estimate) == answer

@@ -40,8 +40,8 @@ def totals(place, turn_deg=0.0, sd=0.001):
     }  # fmt: skip
 
 
-def rows_of(table):
-    return list(csv.DictReader(io.StringIO(table.text)))
+def rows_of(files):
+    return list(csv.DictReader(io.StringIO(files["episodes.csv"])))
 
 
 def test_a_significant_difference_to_earlier_episodes_is_a_move(tmp_path):
@@ -53,8 +53,8 @@ def test_a_significant_difference_to_earlier_episodes_is_a_move(tmp_path):
         "failed": {},
         "again": totals([1.0, 0.02, 0.5], 1.0),
     }
-    found = episodes_table(episodes, is_drawn=True)
-    cameras, rows = found.files, rows_of(found)
+    found, moves = episodes_table(episodes, is_drawn=True)
+    rows = rows_of(found)
     assert tuple(rows[0]) == COLUMNS
     assert [row["moved"] for row in rows] == ["", "no", "yes", "no"]
     assert float(rows[2]["moved_deg"]) == pytest.approx(1.0)
@@ -62,17 +62,19 @@ def test_a_significant_difference_to_earlier_episodes_is_a_move(tmp_path):
     assert (rows[0]["joints"], rows[0]["agreeing"]) == ("A4", "8")
     files = [row["camera_file"] for row in rows]
     assert files == ["cameras_1.yaml", "cameras_1.yaml", "cameras_2.yaml", "cameras_2.yaml"]
-    (tmp_path / "before.yaml").write_text(cameras["cameras_1.yaml"])
+    (tmp_path / "before.yaml").write_text(found["cameras_1.yaml"])
     before = load_cameras(tmp_path / "before.yaml")["left"]
     np.testing.assert_allclose(before.X_WC[:3, 3], [1.0005, -0.0005, 0.5])
     assert [row["pose"] for row in rows] == ["1", "1", "2", "2"]
-    assert found.moves[0].startswith("camera 'left' moved by 1.00 degrees and 20.5 mm before")
-    assert found.moves[1:] == (
+    assert moves[0].startswith("camera 'left' moved by 1.00 degrees and 20.5 mm before")
+    assert moves[1:] == (
         "camera 'left', pose 1: first, same", "camera 'left', pose 2: bumped, again"
     )  # fmt: skip
-    assert cv2.imdecode(np.frombuffer(found.picture, np.uint8), cv2.IMREAD_COLOR) is not None
+    assert (
+        cv2.imdecode(np.frombuffer(found["episodes.png"], np.uint8), cv2.IMREAD_COLOR) is not None
+    )
     none = episodes_table({"scene": {"frame_count": 3, "agreeing_count": 3}}, is_drawn=True)
-    assert (none.files, none.moves, none.picture) == ({}, (), b"")
+    assert none == ({}, ())
 
 
 def test_a_camera_that_is_put_back_shares_its_earlier_pose():
@@ -80,13 +82,13 @@ def test_a_camera_that_is_put_back_shares_its_earlier_pose():
     rng = np.random.default_rng(3)
     places = np.array([[1.0, 0.0, 0.5]] * 8 + [[1.0, 0.02, 0.5]] * 8 + [[1.0, 0.0, 0.5]] * 8)
     noisy = places + rng.normal(0.0, 0.001, places.shape)
-    found = episodes_table({f"e{k:02d}": totals(list(one)) for k, one in enumerate(noisy)})
+    found, moves = episodes_table({f"e{k:02d}": totals(list(one)) for k, one in enumerate(noisy)})
     rows = rows_of(found)
     assert [row["pose"] for row in rows] == ["1"] * 8 + ["2"] * 8 + ["1"] * 8
     assert [row["scene"] for row in rows if row["moved"] == "yes"] == ["e08", "e16"]
-    assert any("moved back to pose 1" in one and "e16" in one for one in found.moves)
-    one = episodes_table({k: totals([1.0, 0.0, 0.5]) for k in ("a", "b")})
-    assert one.moves == ("camera 'left' has one pose in all 2 episodes",)
+    assert any("moved back to pose 1" in one and "e16" in one for one in moves)
+    _, moves = episodes_table({k: totals([1.0, 0.0, 0.5]) for k in ("a", "b")})
+    assert moves == ("camera 'left' has one pose in all 2 episodes",)
 
 
 def test_episodes_start_at_the_cameras_of_the_first(tmp_path, out):
@@ -116,14 +118,15 @@ def test_combined_pose_is_the_information_weighted_mean():
     # A slow drift of insignificant steps is a move as well.
     far = 5.0 * 0.001
     drifting = {str(k): totals([k * far, 0.0, 0.0], sd=0.002) for k in range(9)}
-    moved = [row["moved"] for row in rows_of(episodes_table(drifting))]
+    moved = [row["moved"] for row in rows_of(episodes_table(drifting)[0])]
     assert 0 < moved.count("yes") < 5
     # The second camera has not moved and has one pose in all files.
     episodes = {str(k): totals([float(k), 0.0, 0.0]) for k in range(2)}
     sds = (0.001, 0.002)
     for one, x, sd in zip(episodes.values(), (0.0, 0.005), sds, strict=True):
         one["cameras"]["right"] = totals([x, 0.0, 0.0], sd=sd)["cameras"]["left"]
-    files = [yaml.safe_load(text) for text in episodes_table(episodes).files.values()]
+    found, _ = episodes_table(episodes)
+    files = [yaml.safe_load(found[f"cameras_{k}.yaml"]) for k in (1, 2)]
     assert [file["left"]["X_WC"][0][3] for file in files] == [0.0, 1.0]
     weighted = np.average([0.0, 0.005], weights=np.power(sds, -2.0))
     assert [file["right"]["X_WC"][0][3] for file in files] == pytest.approx([weighted] * 2)

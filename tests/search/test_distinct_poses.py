@@ -81,11 +81,3 @@ def test_an_overlap_above_one_keeps_all_poses(maker, problem):
     poses = BeamSearch(maker.tree, settings()).best_poses(problem.views, count=10, overlap=2.0)
     np.testing.assert_array_equal(objectives(problem, poses), np.sort(problem.Js)[:10])
     assert len({tuple(np.concatenate(values)) for values in poses}) == 10
-
-
-def test_alternatives_to_an_exact_pose_are_found(maker):
-    search = BeamSearch(maker.tree, settings())
-    problem = maker.show([grid[1] for grid in search.sampled.values])
-    poses = search.best_poses(problem.views, count=6, overlap=OVERLAP)
-    assert objectives(problem, poses)[0] == 0.0
-    assert len(poses) == 6

@@ -4,17 +4,14 @@ import math
 from itertools import product
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
-from scipy.ndimage import label
 from scipy.spatial.transform import Rotation
 
 from drake_pose.body import load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.search import BeamSearchSettings
-from drake_pose.search.multi_start import without_specks
 from drake_pose.search.pose_modes import estimate_joints
 from drake_pose.search.root_placement import place_body
 from drake_pose.search.sampled_body import SampledBody
@@ -106,30 +103,6 @@ def test_a_placed_body_has_its_rotations_at_the_positions(sampled) -> None:
         np.testing.assert_allclose(found.p_PB[0][sample], sampled.p_PB[0][turn] + shift)
     assert found.sampled.X_PN[1] is sampled.sampled.X_PN[1]
     np.testing.assert_array_equal(sampled.sampled.X_PN[0], before)
-
-
-@pytest.mark.parametrize("seed", range(12))
-def test_masks_with_many_specks_are_filtered_by_a_median(seed: int) -> None:
-    """A speck is a component, or a hole, of at most six pixels; two in a hundred are many."""
-    rng, mask = np.random.default_rng(seed), np.zeros((50, 60), bool)
-    at = (0, 0) if seed % 3 == 0 else (12, 9)
-    mask[at[0] : at[0] + 30, at[1] : at[1] + 35] = True
-    mask ^= rng.random(mask.shape) < (0.0, 0.002, 0.012, 0.05)[seed % 4]
-    if seed == 5:
-        mask[40:42, 50:53] = True
-    small = 0
-    for side in (mask, ~mask):
-        parts, _ = label(side)
-        areas = np.bincount(parts.ravel())[1:]
-        small += areas[areas <= 6].sum()
-    found = without_specks(mask)
-    if small <= 0.02 * mask.sum():
-        assert found is mask
-    else:
-        np.testing.assert_array_equal(found, cv2.medianBlur(mask.astype(np.uint8), 5) > 0)
-    dot = np.zeros((20, 20), bool)
-    dot[4, 5] = True
-    assert without_specks(dot) is dot
 
 
 def chain_of(folder, *axes: str, limits: str = 'lower="-3.2" upper="3.2"') -> TreeKinematics:

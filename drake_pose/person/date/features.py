@@ -36,20 +36,11 @@ from the right, over the square root of the area; and (2,) middle of the boundin
 """
 
 
-@dataclass(frozen=True)
-class SkinColour:
-    """Range of skin colours: a box in the chroma plane, so that shading matters little.
+SKIN = (30.0, 133.0, 77.0), (255.0, 173.0, 127.0)
+"""Lowest and highest brightness Y and chroma Cr, Cb of skin, 0 to 255; a chroma of 128 is grey.
 
-    The defaults are those of Chai and Ngan (1999), found on faces of many origins.
-    """
-
-    # red, blue: lowest and highest chroma Cr and Cb, 0 to 255; 128 is grey.
-    red: tuple[float, float] = (133.0, 173.0)
-    blue: tuple[float, float] = (77.0, 127.0)
-    darkest: float = 30.0  # Lowest brightness Y, 0 to 255: chroma is unreliable in the dark.
-
-
-SKIN = SkinColour()
+The box in the chroma plane is Chai and Ngan's (1999), found on faces of many origins: shading
+matters little. In the dark, chroma is unreliable."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,15 +56,13 @@ class Blobs:
 def skin_blobs(picture: Picture, region: Mask, min_area: int = 12, max_count: int = 12) -> Blobs:
     """Find skin-coloured blobs of a picture (H, W, 3) in the person's region (H, W) (3.1.1).
 
-    ``min_area``: least area of a blob [pixel^2]. ``max_count``:
-    largest number of blobs; the largest blobs are kept.
+    ``min_area``: least area of a blob [pixel^2]. ``max_count``: the largest blobs are kept.
     """
     # The bounding box of an empty region is empty; one pixel keeps OpenCV's functions working.
     left, top, width, height = cv2.boundingRect(np.ascontiguousarray(region).view(np.uint8))
     part = slice(top, top + max(height, 1)), slice(left, left + max(width, 1))
     chroma = cv2.cvtColor(np.ascontiguousarray(picture[part]), cv2.COLOR_RGB2YCrCb)
-    low = (SKIN.darkest, SKIN.red[0], SKIN.blue[0])
-    inner = (cv2.inRange(chroma, low, (255.0, SKIN.red[1], SKIN.blue[1])) > 0) & region[part]
+    inner = (cv2.inRange(chroma, *SKIN) > 0) & region[part]
     joined = cv2.morphologyEx(inner.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     count, labels, statistics, middles = cv2.connectedComponentsWithStats(joined, connectivity=8)
     order = np.argsort(-statistics[1:, cv2.CC_STAT_AREA], kind="stable")[:max_count] + 1

@@ -125,9 +125,6 @@ def _switch(value: float, last: int, begin: float, end: float) -> int:
     return int(math.copysign(1, value)) if abs(value) >= begin else 0
 
 
-MOTIONS = ("walk", "reach", "lean", "crouch", "turn", "cross")
-"""Motions in their order; the registered pose is shown before the first and after the last."""
-
 UPRIGHT = ("walk", "reach", "turn", "cross")
 """Motions with an upright trunk, which the paper asks for (4.2)."""
 
@@ -144,32 +141,34 @@ def _sides(left: float = 1.0, right: float = 1.0, **degrees: float) -> dict[str,
     return {f"{side}_{joint}": k * a for joint, a in degrees.items() for side, k in sides.items()}
 
 
-def _key_poses(motion: str) -> list[dict[str, float]]:
-    """Return a motion's key poses in order: angles [deg] by joint; other joints are relaxed."""
-    if motion == "walk":
-        return [
-            _sides(side, -side, upper_arm_x=28.0, thigh_x=-25.0)
-            | {"left_shin_x": 18.0 - 12.0 * side, "right_shin_x": 18.0 + 12.0 * side}
-            | _sides(forearm_x=-25.0)
-            for side in (1.0, -1.0)
-        ]
-    if motion == "reach":
-        aside = {"left_forearm_x": -95.0, "left_upper_arm_y": -35.0}
-        return [
-            {"left_upper_arm_x": -85.0, "left_forearm_x": -35.0},
-            {"left_upper_arm_x": -140.0, "right_upper_arm_z": -75.0, "right_forearm_x": -85.0},
-            _sides(right=-1.0, upper_arm_z=80.0) | aside,
-        ]
-    if motion == "lean":
-        return [{"neck_base_x": 35.0} | _sides(thigh_x=-35.0)]
-    if motion == "crouch":
-        bent = _sides(thigh_x=-75.0, shin_x=110.0) | _sides(right=-1.0, thigh_z=15.0)
-        return [{"neck_base_x": 12.0} | bent]
-    if motion == "turn":
-        return [{"head_y": 45.0}, {"head_y": -45.0}]
-    left = {"left_upper_arm_x": -45.0, "left_forearm_x": -85.0}
-    right = {"right_upper_arm_x": -55.0, "right_forearm_x": -75.0}
-    return [left | right | _sides(right=-1.0, upper_arm_y=-45.0)]
+_ARMS_ASIDE = {"left_forearm_x": -95.0, "left_upper_arm_y": -35.0}
+_LEFT_ACROSS = {"left_upper_arm_x": -45.0, "left_forearm_x": -85.0}
+_RIGHT_ACROSS = {"right_upper_arm_x": -55.0, "right_forearm_x": -75.0}
+
+MOTIONS = {
+    "walk": [
+        _sides(side, -side, upper_arm_x=28.0, thigh_x=-25.0)
+        | {"left_shin_x": 18.0 - 12.0 * side, "right_shin_x": 18.0 + 12.0 * side}
+        | _sides(forearm_x=-25.0)
+        for side in (1.0, -1.0)
+    ],
+    "reach": [
+        {"left_upper_arm_x": -85.0, "left_forearm_x": -35.0},
+        {"left_upper_arm_x": -140.0, "right_upper_arm_z": -75.0, "right_forearm_x": -85.0},
+        _sides(right=-1.0, upper_arm_z=80.0) | _ARMS_ASIDE,
+    ],
+    "lean": [{"neck_base_x": 35.0} | _sides(thigh_x=-35.0)],
+    "crouch": [
+        {"neck_base_x": 12.0}
+        | _sides(thigh_x=-75.0, shin_x=110.0)
+        | _sides(right=-1.0, thigh_z=15.0)
+    ],
+    "turn": [{"head_y": 45.0}, {"head_y": -45.0}],
+    "cross": [_LEFT_ACROSS | _RIGHT_ACROSS | _sides(right=-1.0, upper_arm_y=-45.0)],
+}
+"""Key poses of all motions, in order: angles [deg] by joint; other joints are relaxed.
+
+The registered pose is shown before the first and after the last motion."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,14 +198,14 @@ def make_motion(skeleton: Skeleton, frames: int, seed: int) -> Motion:
     whole = max(frames, 120)
     still = whole // 20
     # The time from key pose to key pose is the same in all motions.
-    steps = np.cumsum([0, *(len(_key_poses(motion)) + 1 for motion in MOTIONS)])
+    steps = np.cumsum([0, *(len(keys) + 1 for keys in MOTIONS.values())])
     lengths = np.diff(np.rint((whole - 2 * still) * steps / steps[-1]).astype(int))
     rows, names = [registered] * still, [REGISTERED] * still
     before = registered
-    for motion, length in zip(MOTIONS, lengths, strict=True):
+    for (motion, poses), length in zip(MOTIONS.items(), lengths, strict=True):
         size = generator.uniform(0.85, 1.15)
-        after = registered if motion == MOTIONS[-1] else relaxed
-        keys = [before, *(_positions(skeleton, key, size) for key in _key_poses(motion)), after]
+        after = registered if motion == "cross" else relaxed
+        keys = [before, *(_positions(skeleton, key, size) for key in poses), after]
         rows += list(_through(keys, int(length)))
         names += [motion] * int(length)
         before = relaxed

@@ -3,7 +3,7 @@ import pytest
 
 from drake_pose.filtering.hand import HAND_STATE
 from drake_pose.filtering.state import Belief, Linear
-from drake_pose.filtering.truncated_filter import Hypothesis, merge_duplicates, normalise, prune
+from drake_pose.filtering.truncated_filter import Hypothesis, merge_duplicates, normalise
 from drake_pose.filtering.update import (
     RepeatedView,
     anchored_observation,
@@ -149,12 +149,3 @@ def test_close_hypotheses_merge_and_add_their_weights():
     small = normalise([at(0.0, 0.0, 1e-3), at(0.2e-3, -1.0, 1e-3), at(0.4e-3, -2.0, 1e-3)])
     kept, _ = merge_duplicates(small, 0.3, 7)
     assert [one.belief.mean[0] for one in kept] == [0.0, 0.4e-3]
-
-
-@pytest.mark.parametrize("cap", [1, 2, 5, 6])
-def test_the_heaviest_hypotheses_are_kept_up_to_the_cap(cap):
-    kept, rejected = prune([at(float(k), -1.5 * k) for k in (3, 0, 4, 1, 2)], cap, 3)
-    means = [one.belief.mean[0] for one in kept]
-    assert means == [0.0, 1.0, 2.0, 3.0, 4.0][:cap]
-    assert [(one.step, one.reason) for one in rejected] == [(3, "cap")] * (5 - len(means))
-    assert sum(one.weight for one in kept) == pytest.approx(1.0)

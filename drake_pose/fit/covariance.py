@@ -14,6 +14,7 @@ no calibration is assumed to be better than one pixel.
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +23,9 @@ from scipy.linalg.lapack import dpotri
 from threadpoolctl import ThreadpoolController
 
 from drake_pose.arrays import Array, Indices, Mask
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.fit.contour_fit import Comparison, pixels_per_metre, symmetric
+from drake_pose.fit.parameters import affine_motions
 from drake_pose.silhouette.outline import Outline
 
 # With a few hundred rows, BLAS is ten times slower on two threads than on one.
@@ -62,6 +65,13 @@ class Distances(NamedTuple):
     # Per group (n, k) derivatives by nuisance parameters that are common to all images and not
     # among the values, such as joint offsets; each by a unit of its group.
     nuisances: tuple[Array, ...] = ()
+    # (m,) inverse variances of the values' priors in the fit; 0: none.
+    known: Array | float = 0.0
+
+
+RoundPart = tuple[int, Array]
+"""Index of a node, and its rotation that no silhouette shows: rotation vector, and velocity of the
+node's origin (6,), for 1 rad, in its frame."""
 
 
 class ComparedMask(NamedTuple):
@@ -74,6 +84,73 @@ class ComparedMask(NamedTuple):
     moves: Array  # (nodes, m, 12) affine motions of the nodes caused by the m values.
     size: float  # Unit of errors, some pixels of the image, at the body's distance [m].
     camera: int = 0  # Index of the camera.
+
+
+@lru_cache(maxsize=16)
+def round_parts(
+    kinematics: TreeKinematics,
+    outlines: tuple[Outline, ...],
+    turned: frozenset[str] = frozenset(),
+    sides: int = 12,
+) -> tuple[RoundPart, ...]:
+    """Return parts that are round about the axis of a joint that they carry, or are carried by.
+
+    The facets of a round part's mesh move when it turns; those of the real part do not exist. A
+    part is round if its extent in any direction, from the axis, changes in a turn by no more than
+    that of a regular prism of this many sides.
+
+    ``kinematics``: of the body's pose tree. ``outlines``: surface of each node. ``turned``: names
+    of joints about whose axes all static parts count as round.
+    """
+    values = kinematics.flatten(kinematics.tree.default_values())
+    at, found = kinematics.motions(values), list[RoundPart]()
+    azimuth, height = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 73), np.linspace(-1.0, 1.0, 9))
+    across = np.sqrt(1.0 - height**2)
+    directions = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), height])
+    still: Mask = np.logical_not(at.moves.any(axis=1))
+    for k in np.flatnonzero(kinematics.is_angle).tolist():
+        child = int(kinematics.value_nodes[k])
+        parent = kinematics.tree.nodes[child].parent
+        beside = {child, parent} | (
+            {*np.flatnonzero(still)} if parent < 0 or still[parent] else set()
+        )
+        for node in sorted(one for one in beside if one >= 0 and len(outlines[one].vertices)):
+            X = np.linalg.inv(at.X_WN[node])
+            omega = X[:3, :3] @ at.twists[k, :3]
+            omega /= np.linalg.norm(omega)
+            velocity = X[:3, :3] @ (
+                at.twists[k, 3:6] + np.cross(at.twists[k, :3], at.X_WN[node, :3, 3])
+            )
+            place = np.cross(omega, velocity)
+            frame = np.linalg.svd(omega[None])[2]
+            points = (outlines[node].vertices - place) @ np.vstack([frame[1:], omega]).T
+            reach = np.array([(points @ row).max(axis=0) for row in np.moveaxis(directions, 0, 1)])
+            radius = np.linalg.norm(points[:, :2], axis=1).max()
+            is_round = np.ptp(reach, axis=1).max() <= (1.0 - math.cos(np.pi / sides)) * radius
+            if is_round or (still[node] and kinematics.names[k] in turned):
+                found.append((node, np.append(omega, velocity)))
+    return tuple(found)
+
+
+def without_rotations(compared: Comparison, parts: Sequence[RoundPart]) -> Comparison:
+    """Return a comparison that holds no information on rotations of round parts.
+
+    They are marginalised in each mask: an unknown of its own turns each part.
+    """
+    if not parts:
+        return compared
+    A, b, bias_terms = symmetric(compared.A), compared.b.copy(), compared.bias_terms.copy()
+    for node, twist in parts:
+        X = compared.placement.X_WN[node]
+        omega = X[:3, :3] @ twist[:3]
+        velocity = X[:3, :3] @ twist[3:] - np.cross(omega, X[:3, 3])
+        (r,) = affine_motions(np.concatenate([omega, velocity, [0.0]])[None])
+        pulled = A[:, node] @ r
+        gain = pulled / np.maximum(pulled @ r, 1e-12)[:, None]
+        A[:, node] -= gain[:, :, None] * pulled[:, None]
+        b[:, node] -= gain * (b[:, node] @ r)[:, None]
+        bias_terms[:, node, :12] -= gain * (bias_terms[:, node, :12] @ r)[:, None]
+    return compared._replace(A=A, b=b, bias_terms=bias_terms)
 
 
 def error_unit(size: float) -> float:
@@ -290,7 +367,7 @@ def estimate_sizes(
     effects = [*residuals.effects[active], *(Z @ Z.T for Z in residuals.nuisances)]
     stacked = np.reshape(effects, (len(effects), -1))
 
-    prior_information = _prior_information(is_angle)
+    prior_information, known = _prior_information(is_angle), _known(residuals)
 
     def likelihood(t: Array) -> tuple[float, Array, Array]:
         """Return the restricted log-likelihood plus log prior of log sizes t (k,), P and P y.
@@ -300,7 +377,7 @@ def estimate_sizes(
         L = np.linalg.cholesky((np.exp(2.0 * t) @ stacked).reshape(n, n))
         inverse = symmetric(dpotri(L.T)[0].T) if n else L  # LAPACK refuses empty matrices.
         VX = inverse @ residuals.X
-        H = residuals.X.T @ VX + prior_information
+        H = residuals.X.T @ VX + prior_information + known
         P = inverse - VX @ np.linalg.solve(H, VX.T)
         Py = P @ residuals.y
         freedom = 2.0 * np.log(np.diag(L)).sum() + np.linalg.slogdet(H)[1]
@@ -354,13 +431,14 @@ def values_covariance(
         is_angle: (m,) which values are angles; the others are lengths.
     """
     white = sizes.noise**2 + sizes.repeated**2
-    own = residuals.X[:, free]
+    own, square = residuals.X[:, free], np.ix_(free, free)
     V = distances_covariance(residuals, sizes)
-    prior_information = white * _prior_information(is_angle)[np.ix_(free, free)]
-    H = residuals.information[np.ix_(free, free)] + prior_information
-    # Residuals that were dropped, and the prior, are treated as noise.
-    inverse = np.linalg.inv(H)
-    return np.asarray(inverse @ (own.T @ V @ own + white * (H - own.T @ own)) @ inverse)
+    H = residuals.information[square] + white * _prior_information(is_angle)[square]
+    # Residuals that were dropped, and the range's prior, are treated as noise.
+    known = _known(residuals)[square]
+    inverse = np.linalg.inv(H + known)
+    errors = own.T @ V @ own + white * (H - own.T @ own) + known
+    return np.asarray(inverse @ errors @ inverse)
 
 
 def distances_covariance(residuals: Distances, sizes: ErrorSizes) -> Array:
@@ -392,12 +470,13 @@ def nuisance_covariance(
     variances = np.repeat(np.square(sizes.nuisances), [Z.shape[1] for Z in residuals.nuisances])
     inverse = np.linalg.inv(distances_covariance(residuals, sizes) + (A * variances) @ A.T)
     VX, prior_information = inverse @ residuals.X, _prior_information(is_angle)
+    known = _known(residuals)
     weighted_residuals = inverse @ residuals.y - VX @ np.linalg.solve(
-        residuals.X.T @ VX + prior_information, VX.T @ residuals.y
+        residuals.X.T @ VX + prior_information + known, VX.T @ residuals.y
     )
     estimates = variances * (A.T @ weighted_residuals)
     sensitivities = np.linalg.solve(
-        residuals.information + white * prior_information, residuals.X.T @ A
+        residuals.information + white * prior_information + known, residuals.X.T @ A
     )
     bias = sensitivities @ estimates
     without = residuals._replace(y=residuals.y - A @ estimates, nuisances=())
@@ -424,6 +503,11 @@ def score_nuisances(residuals: Distances, sizes: ErrorSizes) -> tuple[Array, Arr
 def _prior_information(is_angle: Mask) -> Array:
     """Return the information (m, m) of uniform priors: a full turn of angles, ten metres else."""
     return np.diag(12.0 / np.where(is_angle, 2.0 * np.pi, 10.0) ** 2)
+
+
+def _known(residuals: Distances) -> Array:
+    """Return the information (m, m) of the values' priors in the fit."""
+    return np.diag(np.broadcast_to(residuals.known, residuals.X.shape[1]))
 
 
 def vuong_statistic(tiles: Array, others: Array) -> float:

@@ -27,7 +27,7 @@ from drake_pose.fit.contour_fit import (
     pixels_per_metre,
     symmetric,
 )
-from drake_pose.fit.covariance import ComparedMask
+from drake_pose.fit.covariance import ComparedMask, RoundPart, without_rotations
 from drake_pose.fit.evidence import Observation, offset_edges
 from drake_pose.fit.kernel import Sum
 from drake_pose.fit.levenberg_marquardt import (
@@ -135,6 +135,7 @@ class Problem:
         steps: settings of the optimiser's steps; None: ``StepSettings()``.
         pixels: unit of length of stages and noise [pixel], scalar or (cameras,); None: the size of
             a metre at the root.
+        unseen: parts about whose rotations silhouettes say nothing.
 
     Raises:
         UnknownNameError: an unknown is not a parameter.
@@ -150,6 +151,7 @@ class Problem:
         noise: Noise | None = None,
         steps: StepSettings | None = None,
         pixels: float | Array | None = None,
+        unseen: Sequence[RoundPart] = (),
     ) -> None:
         kinematics = body.kinematics
         if pivot is None:
@@ -158,6 +160,7 @@ class Problem:
         if noise is None and pixels is not None:
             noise = Noise.per_pixel(pixels)
         self.body, self._cameras = body, CameraParameters(cameras, pivot)
+        self._unseen = unseen
         every = list(parameter_names(body, cameras))
         unknowns = sorted(unknowns, key=lambda one: one.shared)
         self.names = tuple(name for one in unknowns for name in one.names)
@@ -389,7 +392,7 @@ class Problem:
                     line_weights, offset, compared.A[c], compared.b[c], compared.sums[c],
                     compared.bias_terms[c], theta[self._first_bias + c],
                 )  # fmt: skip
-        return compared, packed_cameras
+        return without_rotations(compared, self._unseen), packed_cameras
 
     def tile_costs(
         self, frame: Observation, theta: Array, stage: AnnealingStage, side: float

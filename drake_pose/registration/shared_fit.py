@@ -10,10 +10,10 @@ offsets, link scales and lens errors that are not fitted are nuisance parameters
 sizes enlarge the covariance.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
-from typing import Any, NamedTuple
+from functools import cached_property, partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from drake_pose.fit.covariance import (
     distances_in_masks,
     estimate_sizes,
     nuisance_covariance,
+    round_parts,
     score_nuisances,
     values_covariance,
 )
@@ -60,6 +61,8 @@ class SharedFitSettings(NamedTuple):
         inlier_stage: stage at which inliers and outliers are classified.
         final_stage: last stage of the fit of cameras.
         steps: limits and damping of a step.
+        last_steps: of the steps that end a fit of cameras and constants: what static parts tell of
+            a first joint is a millionth of what moving parts tell of its sum with the camera.
         constant_deviation: prior standard deviation of joint offsets [rad or m] and of the
             logarithms of link scales.
         determined: maximum standard deviation of a determined constant, over the prior's.
@@ -85,6 +88,7 @@ class SharedFitSettings(NamedTuple):
     inlier_stage: AnnealingStage = AnnealingStage(0.025, 0.01)
     final_stage: AnnealingStage = AnnealingStage(0.005, 0.005)
     steps: StepSettings = StepSettings(max_step=0.3, damping=1e-2, uniform_damping=1e-6)
+    last_steps: StepSettings = StepSettings(0.3, 1e-7, 1e-10, 1e-9, min_decrease=1e-6)
     constant_deviation: float = 0.2
     determined: float = 0.2
     level: float = 0.05
@@ -140,6 +144,9 @@ class SharedFit:
         expected: prior means of constants by name, about which they are bounded; None, and for
             other names: 0.
         focal_deviation: prior standard deviation of the logarithms of focal lengths, if fitted.
+        turned: joints about whose axes static parts may be turned: masks of these do not show it.
+        held: whether the constants are held at `expected`.
+        steps: limits and damping of a step.
     """
 
     def __init__(
@@ -153,13 +160,16 @@ class SharedFit:
         fit_biases: bool = True,
         expected: Mapping[str, float] | None = None,
         focal_deviation: float = SHARED.focal_deviation,
+        turned: Collection[str] = (),
+        held: bool = False,
+        steps: StepSettings = SHARED.steps,
     ) -> None:
-        self.views, self.constants, self._X_CW = tuple(views), tuple(constants), tuple(X_CW)
-        self._options: dict[str, Any] = {
-            "offsets": offsets, "camera_unknowns": camera_unknowns, "fit_biases": fit_biases,
-            "expected": expected,
-            "focal_deviation": focal_deviation,
-        }  # fmt: skip
+        self.views, self.constants = tuple(views), tuple(constants)
+        self._changed = partial(
+            SharedFit, views, X_CW=X_CW, constants=constants, offsets=offsets,
+            camera_unknowns=camera_unknowns, fit_biases=fit_biases, expected=expected,
+            focal_deviation=focal_deviation, turned=turned,
+        )  # fmt: skip
         first, body = views[0], views[0].body
         if offsets:
             body = BodyParameters(first.kinematics, first.outlines, offsets=offsets)
@@ -179,7 +189,8 @@ class SharedFit:
         deviations |= {f"{one.name}.{CAMERA_NAMES[6]}": focal_deviation for one in cameras}
         known = np.array([deviations.get(name, np.inf) for name in self.names])
         bounded = set(constants) - {*TARGET_POSITIONS, TIME_OFFSET}
-        most = np.array([SHARED.max_constant if k in bounded else np.inf for k in self.names])
+        largest = 0.0 if held else SHARED.max_constant
+        most = np.array([largest if k in bounded else np.inf for k in self.names])
         self._expected = np.array([(expected or {}).get(name, 0.0) for name in self.names])
         lower, upper = self._expected - most, self._expected + most
         unknowns = [Unknowns(self.names, True, lower, upper, known)]
@@ -189,7 +200,8 @@ class SharedFit:
             unknowns.append(Unknowns(every[-len(cameras) :], lower=-6.0, upper=6.0))
         self.problem = Problem(
             body, cameras, unknowns, pivot=np.array([one.middle for one in views]),
-            steps=SHARED.steps, pixels=np.array([one.size for one in views]),
+            steps=steps, pixels=np.array([one.size for one in views]),
+            unseen=round_parts(first.kinematics, first.outlines, frozenset(turned)),
         )  # fmt: skip
 
     @property
@@ -222,8 +234,16 @@ class SharedFit:
         count = self.per_camera * len(X_CW)
         shared = found.shared.copy()
         shared[:count].reshape(len(X_CW), -1)[:, : len(POSE_NAMES)] = 0.0
-        fit = SharedFit(self.views, X_CW, self.constants, **self._options)
-        return fit, SharedValues(shared, found.biases)
+        return self._changed(X_CW=X_CW), SharedValues(shared, found.biases)
+
+    def fitted_cameras(self, at: SharedValues, included: Mask) -> SharedValues:
+        """Return given values with cameras and biases fitted again, and the constants held.
+
+        ``included``: (rows,) which masks enter.
+        """
+        held = dict(zip(self.names, at.shared.tolist(), strict=True))
+        fit = self._changed(expected=held, held=True)
+        return fit.fit([SHARED.inlier_stage, SHARED.final_stage], at, included)
 
     def equations(
         self, at: SharedValues, step: AnnealingStage, included: Mask | None = None
@@ -235,24 +255,10 @@ class SharedFit:
         observations, unknowns, expected, _ = self._at(at, included)
         return self.problem.equations(observations, unknowns, step, expected)
 
-    def cost_curvature(
-        self, found: SharedValues, by: Array, step: AnnealingStage, included: Mask | None = None
-    ) -> tuple[float, float]:
-        """Return the cost's curvature along a step `by` (u,), without priors.
-
-        The other arguments are those of `equations`, with `found` for `at`.
-
-        Returns by^T H by from differences of the gradient at +-by, and from the normal equations.
-        """
-        p = self.problem.own_count
-        less, here, more = (
-            self.equations(SharedValues(found.shared + sign * by, found.biases), step, included)
-            for sign in (-1.0, 0.0, 1.0)
-        )
-        known = float(self.problem.information[p:] @ by**2)
-        slopes = (more.g - less.g).sum(axis=0)[p:]
-        predicted = float(by @ here.H.sum(axis=0)[p:, p:] @ by)
-        return 0.5 * float(by @ slopes) - known, predicted - known
+    def fit_to_end(self, start: SharedValues, included: Mask) -> SharedValues:
+        """Return a fit of the included masks (rows,), with all unknowns fitted to the end."""
+        fit = self._changed(steps=SHARED.last_steps)
+        return fit.fit([replace(SHARED.final_stage, iterations=40)], start, included)
 
     def inlier_ratios(self, found: SharedValues) -> Array:
         """Return the inlier ratio (rows,) of each mask: the fraction of both contours that fits."""
@@ -264,11 +270,6 @@ class SharedFit:
         return np.sum(
             [own[:, :-1, [Sum.COMPARED, Sum.FITTING]].sum(axis=0) for own in sums], axis=0
         )
-
-    def costs(self, found: SharedValues) -> Array:
-        """Return the cost (rows,) of each mask's contours, without priors, at the final stage."""
-        compared = self._compared(found, SHARED.final_stage)
-        return np.array([float(one.sums[..., Sum.COST].sum()) for one in compared])
 
     def _compared(self, found: SharedValues, stage: AnnealingStage) -> list[Comparison]:
         """Return the comparison of each mask's contours with the body's at a stage."""
@@ -309,8 +310,9 @@ class SharedFit:
         is_angle = np.zeros(distances.X.shape[1], bool)
         sizes = estimate_sizes(distances, is_angle, 0.0, SHARED.prior_deviation)
         nuisance, distances = nuisance_covariance(distances, sizes, is_angle)
+        scatter = np.sqrt(scatter_factor(distances, sizes, len(self.names)))
+        sizes = ErrorSizes(*(scatter * np.array(sizes[:5])))
         covariance = values_covariance(distances, sizes, np.arange(len(is_angle)), is_angle)
-        covariance *= scatter_factor(distances, sizes, len(self.names))
         # Wrong intrinsics are the same in all frames, and the pose absorbs them without residuals.
         # So a calibration is trusted to a pixel at best where surfaces are seen to err. Repeated
         # noise of a static part may be an error of its surface: none of it counts as noise here.
@@ -476,7 +478,10 @@ class SharedFit:
             Z = distances.X[:, members_free] * [units.get(names[k], 0.01) for k in members_free]
             nuisances.append(np.column_stack([Z, Z.sum(axis=1)]) if kind == "scales" else Z)
         values = np.array([*own, *range(len(names), distances.X.shape[1])])
+        known = np.zeros(len(values))
+        known[: len(own)] = self.problem.information[self.problem.own_count :]
         return distances._replace(
+            known=known,
             X=distances.X[:, values],
             information=distances.information[np.ix_(values, values)],
             nuisances=tuple(Z for Z in nuisances if Z.any()),
@@ -498,8 +503,7 @@ class SharedFit:
         joints = [kinematics.names[k] for k in free if kinematics.names[k] not in self.constants]
         scales = dict.fromkeys(link_scale_name(one.link) for one in offsets)
         names = [*self.constants, *joints, *(one for one in scales if one not in self.constants)]
-        options = self._options | {"offsets": offsets, "camera_unknowns": len(CAMERA_NAMES)}
-        return SharedFit(self.views, self._X_CW, names, **options)
+        return self._changed(constants=names, offsets=offsets, camera_unknowns=len(CAMERA_NAMES))
 
 
 def fit_pose(view: PosedFrames, X_CW: Array, rounds: Sequence[AnnealingStage]) -> Array:
@@ -511,6 +515,9 @@ def fit_pose(view: PosedFrames, X_CW: Array, rounds: Sequence[AnnealingStage]) -
 def pose_covariance(X_CW: Array, motions: Array, covariance: Array) -> Array:
     """Return the (6, 6) covariance of a camera's pose X_WC in the world [rad, m].
 
+    It is that of the linearised pose, and of the second-order term 0.5 w x v of a rotation w and
+    shift v: a camera that turns about a robot moves on an arc.
+
     ``X_CW``: (4, 4) the world's pose in the camera. ``motions``: (6, 12) affine motions of the
     scene for each unknown of the pose, see ``CameraParameters.place``. ``covariance``: (6, 6) of
     these unknowns.
@@ -520,7 +527,16 @@ def pose_covariance(X_CW: Array, motions: Array, covariance: Array) -> Array:
     p_WC = -X_CW[:3, :3].T @ X_CW[:3, 3]
     turns = np.stack([by[:, 2, 1], by[:, 0, 2], by[:, 1, 0]])
     J = np.vstack([turns, (by[:, :, :3] @ p_WC + by[:, :, 3]).T])
-    return np.asarray(J @ covariance @ J.T)
+    C = J @ covariance @ J.T
+    # Fourth moments of a normal distribution (Isserlis 1918).
+    cross = np.cross(np.eye(3)[:, None], np.eye(3))
+    (ww, wv), (vw, vv) = (np.split(rows, 2, axis=1) for rows in np.split(C, 2))
+    moments = (
+        np.einsum("ab,cd->abcd", wv, wv) + np.einsum("ac,bd->abcd", ww, vv)
+        + np.einsum("ad,bc->abcd", wv, vw)
+    )  # fmt: skip
+    C[3:, 3:] += 0.25 * np.einsum("abi,cdj,abcd->ij", cross, cross, moments)
+    return np.asarray(C)
 
 
 def scatter_factor(distances: Distances, sizes: ErrorSizes, shared: int) -> float:

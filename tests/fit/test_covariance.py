@@ -1,12 +1,15 @@
 """Covariances with correlated errors: known answers, and simulated arms."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from drake_pose.body import TriangleMesh
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.fit.contour_fit import symmetric
+from drake_pose.fit.contour_fit import Comparison, symmetric
 from drake_pose.fit.covariance import (
     ComparedMask,
     Distances,
@@ -16,15 +19,24 @@ from drake_pose.fit.covariance import (
     error_unit,
     estimate_sizes,
     nuisance_covariance,
+    round_parts,
     score_nuisances,
     surface_deformations,
     values_covariance,
     vuong_statistic,
+    without_rotations,
 )
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
+from drake_pose.fit.parameters import affine_motions
 from drake_pose.fit.surfaces import simplify_surfaces
 from drake_pose.search import ViewsFit
-from drake_pose.silhouette.outline import Outline, TreeSurfaces, outline_from_mesh
+from drake_pose.silhouette.outline import (
+    EMPTY_OUTLINE,
+    Outline,
+    TreeSurfaces,
+    outline_from_mesh,
+    outline_of_triangles,
+)
 from tests.search.arms import arm_tree, damaged_views, draw_pose
 
 FINE = tuple(AnnealingStage(scale, 0.0125, 8) for scale in (0.025, 0.0125))
@@ -362,3 +374,55 @@ def test_scores_of_nuisances_are_least_squares_beside_the_values() -> None:
         assert deviations[k] == pytest.approx(np.sqrt(covariance[-1, -1]))
     assert len(found) == len(deviations) == 8
     assert score_nuisances(residuals._replace(nuisances=()), sizes)[0].shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("sides", "aside", "is_round"),
+    [(4, 0.0, False), (8, 0.0, False), (16, 0.0, True), (40, 0.0, True), (40, 0.02, False)],
+)
+def test_parts_are_round_within_the_facets_of_their_meshes(tmp_path, sides, aside, is_round):
+    """Marginalised rotations add no information, and other motions lose only what turns."""
+    turn = np.arange(sides) * 2.0 * np.pi / sides
+    ring = np.column_stack([np.cos(turn), np.sin(turn)]) * 0.1 + [aside, 0.0]
+    points = np.vstack([np.insert(ring, 2, z, axis=1) for z in (-0.1, 0.0)])
+    hull = outline_of_triangles(points, ConvexHull(points).simplices)
+    tree = arm_tree(tmp_path)
+    kinematics, box = TreeKinematics(tree), outline_from_mesh(tree.nodes[-1].mesh)
+    outlines = (box, *[EMPTY_OUTLINE] * (len(tree.nodes) - 2), box)
+    child = kinematics.value_nodes[0]
+    parts = round_parts(
+        kinematics, tuple(hull if k == child else o for k, o in enumerate(outlines))
+    )
+    assert [node for node, _ in parts] == [child] * is_round
+    A = np.random.default_rng(0).normal(size=(2, len(outlines), 20, 12))
+    A = np.swapaxes(A, 2, 3) @ A
+    b, bias = A.sum(axis=3), np.concatenate([A.sum(axis=3), A[..., :1, 0]], axis=2)
+    X_WN = kinematics.poses(np.linspace(-0.5, 0.5, len(kinematics.names)))
+    placement = SimpleNamespace(X_WN=X_WN)
+    found = without_rotations(Comparison(A, b, np.zeros(0), bias, placement), parts)
+    for node, _ in parts:
+        omega = X_WN[node, :3, 2]
+        r = affine_motions(np.array([[*omega, *-np.cross(omega, X_WN[node, :3, 3]), 0.0]]))[0]
+        for new, old in zip(found.A[:, node], A[:, node], strict=True):
+            np.testing.assert_allclose(new @ r, 0.0, atol=1e-9)
+            across = np.linalg.svd(r[None])[2][1:]
+            marginal = np.linalg.inv(across @ new @ across.T)
+            whole = np.linalg.inv(np.vstack([across, r]) @ old @ np.vstack([across, r]).T)
+            np.testing.assert_allclose(marginal, whole[:-1, :-1], rtol=1e-6)
+        np.testing.assert_allclose(found.b[:, node] @ r, 0.0, atol=1e-9)
+    kept = np.arange(len(outlines)) != (child if is_round else -1)
+    np.testing.assert_array_equal(found.A[:, kept], A[:, kept])
+
+
+def test_values_without_data_keep_their_prior() -> None:
+    """The sandwich is Bayes' posterior where the noise is what the fit's weights say."""
+    rng = np.random.default_rng(4)
+    X, known = rng.normal(size=(6, 3)) * [1.0, 0.3, 0.0], np.array([0.0, 9.0, 25.0])
+    effects = np.array([np.eye(6), *np.zeros((4, 6, 6))])
+    residuals = Distances(
+        np.zeros(6), X, effects, X.T @ X, np.zeros((6, 0)), np.zeros(6, int), known=known
+    )
+    sizes = ErrorSizes(1.0, 0.0, 1.0, 1.0, 1.0)
+    found = values_covariance(residuals, sizes, np.arange(3), np.zeros(3, bool))
+    np.testing.assert_allclose(found, np.linalg.inv(X.T @ X + np.diag(known)), rtol=0.05, atol=1e-9)
+    assert found[2, 2] == pytest.approx(0.04, rel=0.01)

@@ -356,29 +356,31 @@ def mode_warnings(
 def parameter_warnings(found: JointCalibration) -> list[str]:
     """Return warnings of joint offsets and link scales that are uncertain.
 
-    If no parameter is significant, this is the only warning. Otherwise there is a warning for each
-    parameter that only static parts separate from a camera's pose, and for each that is not
-    determined.
+    There is a warning if no parameter is significant, or for each parameter that only static parts
+    separate from a camera's pose; and for each that is not determined.
     """
     requested = [(f"joint '{offset.name}': its offset", offset) for offset in found.offsets]
     requested += [(f"link '{scale.name}': its length", scale) for scale in found.link_scales]
     if requested and not any(parameter.significant for _, parameter in requested):
-        return [
+        uncertain = [
             "none of the requested joint offsets and link lengths is significant beside other "
             "errors (of each other, focal length, principal point, masks): no corrected URDF is "
             "written"
         ]
-    with_cameras = [
-        f"{what} is good to {np.degrees(one.deviation):.2g} degrees only, and turns the camera "
-        f"about the robot (correlated with {', '.join(one.gauge)}): edges of static parts separate "
-        "the two. Check in the overlays whether the base fits, or give a camera with its pose"
-        for what, one in requested
-        if one.determined and one.gauge
-    ]
-    return with_cameras + [
+    else:
+        uncertain = [
+            f"{what} is good to {np.degrees(one.deviation):.2g} degrees only, and turns the camera "
+            f"about the robot (correlated with {', '.join(one.gauge)}): edges of static parts "
+            "separate the two. Check in the overlays whether the base fits, or give a camera with its "
+            "pose"
+            for what, one in requested
+            if one.determined and one.gauge
+        ]
+    return uncertain + [
         f"{what} is not determined by these silhouettes and was not changed"
         + (
-            f" (correlated with {', '.join(parameter.gauge)}: their values hold if it is 0)"
+            f" (correlated with {', '.join(parameter.gauge)}, which allow for it in their standard "
+            "deviations)"
             if parameter.gauge
             else ""
         )

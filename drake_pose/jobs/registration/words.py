@@ -371,8 +371,8 @@ def parameter_warnings(found: JointCalibration) -> list[str]:
         uncertain = [
             f"{what} is good to {np.degrees(one.deviation):.2g} degrees only, and turns the camera "
             f"about the robot (correlated with {', '.join(one.gauge)}): edges of static parts "
-            "separate the two. Check in the overlays whether the base fits, or give a camera with its "
-            "pose"
+            "separate the two. Check in the overlays whether the base fits, or give a camera with "
+            "its pose"
             for what, one in requested
             if one.determined and one.gauge
         ]

@@ -247,22 +247,17 @@ def save_cameras(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Came
 
 
 def dump_cameras(
-    cameras: Mapping[str, Camera] | Iterable[Camera],
-    links: Mapping[str, str] | None = None,
-    unplaced: Iterable[str] = (),
+    cameras: Mapping[str, Camera] | Iterable[Camera], links: Mapping[str, str] | None = None
 ) -> str:
     """Return the text of a camera file.
 
     ``cameras``: the cameras, by name or in sequence. ``links``: link of each camera that is mounted
-    on one, by the camera's name, whose X_WC is written as X_LC; None: no camera is. ``unplaced``:
-    names of cameras that are written without a pose.
+    on one, by the camera's name, whose X_WC is written as X_LC; None: no camera is.
     """
     content = {camera.name: describe_camera(camera) for camera in camera_tuple(cameras)}
     for name, link in (links or {}).items():
         if name in content:
             content[name] |= {"link": link, "X_LC": content[name].pop("X_WC")}
-    for name in content.keys() & {*unplaced}:
-        del content[name]["X_WC"]
     return yaml.safe_dump(content, sort_keys=False)
 
 

@@ -227,12 +227,8 @@ def record_pose_set(pose_set: PoseSet | None, tree: PoseTree) -> dict[str, Any]:
         estimates = {}
         for joint, value in zip((*joints, *mimic_joints(tree, joints)), values, strict=True):
             unit = 1.0 if kinds.get(joint.name) == "length" else math.degrees(1.0)
-            estimates[joint.name] = {
-                "determined": joint.determined,
-                "low": unit * joint.low,
-                "high": unit * joint.high,
-                "value": None if value is None else unit * value,
-            }
+            shown = None if value is None else unit * value
+            estimates[joint.name] = _entry(joint.determined, joint.low, joint.high, unit, shown)
         return estimates
 
     modes = [
@@ -245,6 +241,14 @@ def record_pose_set(pose_set: PoseSet | None, tree: PoseTree) -> dict[str, Any]:
         "modes": modes,
         "mode_count": pose_set.mode_count,
     }
+
+
+def _entry(
+    determined: bool, low: float, high: float, unit: float = 1.0, value: float | None = None
+) -> dict[str, Any]:
+    """Return a joint's entry of `Joints`; ``low`` and ``high`` are multiplied by ``unit``."""
+    ends = {"low": float(unit * low), "high": float(unit * high)}
+    return {"determined": determined, **ends, "value": value}
 
 
 def record_deviations(model: ArticulatedModel, q: Array, deviations: Array) -> Joints:
@@ -268,12 +272,7 @@ def record_deviations(model: ArticulatedModel, q: Array, deviations: Array) -> J
     determined = 2.0 * half < 0.5 * (model.upper - model.lower)
     unit = user_units(model)
     return {
-        model.position_names[k]: {
-            "determined": bool(determined[k]),
-            "low": float(unit[k] * low[k]),
-            "high": float(unit[k] * high[k]),
-            "value": None,
-        }
+        model.position_names[k]: _entry(bool(determined[k]), low[k], high[k], unit[k])
         for k in np.flatnonzero(np.isfinite(low) & np.isfinite(high))
     }
 
@@ -290,12 +289,11 @@ def record_modes(model: ArticulatedModel, answers: Sequence[tuple[Array, Array]]
     if len(of_modes) < 2:
         return {"joints": of_modes[0]}
     joints = {
-        name: {
-            "determined": all(one[name]["determined"] for one in of_modes),
-            "low": min(one[name]["low"] for one in of_modes),
-            "high": max(one[name]["high"] for one in of_modes),
-            "value": None,
-        }
+        name: _entry(
+            all(one[name]["determined"] for one in of_modes),
+            min(one[name]["low"] for one in of_modes),
+            max(one[name]["high"] for one in of_modes),
+        )
         for name in of_modes[0]
         if all(name in one for one in of_modes)
     }

@@ -252,17 +252,8 @@ class FeatureFinder(PortedSystem):
             return find_features(cameras, views, last)
 
         found = self.add_output("found", None, find)
-
-        def places(context: Context) -> Array:
-            measured = found.Eval(context)
-            return np.full(size, np.nan) if measured is None else measured.positions.ravel()
-
-        def support(context: Context) -> Array:
-            measured = found.Eval(context)
-            return np.zeros(len(FEATURES)) if measured is None else measured.support
-
-        self.add_output("features", size, places)
-        self.add_output("support", len(FEATURES), support)
+        self.add_reading("features", size, found, np.nan, lambda one: one.positions.ravel())
+        self.add_reading("support", len(FEATURES), found, 0.0, lambda one: one.support)
 
 
 class FaceDirectionFinder(PortedSystem):
@@ -342,17 +333,9 @@ class PoseRecogniser(PortedSystem):
             contours = [view.contour for view in seen]
             return recognise(skeleton, registered, going, contours, threshold)
 
-        def positions(context: Context) -> Array:
-            found = recognition.Eval(context)
-            return np.full(len(registered.q), np.nan) if found is None else found[0]
-
-        def similarity(context: Context) -> list[float]:
-            found = recognition.Eval(context)
-            return [0.0 if found is None else found[1]]
-
-        recognition = self.add_output("recognition", None, see)
-        self.add_output("recognised_positions", len(registered.q), positions)
-        self.add_output("similarity", 1, similarity)
+        recognition, nq = self.add_output("recognition", None, see), len(registered.q)
+        self.add_reading("recognised_positions", nq, recognition, np.nan, lambda one: one[0])
+        self.add_reading("similarity", 1, recognition, 0.0, lambda one: [one[1]])
 
 
 class PaperPoseEstimator(MemorySystem):

@@ -136,6 +136,17 @@ class PortedSystem(LeafSystem):
             prerequisites,
         )
 
+    def add_reading(
+        self, name: str, size: int, source: OutputPort, unknown: float, read: Callable[[Any], Any]
+    ) -> None:
+        """Declare an output ``read`` of the output ``source``, ``unknown`` where it is None."""
+
+        def value(context: Context) -> Any:
+            known = source.Eval(context)
+            return np.full(size, unknown) if known is None else read(known)
+
+        self.add_output(name, size, value)
+
     def add_cache(self, name: str, function: Callable[[Context], Any]) -> CacheEntry:
         """Declare a cache entry ``name``; ``function`` computes it from a context's input ports."""
         return self.DeclareCacheEntry(

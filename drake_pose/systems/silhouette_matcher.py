@@ -151,26 +151,23 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
             for camera in self._cameras
             if camera.name in masks and masks[camera.name].any()
         ]
-        estimate, memory = self._find(context, last.memory, views)
-        if estimate is None or not (estimate.found or self._is_predicted(memory)):
+        estimate, memory, is_shown = self._find(context, last.memory, views)
+        if estimate is None or not is_shown:
             return MatcherState(last.q, last.X_WB, estimate, memory)
         return MatcherState(estimate.q, estimate.X_WB, estimate, memory)
 
-    def _is_predicted(self, memory: Any) -> bool:
-        """Return whether an estimate that was not found is a prediction, given the next memory."""
-        return False
-
     def _find(
         self, context: Context, memory: Any, views: Sequence[View]
-    ) -> tuple[PoseEstimate | None, Any]:
-        """Return the pose that the views show, None if there is no view, and the next memory.
+    ) -> tuple[PoseEstimate | None, Any, bool]:
+        """Return the pose that the views show, None without any; next memory; whether to show it.
 
         ``memory``: ``MatcherState.memory`` of the last update. ``views``: the cameras that see the
         body, with its mask.
         """
         if not views:
-            return None, memory
-        return self._search.match(views, self.eval_input(context, "root_position")), memory
+            return None, memory, False
+        found = self._search.match(views, self.eval_input(context, "root_position"))
+        return found, memory, found.found
 
     def _pose_set_values(self, estimate: PoseEstimate | None) -> dict[str, Array]:
         """Return the outputs from an estimate's pose set, by name of the port; {} without one."""
@@ -313,8 +310,11 @@ class SilhouetteTracker(SilhouetteMatcher):
 
     def _find(
         self, context: Context, memory: _Memory, views: Sequence[View]
-    ) -> tuple[PoseEstimate | None, _Memory]:
-        """Return the tracked or searched pose, None before any evidence, and the next memory."""
+    ) -> tuple[PoseEstimate | None, _Memory, bool]:
+        """Return the tracked or searched pose, None before any evidence; next memory; as above.
+
+        A track predicts a pose that is not found.
+        """
         # Views of the images' writable data, as compiled kernels require.
         pictures = {
             name: image.mutable_data
@@ -323,7 +323,7 @@ class SilhouetteTracker(SilhouetteMatcher):
         }
         last, root_position = memory.tracker_state, self.eval_input(context, "root_position")
         if not views and not pictures and last.track is None:
-            return None, memory
+            return None, memory, False
         require_time_forward(self, context, memory.time)
         ports = ["measured_positions", *(["first_positions"] if last.track is None else [])]
         starts = (self.eval_input(context, port) for port in ports)
@@ -334,11 +334,8 @@ class SilhouetteTracker(SilhouetteMatcher):
         measurement = None if now.track is None else now.track.measurement
         distance = np.nan if measurement is None else measurement.distance
         track = float(result.found and is_tracked), float(now.matches), distance
-        return result, _Memory(now, track, context.get_time())
-
-    def _is_predicted(self, memory: _Memory) -> bool:
-        """Return whether there is a track, which predicts a pose that is not found."""
-        return memory.tracker_state.track is not None
+        is_shown = result.found or now.track is not None
+        return result, _Memory(now, track, context.get_time()), is_shown
 
     def with_intervals(self, context: Context) -> PoseEstimate:
         """Return the last tracked pose with intervals, at the cost of an update."""

@@ -5,7 +5,7 @@ A message names the file, link, joint, camera or frame at fault, what was expect
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 
@@ -78,6 +78,13 @@ class UnknownNameError(DrakePoseError):
         self.known = tuple(known)
         listing = ", ".join(self.known) if self.known else "(none)"
         super().__init__(f"{where} has no {kind} '{name}'; it has: {listing}")
+
+
+def require_known(kind: str, names: Iterable[str], known: Collection[str], where: str) -> None:
+    """Raise UnknownNameError for the first of ``names`` that is not in ``known``."""
+    for name in names:
+        if name not in known:
+            raise UnknownNameError(kind, name, known, where)
 
 
 def require_positive(**values: float | None) -> None:

@@ -10,7 +10,7 @@ from drake_pose.arrays import Array, Indices
 from drake_pose.body.link_graph import PlantKinematics, build_link_graph
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.pose_tree import PoseTree
-from drake_pose.errors import ModelError, SettingsError, UnknownNameError
+from drake_pose.errors import ModelError, SettingsError, require_known
 from drake_pose.input_files import read_yaml, typed_entry
 
 
@@ -130,7 +130,6 @@ def landmarks_of_nodes(tree: PoseTree, landmarks: Mapping[str, Landmark]) -> Nod
 
 def _body(model: ParsedModel, name: str, link: str) -> int:
     """Return the index of ``link`` among the plant's bodies; errors name the landmark ``name``."""
-    if link not in model.link_names:
-        where = f"{landmarks_file(model.path)}: '{name}': {model.path.name}"
-        raise UnknownNameError("link", link, model.link_names, where)
+    where = f"{landmarks_file(model.path)}: '{name}': {model.path.name}"
+    require_known("link", (link,), model.link_names, where)
     return model.link_index(link)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.multibody.parsing import PackageMap
 
-from drake_pose.errors import ModelError, UnknownNameError
+from drake_pose.errors import ModelError, require_known
 
 OLD_XACRO_ELEMENTS = ("macro", "include")
 """Elements directly in <robot> of old xacro files, which have no ``xacro:`` prefix."""
@@ -380,6 +380,5 @@ def bundled_model(name: str) -> Path:
     folder = package_folder()
     known = {path.parent.name: path for path in sorted(folder.glob("*/*.urdf"))}
     named = {key: folder / key / f"{key}.urdf" for key in known}
-    if name not in named:
-        raise UnknownNameError("bundled model", name, sorted(named), "drake_pose")
+    require_known("bundled model", (name,), sorted(named), "drake_pose")
     return named[name] if named[name].is_file() else known[name]

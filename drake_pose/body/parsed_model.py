@@ -21,7 +21,7 @@ from drake_pose.arrays import Array
 from drake_pose.body.meshes import TriangleMesh, is_watertight, make_drawable, read_mesh_file
 from drake_pose.body.parsing import ModelSource
 from drake_pose.body.plant_source import Coupling, PlantSource, read_couplings
-from drake_pose.errors import ModelError, UnknownNameError
+from drake_pose.errors import ModelError, UnknownNameError, require_known
 from drake_pose.input_files import read_yaml, typed_entry
 
 
@@ -89,9 +89,7 @@ def load_skin(model_path: Path, link_names: Sequence[str]) -> tuple[SkinBand, ..
     for entry in entries:
         where = f"{path}: band '{entry.get('parent')}' - '{entry.get('child')}'"
         given = typed_entry(entry, BandEntry, where, ModelError)
-        for link in (given.parent, given.child):
-            if link not in link_names:
-                raise UnknownNameError("link", link, link_names, str(path))
+        require_known("link", (given.parent, given.child), link_names, str(path))
         if given.parent == given.child:
             raise ModelError(f"{where}: parent and child must be two links")
         axis, begin, end, colour = given.axis, given.begin, given.end, given.colour
@@ -185,9 +183,7 @@ def describe_positions(
     names = plant.GetPositionNames(add_model_instance_prefix=False, always_add_suffix=False)
     scoped = plant.GetPositionNames(add_model_instance_prefix=True, always_add_suffix=False)
     names = [a if names.count(a) == 1 else b for a, b in zip(names, scoped, strict=True)]
-    for name in given:
-        if name not in names:
-            raise UnknownNameError("joint", name, names, where)
+    require_known("joint", given, names, where)
     count = plant.num_positions()
     kinds: list[PositionKind] = ["angle"] * count
     lower, upper = np.full(count, -np.inf), np.full(count, np.inf)

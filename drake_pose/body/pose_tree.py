@@ -27,7 +27,7 @@ from drake_pose.body.node_skin import NodeSkin
 from drake_pose.body.parsed_model import ParsedModel, covers_full_turn, one_turn
 from drake_pose.body.plant_source import Coupling
 from drake_pose.body.root import BasePose, RootRotation, even_rotations
-from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.errors import SettingsError, require_known
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,8 +200,7 @@ class PoseTree:
     def node_index(self, name: str) -> int:
         """Return the index of the node of a link; UnknownNameError if there is none."""
         names = [node.name for node in self.nodes]
-        if name not in names:
-            raise UnknownNameError("node", name, names, str(self.model.path))
+        require_known("node", (name,), names, str(self.model.path))
         return names.index(name)
 
     def grid(self, node: int, interval: float, length_interval: float = 0.05) -> Array:

@@ -10,7 +10,7 @@ from drake_pose.arrays import Array, Indices, Picture
 from drake_pose.camera.models import Lens, PinholeCamera
 from drake_pose.camera.picture_files import frame_key
 from drake_pose.camera.servo_readings import Servos
-from drake_pose.errors import SceneError, UnknownNameError
+from drake_pose.errors import SceneError, require_known
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,8 +173,7 @@ class Episode:
 
         Raises UnknownNameError: there is no such camera.
         """
-        if name not in self.cameras:
-            raise UnknownNameError("camera", name, self.cameras, str(self.path))
+        require_known("camera", (name,), self.cameras, str(self.path))
         return self.cameras[name]
 
 

@@ -22,7 +22,7 @@ from drake_pose.camera.servo_readings import (
     servo_columns,
     servo_encoding,
 )
-from drake_pose.errors import CameraError, SceneError, SettingsError, UnknownNameError
+from drake_pose.errors import CameraError, SceneError, SettingsError, require_known
 from drake_pose.input_files import read_yaml
 
 UNITS = {"rad": 1.0, "deg": math.pi / 180.0}
@@ -79,12 +79,9 @@ def map_joints(
     if units not in (None, *get_args(Encoding)):
         raise SettingsError(f"units must be {' or '.join(get_args(Encoding))}, not {units!r}")
     columns = dict(table or {})
-    for joint, column in columns.items():
-        if joint not in names:
-            raise UnknownNameError("joint", joint, names, "the model, which the joint map is for,")
-        if column.name not in log.names:
-            raise UnknownNameError("column", column.name, log.names, "the joint log")
-    used = {column.name for column in columns.values()}
+    require_known("joint", columns, names, "the model, which the joint map is for,")
+    used = {column.name: None for column in columns.values()}
+    require_known("column", used, log.names, "the joint log")
     readings_of = dict(zip(log.names, log.positions.T, strict=True))
     others = {name: column for name, column in readings_of.items() if name not in used}
     matched, warnings = _match(others, [name for name in names if name not in columns])

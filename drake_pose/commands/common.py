@@ -63,9 +63,10 @@ def say(message: str) -> None:
     print("".join(safe), file=sys.stderr, flush=True)
 
 
-def warn(message: str) -> None:
-    """Print a warning to stderr."""
-    say(f"drake-pose: warning: {message}")
+def warn(*messages: str) -> None:
+    """Print warnings to stderr."""
+    for message in messages:
+        say(f"drake-pose: warning: {message}")
 
 
 def print_json(value: Mapping[str, Any]) -> None:
@@ -83,8 +84,7 @@ def print_result(result: Any, json: bool, print_text: Callable[[Any], None]) -> 
         json: whether the summary is printed as JSON.
         print_text: prints the result as text, if ``json`` is False.
     """
-    for text in result.warnings:
-        warn(text)
+    warn(*result.warnings)
     if json:
         print_json(result.summary)
     else:

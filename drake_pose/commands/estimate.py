@@ -282,8 +282,7 @@ def capture(
             studio, out, model, live, method, packages=settings.packages, replay=replay,
             on_report=warn, on_frame=lambda count, _: advance(count),
         )  # fmt: skip
-    for text in unreported:
-        warn(text)
+    warn(*unreported)
     if interrupted:
         say("drake-pose: stopped by Ctrl-C; all frames are kept")
     if json:

@@ -245,8 +245,7 @@ def _show(
         json: whether JSON is printed.
         warnings: messages for the user.
     """
-    for text in warnings:
-        warn(text)
+    warn(*warnings)
     if json:
         print_json(figures)
     else:

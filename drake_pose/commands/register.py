@@ -322,8 +322,7 @@ def check(file: Path, /, *, package: Packages | None = None, json: Json = False)
             closed = "yes" if node["watertight"] else "no"
             table.add_row(*map(escape, texts), str(node["triangles"]), closed)
         output_console().print(table)
-    for text in report.warnings:
-        warn(text)
+    warn(*report.warnings)
     if report.errors:
         raise ModelError("; ".join(report.errors))
     say("drake-pose: the model is fit for use")

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_pose.arrays import Array
 from drake_pose.body import ParsedModel
-from drake_pose.errors import ModelError, SettingsError, UnknownNameError
+from drake_pose.errors import ModelError, SettingsError, UnknownNameError, require_known
 from drake_pose.input_files import read_yaml, typed_entry
 
 
@@ -191,9 +191,8 @@ def row_from_terms(columns: Sequence[str], terms: Mapping[str, float], where: st
     place: a name is not among the columns.
     """
     row = np.zeros(len(columns))
+    require_known("joint", terms, columns, where)
     for name, factor in terms.items():
-        if name not in columns:
-            raise UnknownNameError("joint", name, columns, where)
         row[list(columns).index(name)] += factor
     return row
 

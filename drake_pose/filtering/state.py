@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drake_pose.arrays import Array, Mask
-from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.errors import SettingsError, UnknownNameError, require_known
 
 
 def factor_of(covariance: Array, names: Sequence[str] = (), subject: str = "the belief") -> Array:
@@ -137,9 +137,7 @@ class StateLayout:
         """
         m = len(self.moving)
         U = np.zeros((len(self), len(self)))
-        for name in accelerations:
-            if name not in self.moving:
-                raise UnknownNameError("moving element", name, self.moving, "the state")
+        require_known("moving element", accelerations, self.moving, "the state")
         for i, name in enumerate(self.moving):
             deviation = accelerations.get(name, -1.0)
             if not 0 <= deviation < np.inf:

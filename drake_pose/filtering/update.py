@@ -21,7 +21,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 from scipy.special import chdtri
 
 from drake_pose.arrays import Array, Mask
-from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.errors import SettingsError, require_known
 from drake_pose.filtering.state import (
     Belief,
     Function,
@@ -112,9 +112,7 @@ class FunctionObservation:
                 f"the deviations of {len(self.names)} measurements must be one positive number "
                 f"or as many, not {self.deviations!r}"
             )
-        for name in self.angles:
-            if name not in self.names:
-                raise UnknownNameError("measurement", name, self.names, "the observation")
+        require_known("measurement", self.angles, self.names, "the observation")
 
     @cached_property
     def variances(self) -> Array:

@@ -25,7 +25,7 @@ from drake_pose.errors import (
     OutputError,
     SceneError,
     SettingsError,
-    UnknownNameError,
+    require_known,
 )
 from drake_pose.files.folder import OVERLAY, write_file, write_summary, writes_folder
 from drake_pose.files.settings import MaskSettings
@@ -300,8 +300,7 @@ def _read_given(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
     classes = {name if name in known else numbers.get(name, name) for name in settings.classes}
     if not classes or "all" in classes:
         classes = set(known)
-    for name in classes - set(known):
-        raise UnknownNameError("class", name, known, str(source.path))
+    require_known("class", classes, known, str(source.path))
     for camera, frame, entry in source.annotated_pictures():
         where = f"{entry.source}: picture '{entry.file}'"
         source.check_size(camera, (entry.height, entry.width), where)

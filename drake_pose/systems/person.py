@@ -17,7 +17,7 @@ from pydrake.systems.framework import Context, DiagramBuilder, System
 from drake_pose.arrays import Array
 from drake_pose.body import ArticulatedModel, ModelSource, package_folder
 from drake_pose.camera.models import Camera, camera_tuple
-from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.errors import SettingsError, require_known
 from drake_pose.fit.contour_fit import inlier_ratio_of
 from drake_pose.person.date.walking import (
     WALK,
@@ -424,9 +424,7 @@ class Walker(MemorySystem):
         super().__init__()
         require_period("walker", period)
         parts = ("head", "left_foot", "right_foot")
-        for part in parts:
-            if part not in model.link_names:
-                raise UnknownNameError("link", part, model.link_names, str(model.path))
+        require_known("link", parts, model.link_names, str(model.path))
         self._plant, self._period = model.plant, period
         self._parts = [model.plant.GetBodyByName(part) for part in parts]
         self._plant_context = model.plant.CreateDefaultContext()

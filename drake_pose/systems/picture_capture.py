@@ -16,7 +16,7 @@ from drake_pose.arrays import Mask, Picture
 from drake_pose.camera.models import Camera
 from drake_pose.camera.sources import FrameSource, TimedPicture
 from drake_pose.camera.synchroniser import CameraChange, Synchroniser
-from drake_pose.errors import CameraError, SettingsError, UnknownNameError
+from drake_pose.errors import CameraError, SettingsError, require_known
 from drake_pose.silhouette.pictures.label_renderer import fill_label_image, label_image_to_mask
 from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ
 from drake_pose.silhouette.segmentation import Background, person_region
@@ -82,9 +82,7 @@ class PictureCapture(PortedSystem):
         opening_timeout: float = 8.0,
     ) -> None:
         super().__init__()
-        for name in sources:
-            if name not in cameras:
-                raise UnknownNameError("camera", name, cameras, "the calibration")
+        require_known("camera", sources, cameras, "the calibration")
         self._sources = dict(sources)
         self.live = any(one.specification.live for one in sources.values())
         rates = [rate for one in sources.values() if (rate := one.rate_hz) is not None]

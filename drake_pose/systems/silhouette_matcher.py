@@ -11,7 +11,7 @@ from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
 from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera, camera_tuple
-from drake_pose.errors import SettingsError, UnknownNameError, require_at_least
+from drake_pose.errors import SettingsError, require_at_least, require_known
 from drake_pose.filtering.contour_tracker import MatchAndTrack, TrackerState, TrackingSettings
 from drake_pose.search import TRACKED, PoseEstimate, PoseSearch, View
 from drake_pose.silhouette.pictures.label_renderer import label_image_to_mask
@@ -293,9 +293,7 @@ class SilhouetteTracker(SilhouetteMatcher):
         self.add_input("measured_positions", nq)
         self.add_input("first_positions", nq)
         known = {camera.name: camera for camera in cameras}
-        for name in color_cameras:
-            if name not in known:
-                raise UnknownNameError("camera", name, known, "color_cameras")
+        require_known("camera", color_cameras, known, "color_cameras")
         self._colours = self.add_camera_inputs(
             {
                 one.name: camera_port("color_image", one, cameras)

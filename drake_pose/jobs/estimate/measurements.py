@@ -33,7 +33,7 @@ from drake_pose.camera.models import intrinsics_warnings
 from drake_pose.camera.picture_files import VIDEOS, frame_key
 from drake_pose.camera.servo_readings import Column, Servos, read_motors
 from drake_pose.camera.sources import TIME_STAMPS
-from drake_pose.errors import SceneError, UnknownNameError, require_at_least
+from drake_pose.errors import SceneError, require_at_least, require_known
 from drake_pose.files.records import BASE_COLUMNS, FIT_COLUMNS
 from drake_pose.files.settings import EpisodeSettings
 from drake_pose.input_files import read_csv, read_number
@@ -70,8 +70,7 @@ def read_joint_centres(path: Path, joint: str, frames: Sequence[str]) -> dict[st
     if header != ["frame", "joint", "x", "y", "z"]:
         raise SceneError(f"{path}: the first line must be frame,joint,x,y,z")
     joints = sorted({row[1] for _, row in rows})
-    if joint not in joints:
-        raise UnknownNameError("joint", joint, joints, str(path))
+    require_known("joint", (joint,), joints, str(path))
     known: dict[int | str, np.ndarray] = {}
     for line, row in rows:
         if row[1] == joint:
@@ -104,11 +103,9 @@ def read_measured_positions(path: Path, position_names: Sequence[str]) -> Measur
     last = len(header) - len(FIT_COLUMNS) if is_estimate else len(header)
     with_base = is_estimate and tuple(header[last - len(BASE_COLUMNS) : last]) == BASE_COLUMNS
     end = last - len(BASE_COLUMNS) if with_base else last
+    where = f"{path} has an unknown column; the model"
+    require_known("position", header[1:end], position_names, where)
     for name in header[1:end]:
-        if name not in position_names:
-            raise UnknownNameError(
-                "position", name, position_names, f"{path} has an unknown column; the model"
-            )
         if header.count(name) > 1:
             raise SceneError(f"{path}: has the column '{name}' twice")
     values: dict[int | str, np.ndarray] = {}
@@ -309,9 +306,7 @@ def cameras_of(
     Raises UnknownNameError: a camera does not exist; CameraError: the file cannot be used, or is
     for pictures of another size.
     """
-    for name in settings.cameras:
-        if name not in episode.cameras:
-            raise UnknownNameError("camera", name, episode.cameras, str(episode.path))
+    require_known("camera", settings.cameras, episode.cameras, str(episode.path))
     wanted = settings.cameras or tuple(episode.cameras)
     chosen = [one for one in episode.cameras.values() if one.name in wanted]
     file = camera_path or episode.path / CAMERA_FILE

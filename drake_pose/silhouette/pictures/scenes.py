@@ -25,7 +25,13 @@ from drake_pose.camera.picture_files import (
     picture_size,
     read_picture,
 )
-from drake_pose.errors import SceneError, SettingsError, UnknownNameError, require_at_least
+from drake_pose.errors import (
+    SceneError,
+    SettingsError,
+    UnknownNameError,
+    require_at_least,
+    require_known,
+)
 from drake_pose.silhouette.pictures.masks import read_mask
 
 CAMERA_FILE, SCENE_FILE = "cameras.yaml", "scene.yaml"
@@ -89,9 +95,7 @@ class Scene:
 
         Raises UnknownNameError: there is no such camera.
         """
-        for name in wanted:
-            if name not in self.cameras:
-                raise UnknownNameError("camera", name, self.cameras, str(self.path))
+        require_known("camera", wanted, self.cameras, str(self.path))
         used = set(wanted) or {name for name, _ in (*self.masks, *self.images)}
         return replace(
             self,

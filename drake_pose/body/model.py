@@ -103,11 +103,9 @@ class ArticulatedModel(ParsedModel):
         of other model instances and the geometry of the world body are not part of the model: they
         occlude nothing, and their positions keep their defaults.
 
-        Args:
-            plant: a finalized plant that is registered with ``scene_graph``; do not change it
-                later.
-            scene_graph: the SceneGraph that holds the plant's geometry.
-            model_instances: the instances whose bodies are drawn; None: all.
+        ``plant``: a finalized plant that is registered with ``scene_graph``; do not change it
+        later. ``scene_graph``: the SceneGraph that holds the plant's geometry. ``model_instances``:
+        the instances whose bodies are drawn; None: all.
 
         Raises ModelError: the plant is not finalized or not registered, no chosen body has visual
         geometry, or its joints or geometry cannot be used.
@@ -249,14 +247,11 @@ class ArticulatedModel(ParsedModel):
         The model serves a camera that is mounted on ``link``: the world and the link become tiny
         triangles, and links without a joint keep their pose at the default positions.
 
-        Args:
-            link: the link that carries the camera.
-            mesh: the target's surface in its own frame O.
-            X_WO: (4, 4) pose of the target in the world when all TARGET_POSITIONS are zero.
+        ``link``: the link that carries the camera. ``mesh``: the target's surface in its own frame
+        O. ``X_WO``: (4, 4) pose of the target in the world when all TARGET_POSITIONS are zero.
 
-        Raises:
-            UnknownNameError: the link does not exist.
-            ModelError: Drake refuses the model in the new plant.
+        Raises UnknownNameError: the link does not exist; ModelError: Drake refuses the model in the
+        new plant.
         """
         self.link_index(link)
         plant, scene_graph = MultibodyPlant(time_step=0.0), SceneGraph()

@@ -198,12 +198,10 @@ def _is_symmetric(
     The largest distance from the axis is compared between sectors, at each of several levels along
     the axis.
 
-    Args:
-        mesh: the surface.
-        X_turn: (4, 4) a quarter turn about the axis, in the mesh's frame.
-        levels: number of levels along the axis.
-        sectors: number of sectors about the axis; with seven sectors no square passes for round.
-        tolerance: largest difference between sectors, as a fraction of the largest distance.
+    ``mesh``: the surface. ``X_turn``: (4, 4) a quarter turn about the axis, in the mesh's frame.
+    ``levels``: number of levels along the axis. ``sectors``: number of sectors about the axis; with
+    seven sectors no square passes for round. ``tolerance``: largest difference between sectors, as
+    a fraction of the largest distance.
     """
     axis = np.array([X_turn[2, 1], X_turn[0, 2], X_turn[1, 0]])
     axis -= (X_turn[1, 2], X_turn[2, 0], X_turn[0, 1])

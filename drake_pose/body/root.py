@@ -62,9 +62,8 @@ class RootRotation:
     ) -> "RootRotation":
         """Return a free rotation, which a search samples evenly over SO(3).
 
-        Args:
-            interval_deg: sampling interval [deg]; None: the search's own interval.
-            rotation: R_W0 (3, 3), which is one of the samples; None: the identity.
+        ``interval_deg``: sampling interval [deg]; None: the search's own interval. ``rotation``:
+        R_W0 (3, 3), which is one of the samples; None: the identity.
 
         Raises SettingsError: ``rotation`` is no rotation matrix, or the interval is not positive.
         """
@@ -79,11 +78,10 @@ class RootRotation:
     ) -> "RootRotation":
         """Return rotations about one to three different axes, each within limits.
 
-        Args:
-            ranges_deg: (axis letter, lower, upper) [deg] in order of rotation, for example
-                ``[("y", -180, 180), ("z", -10, 10)]``. Each axis is rotated by the preceding ones.
-            rotation: R_W0 (3, 3); None: the identity.
-            interval_deg: sampling interval [deg]; None: the search's own interval.
+        ``ranges_deg``: (axis letter, lower, upper) [deg] in order of rotation, for example ``[("y",
+        -180, 180), ("z", -10, 10)]``. Each axis is rotated by the preceding ones. ``rotation``:
+        R_W0 (3, 3); None: the identity. ``interval_deg``: sampling interval [deg]; None: the
+        search's own interval.
 
         Raises SettingsError: axes are repeated or unknown, limits are crossed, or ``rotation`` is
         no rotation matrix.

@@ -373,13 +373,10 @@ def _rerooted(
 ) -> PoseTree:
     """Return the tree that starts at a link with its own pose in the world.
 
-    Args:
-        start: index of the root's group in ``graph``.
-        is_own: whether the root is the plant's own root.
-        position: (3,) the root's origin in the world [m]; None: its default position, which only
-            the plant's own root has.
-        rotation: the root's rotation in the world.
-        held: values of held positions [rad or m], by index in q.
+    ``start``: index of the root's group in ``graph``. ``is_own``: whether the root is the plant's
+    own root. ``position``: (3,) the root's origin in the world [m]; None: its default position,
+    which only the plant's own root has. ``rotation``: the root's rotation in the world. ``held``:
+    values of held positions [rad or m], by index in q.
 
     Raises SettingsError: a position is missing, or a held position follows from the root's pose.
     """
@@ -434,12 +431,10 @@ def _assemble(
 ) -> PoseTree:
     """Return the pose tree with one node for each branch, in their order.
 
-    Args:
-        branches: branches of ``graph``, parents before children.
-        roots: pose and rotation of the branches without parents.
-        base: how the plant takes up the pose of the tree's root.
-        held: values of held positions [rad or m], by index in q.
-        root: name of the root node, for ``PoseTree.root``.
+    ``branches``: branches of ``graph``, parents before children. ``roots``: pose and rotation of
+    the branches without parents. ``base``: how the plant takes up the pose of the tree's root.
+    ``held``: values of held positions [rad or m], by index in q. ``root``: name of the root node,
+    for ``PoseTree.root``.
 
     Raises ModelError: a searched length has no limits, or the links of a skin band are no
     neighbours.

@@ -338,13 +338,9 @@ def _read_camera(
 
     It has no ``camera`` if the bag has no calibration for images of its size.
 
-    Args:
-        path: the bag.
-        topic: topic of the images.
-        rows: rows of the images.
-        shift: of their stamps, see `_clock_shifts`.
-        infos: CameraInfo messages by topic.
-        warnings: list to which warnings are appended.
+    ``path``: the bag. ``topic``: topic of the images. ``rows``: rows of the images. ``shift``: of
+    their stamps, see `_clock_shifts`. ``infos``: CameraInfo messages by topic. ``warnings``: list
+    to which warnings are appended.
 
     Raises SceneError: the first image is damaged, times run backwards, or the lens is unknown.
     """

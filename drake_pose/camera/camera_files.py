@@ -56,13 +56,11 @@ def load_cameras(
     name), a mapping of CameraConfigs, or a single one; their principal points are converted. Files
     of ROS, Kalibr, OpenCV, anipose, Pose2Sim and Caliscope are recognised likewise.
 
-    Args:
-        known, recording: as in ``load_camera_file``.
-        warnings: list to which warnings are appended; None: they are dropped.
+    ``known``, ``recording``: as in ``load_camera_file``. ``warnings``: list to which warnings are
+    appended; None: they are dropped.
 
-    Raises:
-        CameraError: names the file, the camera and the field at fault. Cameras without a pose, on
-            moving links, or with distortion are refused.
+    Raises CameraError: names the file, the camera and the field at fault. Cameras without a pose,
+    on moving links, or with distortion are refused.
     """
     found = load_camera_file(path, known=known, recording=recording)
     if warnings is not None:

@@ -449,12 +449,10 @@ def _zed_cameras(
 ) -> list[EpisodeCamera]:
     """Return the camera of a video, or both cameras of a side-by-side stereo video.
 
-    Args:
-        file: the open trajectory (h5py.File).
-        path: the video, `<serial>.mp4` or `<serial>-stereo.mp4`.
-        warnings: list to which warnings are appended.
-        stereo: minimum ratio of width to height of a stereo video.
-        calibrated: width and height of the images to which the intrinsics apply: HD720 [pixel].
+    ``file``: the open trajectory (h5py.File). ``path``: the video, `<serial>.mp4` or
+    `<serial>-stereo.mp4`. ``warnings``: list to which warnings are appended. ``stereo``: minimum
+    ratio of width to height of a stereo video. ``calibrated``: width and height of the images to
+    which the intrinsics apply: HD720 [pixel].
     """
     video, serial = TimedVideo(path), path.stem.removesuffix("-stereo")
     times = _picture_times(file, path, serial, len(video.times), warnings)
@@ -552,12 +550,9 @@ def _picture_times(file: Any, path: Path, serial: str, count: int, warnings: lis
     exists, or else those of the trajectory's rows: of capture, reception or reading, by the first
     that there is.
 
-    Args:
-        file: the open trajectory (h5py.File).
-        path: the video.
-        serial: serial number of the camera.
-        count: number of images of the video.
-        warnings: list to which warnings are appended.
+    ``file``: the open trajectory (h5py.File). ``path``: the video. ``serial``: serial number of the
+    camera. ``count``: number of images of the video. ``warnings``: list to which warnings are
+    appended.
     """
     stamps = "observation/timestamp/cameras"
     kinds = ("estimated_capture", "frame_received", "read_end")

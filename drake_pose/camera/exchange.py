@@ -41,16 +41,13 @@ def camera_to_drake(
     Drake has pinhole cameras only, so a parallel camera becomes a telephoto camera 30 km behind the
     middle of the depth range.
 
-    Args:
-        camera: the camera.
-        renderer_name: name of the renderer in the SceneGraph.
-        depth_range: minimum and maximum visible depth [m]; None: `near` to 1 km. For a parallel
-            camera: depths of the body in the camera's frame, possibly negative and as tight as
-            possible, because of the depth buffer's resolution; None: -2 to 2 m.
+    ``camera``: the camera. ``renderer_name``: name of the renderer in the SceneGraph.
+    ``depth_range``: minimum and maximum visible depth [m]; None: `near` to 1 km. For a parallel
+    camera: depths of the body in the camera's frame, possibly negative and as tight as possible,
+    because of the depth buffer's resolution; None: -2 to 2 m.
 
-    Raises:
-        CameraError: the principal point of a pinhole lies outside the image (Drake refuses it), or
-            the depth range is not finite, positive and increasing.
+    Raises CameraError: the principal point of a pinhole lies outside the image (Drake refuses it),
+    or the depth range is not finite, positive and increasing.
     """
     X_CT = RigidTransform()
     if isinstance(camera, PinholeCamera):

@@ -283,15 +283,10 @@ def _without_openings(
     - its name is not a gripper's, and readings are in 0 ... 1 or beyond the joint's limits; or
     - its name is a gripper's, and readings are in 0 ... 1 and beyond the limits.
 
-    Args:
-        matched: joint by column.
-        readings: (n,) readings by column.
-        limits: lower and upper limit by joint [rad or m].
-        unit: unit of the readings [rad].
-        slack: tolerance of the limits, the smaller of this [rad or m] and this fraction of their
-            range.
-        is_mapped: whether a joint map has other joints; then any gripper's column beyond the limits
-            is left out.
+    ``matched``: joint by column. ``readings``: (n,) readings by column. ``limits``: lower and upper
+    limit by joint [rad or m]. ``unit``: unit of the readings [rad]. ``slack``: tolerance of the
+    limits, the smaller of this [rad or m] and this fraction of their range. ``is_mapped``: whether
+    a joint map has other joints; then any gripper's column beyond the limits is left out.
 
     Returns the joint of each column that is kept, and warnings about the other columns.
     """
@@ -402,17 +397,14 @@ def _find_unit(
     Readings within the limits as radians are radians. Otherwise they are degrees if they are within
     the limits as degrees, and as radians exceed them by more than a full turn.
 
-    Args:
-        readings: readings (rows,) of the n columns of revolute joints, by name.
-        others: (k, rows) readings of all columns whose units are unknown, including these.
-        lower, upper: (n,) limits of each column's joint [rad].
-        slack: tolerance of the limits [rad].
-        full_turn: maximum excess over the limits of readings in radians [rad]. A joint without
-            limits is assumed to stay within plus and minus twice this.
-        normalised: if the largest magnitude of ``others`` is in this range, or a column's name
-            ends in ".pos", LeRobot may have normalised the readings to -100 ... 100.
-        moves: range of a column's readings above which readings that may be radians are radians:
-            as degrees the robot would stand still.
+    ``readings``: readings (rows,) of the n columns of revolute joints, by name. ``others``: (k,
+    rows) readings of all columns whose units are unknown, including these. ``lower``, ``upper``:
+    (n,) limits of each column's joint [rad]. ``slack``: tolerance of the limits [rad].
+    ``full_turn``: maximum excess over the limits of readings in radians [rad]. A joint without
+    limits is assumed to stay within plus and minus twice this. ``normalised``: if the largest
+    magnitude of ``others`` is in this range, or a column's name ends in ".pos", LeRobot may have
+    normalised the readings to -100 ... 100. ``moves``: range of a column's readings above which
+    readings that may be radians are radians: as degrees the robot would stand still.
 
     Raises SceneError: the readings fit neither radians nor degrees, or seem to be normalised.
     """
@@ -467,13 +459,10 @@ def _positions(
 
     Anomalies are the ends of warnings. Positions of a revolute joint without limits are unwrapped.
 
-    Args:
-        column: the column's linear map and range.
-        readings: (rows,) readings [unit of the log].
-        limits: lower and upper limit of the joint [rad or m]; infinite: none.
-        is_angle: whether the joint is revolute.
-        slack: tolerance of the limits [rad; for lengths the range of the limits].
-        at_end: maximum distance of a clipped reading from an end of its range [the range].
+    ``column``: the column's linear map and range. ``readings``: (rows,) readings [unit of the log].
+    ``limits``: lower and upper limit of the joint [rad or m]; infinite: none. ``is_angle``: whether
+    the joint is revolute. ``slack``: tolerance of the limits [rad; for lengths the range of the
+    limits]. ``at_end``: maximum distance of a clipped reading from an end of its range [the range].
     """
     positions, anomalies = column.scale * readings + column.offset, list[str]()
     clipped = np.zeros(len(readings), dtype=np.bool_)

@@ -344,12 +344,9 @@ def look_at(
 ) -> Array:
     """Return the pose X_WC (4, 4) of a camera at `eye` (3,) that looks at `target` (3,) [m].
 
-    Args:
-        eye, target: (3,) points [m].
-        up: (3,) direction that is up in the image.
+    ``eye``, ``target``: (3,) points [m]. ``up``: (3,) direction that is up in the image.
 
-    Raises:
-        CameraError: both points coincide, or the camera looks along `up`.
+    Raises CameraError: both points coincide, or the camera looks along `up`.
     """
     forward = np.asarray(target, dtype=np.float64) - np.asarray(eye, dtype=np.float64)
     right = np.cross(forward, np.asarray(up, dtype=np.float64))

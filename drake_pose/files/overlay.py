@@ -38,11 +38,9 @@ def paint_agreement(
 
     Both is AGREEMENT_RGB, mask only MISSING_RGB, body only EXCESS_RGB, neither BACKGROUND_RGB.
 
-    Args:
-        mask: (H, W) bool silhouette.
-        body: (H, W) bool, the estimated body.
-        segments: (H, W) int, index of the body's segment at each pixel, whose borders are drawn in
-            OUTLINE_RGB; None: no borders.
+    ``mask``: (H, W) bool silhouette. ``body``: (H, W) bool, the estimated body. ``segments``: (H,
+    W) int, index of the body's segment at each pixel, whose borders are drawn in OUTLINE_RGB; None:
+    no borders.
     """
     return PALETTE[_number_agreement(mask, body, segments)]
 
@@ -190,12 +188,10 @@ def _framed(
 ) -> np.ndarray:
     """Return a picture with a band for the title above it, and one for the legend below it.
 
-    Args:
-        picture: (H, W, 3) uint8 RGB, or (H, W) uint8 indices into PALETTE; so is the result.
-        title: text above the picture.
-        legend: colour (RGB or index, as in the picture) and text of each entry; empty: no band.
-        least_width: width to which a narrower picture is padded on both sides [pixel].
-        band: height of a band [pixel].
+    ``picture``: (H, W, 3) uint8 RGB, or (H, W) uint8 indices into PALETTE; so is the result.
+    ``title``: text above the picture. ``legend``: colour (RGB or index, as in the picture) and text
+    of each entry; empty: no band. ``least_width``: width to which a narrower picture is padded on
+    both sides [pixel]. ``band``: height of a band [pixel].
     """
     numbered = picture.ndim == 2
     ground, text_colour = (_BACKGROUND, _TEXT) if numbered else (BACKGROUND_RGB, _TEXT_RGB)

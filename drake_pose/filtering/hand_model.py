@@ -307,14 +307,10 @@ def _palm_rings(
 ) -> Array:
     """Return a palm's outlines (2, count, 3) [m] at wrist and knuckles, in the palm's frame.
 
-    Args:
-        model: the hand.
-        palm: name of the palm's link.
-        height: height of the palm [m].
-        count: number of points of an outline.
-        wrist: the wrist's outline is that of the vertices up to this height.
-        knuckles: the other outline is that of the vertices between the first two heights, placed at
-            the third. All heights are fractions of ``height``.
+    ``model``: the hand. ``palm``: name of the palm's link. ``height``: height of the palm [m].
+    ``count``: number of points of an outline. ``wrist``: the wrist's outline is that of the
+    vertices up to this height. ``knuckles``: the other outline is that of the vertices between the
+    first two heights, placed at the third. All heights are fractions of ``height``.
     """
     low = float(model.link_meshes[palm].vertices[:, 1].min())
     angles = 2.0 * np.pi * np.arange(count) / count

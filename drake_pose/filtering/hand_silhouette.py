@@ -217,12 +217,9 @@ def _solve(
 ) -> tuple[Array, Array, Array]:
     """Fit each feature's two unknowns by iteratively reweighted least squares.
 
-    Args:
-        f, side: (n,) feature and side of each point, see ``_match``.
-        g, e: (n, 2) slope and (n,) offset of each point, see ``_match``.
-        weight: (n,) weight of each point.
-        count: number F of features.
-        gate: initial scale of the Geman-McClure weight [pixel].
+    ``f``, ``side``: (n,) feature and side of each point, see ``_match``. ``g``, ``e``: (n, 2) slope
+    and (n,) offset of each point, see ``_match``. ``weight``: (n,) weight of each point. ``count``:
+    number F of features. ``gate``: initial scale of the Geman-McClure weight [pixel].
 
     Returns the unknowns (F, 2), their covariances (F, 2, 2), and the weights (F, 2) of both sides.
     """
@@ -392,13 +389,10 @@ class HandSilhouette:
 
         The measurements of each gate but the last correct x; those of the last are returned.
 
-        Args:
-            mask: (H, W) the silhouette.
-            edge: its edge points.
-            prediction: belief of the state before the measurement.
-            gates: largest distance between edge points and the rough body, by iteration [pixel at
-                ``reference_radius``].
-            scale: known image scale; None: unknown.
+        ``mask``: (H, W) the silhouette. ``edge``: its edge points. ``prediction``: belief of the
+        state before the measurement. ``gates``: largest distance between edge points and the rough
+        body, by iteration [pixel at ``reference_radius``]. ``scale``: known image scale; None:
+        unknown.
         """
         observation, names = self._observation, self._observation.names
         at, prior = names.index("scale"), self._hand.prior

@@ -142,14 +142,11 @@ def from_bounds(
 ) -> Inequalities:
     """Return lower <= x <= upper for each named element; infinite bounds are left out.
 
-    Args:
-        names: (k) elements with bounds.
-        lower, upper: (k,) bounds.
-        columns: elements of the state; ``names`` if not given.
+    ``names``: (k) elements with bounds. ``lower``, ``upper``: (k,) bounds. ``columns``: elements of
+    the state; ``names`` if not given.
 
-    Raises:
-        SettingsError: a lower bound exceeds its upper bound.
-        UnknownNameError: a name is not among the columns.
+    Raises SettingsError: a lower bound exceeds its upper bound; UnknownNameError: a name is not
+    among the columns.
     """
     low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     unit = np.eye(len(names))

@@ -70,12 +70,10 @@ def covariance_from(factor: Array) -> Array:
 class StateLayout:
     """The elements of a state: moving ones, their rates, and constants.
 
-    Args:
-        moving: (m) names of the elements that have a rate.
-        constant: (k) names of the elements that do not change, for example lengths.
+    ``moving``: (m) names of the elements that have a rate. ``constant``: (k) names of the elements
+    that do not change, for example lengths.
 
-    Raises:
-        SettingsError: a name occurs twice.
+    Raises SettingsError: a name occurs twice.
     """
 
     moving: tuple[str, ...]
@@ -112,9 +110,8 @@ class StateLayout:
     def transition(self, decay: float = 1.0) -> Array:
         """Return A (n, n) of (8): a constant-velocity step with rates per step.
 
-        Args:
-            decay: factor on the rates in a step; 1 in (8). ``constant_velocity`` has rates per
-                second.
+        ``decay``: factor on the rates in a step; 1 in (8). ``constant_velocity`` has rates per
+        second.
         """
         m = len(self.moving)
         A = np.eye(len(self))
@@ -127,13 +124,11 @@ class StateLayout:
 
         Constants have no noise.
 
-        Args:
-            accelerations: by moving element, the standard deviation of its acceleration
-                [unit/step^2].
+        ``accelerations``: by moving element, the standard deviation of its acceleration
+        [unit/step^2].
 
-        Raises:
-            UnknownNameError: a name is not a moving element.
-            SettingsError: a moving element's standard deviation is missing, negative or not finite.
+        Raises UnknownNameError: a name is not a moving element; SettingsError: a moving element's
+        standard deviation is missing, negative or not finite.
         """
         m = len(self.moving)
         U = np.zeros((len(self), len(self)))

@@ -343,10 +343,8 @@ class TruncatedFilter:
     ) -> Array:
         """Return a rough state (n,): the truncated mean of ``prediction`` after a measurement.
 
-        Args:
-            prediction: the belief before the measurement.
-            y, variances: as in ``update``.
-            start: (n,) where to linearise first.
+        ``prediction``: the belief before the measurement. ``y``, ``variances``: as in ``update``.
+        ``start``: (n,) where to linearise first.
         """
         measurement = make_measurement(self.observation, y, variances)
         few = min(self.settings.iterations, self.settings.rough_iterations)

@@ -137,13 +137,9 @@ def _scene_job(
 ) -> SceneJob:
     """Return the job of a scene from its entry, the defaults included.
 
-    Args:
-        name: name of the scene.
-        values: the entry, whose keys are known; None means that the key is not given.
-        own: keys that are fields of SceneJob.
-        chunk: number of frames in a chunk.
-        where: file and scene, for messages.
-        base: folder of relative paths.
+    ``name``: name of the scene. ``values``: the entry, whose keys are known; None means that the
+    key is not given. ``own``: keys that are fields of SceneJob. ``chunk``: number of frames in a
+    chunk. ``where``: file and scene, for messages. ``base``: folder of relative paths.
 
     Raises SettingsError: a key is missing or belongs to the other job, or a value cannot be used.
     """

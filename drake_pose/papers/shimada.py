@@ -243,16 +243,11 @@ def _figures(tracks: Sequence[HandTrack]) -> dict[str, float | int]:
     lengths = PIXELS_PER_METRE * np.mean(np.abs(errors[:, lengths_of]), axis=1)
     angles = angle_error(means, truths)
     watched = np.concatenate([lengths_of, angles_of])
-    nees = np.array(
-        [
-            off
-            @ np.linalg.pinv(
-                track.states[-1].best.covariance[np.ix_(lengths_of, lengths_of)], hermitian=True
-            )
-            @ off
-            for track, off in zip(tracks, errors[:, lengths_of], strict=True)
-        ]
-    )
+    own_lengths = np.ix_(lengths_of, lengths_of)
+    nees = np.array([
+        off @ np.linalg.pinv(track.states[-1].best.covariance[own_lengths], hermitian=True) @ off
+        for track, off in zip(tracks, errors[:, lengths_of], strict=True)
+    ])  # fmt: skip
     low, high = chdtri(len(LENGTHS), [0.975, 0.025])
     lost = ~((lengths < 5.0) & (angles[:, -1] < LOST_ANGLE_ERROR))
     milliseconds = np.array([track.milliseconds for track in tracks])

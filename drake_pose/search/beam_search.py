@@ -383,15 +383,11 @@ class _BeamRun:
     ) -> tuple[PartialPoses | None, bool]:
         """Place nodes one after another.
 
-        Args:
-            store: the poses of nodes.
-            partial: the partial poses that are extended.
-            order: the nodes, in the order in which they are placed.
-            width: beam width: greatest number of partial poses kept after each node.
-            outside_weight: cost of a pixel outside, relative to the gain of a newly covered one.
-            limit: greatest objective of completions, beyond which partial poses are dropped
-                [pixel].
-            limited: whether the time limit ends the search.
+        ``store``: the poses of nodes. ``partial``: the partial poses that are extended. ``order``:
+        the nodes, in the order in which they are placed. ``width``: beam width: greatest number of
+        partial poses kept after each node. ``outside_weight``: cost of a pixel outside, relative to
+        the gain of a newly covered one. ``limit``: greatest objective of completions, beyond which
+        partial poses are dropped [pixel]. ``limited``: whether the time limit ends the search.
 
         Returns the partial poses with all nodes placed (None: none was left, or the time is up),
         and whether certainly no partial pose within the limit was dropped.

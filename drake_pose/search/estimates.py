@@ -27,13 +27,10 @@ TRACKED = "tracked"
 class View:
     """A calibrated camera and the body's silhouette in its image.
 
-    Args:
-        camera: the camera.
-        mask: (height, width) the silhouette S. An array of numbers with at most two values is
-            converted to bool, true where it has the larger value.
+    ``camera``: the camera. ``mask``: (height, width) the silhouette S. An array of numbers with at
+    most two values is converted to bool, true where it has the larger value.
 
-    Raises:
-        MaskError: if the mask has not the camera's size, has more than two values, or is empty.
+    Raises MaskError: if the mask has not the camera's size, has more than two values, or is empty.
     """
 
     camera: Camera

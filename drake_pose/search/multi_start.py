@@ -90,12 +90,10 @@ class MultiStartSettings:
 class MultiStartSearch:
     """Estimates poses with continuous values by a multi-start search.
 
-    Args:
-        tree: the pose tree whose values are searched.
-        time_limit: greatest time of a match [s]; None: no limit.
-        exact_masks: whether masks are known to be exact, like Drake's label images. If not, this is
-            decided by a fitted pose; if that pose is wrong, exact masks may be taken for damaged
-            ones.
+    ``tree``: the pose tree whose values are searched. ``time_limit``: greatest time of a match [s];
+    None: no limit. ``exact_masks``: whether masks are known to be exact, like Drake's label images.
+    If not, this is decided by a fitted pose; if that pose is wrong, exact masks may be taken for
+    damaged ones.
     """
 
     def __init__(
@@ -142,15 +140,12 @@ class MultiStartSearch:
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
         """Estimate the pose that the views show.
 
-        Args:
-            views: the silhouettes, one per camera.
-            root_position: (3,) the root's position in the world [m]; None: that of the tree.
+        ``views``: the silhouettes, one per camera. ``root_position``: (3,) the root's position in
+        the world [m]; None: that of the tree.
 
-        Returns:
-            The best pose found; ``stopped_by`` is "end" or "time_limit".
+        Returns the best pose found; ``stopped_by`` is "end" or "time_limit".
 
-        Raises:
-            SettingsError: if there is no view.
+        Raises SettingsError: if there is no view.
         """
         require_views(views)
         if self._time_limit is not None:
@@ -206,14 +201,10 @@ class MultiStartSearch:
 class _MultiStartRun:
     """One match.
 
-    Args:
-        search: the search, with its settings.
-        body: the sampled body with its root in place.
-        fit: the robust fit to the clean views.
-        clean: the views without specks.
-        views: the views as they were given; J is computed from these.
-        root_position: (3,) the root's position [m]; None: that of the tree.
-        deadline: time.perf_counter() at which the search ends [s].
+    ``search``: the search, with its settings. ``body``: the sampled body with its root in place.
+    ``fit``: the robust fit to the clean views. ``clean``: the views without specks. ``views``: the
+    views as they were given; J is computed from these. ``root_position``: (3,) the root's position
+    [m]; None: that of the tree. ``deadline``: time.perf_counter() at which the search ends [s].
     """
 
     def __init__(

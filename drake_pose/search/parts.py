@@ -379,14 +379,11 @@ class PartSearch:
 
         They are found by Gauss-Newton steps.
 
-        Args:
-            parameters: (m + 4,) the start, as in ``RefinementBody``.
-            nodes: (n,) the node of each point.
-            p_N: (n, 3) the points in the nodes' frames [m].
-            wanted: (n, 3) wanted positions in the world [m].
-            columns: indices of the parameters that change. A step in which all change by less than
-                0.002 [rad or m] is the last.
-            how: number of steps, longest step [rad or m] and damping [m^2].
+        ``parameters``: (m + 4,) the start, as in ``RefinementBody``. ``nodes``: (n,) the node of
+        each point. ``p_N``: (n, 3) the points in the nodes' frames [m]. ``wanted``: (n, 3) wanted
+        positions in the world [m]. ``columns``: indices of the parameters that change. A step in
+        which all change by less than 0.002 [rad or m] is the last. ``how``: number of steps,
+        longest step [rad or m] and damping [m^2].
         """
         lower, upper = self.body.lower[columns], self.body.upper[columns]
         (steps, longest, damping), moved = how, parameters.copy()

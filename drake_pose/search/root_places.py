@@ -163,12 +163,9 @@ def _pixel_sizes(
     They are a geometric sequence. Its range follows from the silhouette's area and the areas of
     parallel projections of random poses of the grid along the camera's axis.
 
-    Args:
-        body: the sampled body.
-        view: the silhouette.
-        poses: number of random poses.
-        side: side of the image in which they are drawn [pixel].
-        rare: fraction of the smallest, and of the largest, areas that are disregarded.
+    ``body``: the sampled body. ``view``: the silhouette. ``poses``: number of random poses.
+    ``side``: side of the image in which they are drawn [pixel]. ``rare``: fraction of the smallest,
+    and of the largest, areas that are disregarded.
     """
     generator, sampled, settings = np.random.default_rng(1), body.sampled, RootPlacementSettings()
     samples = np.column_stack([generator.integers(len(X_PN), size=poses) for X_PN in sampled.X_PN])

@@ -96,13 +96,11 @@ def _single_flips(
 ) -> list[Flip]:
     """Return poses with one more triple of joints flipped, regardless of limits.
 
-    Args:
-        kinematics: kinematics of the pose tree, with m values.
-        start: the pose, with what was changed by earlier flips.
-        triples: (n, 3) indices of the values (angles) of three joints of a chain, the first first.
-        stays: greatest motion of the last link, as a fraction of the body's size, or in the entries
-            of its rotation matrix.
-        nearly: greatest error of the cosines by which triples are preselected.
+    ``kinematics``: kinematics of the pose tree, with m values. ``start``: the pose, with what was
+    changed by earlier flips. ``triples``: (n, 3) indices of the values (angles) of three joints of
+    a chain, the first first. ``stays``: greatest motion of the last link, as a fraction of the
+    body's size, or in the entries of its rotation matrix. ``nearly``: greatest error of the cosines
+    by which triples are preselected.
     """
     motions = kinematics.motions(start.values)
     size = float(np.ptp(motions.X_WN[:, :3, 3], axis=0).max()) + 1e-9

@@ -220,8 +220,7 @@ class RobotStateMessage(PortedSystem):
     Output ports:
         lcmt_robot_state: joint names and positions as 32-bit floats, and the context's time [us].
 
-    Args:
-        names: (nq) name of each position, ``model.position_names``.
+    ``names``: (nq) name of each position, ``model.position_names``.
     """
 
     def __init__(self, names: Sequence[str]) -> None:

@@ -86,14 +86,12 @@ class CameraRegistration(BeliefSystem[OnlineState]):
             frames; number of times that the camera was found elsewhere; mean intersection over
             union of body and mask over the kept frames, NaN before the camera is found.
 
-    Args:
-        registration: the method, with the body, and the camera with its intrinsics.
-        period: time between two updates [s].
-        max_coverage: largest fraction of the image that the body may cover.
+    ``registration``: the method, with the body, and the camera with its intrinsics. ``period``:
+    time between two updates [s]. ``max_coverage``: largest fraction of the image that the body may
+    cover.
 
-    Raises:
-        SettingsError: the period is not positive.
-        MaskError: in a simulation, if the body's labels cover more of the image.
+    Raises SettingsError: the period is not positive; MaskError: in a simulation, if the body's
+    labels cover more of the image.
     """
 
     def __init__(
@@ -342,12 +340,9 @@ def _matcher(
 
     The tracker's search has no time limit, so that results are repeatable.
 
-    Args:
-        search: finds poses without a prediction.
-        cameras: the cameras of the masks.
-        period: time between two updates [s].
-        tracking: the tracker's settings.
-        color_cameras: names of the cameras whose pictures the tracker uses.
+    ``search``: finds poses without a prediction. ``cameras``: the cameras of the masks. ``period``:
+    time between two updates [s]. ``tracking``: the tracker's settings. ``color_cameras``: names of
+    the cameras whose pictures the tracker uses.
     """
     if tracking is None:
         return SilhouetteMatcher(search, cameras, period)

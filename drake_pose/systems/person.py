@@ -409,15 +409,11 @@ class Walker(MemorySystem):
         command (2): turn (1 left, -1 right) and walk (1 ahead, -1 behind).
         rest (5): the rest stance; NaN before it is known.
 
-    Args:
-        model: the person, with the links head, left_foot and right_foot.
-        period: time between two updates [s].
-        on_spot: whether standing ahead or behind is a command only while the person also walks on
-            the spot, as in the paper.
+    ``model``: the person, with the links head, left_foot and right_foot. ``period``: time between
+    two updates [s]. ``on_spot``: whether standing ahead or behind is a command only while the
+    person also walks on the spot, as in the paper.
 
-    Raises:
-        SettingsError: the period is not positive.
-        UnknownNameError: a link is missing.
+    Raises SettingsError: the period is not positive; UnknownNameError: a link is missing.
     """
 
     def __init__(self, model: ArticulatedModel, period: float, on_spot: bool = False) -> None:

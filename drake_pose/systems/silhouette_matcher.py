@@ -252,17 +252,15 @@ class SilhouetteTracker(SilhouetteMatcher):
             searches. ``distance`` is the robust root mean square distance of the body's contour
             from the edges [pixel].
 
-    Args:
-        tracking: settings of the tracker; None: TrackingSettings(). They are abstract parameter 1
-            of the context, where all but ``root_moves`` and ``scale_unknown`` can be changed.
-        color_cameras: names of the cameras that have a port for a colour image.
-        search_time: time limit of a ``MultiStartSearch`` [s]; a search that reaches it is repeated
-            in the next updates. None: no limit.
+    ``tracking``: settings of the tracker; None: TrackingSettings(). They are abstract parameter 1
+    of the context, where all but ``root_moves`` and ``scale_unknown`` can be changed.
+    ``color_cameras``: names of the cameras that have a port for a colour image. ``search_time``:
+    time limit of a ``MultiStartSearch`` [s]; a search that reaches it is repeated in the next
+    updates. None: no limit.
 
-    Raises:
-        SettingsError: as for ``SilhouetteMatcher``. In a simulation: time runs backwards, or the
-            context's settings have another state.
-        UnknownNameError: a name in ``color_cameras`` is no camera's.
+    Raises SettingsError: as for ``SilhouetteMatcher``. In a simulation: time runs backwards, or the
+    context's settings have another state; UnknownNameError: a name in ``color_cameras`` is no
+    camera's.
     """
 
     _first_memory = _Memory(TrackerState(), (0.0, 0.0, 0.0), -np.inf)

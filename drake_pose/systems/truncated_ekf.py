@@ -355,17 +355,13 @@ class HandSensor(PortedSystem):
 
     def _measure(self, context: Context) -> HandMeasurement:
         """Measure the hand in the context's image, near the filter's prediction."""
-        image, mean = (
-            self.eval_input(context, "label_image"),
-            self.eval_input(context, "estimated_state"),
-        )
+        image, mean = (self.eval_input(context, k) for k in ("label_image", "estimated_state"))
         covariance = self.eval_input(context, "covariance").reshape(len(mean), len(mean))
         has_started = self.eval_input(context, "statistics")[STATISTICS.index("step")] > 0
         belief = Belief(mean, covariance)
         silhouette = self._silhouette
-        if image is None:
-            mask = np.zeros((silhouette.height, silhouette.width), dtype=np.bool_)
-        else:
+        mask = np.zeros((silhouette.height, silhouette.width), dtype=np.bool_)
+        if image is not None:
             mask = label_image_to_mask(image)
         if has_started:
             return silhouette.measure(mask, silhouette.belief_filter.predict_belief(belief))

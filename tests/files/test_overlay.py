@@ -76,17 +76,6 @@ def test_shapes_are_contours_over_the_silhouette():
     assert count(picture, AGREEMENT_RGB) > 0.95 * 400 * 400
 
 
-def test_shapes_are_contours_over_a_whole_picture():
-    photo = np.full((500, 600, 3), 91, np.uint8)
-    given = rectangle((500, 600), slice(100, 200), slice(150, 300))
-    picture = draw_shapes(photo, [given, np.zeros_like(given)], ("as given", "as found"), "title")
-    assert picture.shape[1] == 600
-    assert count(picture, (91, 91, 91)) > 0.95 * 500 * 600
-    # The contour, and the square in the legend.
-    assert count(picture, MISSING_RGB) > 2 * 100 + 2 * 150
-    assert count(picture, AGREEMENT_RGB) < 50
-
-
 def test_a_small_overlay_is_enlarged_by_an_integer_without_text_on_it():
     whole, none = np.ones((40, 40), dtype=bool), np.zeros((40, 40), dtype=bool)
     drawn = [PALETTE[draw_overlay(whole, body, None, "t")] for body in (none, whole)]

@@ -311,13 +311,9 @@ def write_obj(mesh: TriangleMesh, name: str) -> Path:
     triangles = mesh.triangles
     a, b, c = (mesh.vertices[triangles[:, corner]] for corner in range(3))
     area_normals = np.cross(b - a, c - a)
-    normals = np.stack(
-        [
-            np.bincount(triangles.ravel(), np.repeat(area_normals[:, axis], 3), len(mesh.vertices))
-            for axis in range(3)
-        ],
-        axis=1,
-    )
+    corners, count = triangles.ravel(), len(mesh.vertices)
+    sums = [np.bincount(corners, np.repeat(one, 3), count) for one in area_normals.T]
+    normals = np.stack(sums, axis=1)
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     # If this process crashes, its parent process finds a complete file or none.
     unfinished = path.with_suffix(".part")

@@ -98,13 +98,8 @@ class Synchroniser(Generic[Item]):
         if not heads:
             return None
         begin = min(heads.values())
-        awaited = [
-            name
-            for name in self.cameras
-            if name not in heads
-            and name not in self._ignored_cameras
-            and name not in self._finished
-        ]
+        there = {*heads, *self._ignored_cameras, *self._finished}
+        awaited = [name for name in self.cameras if name not in there]
         if awaited:
             if (self._newest if now is None else max(now, self._newest)) < begin + self.timeout:
                 return None

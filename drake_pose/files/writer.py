@@ -221,8 +221,8 @@ class ResultWriter:
         scales = {
             name: one.camera_scale
             for one in reversed(found)
-            for name in one.ious
             if one.camera_scale
+            for name in one.ious
         }
         cameras = [
             replace(one, pixels_per_metre=scales.get(one.name, one.pixels_per_metre))

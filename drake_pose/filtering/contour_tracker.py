@@ -153,12 +153,9 @@ class ContourTracker:
 
     def acceleration(self, name: str) -> float:
         """Return the standard deviation of an element's acceleration [unit/s^2]."""
-        settings = self.settings
+        own = self.settings
         return self._of_kind(
-            name,
-            settings.log_scale_acceleration,
-            settings.angle_acceleration,
-            settings.length_acceleration,
+            name, own.log_scale_acceleration, own.angle_acceleration, own.length_acceleration
         )
 
     def _of_kind(self, name: str, log_scale: float, angle: float, length: float) -> float:

@@ -357,11 +357,8 @@ class HandSilhouette:
     @property
     def _unit(self) -> float:
         """Ratio of the fingers' mean radius to ``reference_radius``."""
-        return (
-            float(np.mean(self._hand.radii))
-            * self._observation.pixels_per_metre
-            / HAND.reference_radius
-        )
+        radius = float(np.mean(self._hand.radii))
+        return radius * self._observation.pixels_per_metre / HAND.reference_radius
 
     def _rough(self, x: Array) -> RoughBody:
         """Return the image of the hand at a state x (n,)."""

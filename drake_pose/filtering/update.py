@@ -246,15 +246,11 @@ def update(
     P, values = prediction.covariance, function_without_jacobian(measurement.model)
     for made in range(iterations):
         # Linearised at x, over the measurements that are visible there.
+        model = measurement.model
         _, h, H, remainder = (
-            linearise_over(
-                measurement.model.predict,
-                Belief(x, range_covariance),
-                measurement.model.wraps,
-                values,
-            )
+            linearise_over(model.predict, Belief(x, range_covariance), model.wraps, values)
             if range_covariance is not None
-            else Linear(x, *measurement.model.predict(x))
+            else Linear(x, *model.predict(x))
         )
         rows = np.isfinite(measurement.y) & np.isfinite(h)
         count = int(np.count_nonzero(rows))

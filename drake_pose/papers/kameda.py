@@ -259,14 +259,11 @@ def causes_of_wrong_angles(
         unseen: segments that show fewer pixels in both poses are hidden, and inner edges are equal
             if the segments of fewer pixels differ.
     """
-    nodes = len(sampled.tree.nodes)
+    tree, surfaces = sampled.tree, sampled.surfaces
+    nodes = len(tree.nodes)
+    labels = range(1, 1 + nodes)
     images = [
-        draw_labels(
-            sampled.surfaces.at(values),
-            range(1, 1 + nodes),
-            camera.X_CW @ sampled.tree.node_poses(values),
-            camera,
-        )
+        draw_labels(surfaces.at(values), labels, camera.X_CW @ tree.node_poses(values), camera)
         for values in (true_values, found_values)
     ]
     seen = np.max([np.bincount(one.ravel(), minlength=1 + nodes)[1:] for one in images], axis=0)

@@ -332,19 +332,13 @@ class HypothesesResult:
         preferred, then the largest weight. Its survivor is the one nearest to the truth. None:
         there is no such hypothesis.
         """
-        rejected = [
-            one
-            for one in self.histories
-            if one.reason == "constraint" and one.wrong and one.lived > 1
-        ]
+        rejected = [one for one in self.histories if one.reason == "constraint" and one.wrong]
+        rejected = [one for one in rejected if one.lived > 1]
         rejected.sort(key=lambda one: (one.row.startswith(COUPLED), one.weights[-2]), reverse=True)
         for removed in rejected:
             end = int(removed.frames[-1])
-            beside = [
-                one
-                for one in self.histories
-                if one.run == removed.run and one.frames[0] < end < one.frames[-1]
-            ]
+            own = [one for one in self.histories if one.run == removed.run]
+            beside = [one for one in own if one.frames[0] < end < one.frames[-1]]
             truth = self.sequences[removed.run].states[end - 1]
             if beside:
                 return removed, min(beside, key=lambda one: float(angle_error(one.at(end), truth)))

@@ -287,14 +287,9 @@ class _BeamRun:
         if self._all and self._search_within():
             self._stopped_by = "exact"
             return
-        exact, tolerant = (
-            [
-                stage
-                for stage in self._settings.stages
-                if (stage.outside_fraction == 0.0) == is_exact
-            ]
-            for is_exact in (True, False)
-        )
+        stages = self._settings.stages
+        exact = [stage for stage in stages if stage.outside_fraction == 0.0]
+        tolerant = [stage for stage in stages if stage.outside_fraction != 0.0]
         for stage in exact:
             if self._run_stage(stage) or self._stopped_by or self._is_matched:
                 break

@@ -122,14 +122,10 @@ class PictureCapture(PortedSystem):
 
     def counts(self) -> dict[str, CameraCount]:
         """Return the counters of each camera, by name."""
+        late, changes = self._synchroniser.late, self._changes
         return {
-            name: CameraCount(
-                self._used[name],
-                source.dropped,
-                self._synchroniser.late[name],
-                tuple(self._changes[name]),
-            )
-            for name, source in self._sources.items()
+            name: CameraCount(self._used[name], one.dropped, late[name], tuple(changes[name]))
+            for name, one in self._sources.items()
         }
 
     def take_reports(self) -> list[str]:

@@ -312,11 +312,8 @@ class SilhouetteTracker(SilhouetteMatcher):
         A track predicts a pose that is not found.
         """
         # Views of the images' writable data, as compiled kernels require.
-        pictures = {
-            name: image.mutable_data
-            for name, image in self._colours(context).items()
-            if image.size()
-        }
+        images = self._colours(context)
+        pictures = {name: one.mutable_data for name, one in images.items() if one.size()}
         last, root_position = memory.tracker_state, self.eval_input(context, "root_position")
         if not views and not pictures and last.track is None:
             return None, memory, False

@@ -242,12 +242,8 @@ class LabelRenderer:
         self._set_positions(q)
         count = self._plant.num_bodies()
         bodies = [self._plant.get_body(BodyIndex(i)) for i in range(count)]
-        return np.array(
-            [
-                self._plant.EvalBodyPoseInWorld(self._plant_context, body).GetAsMatrix4()
-                for body in bodies
-            ]
-        )
+        poses = [self._plant.EvalBodyPoseInWorld(self._plant_context, one) for one in bodies]
+        return np.array([pose.GetAsMatrix4() for pose in poses])
 
     def _set_positions(self, q: np.ndarray) -> None:
         """Set the plant's positions q (nq,); ValueError unless they are finite."""

@@ -420,12 +420,8 @@ def _visual_meshes(
     names = link_names(plant)
     chosen = [BodyIndex(k) for k in range(len(names))] if bodies is None else bodies
     with _model_errors(path):
-        meshes = {
-            names[int(body)]: join_meshes(
-                [*labelled_meshes(plant, scene_graph, plant.get_body(body)).values()]
-            )
-            for body in chosen
-        }
+        found = {int(k): labelled_meshes(plant, scene_graph, plant.get_body(k)) for k in chosen}
+        meshes = {names[k]: join_meshes([*own.values()]) for k, own in found.items()}
     meshes = {name: mesh for name, mesh in meshes.items() if not mesh.is_empty}
     if not meshes:
         raise ModelError(

@@ -146,10 +146,8 @@ def shimada(
             settings = sequences.experiment_settings(truncation or "joint", iterations or 20)
             followed = [sequences.run_sequence(folder, settings, count) for folder in sequence]
             figures: dict[str, Any] = {one.name: one.figures for one in followed}
-            table, warnings = (
-                sequences.recorded_table(followed),
-                [one.warning() for one in followed],
-            )
+            table = sequences.recorded_table(followed)
+            warnings = [one.warning() for one in followed]
             if out is not None:
                 for one in followed:
                     save_recorded_hand(one, out)

@@ -236,11 +236,8 @@ def record_pose_set(pose_set: PoseSet | None, tree: PoseTree) -> dict[str, Any]:
         for one in pose_set.modes
     ]
     unknown = [None] * (len(pose_set.joints) + len(followers))
-    return {
-        "joints": record(pose_set.joints, unknown),
-        "modes": modes,
-        "mode_count": pose_set.mode_count,
-    }
+    joints = record(pose_set.joints, unknown)
+    return {"joints": joints, "modes": modes, "mode_count": pose_set.mode_count}
 
 
 def _entry(

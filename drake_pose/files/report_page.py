@@ -105,14 +105,10 @@ def estimate_answer(model: ArticulatedModel, estimate: SceneEstimate) -> str:
         return "No pose was found." if count == 1 else f"No pose was found in {count} frames."
     error = "error" if count == 1 else "mean error"
     error += f" {100.0 * estimate.summary['mean_E_total']:.1f} % of the silhouette"
-    names = [
-        name for name in model.position_names if any(name in record.joints for record in found)
-    ]
-    open_joints = [
-        name
-        for name in names
-        if not all(name in one.joints and one.joints[name]["determined"] for one in found)
-    ]
+    known = [record.joints for record in found]
+    names = [name for name in model.position_names if any(name in one for one in known)]
+    sure = [k for k in names if all(k in one and one[k]["determined"] for one in known)]
+    open_joints = [name for name in names if name not in sure]
     determined = f"{len(names) - len(open_joints)} of {len(names)} joints determined"
     if not names:
         return f"Pose found{of_frames}; {error}."

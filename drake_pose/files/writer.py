@@ -218,12 +218,7 @@ class ResultWriter:
         """
         q, measured = np.array([one.q for one in found]), measured_positions(self.model, found)
         ghost = None if np.isnan(measured).all() else np.where(np.isnan(measured), q, measured)
-        scales = {
-            name: one.camera_scale
-            for one in reversed(found)
-            if one.camera_scale
-            for name in one.ious
-        }
+        scales = {k: one.camera_scale for one in found[::-1] for k in one.ious if one.camera_scale}
         cameras = [
             replace(one, pixels_per_metre=scales.get(one.name, one.pixels_per_metre))
             if isinstance(one, ParallelCamera)

@@ -233,10 +233,8 @@ def read_hand(model: ArticulatedModel, palm: str = "palm") -> HandModel:
     names = tuple(chain[0].name().split("_")[0] for chain in chains)
     hidden = ("alpha_palm_top", "rho_palm_top")
     steps, radii = tuple(steps for steps, _ in read), np.array([radii for _, radii in read])
-    hand, file = (
-        HandModel(names, steps, radii, rings, rows, sizes, hidden),
-        couplings_file(model.path),
-    )
+    hand = HandModel(names, steps, radii, rings, rows, sizes, hidden)
+    file = couplings_file(model.path)
     return replace(hand, prior=load_joint_prior(file, hand.angles)) if file.is_file() else hand
 
 

@@ -92,11 +92,8 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
         raise SettingsError(f"{path}: chunk: must be a whole number, 1 or more, not {length!r:.60}")
     own = ("scene", "model", "truth", "overlay", "replay", "audit", "camera_file")
     # A batch can audit episodes, but not estimate them.
-    of_estimates = [
-        one.name
-        for one in fields(EstimateSettings)
-        if one.name not in EpisodeSettings.__annotations__
-    ]
+    of_estimates = [one.name for one in fields(EstimateSettings)]
+    of_estimates = [key for key in of_estimates if key not in EpisodeSettings.__annotations__]
     of_audits = [one.name for one in fields(AuditSettings)]
     keys = tuple(dict.fromkeys((*own, *of_estimates, *of_audits, "episodes")))
     given = content.get("defaults") or {}

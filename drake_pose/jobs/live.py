@@ -123,11 +123,8 @@ def load_live_scene(path: Path) -> LiveScene:
     if len(cameras) < 2:
         raise SceneError(f"{path}: the capture of a person needs two or more calibrated cameras")
     specifications = load_sources(path / SOURCES, cameras)
-    backgrounds = {
-        name: learn_background(load_background_pictures(one))
-        for name, one in specifications.items()
-        if not one.gives_masks
-    }
+    filmed = {name: one for name, one in specifications.items() if not one.gives_masks}
+    backgrounds = {k: learn_background(load_background_pictures(one)) for k, one in filmed.items()}
     return LiveScene(path, cameras, specifications, backgrounds)
 
 

@@ -212,10 +212,8 @@ def run_experiment(
     trials = []
     for values in drawn:
         pose = tree.positions_from(values)
-        seen = [
-            View(camera, renderer.mask(*pose))
-            for camera, renderer in zip(cameras, renderers, strict=True)
-        ]
+        seers = zip(cameras, renderers, strict=True)
+        seen = [View(camera, renderer.mask(*pose)) for camera, renderer in seers]
         tolerance = renderer_tolerance(seen)
         start = time.process_time()
         result = search.match(seen)

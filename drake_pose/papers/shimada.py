@@ -219,10 +219,8 @@ def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
     sizes = sequence.states[0, HAND_STATE.indices(names)]
     factors = sizes / [TWO_FINGERS.sizes[name] for name in names]
     model = _hand().reshaped(link_scales={"palm": factors})
-    q = [
-        plant_positions(x, model.position_names, PIXELS_PER_METRE, distance)
-        for x in sequence.states
-    ]
+    joints = model.position_names
+    q = [plant_positions(x, joints, PIXELS_PER_METRE, distance) for x in sequence.states]
     positions = held_positions(np.array(q), period)
     silhouette = HandSilhouette(hand_filter, width, height, center)
     parts = build_hand_estimation(model, camera, silhouette, sequence.guess, positions, period)
@@ -442,11 +440,8 @@ def _histories(run: int, truths: Array, states: Sequence[FilterState]) -> list[H
         own = truths[frames - 1]
         last = -2 if reason and len(frames) > 1 else -1
         error, kept_error = angle_error(means[last], own[last]), angle_error(kept, own[-1])
-        histories.append(
-            HypothesisHistory(
-                run, frames, means, weights, reason, row, c, float(error), float(kept_error)
-            )
-        )
+        told = reason, row, c, float(error), float(kept_error)
+        histories.append(HypothesisHistory(run, frames, means, weights, *told))
 
     for state in states:
         for end in state.rejections:

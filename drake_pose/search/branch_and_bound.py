@@ -284,11 +284,8 @@ class _BranchAndBound:
         """
         pairs = self.store.pairs(partial, node)
         below = self.reaches.child_rows(node, pairs[:, 1])
-        others = [
-            self.reaches.rows(other, self.store.parents(partial.poses, other))
-            for other in waiting
-            if other != node
-        ]
+        reaches, parents = self.reaches, self.store.parents
+        others = [reaches.rows(k, parents(partial.poses, k)) for k in waiting if k != node]
         table, all_pixels = self.reaches.table, self.bits.all_pixels
         uncovered = all_pixels & ~partial.masks[:, : len(all_pixels)]
         for rows in others:

@@ -194,12 +194,8 @@ class RootPlacementSearch:
         self.scale_unknown = scale_unknown
         p_WR = tree.node_poses(tree.default_values())[0, :3, 3]
         self.tree = tree.with_root_position(p_WR)
-        self._grid = BeamSearch(
-            self.tree,
-            replace(
-                self.settings, stages=(Stage(60, 1.0, 2),), research_hypotheses=0, time_limit=None
-            ),
-        )
+        one_stage = replace(self.settings, stages=(Stage(60, 1.0, 2),), research_hypotheses=0)
+        self._grid = BeamSearch(self.tree, replace(one_stage, time_limit=None))
         self.body = self._grid.body
         self.sampled = self.body.sampled
         self._refined = RefinementBody(self.tree)
@@ -256,10 +252,8 @@ class RootPlacementSearch:
         values = self._refined.node_values(self._refined.nearest_turns(best.parameters))
         # Values of the root that the tree now fixes take the fixed value exactly.
         bounds = [tree.value_bounds(i) for i in range(len(tree.nodes))]
-        held = [
-            np.where(lower == upper, lower, one)
-            for one, (lower, upper) in zip(values, bounds, strict=True)
-        ]
+        limited = zip(values, bounds, strict=True)
+        held = [np.where(lower == upper, lower, one) for one, (lower, upper) in limited]
         J = RefinementProblem(self._refined, best.views).J(best.parameters)
         now = time.perf_counter()
         return PoseEstimate.of_values(
@@ -291,12 +285,9 @@ class RootPlacementSearch:
             [coarsen(view, self._placement.coarse_pixels) for view in layer.views],
         )
         quota, factor = math.ceil(settings.quota * width), settings.root_factor
+        most = settings.root_spare * factor * quota
         chosen = choose_root_samples(
-            self.body,
-            views,
-            layer.positions,
-            settings.root_spare * factor * quota,
-            settings.outside_weight,
+            self.body, views, layer.positions, most, settings.outside_weight
         )
         body = place_body(self.body, layer.positions, chosen)
         store = PoseStore(body, SilhouetteBits(body, views), outside_fraction)

@@ -223,9 +223,8 @@ class Scoring:
         """Return (n,) the objective J of the poses at samples (n, nodes), equation (1) [pixel]."""
         total, X_WN = np.full(len(samples), self.silhouette_area), self.sampled.poses(samples)
         everything = range(len(self.sampled.outlines))
-        for view, prefixes, X_CW in zip(
-            self.views, self.silhouette_prefixes, self.X_CW, strict=True
-        ):
+        views = zip(self.views, self.silhouette_prefixes, self.X_CW, strict=True)
+        for view, prefixes, X_CW in views:
             areas = self.sampled.areas(everything, samples, X_CW @ X_WN, view.camera, prefixes)
             total += areas[:, 0] - 2.0 * areas[:, 1]
         return total
@@ -242,16 +241,11 @@ class Scoring:
         first = np.zeros((1, 1), dtype=np.int64)
         solid = [i for i, node in enumerate(self.sampled.tree.nodes) if len(node.mesh.triangles)]
         means = []
-        for view, prefixes, X_CW in zip(
-            self.views, self.silhouette_prefixes, self.X_CW, strict=True
-        ):
-            areas = [
-                self.sampled.areas([i], first, (X_CW @ X_WN[i])[None, None], view.camera, prefixes)[
-                    0, 0
-                ]
-                for i in solid
-            ]
-            means.append(float(np.mean(areas)))
+        views = zip(self.views, self.silhouette_prefixes, self.X_CW, strict=True)
+        for view, prefixes, X_CW in views:
+            X_CN, own = {i: (X_CW @ X_WN[i])[None, None] for i in solid}, (view.camera, prefixes)
+            areas = [self.sampled.areas([i], first, X, *own) for i, X in X_CN.items()]
+            means.append(float(np.mean([one[0, 0] for one in areas])))
         return means
 
 
@@ -377,11 +371,8 @@ class SampledBody:
 
     def root_distances(self, camera: Camera) -> np.ndarray:
         """Return the distances (n,) from the camera to the roots at all their samples [m]."""
-        roots = [
-            X[:, :3, 3]
-            for X, node in zip(self.sampled.X_PN, self.sampled.tree.nodes, strict=True)
-            if node.parent < 0
-        ]
+        nodes = zip(self.sampled.X_PN, self.sampled.tree.nodes, strict=True)
+        roots = [X_PN[:, :3, 3] for X_PN, node in nodes if node.parent < 0]
         return np.asarray(np.linalg.norm(np.vstack(roots) - camera.X_WC[:3, 3], axis=1))
 
     def _find_balls(self, node: int, hulls: list[VisualHull]) -> np.ndarray:

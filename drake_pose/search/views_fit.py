@@ -404,10 +404,8 @@ class RobustModes:
             above = np.where(flip.changed & (mode.high >= upper - 1e-9), math.inf, above)
             swapped = np.where(flip.mirrored, [above, below], [below, above])
             lower, upper = kinematics.local_limits(values)
-            low, high = (
-                np.maximum(values - swapped[0], lower),
-                np.minimum(values + swapped[1], upper),
-            )
+            low = np.maximum(values - swapped[0], lower)
+            high = np.minimum(values + swapped[1], upper)
             modes.append(FittedPose(values, low=low, high=high))
 
     def _with_intervals(self, values: np.ndarray, moves: bool = True) -> FittedPose:

@@ -249,11 +249,8 @@ def require_visible(
         camera: the camera.
         max_pictures: largest size of the body, as a multiple of the image's diagonal.
     """
-    solid = [
-        (outline, np.asarray(X))
-        for outline, X in zip(outlines, X_CN, strict=True)
-        if len(outline.triangles)
-    ]
+    pairs = zip(outlines, X_CN, strict=True)
+    solid = [(outline, np.asarray(X)) for outline, X in pairs if len(outline.triangles)]
     where = f"camera '{camera.name}'"
     placed = [(outline, outline.vertices @ X[:3, :3].T + X[:3, 3]) for outline, X in solid]
     if isinstance(camera, PinholeCamera):

@@ -146,11 +146,8 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
         """Return the state after matching the context's images, given the last state."""
         images, labels = self._images(context), self._labels(context)
         masks = {name: label_image_to_mask(image, labels) for name, image in images.items()}
-        views = [
-            View(camera, masks[camera.name])
-            for camera in self._cameras
-            if camera.name in masks and masks[camera.name].any()
-        ]
+        seen = {name: mask for name, mask in masks.items() if mask.any()}
+        views = [View(one, seen[one.name]) for one in self._cameras if one.name in seen]
         estimate, memory, is_shown = self._find(context, last.memory, views)
         if estimate is None or not is_shown:
             return MatcherState(last.q, last.X_WB, estimate, memory)

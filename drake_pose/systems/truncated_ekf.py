@@ -245,11 +245,8 @@ def plant_motion(
         SettingsError: the plant's joints are not the state's moving elements, or the period is not
             a multiple of the plant's time step.
     """
-    joints = {
-        joint.name(): joint
-        for joint in map(plant.get_joint, plant.GetJointIndices())
-        if joint.num_velocities()
-    }
+    every = map(plant.get_joint, plant.GetJointIndices())
+    joints = {joint.name(): joint for joint in every if joint.num_velocities()}
     single = all(one.num_positions() == one.num_velocities() == 1 for one in joints.values())
     if not single or set(joints) != set(layout.moving):
         raise SettingsError(

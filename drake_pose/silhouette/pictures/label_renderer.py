@@ -112,11 +112,8 @@ class DeformableSkin:
                 RigidTransform(), _tetrahedra(band.mesh), f"{band.child}_skin"
             )
             geometry.set_perception_properties(properties)
-            self._geometries.append(
-                scene_graph.RegisterDeformableGeometry(
-                    self.source, scene_graph.world_frame_id(), geometry, 1.0
-                )
-            )
+            given = self.source, scene_graph.world_frame_id(), geometry, 1.0
+            self._geometries.append(scene_graph.RegisterDeformableGeometry(*given))
 
     def configuration(self, vertices: Sequence[np.ndarray]) -> GeometryConfigurationVector:
         """Return the source's port value, given each band's vertices (v, 3) in the world [m]."""

@@ -104,11 +104,8 @@ class ModelSource:
                 ) from error
         # Inertias have no effect on silhouettes.
         about_inertia = ("invalid inertia", "parsing inertia matrix", "as central inertia")
-        remarks = [
-            self._restore_names(warning, str(self.path))
-            for warning in warnings
-            if not any(mark in warning for mark in about_inertia)
-        ]
+        kept = [one for one in warnings if not any(mark in one for mark in about_inertia)]
+        remarks = [self._restore_names(one, str(self.path)) for one in kept]
         return list(instances), [*self.warnings, *remarks]
 
     def _sanitise(self, path: Path) -> tuple[str, str]:

@@ -188,10 +188,8 @@ def column_names(keys: Sequence[str], widths: Iterable[int], features: Features)
     A name that occurs in several features begins with its feature's key, and one that still occurs
     twice ends with its index. ``widths``: each feature's count of numbers in a row.
     """
-    parts = [
-        feature_names(key, {**features[key], "shape": [width]})
-        for key, width in zip(keys, widths, strict=True)
-    ]
+    pairs = zip(keys, widths, strict=True)
+    parts = [feature_names(key, {**features[key], "shape": [width]}) for key, width in pairs]
     every = [name for part in parts for name in part]
     names = []
     for key, part in zip(keys, parts, strict=True):

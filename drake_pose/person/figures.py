@@ -123,10 +123,8 @@ def find_persons(
     middles = [np.array([figure.middle for figure in own]).reshape(-1, 2) for own in figures]
     persons: list[Person] = []
     while True:
-        is_candidate = [
-            np.isin(np.arange(len(own)), list(rest))
-            for own, rest in zip(figures, free, strict=True)
-        ]
+        pairs = zip(figures, free, strict=True)
+        is_candidate = [np.isin(np.arange(len(own)), list(rest)) for own, rest in pairs]
         positions = meeting_points(cameras, middles, 2.0 * _MAX_RAY_DISTANCE, is_candidate)
         best: tuple[float, float, Person] | None = None
         scores, nearest = _support(cameras, figures, free, positions)

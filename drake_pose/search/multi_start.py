@@ -402,10 +402,8 @@ class _MultiStartRun:
 
         def search_again(nodes: tuple[int, ...]) -> list[np.ndarray]:
             again = self._coarse.find_again(X_WN, nodes)
-            return self._values(
-                self._coarse.choose_distinct(again, settings.alternatives, settings.separation),
-                values,
-            )
+            most, apart = settings.alternatives, settings.separation
+            return self._values(self._coarse.choose_distinct(again, most, apart), values)
 
         limbs = [one for one in below if 2 * len(one) <= len(X_WN)]
         tried += itertools.chain.from_iterable(map_ordered(search_again, limbs))

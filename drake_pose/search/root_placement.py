@@ -280,10 +280,8 @@ class RootPlacementSearch:
         """
         if len(layer.positions) == 0:
             return []
-        settings, views = (
-            self._placement,
-            [coarsen(view, self._placement.coarse_pixels) for view in layer.views],
-        )
+        settings = self._placement
+        views = [coarsen(view, settings.coarse_pixels) for view in layer.views]
         quota, factor = math.ceil(settings.quota * width), settings.root_factor
         most = settings.root_spare * factor * quota
         chosen = choose_root_samples(

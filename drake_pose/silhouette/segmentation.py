@@ -122,10 +122,8 @@ def person_region(picture: Picture, background: Background, min_fraction: float 
     eroded = cv2.erode(_differs(*(image[inner] for image in inputs)), square)
     # Erosion counts pixels beyond the inner part as foreground: keep the squares' middles only.
     kept = np.zeros_like(eroded)
-    place = tuple(
-        slice(own.start - outer.start, own.stop - outer.start)
-        for own, outer in zip(middles, inner, strict=True)
-    )
+    pairs = zip(middles, inner, strict=True)
+    place = tuple(slice(own.start - out.start, own.stop - out.start) for own, out in pairs)
     kept[place] = eroded[place]
     patches = cv2.morphologyEx(cv2.dilate(kept, square), cv2.MORPH_CLOSE, square)
     # Usually there is one patch; counting contours is faster than measuring areas.

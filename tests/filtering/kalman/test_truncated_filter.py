@@ -218,16 +218,6 @@ def test_covariance_from_is_positive_definite_and_equals_the_product(rank):
     np.testing.assert_allclose(root @ root.T, factor @ factor.T, atol=1e-12)
 
 
-def test_transition_and_process_noise_of_constant_velocity():
-    layout = StateLayout(("a", "b"), ("c",))
-    x = np.array([1.0, 2, 0.1, 0.2, 5])
-    np.testing.assert_allclose(layout.transition() @ x, [1.1, 2.2, 0.1, 0.2, 5])
-    U = layout.process_noise({"a": 2.0, "b": 0.0})
-    # An acceleration u over one step changes a by u / 2 and its rate by u.
-    g = np.array([0.5, 0, 1, 0, 0])
-    np.testing.assert_allclose(U, 4 * np.outer(g, g))
-
-
 @pytest.mark.parametrize(
     ("make", "word"),
     [

@@ -140,11 +140,9 @@ def _size_warnings(model: ArticulatedModel, tree: PoseTree, largest: float = 50.
     ``largest``: plausible extent of the body in its default pose [m]; the smallest is 1 / largest.
     """
     poses = tree.node_poses(tree.default_values())
-    corners = [
-        node.mesh.vertices @ X[:3, :3].T + X[:3, 3]
-        for node, X in zip(tree.nodes, poses, strict=True)
-        if not node.mesh.is_empty
-    ]
+    pairs = zip(tree.nodes, poses, strict=True)
+    placed = [(node.mesh.vertices, X) for node, X in pairs if not node.mesh.is_empty]
+    corners = [vertices @ X[:3, :3].T + X[:3, 3] for vertices, X in placed]
     size = float(np.ptp(np.concatenate(corners), axis=0).max()) if corners else 1.0
     warnings = []
     if not 1.0 / largest <= size <= largest:

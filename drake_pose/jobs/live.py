@@ -557,10 +557,8 @@ class _FrameWriter:
         writer, sources, warnings = self.writer, {}, []
         for name, count in sensors.counts().items():
             given = self.scene.specifications[name]
-            changes = [
-                {"time": one.time, "what": "stopped" if one.stopped else "returned"}
-                for one in count.changes
-            ]
+            what = {True: "stopped", False: "returned"}
+            changes = [{"time": one.time, "what": what[one.stopped]} for one in count.changes]
             known = {"kind": given.kind, "location": given.location, **asdict(count)}
             sources[name] = known | {"changes": changes}
             numbers = {"could not be used": count.dropped, "came too late": count.late}

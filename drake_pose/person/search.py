@@ -395,10 +395,8 @@ class PersonSearch:
     def _fit_coarsely(self, values: Array, frame: FrameViews) -> PoseFit:
         """Fit from values (m,) to the scoring cameras, by a few stages with fewer points."""
         prior, coarser = Prior(values, 0.1 * self._information), self._settings.ranking_spacing
-        stages = [
-            replace(one, spacing=coarser * one.spacing)
-            for one in self._settings.search[: self._settings.ranking_stages]
-        ]
+        ranking = self._settings.search[: self._settings.ranking_stages]
+        stages = [replace(one, spacing=coarser * one.spacing) for one in ranking]
         return self._fit.fit(frame.scoring_edges, values, stages, prior, self._held)
 
     def refine(self, values: Array, frame: FrameViews) -> PoseFit:

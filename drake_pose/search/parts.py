@@ -428,10 +428,8 @@ class NeighbourhoodSearch:
         # In several views a part mirrored in the depth of one is visible in another.
         mirrored = search.reflections if reflections and len(problem.views) == 1 else ()
         self._parts = (*search.parts, *mirrored)
-        self._freedoms = [
-            problem.body.freedom(None if part.exchanged else (*part.nodes, *part.held))
-            for part in self._parts
-        ]
+        moved = [None if one.exchanged else (*one.nodes, *one.held) for one in self._parts]
+        self._freedoms = [problem.body.freedom(nodes) for nodes in moved]
         self._sizes = np.array([len(part.nodes) for part in self._parts])
         # The error near each part after its last try, and the number of its tries.
         self._left_error = np.full(len(self._parts), np.inf)

@@ -169,10 +169,8 @@ class RefinementProblem:
         self.body, self.views = body, tuple(views)
         self.area = float(sum(np.count_nonzero(view.mask) for view in views))
         self._silhouettes = [find_border(view.mask) for view in views]
-        self._cameras = [
-            (np.ascontiguousarray(view.camera.X_CW), view.camera.kernel_parameters())
-            for view in views
-        ]
+        cameras = [view.camera for view in views]
+        self._cameras = [(np.ascontiguousarray(k.X_CW), k.kernel_parameters()) for k in cameras]
         self._nothing = [Border.empty(*view.mask.shape) for view in views]
         self.border_length = sum(border.length for border in self._silhouettes)
 

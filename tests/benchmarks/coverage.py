@@ -1,10 +1,10 @@
 """Benchmark of intervals: the fraction that covers the truth, and their widths.
 
-Run as ``python -m tests.benchmarks.coverage [DATA] [--draws N] [--only TEXT]``; DATA is a folder
+Run as ``python -m tests.benchmarks.coverage DATA [--draws N] [--only TEXT]``; DATA is a folder
 with ``franka_one_view/panda`` (Drake renders sequences of this arm), ``arm_two_views`` and
-``hand_sequences``; sets with missing files are skipped. Intervals are read from ``joints.csv``, and
-lost frames from ``summary.json``. A frame is wrong without warning if a true joint position lies
-more than 10 degrees, or 5 cm, outside its interval.
+``hand_sequences``. Intervals are read from ``joints.csv``, and lost frames from ``summary.json``.
+A frame is wrong without warning if a true joint position lies more than 10 degrees, or 5 cm,
+outside its interval.
 """
 
 import argparse
@@ -75,35 +75,31 @@ class Evaluation(NamedTuple):
     wrong: int
 
 
-def coverage_sets(data: Path | None) -> Iterator[CoverageSet]:
-    """Yield the sets whose files exist."""
+def coverage_sets(data: Path) -> Iterator[CoverageSet]:
+    """Yield the sets of scenes."""
     person = bundled_model("person")
     for name, damage in _damages():
         yield CoverageSet(
             f"person, sequence, four views, {name}", person, _draw_person(damage), ("",), draws=1
         )
-    if data is None:
-        return
-    if (data / _PANDA).is_file():
-        panda = data / _PANDA
-        for name, damage in _damages():
-            make = _draw_arm(panda, damage)
-            yield CoverageSet(f"arm, sequence, {name}", panda, make, _ARM_JOINTS[:1])
-        make = _draw_arm(panda, cameras_off=_CAMERAS_OFF)
-        yield CoverageSet(f"arm, sequence, cameras {_CAMERAS_OFF} px off", panda, make, ("panda_",))
-        make = _draw_arm(panda, colours=True)
-        yield CoverageSet("arm, sequence by colour", panda, make, _ARM_JOINTS[:1])
-        make = _draw_arm(panda, _half_hidden)
-        yield CoverageSet("arm, sequence, half hidden for 8 frames", panda, make, ("panda_",))
-        stills = EstimateSettings(track=False, frames=("0000:0005",))
-        make = _draw_arm(panda, _with_ragged_edges)
-        yield CoverageSet("arm, stills, edges 1.5 px off", panda, make, ("panda_",), stills)
-        make = _draw_arm(panda, views=1)
-        yield CoverageSet("arm, stills, one view, exact masks", panda, make, ("panda_",), stills)
-    if (data / _LBR).is_dir():
-        arm = data / _LBR
-        model = arm / "med7" / "med7.urdf"
-        yield CoverageSet("real arm, stills", model, lambda _, k: arm, _ARM_JOINTS[1:], draws=1)
+    panda = data / _PANDA
+    for name, damage in _damages():
+        make = _draw_arm(panda, damage)
+        yield CoverageSet(f"arm, sequence, {name}", panda, make, _ARM_JOINTS[:1])
+    make = _draw_arm(panda, cameras_off=_CAMERAS_OFF)
+    yield CoverageSet(f"arm, sequence, cameras {_CAMERAS_OFF} px off", panda, make, ("panda_",))
+    make = _draw_arm(panda, colours=True)
+    yield CoverageSet("arm, sequence by colour", panda, make, _ARM_JOINTS[:1])
+    make = _draw_arm(panda, _half_hidden)
+    yield CoverageSet("arm, sequence, half hidden for 8 frames", panda, make, ("panda_",))
+    stills = EstimateSettings(track=False, frames=("0000:0005",))
+    make = _draw_arm(panda, _with_ragged_edges)
+    yield CoverageSet("arm, stills, edges 1.5 px off", panda, make, ("panda_",), stills)
+    make = _draw_arm(panda, views=1)
+    yield CoverageSet("arm, stills, one view, exact masks", panda, make, ("panda_",), stills)
+    arm = data / _LBR
+    model = arm / "med7" / "med7.urdf"
+    yield CoverageSet("real arm, stills", model, lambda _, k: arm, _ARM_JOINTS[1:], draws=1)
     for scene in sorted(data.glob("hand_sequences/*/scene.yaml")):
         model = bundled_model("hand").with_name("right_hand.urdf")
         yield CoverageSet(
@@ -312,7 +308,7 @@ def _table(sets: Iterator[CoverageSet], draws: int, folder: Path) -> Iterator[tu
 def main() -> None:
     """Print the coverage of intervals."""
     parser = argparse.ArgumentParser(description="Whether intervals hold, and how wide they are.")
-    parser.add_argument("data", nargs="?", type=Path, help="a folder of recorded scenes")
+    parser.add_argument("data", type=Path, help="a folder of recorded scenes")
     parser.add_argument("--draws", type=int, default=2, help="scenes drawn for each set")
     parser.add_argument("--only", default="", help="sets whose name holds this text")
     asked = parser.parse_args()

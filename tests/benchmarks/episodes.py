@@ -4,13 +4,16 @@ Run as ``python -m tests.benchmarks.episodes DATA [--rooms N] [--first K] [--onl
 folder with the arms ``arm_two_views/med7``, ``franka_one_view/panda``, ``droid_episodes/robot`` and
 ``so101``, N the number of rooms per arm and set. In sets with wrong rows, frames near the start and
 end of these rows are not evaluated. ``--spoilt``: instead, episodes that must be refused.
+An accepted camera is wrong if its error is too improbable by its covariance.
 """
 
 import argparse
+import re
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,10 +21,10 @@ import numpy as np
 
 from drake_pose.body import ArticulatedModel, load_model
 from drake_pose.camera.camera_files import save_cameras
-from drake_pose.errors import RegistrationError
+from drake_pose.errors import DrakePoseError
 from drake_pose.files.settings import RegistrationSettings
 from drake_pose.jobs.registration.register import SceneRegistration, register_scene
-from tests.benchmarks.registration import pose_error
+from tests.benchmarks.registration import CameraError
 from tests.benchmarks.rooms import LOG_HZ, SimulatedEpisode, simulate
 from tests.benchmarks.tables import print_table
 from tests.camera.recordings import write_pictures
@@ -49,8 +52,8 @@ _JOINTS = ("A", "panda_joint", "lbr_", "shoulder_", "elbow_", "wrist_", "gripper
 GREY = 5
 # Maximum time offset [s], joint offset [deg], and duration of wrong rows [s].
 _LATE, _ZERO, _WRONG = 0.3, 2.0, 2.0
-# Maximum position error of a correct camera [mm].
-FAR = 50.0
+# Probability of a larger error by its covariance, at least, of a camera that is right.
+LEAST = 0.001
 # Frames this close to the start or end of wrong rows are not evaluated [s].
 _BETWEEN = 0.15
 
@@ -61,8 +64,8 @@ class EpisodeSet(NamedTuple):
     Attributes:
         off: bound of the offsets of all joints [deg]; zeros: offsets of three joints.
         codec: encoder of the pictures' video, with its option `crf`; "": PNG files.
-        spoilt: what no pose explains: "joints" of another episode, "mirrored" pictures, or the
-            "model" of another arm; "": nothing.
+        small: as of ``simulate``.
+        cause: pattern of words that name what is wrong, if no pose explains the episode.
     """
 
     name: str
@@ -73,12 +76,15 @@ class EpisodeSet(NamedTuple):
     off: float = 0.0
     codec: str = ""
     crf: int = 23
-    spoilt: str = ""
+    small: bool = False
+    cause: str = ""
 
 
 SETS = (
     EpisodeSet("as recorded"),
     EpisodeSet("in a video (H.264)", codec="libx264"),
+    EpisodeSet("in a video (H.264, crf 32)", codec="libx264", crf=32),
+    EpisodeSet("the arm 50 pixels tall, crf 32", codec="libx264", crf=32, small=True),
     EpisodeSet("in a video (AV1, as LeRobot's)", codec="libsvtav1", crf=30),
     EpisodeSet("clock off by up to .3 s, log at 33 Hz", late=True, log_hz=33.0),
     EpisodeSet("three zeros off by 2 degrees", zeros=True),
@@ -86,21 +92,29 @@ SETS = (
     EpisodeSet("all zeros off by up to 20 degrees", off=20.0),
     EpisodeSet("a third of the rows wrong", wrong=True),
 )
-SPOILT = (
-    EpisodeSet("joints of another episode", codec="libx264", spoilt="joints"),
-    EpisodeSet("mirrored pictures", codec="libx264", spoilt="mirrored"),
-    EpisodeSet("model of another arm", codec="libx264", spoilt="model"),
+_ROWS = "other (episode|pictures|times|rows)|another (episode|time)|later|earlier|reverse|clock"
+SPOILT = tuple(
+    EpisodeSet(name, codec="libx264", cause=cause)
+    for name, cause in (
+        ("joints of another episode", _ROWS),
+        ("rows in reverse", _ROWS),
+        ("rows 2 to 10 s late or early", _ROWS),
+        ("mirrored pictures", "mirrored"),
+        ("model of another arm", "(other|another) (robot|arm)"),
+        ("picture frozen", "frozen|same picture|do(es)? not change"),
+        ("sign of a joint", r"\bsign\b"),
+    )
 )
 
 
 class Outcome(NamedTuple):
-    """Result of an episode; only found and seconds are set if the registration was refused.
+    """Result of an episode; the last five are set by episodes with these errors only.
 
     Attributes:
-        found: whether a camera was found.
+        refusal: message of the error; "": the registration was accepted.
         seconds: CPU time [s].
-        off: position and orientation error of the camera [mm, deg].
-        inside: number of the pose's six coordinates inside their 95 % intervals.
+        error: of the camera.
+        cause: whether an error or warning states what is wrong with the episode.
         clock: error of the time offset [s].
         zeros: errors of the wrong joint offsets [deg]; without the first joint's.
         first: error of the first joint's offset [deg]; NaN: it is right, or not determined.
@@ -108,10 +122,10 @@ class Outcome(NamedTuple):
         named: fractions of wrong and of correct frames reported as outliers.
     """
 
-    found: bool
+    refusal: str
     seconds: float
-    off: tuple[float, float] = (np.inf, np.inf)
-    inside: int = 0
+    error: CameraError = CameraError()
+    cause: bool = False
     clock: float = np.nan
     zeros: tuple[float, ...] = ()
     first: float = np.nan
@@ -133,8 +147,11 @@ def measure_episode(data: Path, name: str, folder: Path, seed: int, kind: Episod
     arm, path = ARMS[name], data / ARMS[name].file
     model = load_model(path, check=False)
     late = float(rng.uniform(-_LATE, _LATE)) if kind.late else 0.0
+    if "s late" in kind.name:
+        late = float(rng.choice([-1.0, 1.0]) * rng.uniform(2.0, 10.0))
     grey = seed % GREY == GREY - 1
-    episode = simulate(model, folder, seed, grey, late, distance=arm.distance, middle=arm.middle)
+    room = partial(simulate, model, folder, grey=grey, distance=arm.distance, middle=arm.middle)
+    episode = room(seed, late=late, small=kind.small)
     moving = [
         name
         for name, low, high in zip(model.position_names, model.lower, model.upper, strict=True)
@@ -151,30 +168,44 @@ def measure_episode(data: Path, name: str, folder: Path, seed: int, kind: Episod
     if kind.wrong:
         begin = float(rng.uniform(0.5, episode.times[-1] - _WRONG - 0.5))
         wrong = (begin, begin + _WRONG)
-    if kind.spoilt == "joints":
-        other = simulate(model, folder, seed + 1000, grey, distance=arm.distance, middle=arm.middle)
-        episode = replace(episode, positions=other.positions)
-    elif kind.spoilt == "mirrored":
-        episode = mirrored(episode)
-    elif kind.spoilt == "model":
-        after = ([*ARMS] * 2)[[*ARMS].index(name) + 1 :]
+    positions, pictures = episode.positions.copy(), episode.pictures.copy()
+    if "another episode" in kind.name:
+        episode = replace(episode, positions=room(seed + 1000).positions)
+    elif "reverse" in kind.name:
+        episode = replace(episode, positions=positions[::-1])
+    elif "mirrored" in kind.name:
+        episode = replace(episode, pictures=pictures[:, :, ::-1])
+    elif "another arm" in kind.name:
         # A Panda with another gripper is the same arm.
-        path = data / next(ARMS[k].file for k in after if not ("Panda" in k and "Panda" in name))
+        others = [k for k in ARMS if k != name and not ("Panda" in k and "Panda" in name)]
+        path = data / ARMS[str(rng.choice(others))].file
         model, episode = of_another_arm(model, episode, path)
+    elif "frozen" in kind.name:
+        first = int(rng.uniform(0.0, 0.6) * len(pictures))
+        pictures[first:] = pictures[first]
+        episode = replace(episode, pictures=pictures)
+    elif "sign" in kind.name:
+        # The sign of the last joint is hardly visible.
+        positions[:, model.position_index(str(rng.choice(moving[:-1])))] *= -1.0
+        episode = replace(episode, positions=positions)
     write_episode(folder, model, episode, kind.log_hz, turned, wrong, kind.codec, kind.crf)
     settings = RegistrationSettings(zeros=("all",) if turned else ())
     start = time.process_time()
     try:
         found = register_scene(folder, path, settings=settings)
-    except RegistrationError:
-        return Outcome(False, time.process_time() - start)
-    seconds = time.process_time() - start
-    return _outcome(found, episode, late, turned, wrong, seconds)
+    except DrakePoseError as error:
+        texts = [str(error), *getattr(error, "__notes__", [])]
+        outcome = Outcome(texts[0], time.process_time() - start)
+    else:
+        seconds, texts = time.process_time() - start, [*found.warnings]
+        outcome = _outcome(found, episode, late, turned, wrong, seconds)
+    return outcome._replace(cause=names_cause(kind, texts))
 
 
-def mirrored(episode: SimulatedEpisode) -> SimulatedEpisode:
-    """Return an episode with mirrored pictures."""
-    return replace(episode, pictures=np.ascontiguousarray(episode.pictures[:, :, ::-1]))
+def names_cause(kind: EpisodeSet, texts: Sequence[str]) -> bool:
+    """Return whether texts state what is wrong with an episode; what they only ask is ignored."""
+    said = re.sub(r"[^.:;?]*\?", "", " ".join(texts))
+    return bool(kind.cause) and re.search(kind.cause, said) is not None
 
 
 def of_another_arm(
@@ -232,8 +263,6 @@ def _outcome(
 ) -> Outcome:  # fmt: skip
     """Return the errors of an episode's camera, clock, joint offsets and outliers."""
     one, summary = found.registered["camera"], found.summary
-    error = pose_error(one.camera.X_WC, episode.camera.X_WC)
-    inside = np.abs(error) < 1.96 * np.sqrt(np.diag(one.covariance))
     offset, false, off = summary["time_offset_s"], 0, dict[str, float]()
     for name, estimate in summary["zeros"].items():
         if name not in turned:
@@ -251,19 +280,17 @@ def _outcome(
         float(named[own].mean()) if own.any() else np.nan
         for own in (is_wrong & ~between, ~is_wrong & ~between)
     ]
-    return Outcome(
-        True, seconds, (1e3 * float(np.linalg.norm(error[3:])),
-        float(np.degrees(np.linalg.norm(error[:3])))), int(inside.sum()),
-        np.nan if offset is None else offset - late, tuple(off.values()), first, false,
-        (fractions[0], fractions[1]),
-    )  # fmt: skip
+    clock = np.nan if offset is None else offset - late
+    error = CameraError.of(one, episode.camera.X_WC)
+    more = clock, tuple(off.values()), first, false, (fractions[0], fractions[1])
+    return Outcome("", seconds, error, False, *more)
 
 
 def _row(name: str, outcomes: Sequence[Outcome]) -> list[str]:
     """Return a row of the table."""
-    found = [one for one in outcomes if one.found]
-    right = [one for one in found if one.off[0] <= FAR]
-    off = np.array([one.off for one in found]).reshape(-1, 2)
+    found = [one for one in outcomes if not one.refusal]
+    right = [one for one in found if one.error.probable >= LEAST]
+    off = np.array([one.error[:2] for one in found]).reshape(-1, 2)
     clocks = np.abs([one.clock for one in found if np.isfinite(one.clock)])
     zeros = [off for one in found for off in one.zeros]
     first = [one.first for one in found if np.isfinite(one.first)]
@@ -271,9 +298,11 @@ def _row(name: str, outcomes: Sequence[Outcome]) -> list[str]:
     return [
         name,
         f"{len(right)} of {len(outcomes)}",
+        f"{len(outcomes) - len(found)}",
         f"{len(found) - len(right)}",
+        f"{sum(one.cause for one in outcomes)}",
         *(f"{one:.2g}" for one in (np.median(off, axis=0) if len(off) else (np.nan, np.nan))),
-        f"{100.0 * sum(one.inside for one in found) / max(6 * len(found), 1):.0f}%",
+        f"{100.0 * sum(one.error.inside for one in found) / max(6 * len(found), 1):.0f}%",
         f"{1e3 * float(np.median(clocks)):.2g} ({1e3 * float(clocks.max()):.2g})"
         if len(clocks)
         else "-",
@@ -313,7 +342,7 @@ def main() -> None:
     given = parser.parse_args()
     rooms = range(given.first, given.first + given.rooms)
     headings = (
-        "set, arm", "found", f"over {FAR:g} mm off", "mm", "degrees", "inside 95 %",
+        "set, arm", "found", "refused", "wrong", "cause named", "mm", "degrees", "inside 95 %",
         "clock [ms] (worst)", "zeros [degrees] (worst), sound ones named",
         "first joint's zero (worst), determined",
         "frames named: wrong / right", "CPU s",

@@ -1,9 +1,8 @@
 """Benchmark of whole estimates: errors, and CPU time per frame relative to Drake's label images.
 
 Run as ``python -m tests.benchmarks.estimates [DATA] [--hands]``; DATA is a folder with the scenes
-``arm_two_views``, ``human_four_views``, ``hand_photos`` and ``hand_sequences``. Missing scenes are
-skipped; the demonstration is always there. ``--hands``: instead, all sequences of hands with an
-uncalibrated camera.
+``arm_two_views``, ``human_four_views``, ``hand_photos`` and ``hand_sequences``; without it only the
+demonstration is estimated. ``--hands``: instead, hands with an uncalibrated camera.
 """
 
 import argparse
@@ -59,32 +58,28 @@ class Work(NamedTuple):
 
 
 def works(data: Path | None, folder: Path) -> Iterator[Work]:
-    """Yield the rows whose scenes exist; rendered scenes are written to a folder."""
+    """Yield the rows; rendered scenes are written to a folder."""
     man, demo = bundled_model("man"), stored_scene("human")
     yield Work("demo: man, one view", demo, man, demo_settings(demo))
     if data is None:
         return
     arm, human = data / "arm_two_views", data / "human_four_views"
-    if arm.is_dir():
-        model = arm / "med7" / "med7.urdf"
-        yield Work("arm, two views, one pose", arm, model, joints=_ARM_JOINTS)
-        drawn = draw_arm_sequence(arm, folder / "arm_sequence")
-        yield Work("arm, two views, sequence", drawn, model, uncounted=2, joints=_ARM_JOINTS)
-    if human.is_dir():
-        settings = EstimateSettings(
-            frames=("0010", "0011"),
-            root="right_foot",
-            root_position=(human / "joint_centres.csv", "right_ankle"),
-            root_rotation={"y": (-180.0, 180.0), "x": (-20.0, 20.0), "z": (-20.0, 20.0)},
-            track=False,
-        )
-        yield Work("man, four views, one frame", human, man, settings)
-    if (data / "hand_photos").is_dir():
-        yield Work("hand photograph", data / "hand_photos", bundled_model("hand"))
+    model = arm / "med7" / "med7.urdf"
+    yield Work("arm, two views, one pose", arm, model, joints=_ARM_JOINTS)
+    drawn = draw_arm_sequence(arm, folder / "arm_sequence")
+    yield Work("arm, two views, sequence", drawn, model, uncounted=2, joints=_ARM_JOINTS)
+    settings = EstimateSettings(
+        frames=("0010", "0011"),
+        root="right_foot",
+        root_position=(human / "joint_centres.csv", "right_ankle"),
+        root_rotation={"y": (-180.0, 180.0), "x": (-20.0, 20.0), "z": (-20.0, 20.0)},
+        track=False,
+    )
+    yield Work("man, four views, one frame", human, man, settings)
+    yield Work("hand photograph", data / "hand_photos", bundled_model("hand"))
     sequence = data / "hand_sequences" / "count"
-    if sequence.is_dir():
-        frames = EstimateSettings(frames=(f"0000:{_FRAMES - 1:04d}",))
-        yield Work("hand, sequence, no camera known", sequence, _RIGHT_HAND, frames, uncounted=1)
+    frames = EstimateSettings(frames=(f"0000:{_FRAMES - 1:04d}",))
+    yield Work("hand, sequence, no camera known", sequence, _RIGHT_HAND, frames, uncounted=1)
 
 
 def draw_arm_sequence(arm: Path, out: Path, frames: int = _FRAMES) -> Path:

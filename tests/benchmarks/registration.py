@@ -1,23 +1,21 @@
 """Benchmark of registrations without an initial guess: success, errors and time.
 
-Run as ``python -m tests.benchmarks.registration [DATA] [--cases N]``; DATA is a folder with the
+Run as ``python -m tests.benchmarks.registration DATA [--cases N]``; DATA is a folder with the
 scenes ``arm_two_views``, ``arm_one_view`` and ``franka_one_view``, N the number of simulated cases
-per arm. Without any arm in DATA an arm of boxes is used.
+per arm.
 """
 
 import argparse
-import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import replace
-from importlib.metadata import PackageNotFoundError, distribution
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from drake_pose.arrays import Array
 from drake_pose.body import load_model
@@ -29,7 +27,12 @@ from drake_pose.jobs.estimate.inputs import make_tree
 from drake_pose.jobs.registration.inputs import read_inputs
 from drake_pose.registration.joint_offsets import scalable_links
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
-from drake_pose.registration.register import CameraSearch, RegistrationBody, overlap_areas
+from drake_pose.registration.register import (
+    CameraSearch,
+    RegisteredCamera,
+    RegistrationBody,
+    overlap_areas,
+)
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.benchmarks.tables import print_table
 from tests.registration.arm_pictures import damaged
@@ -45,7 +48,7 @@ _LEAST_PIXELS, _TRIES = 3000, 30
 # Standard deviations of errors: joint offsets [rad], link scales, focal length, centre [pixel].
 _ZERO_SD, _LENGTH_SD, _FOCAL_SD, _CENTER_SD = np.radians(0.3), 0.01, 0.01, 3.0
 _LBR, _PANDA = "arm_two_views/med7/med7.urdf", "franka_one_view/panda/panda.urdf"
-_XARM = "cmeel.prefix/share/example-robot-data/robots/xarm_description/urdf/xarm7.urdf"
+_ARMS = {"LBR Med 7": _LBR, "Franka Panda": _PANDA}
 # Recorded scenes, their arm, the table of their joints, and the cameras whose poses are withheld.
 _RECORDED = (
     ("arm_two_views", _LBR, "joint_angles", ("left", "right")),
@@ -63,36 +66,50 @@ _BOXES = (
 )
 
 
-class CameraOutcome(NamedTuple):
-    """Result of one registration.
+class CameraError(NamedTuple):
+    """Error of a registered camera.
 
     Attributes:
         millimetres, degrees: position and orientation error.
         inside: number of the pose's six coordinates inside their 95 % intervals.
+        probable: probability of a larger error, by the pose's covariance.
+        sd: standard deviations of position and orientation, root mean square [mm, deg].
+    """
+
+    millimetres: float = np.inf
+    degrees: float = np.inf
+    inside: int = 0
+    probable: float = 0.0
+    sd: tuple[float, float] = (np.inf, np.inf)
+
+    @classmethod
+    def of(cls, found: RegisteredCamera, X_WC: Array) -> "CameraError":
+        """Return the error of a camera whose true pose is X_WC (4, 4)."""
+        error = pose_error(found.camera.X_WC, X_WC)
+        inside = np.abs(error) < 1.96 * np.sqrt(np.diag(found.covariance))
+        probable = chi2.sf(error @ np.linalg.solve(found.covariance, error), 6)
+        degrees, metres = np.degrees(np.linalg.norm(error[:3])), np.linalg.norm(error[3:])
+        sd = 1e3 * found.translation_sd, float(np.degrees(found.rotation_sd))
+        return cls(1e3 * float(metres), float(degrees), int(inside.sum()), float(probable), sd)
+
+
+class CameraOutcome(NamedTuple):
+    """Result of one registration.
+
+    Attributes:
+        error: of the camera.
         named: whether exactly the wrong frames are reported as outliers.
         seconds: CPU time [s].
     """
 
-    millimetres: float
-    degrees: float
-    inside: int
+    error: CameraError
     named: bool
     seconds: float
 
     @property
     def found(self) -> bool:
         """Whether the true pose was found, and not another one with similar silhouettes."""
-        return self.millimetres < _FOUND[0] and self.degrees < _FOUND[1]
-
-
-def load_arms(data: Path | None) -> dict[str, RegistrationBody]:
-    """Return the arms that exist: those of scenes and the xArm7; else one of boxes."""
-    places = {} if data is None else {"LBR Med 7": data / _LBR, "Franka Panda": data / _PANDA}
-    with suppress(PackageNotFoundError):
-        places["xArm7"] = Path(str(distribution("example-robot-data").locate_file(_XARM)))
-    found = {name: load_arm(path) for name, path in places.items() if path.is_file()}
-    with tempfile.TemporaryDirectory() as folder:
-        return found or {"boxes": load_arm(write_box_arm(Path(folder) / "boxes.urdf"))}
+        return self.error.millimetres < _FOUND[0] and self.error.degrees < _FOUND[1]
 
 
 def write_box_arm(path: Path) -> Path:
@@ -184,12 +201,9 @@ def measure_camera(
     try:
         found = CameraSearch(body).register(camera, frames)
     except RegistrationError:
-        return CameraOutcome(np.inf, np.inf, 0, False, time.process_time() - start)
+        return CameraOutcome(CameraError(), False, time.process_time() - start)
     seconds = time.process_time() - start
-    error = pose_error(found.camera.X_WC, camera.X_WC)
-    inside = np.abs(error) < 1.96 * np.sqrt(np.diag(found.covariance))
-    named = found.outliers == wrong
-    return CameraOutcome(*_sizes(error), int(np.count_nonzero(inside)), named, seconds)
+    return CameraOutcome(CameraError.of(found, camera.X_WC), found.outliers == wrong, seconds)
 
 
 def _with_other_lengths(body: RegistrationBody, rng: np.random.Generator) -> RegistrationBody:
@@ -204,11 +218,6 @@ def pose_error(X_WC: Array, true: Array) -> Array:
     """Return (6,) the rotation vector [rad] and translation [m] from a pose to the true one."""
     turn = Rotation.from_matrix(true[:3, :3] @ X_WC[:3, :3].T).as_rotvec()
     return np.concatenate([turn, true[:3, 3] - X_WC[:3, 3]])
-
-
-def _sizes(error: Array) -> tuple[float, float]:
-    """Return the norms of a pose error (6,) [mm, deg]."""
-    return 1e3 * float(np.linalg.norm(error[3:])), float(np.degrees(np.linalg.norm(error[:3])))
 
 
 def _camera_rows(arms: dict[str, RegistrationBody], cases: int) -> Iterator[list[str]]:
@@ -226,7 +235,9 @@ def _camera_rows(arms: dict[str, RegistrationBody], cases: int) -> Iterator[list
         }
         for name, outcomes in {**own, "all": [*chain(*own.values())]}.items():
             found = [one for one in outcomes if one.found]
-            millimetres, degrees, inside = np.array([one[:3] for one in found]).reshape(-1, 3).T
+            millimetres, degrees, inside = (
+                np.array([one.error[:3] for one in found]).reshape(-1, 3).T
+            )
             error = f"{np.median(millimetres):.2f} mm, {np.median(degrees):.3f} deg"
             yield [
                 f"{name}, {masks}",
@@ -242,8 +253,6 @@ def _recorded_rows(data: Path) -> Iterator[list[str]]:
     """Yield results of recorded arms; the cameras' poses, if known, are withheld."""
     for name, arm, joints, cameras in _RECORDED:
         scene, model = data / name, data / arm
-        if not (scene.is_dir() and model.is_file()):
-            continue
         settings = RegistrationSettings(cameras=cameras)
         inputs = read_inputs(scene, model, scene / f"{joints}.csv", None, settings)
         body = RegistrationBody(inputs.tree)
@@ -254,8 +263,8 @@ def _recorded_rows(data: Path) -> Iterator[list[str]]:
             seconds = time.process_time() - start
             iou, distance = f"{np.mean([one.iou for one in found.frames]):.3f}", ""
             if cameras:
-                off = _sizes(pose_error(found.camera.X_WC, camera.X_WC))
-                distance = f"{off[0]:.1f} mm, {off[1]:.2f} deg"
+                off = CameraError.of(found, camera.X_WC)
+                distance = f"{off.millimetres:.1f} mm, {off.degrees:.2f} deg"
                 posed = PosedFrames(body.kinematics, body.full, camera, frames)
                 seen, mask, both = overlap_areas(posed, camera.X_CW[None], np.inf)[0].T
                 iou += f" ({np.mean(both / (seen + mask - both)):.3f})"
@@ -266,15 +275,15 @@ def _recorded_rows(data: Path) -> Iterator[list[str]]:
 def main() -> None:
     """Print success, errors and times of registrations."""
     parser = argparse.ArgumentParser(description="Where cameras stand: errors and times.")
-    parser.add_argument("data", nargs="?", type=Path, help="a folder of recorded scenes")
+    parser.add_argument("data", type=Path, help="a folder of recorded scenes")
     parser.add_argument("--cases", type=int, default=2, help="simulated cases for each arm")
     asked = parser.parse_args()
     headings = ("arm, masks", "found", "error, median", "95 % hold", "named", "CPU, median")
     title = f"Simulated arms, {_FRAMES} frames, no guess: where the camera is"
-    print_table(title, headings, _camera_rows(load_arms(asked.data), asked.cases))
-    if asked.data is not None:
-        headings = ("scene, camera", "from the file's", "IoU (at the file's)", "named", "CPU")
-        print_table("Recorded arms, no guess", headings, _recorded_rows(asked.data))
+    arms = {name: load_arm(asked.data / file) for name, file in _ARMS.items()}
+    print_table(title, headings, _camera_rows(arms, asked.cases))
+    headings = ("scene, camera", "from the file's", "IoU (at the file's)", "named", "CPU")
+    print_table("Recorded arms, no guess", headings, _recorded_rows(asked.data))
 
 
 if __name__ == "__main__":

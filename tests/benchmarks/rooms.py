@@ -199,6 +199,7 @@ def simulate(
     moved: Callable[[int], Array] | None = None,
     distance: tuple[float, float] = (1.1, 1.7),
     middle: tuple[float, float, float] = (0.0, 0.0, 0.4),
+    small: bool = False,
 ) -> SimulatedEpisode:
     """Simulate an arm that swings, seen by a camera on any side.
 
@@ -207,8 +208,10 @@ def simulate(
         moved: returns the pose (4, 4) of the camera that takes picture k in the returned one;
             None: it stands still.
         distance: bounds of the camera's distance from the point that it looks at [m].
-        middle: this point (x, y, z) in the world [m].
+        middle: this point (x, y, z) in the world [m], half as high as the arm is.
+        small: whether the arm is about 50 pixels tall, in pictures of a quarter of the size.
     """
+    width, height, focal = (320, 240, 150.0) if small else (_WIDTH, _HEIGHT, _FOCAL)
     rng = np.random.default_rng([9, seed])
     moving = np.isfinite(model.lower) & (model.upper - model.lower > 0.1)
     lower, upper = model.lower[moving], model.upper[moving]
@@ -224,7 +227,8 @@ def simulate(
             q[:, follower] = multiplier * q[:, leader] + offset
         return q
 
-    away = rng.uniform(*distance) * _around(rng, rng.uniform(-0.1, 0.8))
+    length = focal * 2.0 * middle[2] / 50.0 if small else rng.uniform(*distance)
+    away = length * _around(rng, rng.uniform(-0.1, 0.8))
     X_WC = np.eye(4)
     forward = -away / np.linalg.norm(away)
     right = np.cross(forward, [0, 0, 1])
@@ -234,7 +238,7 @@ def simulate(
     X_WC[:3, :3] = X_WC[:3, :3] @ tilt.ToRotationMatrix().matrix()
     X_WC[:3, 3] = np.array(middle) + away
     camera = PinholeCamera(
-        "camera", _WIDTH, _HEIGHT, _FOCAL, _FOCAL, _WIDTH / 2 - 0.5, _HEIGHT / 2 - 0.5, X_WC
+        "camera", width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5, X_WC
     )
     times = np.arange(_PICTURES) / _RATE_HZ
     log_times = np.arange(-1.0, times[-1] + 1.0, 1.0 / LOG_HZ)

@@ -49,7 +49,7 @@ def test_a_simulated_camera_is_found(tmp_path):
     arm = registration.load_arm(registration.write_box_arm(tmp_path / "boxes.urdf"))
     exact, worn = (registration.measure_camera(arm, 1, worn) for worn in (False, True))
     assert all(outcome.found and outcome.named for outcome in (exact, worn))
-    assert exact.millimetres < 5.0
+    assert exact.error.millimetres < 5.0
 
 
 @pytest.mark.slow

@@ -11,15 +11,15 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from drake_pose.errors import RegistrationError
 from drake_pose.files.settings import RegistrationSettings
 from drake_pose.jobs.registration.register import register_scene
-from tests.benchmarks.episodes import mirrored, of_another_arm, write_episode
-from tests.benchmarks.registration import pose_error
+from tests.benchmarks.episodes import Outcome, of_another_arm, write_episode
+from tests.benchmarks.registration import CameraError
 from tests.benchmarks.rooms import LOG_HZ
 from tests.benchmarks.tables import print_table
 from tests.benchmarks.wrist_rooms import GRIPPERS, simulate_wrist
@@ -67,31 +67,7 @@ KINDS = (
 BEFORE = {"panda": "panda_link6", "robotiq": "panda_link6", "so101": "wrist_link"}
 
 
-class Decision(NamedTuple):
-    """Result of one episode.
-
-    Attributes:
-        told: why it was refused; "": it was not.
-        off: error of its position [mm] and of its orientation [deg]; NaN: refused.
-        sds: root mean square standard deviation of position [mm] and of orientation [deg].
-        inside: number of the pose's six coordinates inside their 95 % intervals.
-        most: largest error of a coordinate [standard deviations].
-        seconds: CPU time [s].
-    """
-
-    told: str
-    off: tuple[float, float]
-    sds: tuple[float, float]
-    inside: int
-    most: float
-    seconds: float
-
-    @property
-    def accepted(self) -> bool:
-        return bool(np.isfinite(self.most))
-
-
-def decide(data: Path, name: str, kind: Kind, seed: int, codec: str) -> Decision:
+def decide(data: Path, name: str, kind: Kind, seed: int, codec: str) -> Outcome:
     """Simulate an episode of an arm, spoil it as the kind says, and register its camera.
 
     Args:
@@ -107,7 +83,7 @@ def decide(data: Path, name: str, kind: Kind, seed: int, codec: str) -> Decision
         folder = Path(text)
         model, episode = simulate_wrist(data, folder, one, seed, **kind.room)
         if kind.wrong == "mirrored":
-            episode = mirrored(episode)
+            episode = replace(episode, pictures=episode.pictures[:, :, ::-1])
         elif kind.wrong == "joints":
             _, other = simulate_wrist(data, folder, one, seed + 1000, **kind.room)
             episode = replace(episode, positions=other.positions)
@@ -121,22 +97,13 @@ def decide(data: Path, name: str, kind: Kind, seed: int, codec: str) -> Decision
         turned = {k: float(rng.uniform(-kind.off, kind.off)) for k in arm} if kind.off else {}
         write_episode(folder / "scene", model, episode, LOG_HZ, turned, (0.0, 0.0), codec)
         settings = RegistrationSettings(on=link, zeros=("all",) if kind.off else ())
-        start, nothing = time.process_time(), (np.nan, np.nan)
+        start = time.process_time()
         try:
             found = register_scene(folder / "scene", path, settings=settings)
         except RegistrationError as error:
-            seconds = time.process_time() - start
-            return Decision(f"refused: {error}", nothing, nothing, 0, np.nan, seconds)
+            return Outcome(str(error), time.process_time() - start)
         seconds = time.process_time() - start
-    camera = found.registered["wrist"]
-    error = pose_error(camera.camera.X_WC, episode.camera.X_WC)
-    sds = np.sqrt(np.diag(camera.covariance))
-    sizes = [float(np.sqrt(np.mean(k**2))) for k in (sds[3:], sds[:3])]
-    most = float(np.abs(error / sds).max())
-    inside = int((np.abs(error) < 1.96 * sds).sum())
-    off = 1e3 * float(np.linalg.norm(error[3:])), float(np.degrees(np.linalg.norm(error[:3])))
-    sds_told = 1e3 * sizes[0], float(np.degrees(sizes[1]))
-    return Decision("", off, sds_told, inside, most, seconds)
+    return Outcome("", seconds, CameraError.of(found.registered["wrist"], episode.camera.X_WC))
 
 
 def _rows(data: Path, first: int, only: str) -> Iterator[list[str]]:
@@ -144,16 +111,16 @@ def _rows(data: Path, first: int, only: str) -> Iterator[list[str]]:
     for n, kind in enumerate(KINDS):
         if only not in kind.name:
             continue
-        found = list[Decision]()
+        found = list[Outcome]()
         for m, name in enumerate(GRIPPERS):
             if name not in kind.arms:
                 continue
             seed = first + len(GRIPPERS) * n + m
             found.append(decide(data, name, kind, seed, "libx264" if seed % 2 else ""))
             print(kind.name, name, seed, found[-1], flush=True)
-        accepted = [one for one in found if one.accepted]
+        accepted = [one.error for one in found if not one.refusal]
         off = [
-            f"{one.off[0]:.2g} ({one.sds[0]:.2g}), {one.off[1]:.2g} ({one.sds[1]:.2g})"
+            f"{one.millimetres:.2g} ({one.sd[0]:.2g}), {one.degrees:.2g} ({one.sd[1]:.2g})"
             for one in accepted
         ]
         yield [

@@ -450,13 +450,14 @@ def distances_covariance(residuals: Distances, sizes: ErrorSizes) -> Array:
 @_on_one_thread
 def nuisance_covariance(
     residuals: Distances, sizes: ErrorSizes, is_angle: Mask
-) -> tuple[Array, Distances]:
-    """Return the covariance of the values (m, m) due to nuisances, and the residuals without them.
+) -> tuple[Array, Array, Distances]:
+    """Return two covariances of the values (m, m) due to nuisances, and residuals without them.
 
-    Nuisance parameters were not fitted, so they bias the values. The result is their variance plus
-    the square of their most likely values, given the residuals (best linear unbiased
-    prediction, Henderson 1975). The second result has these values' effect subtracted from y, and
-    no nuisances.
+    Nuisance parameters were not fitted, so they bias the values. The first result is their variance
+    plus the square of their most likely values, given the residuals (best linear unbiased
+    prediction, Henderson 1975). The second is what lacks to a standard deviation of their unit, as
+    far as the residuals do not show them. The third has the likely values' effect subtracted from
+    y, and no nuisances.
 
     Args:
         residuals: the residuals; without nuisances the covariance is 0.
@@ -464,23 +465,24 @@ def nuisance_covariance(
         is_angle: (m,) which values are angles; the others are lengths.
     """
     if not residuals.nuisances:
-        return np.zeros((len(is_angle), len(is_angle))), residuals
+        return *np.zeros((2, len(is_angle), len(is_angle))), residuals
     white = sizes.noise**2 + sizes.repeated**2
     A = np.concatenate(residuals.nuisances, axis=1)
     variances = np.repeat(np.square(sizes.nuisances), [Z.shape[1] for Z in residuals.nuisances])
     inverse = np.linalg.inv(distances_covariance(residuals, sizes) + (A * variances) @ A.T)
     VX, prior_information = inverse @ residuals.X, _prior_information(is_angle)
     known = _known(residuals)
-    weighted_residuals = inverse @ residuals.y - VX @ np.linalg.solve(
-        residuals.X.T @ VX + prior_information + known, VX.T @ residuals.y
-    )
-    estimates = variances * (A.T @ weighted_residuals)
+    P = inverse - VX @ np.linalg.solve(residuals.X.T @ VX + prior_information + known, VX.T)
+    estimates = variances * (A.T @ P @ residuals.y)
+    shown = np.einsum("nk,nm,mk->k", A, P, A, optimize=True)
+    lacking = np.maximum(0.0, 1.0 / (1.0 + shown) - variances)
     sensitivities = np.linalg.solve(
         residuals.information + white * prior_information + known, residuals.X.T @ A
     )
     bias = sensitivities @ estimates
     without = residuals._replace(y=residuals.y - A @ estimates, nuisances=())
-    return (sensitivities * variances) @ sensitivities.T + np.outer(bias, bias), without
+    found = (sensitivities * variances) @ sensitivities.T + np.outer(bias, bias)
+    return found, (sensitivities * lacking) @ sensitivities.T, without
 
 
 @_on_one_thread

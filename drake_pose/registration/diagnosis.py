@@ -7,7 +7,8 @@ or the base. A frame is an outlier if its residual r = h - N x_common is signifi
 r^T Q^-1 r follows an F distribution.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import reduce
 from itertools import compress
 from typing import NamedTuple
@@ -17,16 +18,15 @@ from scipy.special import chdtrc, fdtrc, fdtri
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.fit.covariance import (
-    ComparedMask,
     Distances,
     ErrorSizes,
     distances_covariance,
     distances_in_masks,
     estimate_sizes,
 )
-from drake_pose.fit.parameters import POSE_NAMES
+from drake_pose.fit.parameters import CAMERA_NAMES, POSE_NAMES
 from drake_pose.registration.findings import Diagnosis, Finding, FrameDiagnosis
-from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit
+from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit, explained_frames
 from drake_pose.registration.shared_fit import SHARED
 
 
@@ -35,9 +35,9 @@ class DiagnosisSettings(NamedTuple):
 
     # Probability with which a correct scene, or a correct frame, gets a finding.
     significance: float = 1e-4
-    min_pixels: float = 1.0  # Errors that move outlines by less get no finding [pixel].
-    # The same for joint offsets in all frames, beside errors of the cameras.
-    min_joint_pixels: float = 0.3
+    # Errors of a frame, and of all frames, that move outlines by less get no finding [pixel].
+    min_pixels: float = 1.0
+    min_common_pixels: float = 0.3
     focal_sd_floor: float = 0.001  # Minimum standard deviation of focal lengths [relative].
     # Statistics use directions of x with more information [of x's prior].
     min_information: float = 1.0
@@ -75,6 +75,12 @@ class _Information(NamedTuple):
             freedom=self.freedom + sign * info.freedom,
         )
 
+    def part(self, rows: Mask) -> "_Information":
+        """Return the information about the errors in `rows` (p,) if the others are known."""
+        both = np.ix_(rows, rows)
+        N, outlines = self.N[both], self.outlines[:, rows][:, :, rows]
+        return self._replace(N=N, h=self.h[rows], outlines=outlines)
+
     def pixels(self, x: Array) -> float:
         """Return the root mean square motion of the outlines that x (p,) moves [pixel]."""
         squares = np.einsum("p,npq,q->n", x, self.outlines, x)
@@ -85,10 +91,11 @@ class _Information(NamedTuple):
 class _Cause(NamedTuple):
     """A possible cause of errors, and the result of its test.
 
-    kind: "joint", "camera", "base", "focal" or "center"; name: of the joint or camera, or words.
+    kind: "joint", "length", "camera", "base", "focal" or "center"; name: of the joint, link or
+    camera, or words.
     jacobian: (p, d) derivative of x by the cause's d parameters. units: (d,) factors from amounts
     to a joint's position [rad or m]; rotation vector [rad] and translation [m] of a camera along
-    its axes, or of the base in the world; focal lengths [relative]; principal points [pixel].
+    its axes, or of the base in the world; logarithms of lengths; principal points [pixel].
     rank: of causes that explain errors equally well, the one with the lowest rank is reported.
     amount: (d,) the estimated parameters, with covariance (d, d). x: (p,) the errors they explain.
     p_value: of the test. gain: improvement of Akaike's information criterion.
@@ -131,27 +138,42 @@ class _Residual(NamedTuple):
     def test(self, cause: _Cause) -> _Cause:
         """Return a cause with estimated amount, covariance and x, and with its p_value and gain."""
         M = cause.jacobian
-        N, r, Q = M.T @ self.N @ M, M.T @ self.r, M.T @ self.Q @ M
-        T, rank = _statistic(r, Q, N)
-        inverse = np.linalg.inv(N + 1e-3 * np.eye(len(r)))
-        amount = inverse @ r
+        T, rank = _statistic(M.T @ self.r, M.T @ self.Q @ M, M.T @ self.N @ M)
         # The rank penalises causes with several parameters.
-        return cause._replace(
-            amount=amount, covariance=inverse @ Q @ inverse, x=M @ amount,
-            p_value=_p_value(T, rank, self.info.freedom), gain=T - 2.0 * rank,
-        )  # fmt: skip
+        p_value, gain = _p_value(T, rank, self.info.freedom), T - 2.0 * rank
+        return self.together([cause._replace(p_value=p_value, gain=gain)])[0]
 
-    def sufficient(
-        self, tests: Sequence[_Cause], least: float, fraction: float = 0.25
-    ) -> list[_Cause]:
-        """Return the tested causes that explain the residual by themselves, lowest rank first.
+    def together(self, causes: Sequence[_Cause], cameras: Sequence[_Cause] = ()) -> list[_Cause]:
+        """Return the causes, estimated together and beside small errors of the cameras' poses.
 
-        They leave less than a fraction of the residual's pixels, or less than `least` [pixel].
-        Among equal ranks, the cause with the largest gain comes first.
+        cameras: causes with a prior: errors along each direction move outlines by
+            ``min_common_pixels``.
         """
-        most = max(least, fraction * self.pixels())
-        enough = [one for one in tests if self.pixels(one.x) < most]
-        return sorted(enough, key=lambda one: (one.rank, -one.gain))
+        M = np.hstack([one.jacobian for one in (*causes, *cameras)])
+        ends = np.cumsum([one.jacobian.shape[1] for one in causes])
+        prior, own = np.zeros((M.shape[1],) * 2), M[:, ends[-1] :]
+        length = max(float(self.info.lengths.sum()), 1e-9) * DIAGNOSIS.min_common_pixels**2
+        prior[ends[-1] :, ends[-1] :] = own.T @ self.info.outlines.sum(axis=0) @ own / length
+        inverse = np.linalg.inv(M.T @ self.N @ M + prior + 1e-3 * np.eye(len(prior)))
+        amounts = inverse @ M.T @ self.r
+        covariance = inverse @ (M.T @ self.Q @ M + prior) @ inverse
+        rows = (
+            slice(end - one.jacobian.shape[1], end) for one, end in zip(causes, ends, strict=True)
+        )
+        return [
+            one._replace(
+                amount=amounts[k], covariance=covariance[k, k], x=one.jacobian @ amounts[k]
+            )
+            for one, k in zip(causes, rows, strict=True)
+        ]
+
+    def sufficient(self, tests: Sequence[_Cause], fraction: float = 0.25) -> list[_Cause]:
+        """Return the tested causes that explain the residual by themselves, see `_best_first`.
+
+        They leave less than a fraction of the residual's pixels, or less than ``min_pixels``.
+        """
+        most = max(DIAGNOSIS.min_pixels, fraction * self.pixels())
+        return _best_first(one for one in tests if self.pixels(one.x) < most)
 
     def without(self, cause: _Cause) -> "_Residual":
         """Return the residual after elimination of a cause's parameters, whatever their amount."""
@@ -163,16 +185,16 @@ class _Residual(NamedTuple):
 def diagnose_frames(
     fit: PerFrameFit,
     frames: Sequence[FrameFit],
-    requested: Collection[tuple[str, str]] = (),
+    at: Array | None = None,
     moved: bool = False,
 ) -> Diagnosis:
     """Diagnose fitted frames, in time linear in their number.
 
-    ``fit``: the fit with which the frames were fitted. ``requested``: (kind, name) of causes, as of
-    ``Finding``, that are always among the findings common to all inlier frames. ``moved``: whether
-    cameras or the base may be far from their given poses, and intrinsics are right.
+    ``fit``: the fit with which the frames were fitted. ``at``: (p,) corrections at which they were
+    fitted; None: 0. ``moved``: whether cameras or the base may be far from their given poses, and
+    intrinsics are right.
     """
-    return _Diagnoser(fit, frames, requested, moved).diagnose()
+    return _Diagnoser(fit, frames, np.zeros(len(fit.names)) if at is None else at, moved).diagnose()
 
 
 class _Diagnoser:
@@ -182,10 +204,10 @@ class _Diagnoser:
         self,
         fit: PerFrameFit,
         frames: Sequence[FrameFit],
-        requested: Collection[tuple[str, str]],
+        at: Array,
         moved: bool,
     ) -> None:
-        self._fit, self._frames, self._requested, self._moved = fit, frames, requested, moved
+        self._fit, self._frames, self._at, self._moved = fit, frames, at, moved
         # Tolerated errors of a single frame: standard deviations [rad, m].
         tolerance = np.where(fit.is_angle, np.radians(0.1), 0.001)
         self._tolerance = np.diag((tolerance / fit.deviations) ** 2)
@@ -207,7 +229,7 @@ class _Diagnoser:
             """Return p-values (frames,) and common errors (p,) of a set, see likeliest_inliers."""
             common = self._common(self._sum(kept))
             residuals = [self._residual(info, *common) for info in self._info]
-            return np.array([one.p_value for one in residuals]), common[0]
+            return np.array([one.p_value for one in residuals]), common[0] - self._at
 
         # In the first pass inliers are unknown, so error sizes come from single frames.
         inliers, together = explained, 1
@@ -229,14 +251,16 @@ class _Diagnoser:
             if not is_explained:
                 finding = self._joints_finding("unexplained", residual)
             elif least <= DIAGNOSIS.significance and pixels >= DIAGNOSIS.min_pixels:
-                sufficient = residual.sufficient(tests, DIAGNOSIS.min_pixels)
+                sufficient = residual.sufficient(tests)
                 finding = self._joints_finding("joints", residual)
                 if sufficient:
-                    finding = self._finding(sufficient, info.pixels(sufficient[0].x))
+                    finding = self._finding(sufficient, residual.info.pixels(sufficient[0].x))
             frames.append(FrameDiagnosis(fitted.name, *fitted.inlier_ratios, pixels, finding))
         kept = np.array([one.finding is None for one in frames])
-        common_findings = self._common_findings(kept) if kept.any() else ((), None, {})
-        return Diagnosis(tuple(frames), *common_findings)
+        common_findings = self._common_findings(kept) if kept.any() else ((), None, {}, self._at)
+        found = Diagnosis(tuple(frames), *common_findings)
+        remaining = total.pixels(found.corrections - self._at)
+        return replace(found, remaining=min(remaining, self._max_pixels))
 
     def _pooled_sizes(self, indices: Sequence[int], together: int, most: int = 5) -> ErrorSizes:
         """Return the median error sizes of up to `most` groups of `together` frames.
@@ -252,14 +276,10 @@ class _Diagnoser:
         sizes = []
         for k in range(groups):
             masks = [one for i in spread[k::groups] for one in self._frames[i].compared_masks]
-            distances = self._distances(masks)
+            distances = distances_in_masks(self._fit.outlines, masks, with_bias=True)
             is_angle = np.append(self._fit.is_angle, np.zeros(len(masks), bool))
             sizes.append(estimate_sizes(distances, is_angle, min_camera=0.0)[:5])
         return ErrorSizes(*np.median(np.array(sizes), axis=0).tolist())
-
-    def _distances(self, masks: Sequence[ComparedMask]) -> Distances:
-        """Return distances in masks, linear in the p unknowns, then each mask's boundary bias."""
-        return distances_in_masks(self._fit.outlines, masks, with_bias=True)
 
     def _info_of(self, fitted: FrameFit, sizes: ErrorSizes, bias_sd: float = 2.0) -> _Information:
         """Return a frame's information; bias_sd: prior deviation of its masks' biases [pixel]."""
@@ -267,7 +287,9 @@ class _Diagnoser:
         if not fitted.compared_masks:
             return self._empty._replace(lengths=fitted.outline_lengths, freedom=known)
         if fitted.name not in self._known_distances:
-            self._known_distances[fitted.name] = self._distances(fitted.compared_masks)
+            self._known_distances[fitted.name] = distances_in_masks(
+                self._fit.outlines, fitted.compared_masks, with_bias=True
+            )
         distances = self._known_distances[fitted.name]
         own, biases = np.split(distances.X, [len(self._fit.names)], axis=1)
         X = own * self._fit.deviations
@@ -300,45 +322,53 @@ class _Diagnoser:
         """Return the errors x (p,) common to the frames of a sum, and their covariance (p, p)."""
         # Without frames, the given values are right to within the tolerance.
         prior = np.eye(len(total.h)) if total.freedom else np.linalg.inv(self._tolerance)
-        inverse = np.linalg.inv(total.N + prior)
-        return inverse @ total.h, inverse @ (self._covariance(total) + prior) @ inverse
+        inverse, left = np.linalg.inv(total.N + prior), total.h - total.N @ self._at
+        return self._at + inverse @ left, inverse @ (self._covariance(total) + prior) @ inverse
 
     def _residual(self, info: _Information, x: Array, covariance: Array) -> _Residual:
         """Return a frame's residual from the common errors x (p,), with their covariance (p, p)."""
         Q = info.scale * info.N + info.N @ (covariance + self._tolerance) @ info.N
-        return _Residual(info, info.N, info.h - info.N @ x, Q)
+        rows, part = self._fit.posed, info.part(self._fit.posed)
+        return _Residual(part, part.N, (info.h - info.N @ x)[rows], Q[np.ix_(rows, rows)])
 
     def _causes(self, fitted: FrameFit | None) -> list[_Cause]:
         """Return the possible causes, untested, of errors in one fitted frame, or in all (None).
 
         A frame's cameras are those with a mask. In all frames focal lengths and principal points
-        are causes, too, of all cameras together and of each.
+        are causes, too, of all cameras together and of each; and lengths of links.
         """
-        fit, six = self._fit, len(POSE_NAMES)
-        deviations, joints, names = fit.deviations, len(fit.joints), fit.camera_names
-        eye = np.eye(len(fit.names))
-        causes = [
-            _Cause("joint", name, eye[:, [k]], deviations[[k]], 1)
-            for k, name in enumerate(fit.joints)
-        ]
+        fit, names, six = self._fit, self._fit.camera_names, len(POSE_NAMES)
+
+        def cause(kind: str, name: str, rows: Sequence[int], rank: float) -> _Cause:
+            """Return a cause with one parameter for each of some rows."""
+            return _Cause(kind, name, np.eye(len(fit.names))[:, rows], fit.deviations[rows], rank)
+
+        causes = [cause("joint", name, [k], 1.0) for k, name in enumerate(fit.joints)]
         for c, name in enumerate(names):
             if fitted is None or c in {one.camera for one in fitted.compared_masks}:
-                own = slice(joints + c * six, joints + (c + 1) * six)
-                causes.append(_Cause("camera", name, eye[:, own], deviations[own], six))
+                causes.append(cause("camera", name, fit.rows(POSE_NAMES, [name]), six))
         if len(names) > 1:
             causes.append(_Cause("base", "base", fit.base_jacobian(), np.ones(six), six))
-        if fitted is not None or self._moved:
+        if fitted is not None:
+            return [one._replace(jacobian=one.jacobian[fit.posed]) for one in causes]
+        if self._moved:
             return causes
-        groups = [("", [*range(len(names))])] if len(names) > 1 else []
-        groups += [(f" of camera '{name}'", [c]) for c, name in enumerate(names)]
+        for k, link in enumerate(fit.links, len(fit.names) - len(fit.links)):
+            causes.append(cause("length", link, [k], 1.5))
+        groups = [("", names)] if len(names) > 1 else []
+        groups += [(f" of camera '{name}'", (name,)) for name in names]
         for where, group in groups:
             # For one camera, a wrong pose explains more often than a wrong principal point.
             many, rank = ("", 6.5) if where else ("s", 2.0)
-            focal, center = fit.focal_jacobian(group), fit.center_jacobian(group)
-            if focal.any():
-                causes.append(_Cause("focal", f"focal length{many}{where}", focal, np.ones(1), 1))
-            text = f"principal point{many}{where}"
-            causes.append(_Cause("center", text, center, np.ones(2), rank))
+            for kind, text, of, order in (
+                ("focal", f"focal length{many}{where}", CAMERA_NAMES[six:7], 1.0),
+                ("center", f"principal point{many}{where}", CAMERA_NAMES[7:], rank),
+            ):
+                if kind == "focal" and any(fit.is_flat(name) for name in group):
+                    continue
+                single = [cause(kind, text, fit.rows(of, [name]), order) for name in group]
+                jacobian = np.sum([one.jacobian for one in single], axis=0)
+                causes.append(single[0]._replace(jacobian=jacobian))
         return causes
 
     def _finding(self, sufficient: Sequence[_Cause], pixels: float) -> Finding:
@@ -353,10 +383,10 @@ class _Diagnoser:
             alternatives.append("base")
         kind, name = best.kind, best.name
         variances = np.maximum(np.diag(best.covariance), 0.0)
-        if kind == "focal":
-            # Errors of the body's size limit the accuracy of a focal length.
-            variances = variances + DIAGNOSIS.focal_sd_floor**2
         x, sd = best.amount * best.units, np.sqrt(variances) * best.units
+        if kind in ("focal", "length"):
+            # Errors of the body's size limit the accuracy of a focal length.
+            x, sd = np.expm1(x), np.exp(x) * np.hypot(sd, DIAGNOSIS.focal_sd_floor)
         # Poses are rotation, then translation; a joint is one of them; the rest counts as shift.
         turns = len(x) // 2 if kind in ("camera", "base") else 0
         if kind == "joint":
@@ -379,7 +409,7 @@ class _Diagnoser:
         """Return a finding, "joints" or "unexplained", of a frame that no single cause explains."""
         x, names = residual.solved(residual.r), self._fit.joints
         sd = np.sqrt(residual.info.scale * np.diag(np.linalg.inv(residual.N + np.eye(len(x)))))
-        joints = (x * self._fit.deviations)[: len(names)]
+        joints = x[: len(names)] * self._fit.deviations[: len(names)]
         turns = self._fit.is_angle[: len(names)]
         angle = float(np.abs(joints[turns]).max(initial=0.0))
         shift = float(np.abs(joints[~turns]).max(initial=0.0))
@@ -390,72 +420,63 @@ class _Diagnoser:
 
     def _common_findings(
         self, kept: Mask
-    ) -> tuple[tuple[Finding, ...], tuple[list[float], list[float]] | None, dict[str, float]]:
-        """Return common, center and minimum_detectable of a ``Diagnosis`` from `kept` (frames,)."""
-        info, count = self._sum(kept), np.count_nonzero(kept)
-        Q = self._covariance(info) + info.N @ self._tolerance @ info.N / count
-        residual = _Residual(info, info.N, info.h, Q)
+    ) -> tuple[
+        tuple[Finding, ...], tuple[list[float], list[float]] | None, dict[str, float], Array
+    ]:
+        """Return all but the frames of a ``Diagnosis`` from `kept` (frames,)."""
+        info = self._sum(kept)
+        Q = self._covariance(info) + info.N @ self._tolerance @ info.N / np.count_nonzero(kept)
+        h = info.h - info.N @ self._at * self._moved
+        residual = _Residual(info, info.N, h, Q)
         causes = self._causes(None)
         if self._moved:
             # The base is a cause only if its motion explains nearly all by itself.
             tests = [residual.test(one) for one in causes if one.kind == "base"]
-            alone = residual.sufficient(tests, DIAGNOSIS.min_pixels, 0.1)
+            alone = residual.sufficient(tests, 0.1)
             causes = [one for one in causes if one.kind != "base" or alone]
-        every = range(len(self._fit.camera_names))
-        jacobian = self._fit.center_jacobian(every)
-        shifted = residual.test(_Cause("center", "", jacobian, np.ones(2), 2))
+        # The first principal points are those of all cameras.
+        shifted = next((residual.test(one) for one in causes if one.kind == "center"), None)
         others = [residual.test(one).gain for one in causes if one.kind != "center"]
         center = None
-        if is_half_pixel(shifted.amount, shifted.covariance) and shifted.gain > max(others):
-            residual = residual.without(shifted)
-            sd = np.sqrt(np.diag(shifted.covariance))
-            center = shifted.amount.tolist(), sd.tolist()
-        whole, (residual, found) = residual, _name(residual, causes, DIAGNOSIS.min_pixels)
-        # Small joint offsets are tested after elimination of all cameras' poses.
-        named, joints, freed = [one[0].name for one in found], list[_Cause](), list[_Cause]()
-        for cause in causes:
-            if cause.kind == "camera":
-                residual = residual.without(cause)
-                freed.append(cause)
-            elif cause.kind == "joint" and cause.name not in named:
-                joints.append(cause)
-        residual, offsets = _name(residual, joints, DIAGNOSIS.min_joint_pixels)
+        if shifted is not None and shifted.gain > max(others):
+            x, covariance = shifted.amount * shifted.units, shifted.covariance * shifted.units**2
+            if is_half_pixel(x, covariance):
+                residual = residual.without(shifted)
+                center = x.tolist(), np.sqrt(np.diag(covariance)).tolist()
+        # The linear equations err by a part of the step from where the frames were fitted.
+        slack = 0.25 * residual.pixels(self._at)
+        whole, (residual, found, left) = residual, _name(residual, causes, slack)
+        # Small offsets and lengths are tested after elimination of all cameras' poses.
+        for cause in (one for one in causes if one.kind == "camera"):
+            residual = residual.without(cause)
+        small = [one for one in left if one.kind in ("joint", "length")]
+        residual, offsets, undetected = _name(residual, small, slack)
         found += offsets
-        names = {(one[0].kind, one[0].name) for one in found}
-        for cause in causes:
-            if (key := (cause.kind, cause.name)) in self._requested and key not in names:
-                found.append([whole.test(cause)])
-        findings = list[Finding]()
+        findings, at = list[Finding](), np.zeros(len(info.h))
         if found:
-            # Final amounts are estimated jointly, beside the eliminated cameras.
+            free = [one for one in left if one.kind == "camera"]
             own = [best for best, *_ in found]
-            names = {(one.kind, one.name) for one in own}
-            freed = freed if offsets or self._requested else []
-            free = [one for one in freed if (one.kind, one.name) not in names]
-            jacobian = np.hstack([one.jacobian for one in (*own, *free)])
-            whole_test, first = whole.test(_Cause("", "", jacobian, np.ones(0), 0)), 0
-            for best, *alternatives in found:
-                k = slice(first, first + len(best.amount))
-                first = k.stop
-                amount, covariance = whole_test.amount[k], whole_test.covariance[k, k]
-                better = best._replace(amount=amount, covariance=covariance)
-                pixels = whole.info.pixels(best.jacobian @ better.amount)
-                least = DIAGNOSIS.min_joint_pixels if best.kind == "joint" else DIAGNOSIS.min_pixels
+            for better, (_, *others_too) in zip(whole.together(own, free), found, strict=True):
+                pixels = info.pixels(better.x)
                 # A cause may vanish in the joint estimate.
-                if pixels >= least or (best.kind, best.name) in self._requested:
-                    findings.append(self._finding([better, *alternatives], pixels))
-        named = [one[0].name for one in found]
-        undetected = [one for one in joints if one.name not in named]
-        return tuple(findings), center, _minimum_detectable(residual, undetected)
+                if pixels >= DIAGNOSIS.min_common_pixels:
+                    findings.append(self._finding([better, *others_too], pixels))
+                    at += better.x
+        undetected = [one for one in undetected if one.kind == "joint"]
+        return tuple(findings), center, _minimum_detectable(residual, undetected), at
 
 
 def _name(
-    residual: _Residual, causes: Sequence[_Cause], least: float
-) -> tuple[_Residual, list[list[_Cause]]]:
+    residual: _Residual, causes: Sequence[_Cause], slack: float = 0.0
+) -> tuple[_Residual, list[list[_Cause]], list[_Cause]]:
     """Select significant causes, of untested ones, one after another.
 
-    ``least``: minimum motion of outlines by a cause [pixel]. Returns the residual without the
-    selected causes; and for each a list of it and its alternatives.
+    Of those that explain as much as the best, so that it is not significant beside them, the one
+    with the lowest rank is selected.
+
+    ``slack``: causes that leave less of the residual explain as much, too [pixel]. Returns the
+    residual without the selected causes; for each a list of it and its alternatives; and the
+    causes that are left.
     """
     left, named = list(causes), list[list[_Cause]]()
     while left:
@@ -464,16 +485,28 @@ def _name(
             one
             for one in map(residual.test, left)
             if one.p_value * len(left) <= DIAGNOSIS.significance
-            and residual.info.pixels(one.x) >= least
+            and residual.info.pixels(one.x) >= DIAGNOSIS.min_common_pixels
         ]
         if not tests:
             break
-        most = max(tests, key=lambda one: one.gain)
-        named.append(residual.sufficient(tests, least) or [most])
+        most, level = max(tests, key=lambda one: one.gain), DIAGNOSIS.significance / len(left)
+        enough = (
+            one
+            for one in tests
+            if one is most
+            or residual.pixels(one.x) < slack
+            or residual.without(one).test(most).p_value > level
+        )
+        named.append(_best_first(enough))
         best = named[-1][0]
         residual = residual.without(best)
         left = [one for one in left if (one.kind, one.name) != (best.kind, best.name)]
-    return residual, named
+    return residual, named, left
+
+
+def _best_first(causes: Iterable[_Cause]) -> list[_Cause]:
+    """Return causes, the lowest rank first, among equal ranks that with the largest gain."""
+    return sorted(causes, key=lambda one: (one.rank, -one.gain))
 
 
 def _minimum_detectable(residual: _Residual, causes: Sequence[_Cause]) -> dict[str, float]:
@@ -490,7 +523,7 @@ def _minimum_detectable(residual: _Residual, causes: Sequence[_Cause]) -> dict[s
         amount = (np.sqrt(critical) + 1.645) * sd / information
         pixels = max(residual.info.pixels(along), 1e-9)
         is_observable = information > DIAGNOSIS.min_information
-        least = max(amount, DIAGNOSIS.min_joint_pixels / pixels) if is_observable else np.inf
+        least = max(amount, DIAGNOSIS.min_common_pixels / pixels) if is_observable else np.inf
         found[cause.name] = float(least * cause.units[0])
     return found
 
@@ -531,36 +564,18 @@ def likeliest_inliers(
             kept = now
         else:
             x = evaluate(kept)[1]
-        off = x / usual_deviation
-        unlikely = outlier_cost * np.count_nonzero(~kept) + 0.5 * float(off @ off)
+        # One cause may be far off: a Cauchy distribution.
+        off = float(np.log1p((x / usual_deviation) ** 2).sum())
+        unlikely = outlier_cost * np.count_nonzero(~kept) + off
         if unlikely < least:
             best, least = kept, unlikely
     return best
 
 
-def explained_frames(
-    ratios: Sequence[Mapping[str, float]], of_best: float = 0.75, least: float = 0.5
-) -> Mask:
-    """Return which frames (frames,) the fit explains in all their pictures.
-
-    Args:
-        ratios: for each frame the fitted inlier ratios by camera.
-        of_best, least: minimum, relative to the mean of the camera's best quarter, and absolute.
-    """
-    limits = {}
-    for name in {name for one in ratios for name in one}:
-        own = sorted(one[name] for one in ratios if name in one)
-        best = float(np.mean(own[-max(2, len(own) // 4) :]))
-        limits[name] = max(of_best * best, least)
-    return np.array([all(ratio >= limits[name] for name, ratio in one.items()) for one in ratios])
-
-
 def is_half_pixel(offset: Array, covariance: Array, near: float = 0.25) -> bool:
-    """Return whether principal points are significantly off by half a pixel along both axes.
+    """Return whether principal points' offset (2,) [pixel] is significant, and half a pixel.
 
-    Args:
-        offset: (2,) estimated correction, and covariance: (2, 2) [pixel].
-        near: largest difference from half a pixel [pixel].
+    ``near``: largest difference from half a pixel along both axes [pixel].
     """
     half = np.copysign(0.5, offset.sum())
     T = float(offset @ np.linalg.solve(covariance, offset))

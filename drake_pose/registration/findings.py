@@ -3,6 +3,10 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from drake_pose.arrays import Array
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -12,14 +16,14 @@ class Finding:
     # "center": principal points; "clock": a camera's time offset; "rate": its drift; "joints":
     # several joints; "unexplained": nothing within reach explains the frame; "refused": a camera
     # whose pictures no pose explains. In all frames also "sign" or "log": a joint's column in the
-    # log; "link": a link's shape; "reading": the meaning of what is given; "moved": a pose that
-    # changed after a frame.
+    # log; "length": the distances between a link's joints; "link": a link's shape; "reading": the
+    # meaning of what is given; "moved": a pose that changed after a frame.
     kind: str
     name: str  # Of the joint or camera, "" for several; for a "reading" a sentence.
     # angle, shift: correction to be added [rad, m]. Of several joints, the largest. Focal lengths
-    # [relative], principal points [pixel]; a camera's shift is that of its own centre. Clock [s]:
-    # how much later the pictures' joint positions are logged. Rate [s/s]: how much faster the log's
-    # clock runs.
+    # and lengths [relative], principal points [pixel]; a camera's shift is that of its own centre.
+    # Clock [s]: how much later the pictures' joint positions are logged. Rate [s/s]: how much
+    # faster the log's clock runs.
     angle: float
     shift: float
     # angle_sd, shift_sd: their standard deviations; 0 for several joints.
@@ -62,12 +66,16 @@ class Diagnosis:
             where they are off by half a pixel along x and y; otherwise None.
         minimum_detectable: by joint without a finding, the smallest offset in all frames that
             would be detected [rad or m].
+        corrections: (p,) the ``PerFrameFit``'s corrections that these findings state.
+        remaining: by how much outlines move from those that the frames were fitted with [pixel].
     """
 
     frames: tuple[FrameDiagnosis, ...]
     common: tuple[Finding, ...]
     center: tuple[list[float], list[float]] | None = None
     minimum_detectable: Mapping[str, float] = field(default_factory=dict)
+    corrections: Array = field(default_factory=lambda: np.zeros(0))
+    remaining: float = 0.0
 
     @property
     def outliers(self) -> tuple[str, ...]:

@@ -168,8 +168,8 @@ def calibrate_joints(
     fit, found, included = _fit_to_inliers(fit, begin, known)
     # Each mask contributes six affine motions to the estimate of the error sizes.
     freedom = max(1, 6 * int(np.count_nonzero(included)) - len(fit.names))
-    own, shared = fit.covariances(found, included)
-    found, covariance = with_measured(fit, found, own + shared, static)
+    covariance = np.sum(fit.covariances(found, included), axis=0)
+    found, covariance = with_measured(fit, found, covariance, static)
     least = SHARED.level / max(1, len(requested))
     describe = partial(describe_constants, fit, freedom=freedom, level=least, measured=static)
     values = describe(found, covariance=covariance, names=requested)

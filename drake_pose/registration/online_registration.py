@@ -1,7 +1,8 @@
 """Register a camera frame by frame while the body moves, and detect that the camera was moved.
 
 A bounded number of keyframes is kept, the newest ones in which the body's pose differs, and the
-camera's pose is fitted to them. Two events show that the camera was moved: outlier frames that
+camera's pose is fitted to them. A pose found without an initial guess is judged by keyframes that
+it was not fitted to. Two events show that the camera was moved: outlier frames that
 agree with each other, or a significant difference between the pose from the newest keyframes and
 that from all. Differences observed while the camera rests set the scale, since wrong joint offsets
 or link scales cause differences, too.
@@ -25,6 +26,7 @@ from drake_pose.registration.register import (
     E_total,
     RegisteredCamera,
     RegistrationBody,
+    fits_better,
     overlap_areas,
 )
 from drake_pose.registration.shared_fit import SHARED
@@ -50,9 +52,6 @@ class OnlineSettings:
     most_frames: int = 12  # Maximum number of keyframes; the newest are kept.
     # Number of newest keyframes, or of outlier frames, that show a motion of the camera.
     newest: int = 3
-    # Maximum rotation [rad] and shift [its distance from the body] of a camera that a local fit
-    # finds again. After larger motions all poses are searched.
-    bump: float = 0.2
     # Degrees of freedom of the prior of the covariance's scale. Successive poses are fitted to
     # overlapping newest keyframes, so each adds fewer than the pose's six.
     trust: float = 4.0
@@ -62,7 +61,6 @@ class OnlineSettings:
     # A frame in the pose of a keyframe is fitted, and replaces it, only if its E_total is larger by
     # more than this [the mask's area].
     tolerance: float = 0.04
-    min_iou: float = 0.5  # Minimum mean intersection over union of a found pose.
     false_alarm: float = 1e-6  # P-value of a difference that counts as a moved camera.
 
     def __post_init__(self) -> None:
@@ -193,14 +191,11 @@ class OnlineRegistration:
         state = replace(state, outlier_frames=frames, outlier_count=state.outlier_count + 1)
         if near is not None or len(frames) < settings.newest:
             return state
-        least, X_WC = self._least_inlier_ratio(registered), registered.camera.X_WC
+        least = self._least_inlier_ratio(registered)
+        # A local fit finds the camera again after a bump, but not after larger motions.
         found: RegisteredCamera | None = self._search.refine(registered.camera, frames)
         assert found is not None
-        off = pose_difference(found.camera.X_WC, X_WC)
-        distance = np.linalg.norm(X_WC[:3, 3] - self._points(frame).mean(axis=0))
-        turn, shift = np.linalg.norm(off[:3]), np.linalg.norm(off[3:]) / distance
-        is_bump = max(turn, shift) <= settings.bump
-        if not (is_bump and self._is_found(found, settings.newest, least)):
+        if not self._is_found(found, settings.newest, least):
             enough = len(frames) >= settings.least_frames
             found = self._find(frames, least) if enough else None
         if found is None:
@@ -230,25 +225,31 @@ class OnlineRegistration:
     def _find(self, frames: Sequence[PosedFrame], least: float) -> RegisteredCamera | None:
         """Search the camera's pose in frames without an initial guess; None: not determined.
 
+        Frames must agree better with their own joint positions than with those of other frames
+        (``fit.judge``), and must not fit better when they are mirrored.
+
         least: minimum median inlier ratio.
         """
         try:
             found = self._search.register(self.camera, frames)
         except RegistrationError:
             return None
+        if found.evidence is None or not found.evidence.holds:
+            return None
+        given, mirrored = self._search.mirrored_costs(found, frames)
+        if fits_better(mirrored, given):
+            return None
         return found if self._is_found(found, self.settings.least_frames, least) else None
 
     def _is_found(self, found: RegisteredCamera, count: int, least: float) -> bool:
         """Return whether at least `count` frames, and over half, are inliers of a unique pose.
 
-        Their mean intersection over union must be at least `min_iou`, and their median inlier ratio
-        at least `least`.
+        Their median inlier ratio must be at least `least`.
         """
         inliers = [frame for frame in found.frames if frame.is_inlier]
         return (
             not len(found.alternatives)
             and len(inliers) >= max(count, len(found.frames) // 2 + 1)
-            and float(np.mean([frame.iou for frame in inliers])) >= self.settings.min_iou
             and float(np.median([frame.inlier_ratio for frame in inliers])) >= least
         )
 
@@ -314,6 +315,6 @@ def _registered(
 
 
 def _distance(found: RegisteredCamera, registered: RegisteredCamera) -> float:
-    """Return the squared Mahalanobis distance of two poses, by the covariance of the first."""
+    """Return the squared Mahalanobis distance of two poses, by the first one's own errors."""
     off = pose_difference(found.camera.X_WC, registered.camera.X_WC)
-    return squared_distance(off, found.covariance)
+    return squared_distance(off, found.covariance - found.common)

@@ -7,11 +7,12 @@ returned as linear functions of the corrections. ``adjust_bundle`` has no given 
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 
 from drake_pose.arrays import Array, Mask
-from drake_pose.body.tree_kinematics import TreeKinematics
+from drake_pose.body.tree_kinematics import LinkVector, TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.fit.contour_fit import Comparison, inlier_ratio_of
 from drake_pose.fit.covariance import (
@@ -23,11 +24,21 @@ from drake_pose.fit.covariance import (
 from drake_pose.fit.evidence import Observation
 from drake_pose.fit.kernel import Sum
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, StepSettings
-from drake_pose.fit.parameters import CAMERA_NAMES, POSE_NAMES, RADIUS_SCALE_PREFIX, BodyParameters
+from drake_pose.fit.parameters import (
+    CAMERA_NAMES,
+    POSE_NAMES,
+    RADIUS_SCALE_PREFIX,
+    BodyParameters,
+    CameraParameters,
+    carried_joints,
+    link_scale_name,
+)
 from drake_pose.fit.problem import Problem, Unknowns
 from drake_pose.registration.posed_frames import MultiViewFrame, common_size, middle_of
 from drake_pose.registration.shared_fit import SHARED, pose_covariance
 from drake_pose.silhouette.outline import Outline
+
+_INTRINSICS = ("focal_x", "focal_y", "center_x", "center_y")
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +67,13 @@ class PerFrameFit:
         cameras, camera_names: the c cameras at their given poses, and their names.
         joints: names of the tree's values that are not fixed.
         size: square root of the silhouettes' median area [pixel].
-        names: names of the p unknowns: the joints, and POSE_NAMES of each camera.
-        is_angle: (p,) which unknowns are angles.
-        deviations: (p,) prior standard deviations of the corrections [rad or m].
+        links: names of the links that a joint moves and that carry another joint.
+        names: names of the p corrections: of the joints, CAMERA_NAMES of each camera, and the
+            logarithms of the links' lengths.
+        posed: (p,) which of them each frame determines for itself: joints and cameras' poses. The
+            others are the same in all frames.
+        is_angle: (p,) which corrections are angles.
+        deviations: (p,) their prior standard deviations [rad, m, logarithm or pixel].
 
     Args:
         kinematics: of the body's pose tree.
@@ -80,55 +95,67 @@ class PerFrameFit:
     ) -> None:
         self.cameras, self.outlines = tuple(cameras), outlines[1]
         self.size = common_size(cameras, frames)
-        joints = np.flatnonzero(kinematics.lower < kinematics.upper)
+        self._values = joints = np.flatnonzero(kinematics.lower < kinematics.upper)
         self.camera_names = tuple(camera.name for camera in cameras)
         self.joints = tuple(kinematics.names[k] for k in joints)
-        poses = tuple(f"{camera.name}.{name}" for camera in cameras for name in POSE_NAMES)
-        self.names = (*self.joints, *poses)
-        turns = np.tile([name.startswith("turn") for name in POSE_NAMES], len(cameras))
-        self.is_angle = np.concatenate([kinematics.is_angle[joints], turns])
-        # Prior standard deviations of joints, and of cameras about the body [rad, m].
+        offsets = moved_links(kinematics)
+        self.links = tuple(dict.fromkeys(one.link for one in offsets))
+        of_cameras = [f"{camera.name}.{name}" for camera in cameras for name in CAMERA_NAMES]
+        self.names = (*self.joints, *of_cameras, *map(link_scale_name, self.links))
+        # Prior standard deviations of joints, of cameras about the body [rad, m], of the logarithms
+        # of focal lengths and lengths, and of principal points [pixel].
         of_joints = np.where(kinematics.is_angle[joints], 0.1, 0.02)
-        self.deviations = np.concatenate([of_joints, np.full(len(turns), 0.05)])
+        of_camera = [0.05] * (len(POSE_NAMES) + 1) + [0.05 * self.size] * 2
+        lengths = np.full(len(self.links), 0.05)
+        self.deviations = np.concatenate([of_joints, *[of_camera] * len(cameras), lengths])
+        kinds = [name.startswith("turn") for name in CAMERA_NAMES]
+        self.is_angle = np.concatenate(
+            [kinematics.is_angle[joints], *[kinds] * len(cameras), lengths < 0.0]
+        ).astype(bool)
+        poses = np.tile(np.arange(len(CAMERA_NAMES)) < len(POSE_NAMES), len(cameras))
+        self.posed = np.concatenate([joints >= 0, poses, lengths < 0.0])
         error = SHARED.point_error * np.sqrt(SHARED.error_length)
         self._middle = middle_of(kinematics, frames)
         self._simplified, self._full = (
             Problem(
-                BodyParameters(kinematics, one), cameras,
-                [Unknowns(self.names, deviation=self.deviations / error)], pivot=self._middle,
+                BodyParameters(kinematics, one, offsets=offsets), cameras,
+                [Unknowns([*compress(self.names, own)], deviation=self.deviations[own] / error)],
+                pivot=self._middle, pixels=self.size,
                 steps=StepSettings(max_step=0.2, damping=1e-3, uniform_damping=1e-6),
-                pixels=self.size,
             )
-            for one in outlines
+            for one, own in zip(outlines, (self.posed, self.posed | True), strict=True)
         )  # fmt: skip
 
     def fit(
         self,
         frame: MultiViewFrame,
+        at: Array | None = None,
         scales: Sequence[float] = (0.12, 0.09, 0.07, 0.05, 0.04, 0.03, 0.025),
         already: float = 1.3,
     ) -> FrameFit:
         """Fit one frame.
 
         Args:
-            frame: the frame, whose values are the start and the mean of the prior.
+            frame: the frame.
+            at: (p,) corrections, over their `deviations`, which are the start and the mean of the
+                prior; None: 0.
             scales: scales of the annealing stages [square root of the silhouettes' area].
-            already: if the cost at the given values is at most this multiple of the fitted cost,
-                distances are linearised about the given values: weakly observable unknowns may have
-                moved far without effect on the cost.
+            already: if the cost at `at` is at most this multiple of the fitted cost, distances are
+                linearised there: weakly observable unknowns may have moved far without effect on
+                the cost.
 
         Raises MaskError: a mask's size differs from its camera's.
         """
-        edges = frame.edges(self.cameras, 0.01 * self.size)
-        start, count = (np.zeros((1, len(self.names))), np.zeros(0)), len(self.cameras)
-        given = Observation(edges, frame.values)
-        change, base = start, given
-        rounds = [AnnealingStage(scale, 0.02) for scale in scales]
+        edges, count = frame.edges(self.cameras, 0.01 * self.size), len(self.cameras)
+        change = np.zeros(len(self.names)) if at is None else at * self.deviations
+        given, nothing = Observation(edges, frame.values), np.zeros(0)
+        held = self._full.parameters([given], change[None], nothing)[0]
+        base, own = given._replace(values=held), np.zeros((1, np.count_nonzero(self.posed)))
+        rounds, start = [AnnealingStage(scale, 0.02) for scale in scales], (own, nothing)
         for part in (rounds, rounds[-2:]):
-            found = self._simplified.solve([base], part, change, expected=start)
-            change = found.own, found.shared
+            found = self._simplified.solve([base], part, (own, nothing), expected=start)
+            own = found.own
             theta = self.with_boundary_biases(base, found.parameters[0])
-            held = self._full.parameters([given], *start)[0]
             base = given._replace(values=np.append(held[:-count], theta[-count:]))
         held = self.with_boundary_biases(given, held)
         before, after = (
@@ -137,12 +164,14 @@ class PerFrameFit:
         compared = after
         costs = [float(one.sums[:, :, Sum.COST].sum()) for one in (before, after)]
         if costs[0] <= already * costs[1]:
-            theta, compared, change = held, before, start
+            theta, compared = held, before
+        else:
+            change[self.posed] += own[0]
         weights = compared.sums[:, :, Sum.WEIGHT].sum(axis=0)
         return FrameFit(
             frame.name,
             tuple(
-                one._replace(b=one.b + np.einsum("nkl,npl,p->nk", one.A, one.moves, change[0][0]))
+                one._replace(b=one.b + np.einsum("nkl,npl,p->nk", one.A, one.moves, change))
                 for one in self._full.compared_masks([given], theta[None], SHARED.inlier_stage)
             ),
             (self._inlier_ratios(before, frame), self._inlier_ratios(after, frame)),
@@ -180,50 +209,47 @@ class PerFrameFit:
         found[-count:] = biases[best] + np.clip(step, -1.0, 1.0) * (biases[1] - biases[0])
         return found
 
+    def values_at(self, values: Array, at: Array) -> Array:
+        """Return values (m,) of the tree with corrections `at` (p,) added."""
+        found = values.copy()
+        found[self._values] += (at * self.deviations)[: len(self.joints)]
+        return found
+
+    def cameras_at(self, at: Array) -> tuple[Camera, ...]:
+        """Return the cameras with corrections `at` (p,)."""
+        first, kinds = len(self.joints), len(CAMERA_NAMES)
+        change = (at * self.deviations)[first : first + kinds * len(self.cameras)]
+        if not change.any():
+            return self.cameras
+        X_CW, kernel, _ = CameraParameters(self.cameras, self._middle).place(change)
+        return tuple(
+            replace(
+                one.with_pose(np.linalg.inv(X)),
+                **dict(zip(_INTRINSICS, k[1:5].tolist(), strict=True)),
+            )
+            if isinstance(one, PinholeCamera)
+            else one.with_pose(np.linalg.inv(X))
+            for one, X, k in zip(self.cameras, X_CW, kernel, strict=True)
+        )
+
+    def is_flat(self, camera: str) -> bool:
+        """Return whether a camera, given by name, is a parallel one."""
+        return self.cameras[self.camera_names.index(camera)].kernel_parameters()[0] == 1.0
+
+    def rows(self, names: Collection[str], cameras: Collection[str]) -> list[int]:
+        """Return the indices of the corrections of some CAMERA_NAMES of some cameras."""
+        return [self.names.index(f"{camera}.{name}") for camera in cameras for name in names]
+
     def base_jacobian(self) -> Array:
-        """Return the derivative (p, 6) of the unknowns by a motion of the robot's base.
+        """Return the derivative (p, 6) of the corrections by a motion of the robot's base.
 
         The motion is a rotation vector [rad] and a translation [m] in the world, about the body's
-        middle, and is seen by every camera. Rows are divided by the unknowns' `deviations`, as in
-        `center_jacobian` and `focal_jacobian`.
+        middle, and is seen by every camera. Rows are divided by the corrections' `deviations`.
         """
         moves = np.zeros((len(self.names), 6))
-        for c, camera in enumerate(self.cameras):
-            first = len(self.joints) + 6 * c
-            R_CW = camera.X_CW[:3, :3]
-            moves[first : first + 3, :3] = R_CW
-            moves[first + 3 : first + 6, 3:] = R_CW
-        return np.asarray(moves / self.deviations[:, None])
-
-    def center_jacobian(self, cameras: Sequence[int]) -> Array:
-        """Return the derivative (p, 2) of the unknowns by principal points along x and y [pixel].
-
-        cameras: indices of the cameras whose principal points change together.
-
-        A pixel shifts a body at depth z by z over the focal length, and turns it by one over the
-        focal length; the turn's effect on the depth is neglected.
-        """
-        moves = np.zeros((len(self.names), 2))
-        for c in cameras:
-            kind, focal_x, focal_y = self.cameras[c].kernel_parameters()[:3]
-            first, z = len(self.joints) + 6 * c, self._depth(c)
-            of_x, of_y = moves[first : first + 6].T
-            of_x[3], of_y[4] = ((1.0 if kind == 1.0 else z) / focal for focal in (focal_x, focal_y))
-            of_x[1], of_y[0] = (0.0, 0.0) if kind == 1.0 else (1.0 / focal_x, -1.0 / focal_y)
-        return np.asarray(moves / self.deviations[:, None])
-
-    def focal_jacobian(self, cameras: Sequence[int]) -> Array:
-        """Return the derivative (p, 1) of the unknowns by a relative change of focal lengths.
-
-        cameras: indices of the cameras whose focal lengths change together.
-
-        A longer focal length makes the body seem nearer by that fraction of its depth; in a
-        parallel camera nothing changes.
-        """
-        moves = np.zeros((len(self.names), 1))
-        for c in cameras:
-            if self.cameras[c].kernel_parameters()[0] != 1.0:
-                moves[len(self.joints) + 6 * c + 5] = -self._depth(c)
+        for camera in self.cameras:
+            rows = np.array(self.rows(POSE_NAMES, [camera.name]))
+            moves[rows[:3], :3] = moves[rows[3:], 3:] = camera.X_CW[:3, :3]
         return np.asarray(moves / self.deviations[:, None])
 
     def camera_jacobian(self, camera: str) -> Array:
@@ -235,10 +261,36 @@ class PerFrameFit:
         middle = X_CW[:3, :3] @ self._middle + X_CW[:3, 3]
         return np.hstack([np.cross(np.eye(3), middle).T, -np.eye(3)])
 
-    def _depth(self, camera: int) -> float:
-        """Return the depth of the body's middle in camera number `camera` [m]."""
-        X_CW = self.cameras[camera].X_CW
-        return float(X_CW[2, :3] @ self._middle + X_CW[2, 3])
+
+def explained_frames(
+    ratios: Sequence[Mapping[str, float]], of_best: float = 0.75, least: float = 0.5
+) -> Mask:
+    """Return which frames (frames,) the fit explains in all their pictures.
+
+    Args:
+        ratios: for each frame the fitted inlier ratios by camera.
+        of_best, least: minimum, relative to the mean of the camera's best quarter, and absolute.
+    """
+    limits = {}
+    for name in {name for one in ratios for name in one}:
+        own = sorted(one[name] for one in ratios if name in one)
+        best = float(np.mean(own[-max(2, len(own) // 4) :]))
+        limits[name] = max(of_best * best, least)
+    return np.array([all(ratio >= limits[name] for name, ratio in one.items()) for one in ratios])
+
+
+def moved_links(kinematics: TreeKinematics) -> list[LinkVector]:
+    """Return the vectors of ``carried_joints`` on links that a joint moves.
+
+    Other links' lengths look like the base's place.
+    """
+    tree = kinematics.tree
+    moved = np.any(kinematics.motions(kinematics.flatten(tree.default_values())).moves, axis=1)
+    return [
+        one
+        for one in carried_joints(tree)
+        if one.step > 0 or moved[max(0, tree.nodes[one.node].parent)]
+    ]
 
 
 def adjust_bundle(

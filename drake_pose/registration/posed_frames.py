@@ -43,6 +43,10 @@ class PosedFrame:
     foreground: NDArray[np.uint8] | None = None
     rates: Array | None = None  # (m,) velocities of the values [rad/s or m/s]; None: unknown.
 
+    def mirrored(self) -> "PosedFrame":
+        """Return the frame with its mask mirrored left-right, without log-odds."""
+        return PosedFrame(self.name, self.values, np.ascontiguousarray(self.mask[:, ::-1]))
+
 
 class PosedFrames:
     """All frames of one camera, prepared for searches and fits.

@@ -5,17 +5,22 @@ silhouettes' bounds. The best hypotheses are fitted to the contours by graduated
 first to all contour points within reach, finally to inliers only. Tools missing from the model,
 occluded parts and wrong frames therefore do not bias the pose. Each frame is then an inlier or an
 outlier of the final pose.
+
+With five frames or more, the search runs on two halves of the frames, and the pose found in each
+half is judged by the frames of the other (``fit.judge``).
 """
 
 import copy
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from math import factorial
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.special import ndtri
 
 from drake_pose.arrays import Array
 from drake_pose.body import PoseTree
@@ -23,6 +28,7 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.fit.covariance import vuong_statistic
+from drake_pose.fit.judge import LEVEL, Evidence, depth_twin, paired_evidence
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import FEW, VERY_FEW, simplify_surfaces, with_radius_scales
 from drake_pose.registration.posed_frames import (
@@ -179,6 +185,14 @@ class RegisteredCamera(_UncertainPose):
     # (n, 4, 4) other poses X_WC that fit equally well.
     alternatives: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
     target: TargetPose | None = None  # The pose of the calibration target, where it was estimated.
+    # (6, 6) part of the covariance that is the same for all frames, and that no residual shows: the
+    # camera is known relative to the zeros of joints such as the first one.
+    common: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    # Whether the joint positions belong to the frames, judged by frames to which the pose was not
+    # fitted; None: not tested, as in a refinement, or with too few frames.
+    evidence: Evidence | None = None
+    # (frames, k, k) cost of each frame's contours in square image tiles.
+    costs: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
 
     @property
     def outliers(self) -> tuple[str, ...]:
@@ -199,6 +213,11 @@ class CameraSearch:
         self._body, self._fitted_count = body, fitted
         self._R_CW = uniform_rotations(rotations)
 
+    @property
+    def kinematics(self) -> TreeKinematics:
+        """Kinematics of the body's pose tree."""
+        return self._body.kinematics
+
     def rough(self) -> "CameraSearch":
         """Return a faster, less reliable search."""
         return CameraSearch(self._body, rotations=2000, fitted=15)
@@ -214,7 +233,18 @@ class CameraSearch:
                 f"camera '{camera.name}': no frame shows the body; give masks and joint positions "
                 "of one or more frames"
             )
-        return self._fitted(camera, frames, self.search(camera, frames))
+        some, starts, evidence = evenly_spaced(frames, 24), list[Array](), None
+        if factorial(len(some)) * LEVEL < 1.0:
+            # However well they fit, so few frames cannot be told from frames wrongly paired.
+            starts = self.search(camera, some)
+        else:
+            posed = PosedFrames(self._body.kinematics, self._body.coarse, camera, some)
+            gains = np.zeros((len(some), len(some)))
+            for k in range(2):
+                starts += (own := self.search(camera, some[k::2], 4))
+                gains[1 - k :: 2] = pairing_gains(posed, own[0])[1 - k :: 2]
+            evidence = paired_evidence(gains, posed.X_WN[:, :, :3, 3].reshape(len(some), -1))
+        return replace(self._fitted(camera, frames, starts), evidence=evidence)
 
     def refine(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
         """Return the camera with its current pose refined, without alternatives.
@@ -224,6 +254,38 @@ class CameraSearch:
         Raises MaskError: a mask is empty, or its size differs from the camera's.
         """
         return self._fitted(camera, frames, [camera.X_CW])
+
+    def mirrored_costs(
+        self, found: RegisteredCamera, frames: Sequence[PosedFrame]
+    ) -> tuple[Array, Array]:
+        """Return the costs (n, k, k) of frames at a found pose, and of their mirror images.
+
+        The mirror image of a silhouette is nearly the silhouette from the opposite side, from which
+        the camera of the mirrored frames is fitted. Costs are in the same image tiles.
+
+        ``frames``: of the found camera; at most 8 are compared.
+        """
+        body, some, X_CW = self._body, evenly_spaced(frames), found.camera.X_CW
+        middle = PosedFrames(body.kinematics, body.coarse, found.camera, some).middle
+        opposite = np.eye(4)
+        opposite[:3, :3] = np.diag([-1.0, 1.0, -1.0]) @ X_CW[:3, :3]
+        opposite[:3, 3] = (X_CW[:3, :3] @ middle + X_CW[:3, 3]) * [-1.0, 1.0, 1.0]
+        opposite[:3, 3] -= opposite[:3, :3] @ middle
+        costs = []
+        for camera, own, start in (
+            (found.camera, some, X_CW),
+            (found.camera.mirrored(), [one.mirrored() for one in some], opposite),
+        ):
+            X = start
+            for outlines, spacing, rounds in (
+                (body.coarse, SEARCH.coarse_spacing, SEARCH.coarse),
+                (body.medium, SEARCH.fine_spacing, SEARCH.fine),
+            ):
+                view = PosedFrames(body.kinematics, outlines, camera, own, spacing)
+                X = fit_pose(view, X, rounds)
+            fit = SharedFit([view], [X], fit_biases=False)
+            costs.append(fit.tile_costs(fit.start, max(1.0, SEARCH.tile_side * view.size)))
+        return costs[0], costs[1][..., ::-1]
 
     def _fitted(
         self, camera: PinholeCamera, frames: Sequence[PosedFrame], starts: Sequence[Array]
@@ -252,15 +314,16 @@ class CameraSearch:
         return select_best([*zip(fits, map_ordered(fit_to_inliers, fits), strict=True)])[0]
 
     def search(
-        self, camera: PinholeCamera, frames: Sequence[PosedFrame], kept: int = 6
+        self, camera: PinholeCamera, frames: Sequence[PosedFrame], most: int = 8, kept: int = 6
     ) -> list[Array]:
         """Return up to `kept` coarsely fitted pose hypotheses X_CW (4, 4), best first.
 
-        At most 8 frames, evenly spaced, are used, and not the camera's current pose.
+        At most `most` frames, evenly spaced, are used, and not the camera's current pose. The best
+        hypothesis brings its twin reversed in depth, see ``depth_twin``.
         """
         body = self._body
         posed = PosedFrames(
-            body.kinematics, body.coarse, camera, evenly_spaced(frames), SEARCH.coarse_spacing
+            body.kinematics, body.coarse, camera, evenly_spaced(frames, most), SEARCH.coarse_spacing
         )
 
         def best_first(X_CW: Sequence[Array] | Array, side: float) -> list[Array]:
@@ -278,7 +341,9 @@ class CameraSearch:
         for part, count in ((SEARCH.coarse[:3], 12), (SEARCH.coarse[3:], kept)):
             found = map_ordered(partial(fit_pose, posed, rounds=part), hypotheses)
             hypotheses = distinct_poses(posed, best_first(found, SEARCH.refined_side))[:count]
-        return hypotheses
+        twin = depth_twin(hypotheses[0], posed.some_points)
+        twin = fit_pose(posed, twin, SEARCH.coarse)
+        return distinct_poses(posed, best_first([*hypotheses, twin], SEARCH.refined_side))
 
 
 def select_best(
@@ -305,12 +370,15 @@ def select_best(
     # Fits from different starts may have converged to the same pose.
     poses = [fitted[k][0].cameras(fitted[k][1])[0].X_CW for k in as_good]
     alike = distinct_poses(posed, poses)
-    covariance = sum(fit.covariances(best, inliers))
+    parts = fit.covariances(best, inliers)
+    covariance = np.sum(parts, axis=0)
     registered = RegisteredCamera(
         camera,
         fit.camera_covariances(best, covariance)[0],
         misfits,
         np.array([np.linalg.inv(X) for X in alike[1:]]).reshape(-1, 4, 4),
+        common=fit.camera_covariances(best, parts[-1])[0],
+        costs=costs[order[0]],
     )
     return registered, covariance, as_good
 
@@ -323,6 +391,11 @@ def frame_misfits(
     columns = (E_total(found), intersection_over_union(found), ratios, inliers)
     rows = zip(posed.frames, *(one.tolist() for one in columns), strict=True)
     return tuple(FrameMisfit(frame.name, *row) for frame, *row in rows)
+
+
+def fits_better(costs: Array, others: Array) -> bool:
+    """Return whether costs of image tiles are significantly below others of the same tiles."""
+    return vuong_statistic(others, costs) > ndtri(1.0 - LEVEL)
 
 
 def evenly_spaced(frames: Sequence[T], most: int = 8) -> list[T]:
@@ -481,6 +554,22 @@ def overlap_areas(frames: PosedFrames, X_CW: Array, side: float) -> Array:
 
     map_ordered(score, range(len(frames.frames)))
     return found
+
+
+def pairing_gains(frames: PosedFrames, X_CW: Array) -> Array:
+    """Return the gains (n, n) of n frames with the rows of all, see ``paired_evidence``.
+
+    The gain is the intersection over union of mask and body at a pose X_CW (4, 4).
+    """
+    camera = frames.downscaled(SEARCH.refined_side)
+
+    def gains(k: int) -> Array:
+        sums = frames.sums(k, camera)
+        body, both = score_bodies(frames.outlines, X_CW @ frames.X_WN, camera, sums[None]).T
+        mask = np.full(len(body), sums[:, -1].sum())
+        return intersection_over_union(np.stack([body, mask, both], axis=-1))
+
+    return np.array(map_ordered(gains, range(len(frames.frames))))
 
 
 def E_total(found: Array) -> Array:

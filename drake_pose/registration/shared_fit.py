@@ -104,6 +104,9 @@ class SharedFitSettings(NamedTuple):
 
 SHARED = SharedFitSettings()
 
+OFFSET_UNITS = np.radians(0.5), 0.002
+"""Units of joint offsets that are not fitted: half a degree [rad], or 2 mm [m]."""
+
 
 def inlier_threshold(ratios: Array) -> float:
     """Return the minimum inlier ratio of an inlier; ratios (n,) of one camera's masks."""
@@ -298,18 +301,21 @@ class SharedFit:
             for one, X, k in zip(self.views, X_CW, kernel, strict=True)
         ]
 
-    def covariances(self, found: SharedValues, included: Mask | None = None) -> tuple[Array, Array]:
+    def covariances(
+        self, found: SharedValues, included: Mask | None = None
+    ) -> tuple[Array, Array, Array]:
         """Estimate the covariance of the shared unknowns from the included masks (rows,).
 
         included: None: all masks.
 
-        Returns two (u, u) parts, whose sum is the covariance: from contour errors, and from
-        nuisance parameters and errors of the cameras' intrinsics.
+        Returns three (u, u) parts, whose sum is the covariance: from contour errors, from nuisance
+        parameters and errors of the cameras' intrinsics, and from nuisance parameters that no
+        residual shows, such as the first joint's offset without a base.
         """
         distances = self._distances_with_nuisances(found, SHARED.final_stage, included)
         is_angle = np.zeros(distances.X.shape[1], bool)
         sizes = estimate_sizes(distances, is_angle, 0.0, SHARED.prior_deviation)
-        nuisance, distances = nuisance_covariance(distances, sizes, is_angle)
+        nuisance, unseen, distances = nuisance_covariance(distances, sizes, is_angle)
         scatter = np.sqrt(scatter_factor(distances, sizes, len(self.names)))
         sizes = ErrorSizes(*(scatter * np.array(sizes[:5])))
         covariance = values_covariance(distances, sizes, np.arange(len(is_angle)), is_angle)
@@ -330,7 +336,7 @@ class SharedFit:
             at = np.arange(self.per_camera) + c * self.per_camera
             nuisance[at, at] += off[: self.per_camera] ** 2
         own = slice(len(self.names))
-        return covariance[own, own], nuisance[own, own]
+        return covariance[own, own], nuisance[own, own], unseen[own, own]
 
     def likely_offsets(
         self, found: SharedValues, included: Mask, min_score: float = 6.0, smallest: float = 2.0
@@ -491,7 +497,7 @@ class SharedFit:
     def _offset_units(self) -> dict[str, float]:
         """Units of nuisance joint offsets by joint: half a degree or 2 mm [rad or m]."""
         kinematics = self.views[0].kinematics
-        units = np.where(kinematics.is_angle, np.radians(0.5), 0.002)
+        units = np.where(kinematics.is_angle, *OFFSET_UNITS)
         return dict(zip(kinematics.names, units.tolist(), strict=True))
 
     @cached_property

@@ -6,6 +6,7 @@ for X_LC and X_WT (`hand_eye`), which are then fitted to all silhouettes togethe
 
 import copy
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 
@@ -27,6 +28,7 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, SettingsError
 from drake_pose.fit.background import KnownBackground
+from drake_pose.fit.judge import paired_evidence
 from drake_pose.fit.surfaces import FEW, simplify_surfaces, surface_distance
 from drake_pose.registration.hand_eye import hand_eye_starts, rotation_spread
 from drake_pose.registration.picture_search import PosedPicture, segment_picture
@@ -256,6 +258,9 @@ def require_rotation(
     )
 
 
+SinglePoses = tuple[list[PosedFrame], Array]
+"""The likely masks of a picture, best first, and the target's poses X_CT (n, 4, 4) in them."""
+
 HandEye = Array
 """(2, 4, 4): the camera's pose X_LC on the link and the target's pose X_WT in the world."""
 
@@ -276,6 +281,11 @@ class TargetSearch:
             single_search or CameraSearch(target.in_own_frame),
         )
 
+    @property
+    def kinematics(self) -> TreeKinematics:
+        """Kinematics of the pose tree from the link to the target."""
+        return TreeKinematics(self._target.tree(np.eye(4)))
+
     def rough(self) -> "TargetSearch":
         """Return a faster, less reliable search."""
         return TargetSearch(self._target, self._single_search.rough())
@@ -288,7 +298,16 @@ class TargetSearch:
         link rotates about one axis only in all frames, or in those that agree.
         """
         require_rotation(camera.name, self._target, frames)
-        poses = self._search(camera, [[one] for one in evenly_spaced(frames)])
+        single = self._single_poses(camera, [[one] for one in evenly_spaced(frames)])
+        poses, evidence = list[HandEye](), None
+        with suppress(RegistrationError):
+            gains = np.zeros((len(single), len(single)))
+            for k in range(2):
+                poses += (own := self._starts(camera, single[k::2]))
+                gains[1 - k :: 2] = self._gains(camera, single, own[0])[1 - k :: 2]
+            rows = np.array([own[0].values for own, _ in single])
+            evidence = paired_evidence(gains, rows)
+        poses = poses if evidence else self._starts(camera, single)
         for rounds, spacing, surfaces in (
             (SEARCH.fine, SEARCH.fine_spacing, "medium"),
             (SHARED.stages_with_constants, LAST_SPACING, "full"),
@@ -322,7 +341,7 @@ class TargetSearch:
         )
         inliers = [one for one, fit in zip(frames, found.frames, strict=True) if fit.is_inlier]
         require_rotation(camera.name, self._target, inliers, "that agree ")
-        return replace(found, target=target_pose)
+        return replace(found, target=target_pose, evidence=evidence)
 
     def choose(
         self,
@@ -341,12 +360,12 @@ class TargetSearch:
 
         Raises RegistrationError: no three frames have regions that rotate as the link does.
         """
-        poses = self._search(camera, choices, explained)[0]
+        poses = self._starts(camera, self._single_poses(camera, choices, explained))[0]
         seen = [own for own in choices if own]
         off = [self._misfits(camera, [own], poses[None], SEARCH.refined_side)[0] for own in seen]
         return poses, int(np.count_nonzero(np.array(off) < explained))
 
-    def _search(
+    def _single_poses(
         self,
         camera: PinholeCamera,
         choices: Sequence[Sequence[PosedFrame]],
@@ -354,10 +373,8 @@ class TargetSearch:
         *,
         single_poses: int = 8,
         regions: int = 3,
-        starts: int = 12,
-        kept: int = 4,
-    ) -> list[HandEye]:
-        """Return hypotheses of both poses, best first; at least one.
+    ) -> list[SinglePoses]:
+        """Return the likely masks of each picture that has any, with the target's poses in them.
 
         Args:
             camera: its pose is not used.
@@ -365,35 +382,45 @@ class TargetSearch:
             explained: maximum E_total of a mask, where a picture has several.
             single_poses, regions: maximum numbers of target poses of a mask, and of masks of a
                 picture.
-            starts, kept: maximum numbers of hypotheses that are fitted, and that are returned.
-
-        Raises RegistrationError: no three pictures agree with the link's rotation.
         """
-        turns = self._target.symmetry[0]
-        likely_masks, X_CT = list[list[PosedFrame]](), list[Array]()
-        body = self._target.in_own_frame
+        body, found = self._target.in_own_frame, list[SinglePoses]()
         for own in choices:
             likely = []
             for one in own:
                 alone = [PosedFrame(one.name, np.zeros(0), one.mask)]
-                found = self._single_search.search(camera, alone, single_poses)
+                poses = self._single_search.search(camera, alone, kept=single_poses)
                 posed = PosedFrames(body.kinematics, body.coarse, camera, alone)
                 off = float(
-                    E_total(overlap_areas(posed, np.array(found), SEARCH.refined_side)).min()
+                    E_total(overlap_areas(posed, np.array(poses), SEARCH.refined_side)).min()
                 )
                 # A frame's only mask is known to be the target's.
                 if len(own) == 1 or off < explained:
-                    likely.append((off, one, found))
+                    likely.append((off, one, poses))
             likely = sorted(likely, key=lambda each: each[0])[:regions]
             if likely:
-                likely_masks.append([one for _, one, _ in likely])
-                alike = [self._apart([X[None] for X in found], turns) for *_, found in likely]
-                X_CT.append(np.concatenate([X for found in alike for X in found]))
-        some = [own[0] for own in likely_masks]
+                turns = self._target.symmetry[0]
+                alike = [self._apart([X[None] for X in poses], turns) for *_, poses in likely]
+                X_CT = np.concatenate([X for poses in alike for X in poses])
+                found.append(([one for _, one, _ in likely], X_CT))
+        return found
+
+    def _starts(
+        self,
+        camera: PinholeCamera,
+        single: Sequence[SinglePoses],
+        starts: int = 12,
+        kept: int = 4,
+    ) -> list[HandEye]:
+        """Return up to `kept` hypotheses of both poses, best first; `starts` of them are fitted.
+
+        Raises RegistrationError: no three pictures agree with the link's rotation.
+        """
+        likely_masks, some = [own for own, _ in single], [own[0] for own, _ in single]
         hypotheses = np.zeros((0, 2, 4, 4))
         if len(some) >= 3:
             X_WL = self._target.link_poses(np.array([one.values for one in some]))
-            hypotheses = hand_eye_starts(X_WL, X_CT, turns)
+            X_CT = [X for _, X in single]
+            hypotheses = hand_eye_starts(X_WL, X_CT, self._target.symmetry[0])
         if not len(hypotheses):
             raise RegistrationError(
                 f"camera '{camera.name}': in no three of its frames does the target rotate in the "
@@ -406,7 +433,10 @@ class TargetSearch:
         fitted = []
         for pose in self._distinct(hypotheses[order[: 10 * starts]], some)[:starts]:
             # The mask of each frame that the hypothesis explains best.
-            by = [[self._misfit(camera, one, pose[None])[0] for one in own] for own in likely_masks]
+            by = [
+                [self._misfits(camera, [[one]], pose[None])[0] for one in own]
+                for own in likely_masks
+            ]
             chosen = [own[int(np.argmin(each))] for own, each in zip(likely_masks, by, strict=True)]
             fit = self._fit(camera, chosen, pose, SEARCH.coarse_spacing, "coarse")
             fitted.append(self._fitted(fit, fit.fit(SEARCH.coarse), pose))
@@ -417,20 +447,27 @@ class TargetSearch:
         best = [fitted[k] for k in order if misfits[k] <= limit]
         return self._distinct(best, some)[:kept]
 
+    def _gains(self, camera: PinholeCamera, single: Sequence[SinglePoses], pose: HandEye) -> Array:
+        """Return the gains (n, n) of n pictures' best masks with the rows of all pictures."""
+        rows = np.array([own[0].values for own, _ in single])
+        X_CT = np.concatenate([self.poses_in_camera(pose[None], row) for row in rows])
+        return np.array([1.0 - self._misfit(camera, own[0], X_CT) for own, _ in single])
+
     def _misfits(
         self,
         camera: PinholeCamera,
         choices: Sequence[Sequence[PosedFrame]],
         poses: Array,
-        side: float,
+        side: float = SEARCH.refined_side,
     ) -> Array:
         """Return the mean E_total (n,) of ``HandEye`` poses (n, 2, 4, 4), by the best masks.
 
         ``side``: square root of the mask's area in the downscaled picture [pixel].
         """
         off = [
-            np.min([self._misfit(camera, one, poses, side) for one in own], axis=0)
+            np.min([self._misfit(camera, one, X, side) for one in own], axis=0)
             for own in choices
+            for X in [self.poses_in_camera(poses, own[0].values)]
         ]
         return np.asarray(np.mean(off, axis=0))
 
@@ -438,17 +475,16 @@ class TargetSearch:
         self,
         camera: PinholeCamera,
         one: PosedFrame,
-        poses: Array,
+        X_CT: Array,
         side: float = SEARCH.refined_side,
     ) -> Array:
-        """Return E_total (n,) of ``HandEye`` poses (n, 2, 4, 4) in one frame, clipped at 1.
+        """Return E_total (n,) of the target at poses X_CT (n, 4, 4) in one mask, clipped at 1.
 
         side: square root of the mask's area in the downscaled picture [pixel].
         """
         body = self._target.in_own_frame
         alone = PosedFrame(one.name, np.zeros(0), one.mask)
         posed = PosedFrames(body.kinematics, body.coarse, camera, [alone])
-        X_CT = self.poses_in_camera(poses, one.values)
         return np.minimum(E_total(overlap_areas(posed, X_CT, side))[:, 0], 1.0)
 
     def poses_in_camera(self, poses: Array, values: Array) -> Array:

@@ -78,7 +78,8 @@ class CameraRegistration(BeliefSystem[OnlineState]):
         X_WC (RigidTransform): the camera's pose in the plant's world, as last found; its
             translation is NaN before.
         covariance (6 x 6, row by row): of the pose's error, a rotation vector [rad] and a
-            translation [m] in world axes. Infinite unless the status is 1.
+            translation [m] in world axes. Infinite unless the status is 1. If all that is seen and
+            not round turns with a first joint, it allows for half a degree of that joint's zero.
         status (1): 0 before the camera is found; 1 while the pose is valid; 2 while the last frames
             are outliers, because the camera was moved or the body is occluded. X_WC must then not
             be used; the status returns to 1 when a frame fits or the camera is found elsewhere.

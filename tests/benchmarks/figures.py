@@ -43,7 +43,9 @@ SECTIONS: dict[str, tuple[str, ...]] = {
     "hands": ("python -m tests.benchmarks.estimates DATA --hands",),
     "intervals": ("python -m tests.benchmarks.coverage DATA",),
     "registration": ("python -m tests.benchmarks.registration DATA --cases 5",),
-    "episodes": ("python -m tests.benchmarks.episodes DATA --rooms 3",),
+    "episodes": tuple(
+        f"python -m tests.benchmarks.episodes DATA --rooms {more}" for more in ("3", "1 --spoilt")
+    ),
     "filters": ("python -m tests.benchmarks.filters",),
     "speed": (
         "python -m tests.benchmarks.speed",

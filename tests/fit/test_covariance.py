@@ -110,7 +110,7 @@ def test_nuisances_widen_the_intervals_of_dependent_values(size):
         sizes = ErrorSizes(1.0, 0.0, 0.1, 0.1, 0.1, (size,))
         residuals, errors = drawn_distances(generator, sizes, 60)
         found = estimate_sizes(residuals, ANGLES, 0.0, 3.0)
-        by_nuisances, without = nuisance_covariance(residuals, found, ANGLES)
+        by_nuisances, _, without = nuisance_covariance(residuals, found, ANGLES)
         own = values_covariance(without, found, ALL, ANGLES)
         deviations = np.sqrt(np.diag(own + by_nuisances))
         inside += (np.abs(errors) < 1.96 * deviations).tolist()
@@ -130,8 +130,9 @@ def test_unobservable_values_have_the_prior_deviation(capfd):
         np.zeros(0, dtype=np.intp),
     )
     sizes = estimate_sizes(empty, ANGLES)
-    by_nuisances, without = nuisance_covariance(empty, sizes, ANGLES)
+    by_nuisances, unseen, without = nuisance_covariance(empty, sizes, ANGLES)
     assert not by_nuisances.any()
+    assert not unseen.any()
     assert without is empty
     for is_angle, widest in ((ANGLES, 2.0 * np.pi), (~ANGLES, 10.0)):
         deviations = np.sqrt(np.diag(values_covariance(empty, sizes, ALL, is_angle)))
@@ -211,7 +212,7 @@ def test_tile_costs_add_up_to_the_cost(kinematics):
 def test_nuisances_are_removed_by_their_posterior_mean():
     sizes = ErrorSizes(1.0, 0.5, 0.2, 0.1, 0.3, (2.0,))
     residuals, _ = drawn_distances(np.random.default_rng(5), sizes, 40)
-    _, without = nuisance_covariance(residuals, sizes, ANGLES)
+    _, _, without = nuisance_covariance(residuals, sizes, ANGLES)
     (A,) = residuals.nuisances
     values = residuals.X @ np.linalg.inv(PRIOR) @ residuals.X.T
     whole = distances_covariance(residuals, sizes) + 4.0 * A @ A.T + values
@@ -426,3 +427,17 @@ def test_values_without_data_keep_their_prior() -> None:
     found = values_covariance(residuals, sizes, np.arange(3), np.zeros(3, bool))
     np.testing.assert_allclose(found, np.linalg.inv(X.T @ X + np.diag(known)), rtol=0.05, atol=1e-9)
     assert found[2, 2] == pytest.approx(0.04, rel=0.01)
+
+
+def test_nuisances_that_nothing_shows_keep_the_deviation_of_their_unit() -> None:
+    """One has the effect of a value, and no other residual; the other is seen well."""
+    rng = np.random.default_rng(7)
+    X = rng.normal(size=(40, 3)) * 30.0
+    A = np.column_stack([X @ [0.02, 0.01, 0.0], 50.0 * rng.normal(size=40)])
+    effects = np.array([np.eye(40), *np.zeros((4, 40, 40))])
+    y = rng.normal(size=40)
+    residuals = Distances(y, X, effects, X.T @ X, np.zeros((40, 0)), np.arange(40), (A,))
+    sizes = ErrorSizes(1.0, 0.0, 1.0, 1.0, 1.0, (0.01,))
+    _, unseen, _ = nuisance_covariance(residuals, sizes, ANGLES)
+    moved = np.array([0.02, 0.01, 0.0])
+    np.testing.assert_allclose(unseen, np.outer(moved, moved), atol=0.02 * 0.02**2)

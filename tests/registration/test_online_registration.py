@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, SettingsError
+from drake_pose.fit.judge import Evidence
 from drake_pose.registration.online_registration import (
     CameraStatus,
     OnlineRegistration,
@@ -41,6 +42,7 @@ class ScriptedSearch:
     def __init__(self) -> None:
         self.searches = self.refinements = 0
         self.alternatives = 0
+        self.p_value, self.mirrored = 0.001, 2.0
         self.deviation = 0.0004
 
     def register(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
@@ -69,7 +71,16 @@ class ScriptedSearch:
         ]
         covariance = np.diag(np.full(6, self.deviation**2))
         alternatives = np.tile(np.eye(4), (others, 1, 1))
-        return RegisteredCamera(camera_at(PLACES[place]), covariance, tuple(misfits), alternatives)
+        return RegisteredCamera(
+            camera_at(PLACES[place]), covariance, tuple(misfits), alternatives,
+            evidence=Evidence(0.9, 0.4, self.p_value, 0.001, len(frames), 5),
+        )  # fmt: skip
+
+    def mirrored_costs(
+        self, found: RegisteredCamera, frames: Sequence[PosedFrame]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        costs = np.ones((len(frames), 9, 9))
+        return costs, self.mirrored * costs
 
 
 @pytest.fixture
@@ -131,11 +142,17 @@ class TestKeyframes:
         assert len(state.registered.frames) == 6
         assert copy.deepcopy(state) is state
 
-    def test_an_ambiguous_camera_is_not_registered(self, online, search) -> None:
-        search.alternatives = 1
+    @pytest.mark.parametrize(
+        ("doubt", "value"), [("alternatives", 1), ("p_value", 0.02), ("mirrored", 0.5)]
+    )
+    def test_an_ambiguous_or_unproven_camera_is_not_registered(
+        self, online, search, doubt, value
+    ) -> None:
+        usual = getattr(search, doubt)
+        setattr(search, doubt, value)
         state, statuses = follow(online, OnlineState(), [frame("here", t) for t in TURNS[:5]])
         assert statuses[-1] == NOT_REGISTERED
-        search.alternatives = 0
+        setattr(search, doubt, usual)
         _, statuses = follow(online, state, [frame("here", TURNS[5])])
         assert statuses == [REGISTERED]
 

@@ -1,5 +1,7 @@
 """A camera is found without an initial guess from Drake's masks of an arm at known positions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -34,7 +36,10 @@ class TestCameraSearch:
         assert turn < np.radians(0.1)
         assert not found.outliers
         assert not len(found.alternatives)
-        assert shift < 4.0 * np.sqrt(3.0) * found.translation_sd < 0.01
+        own = replace(found, covariance=found.covariance - found.common)
+        assert shift < 4.0 * np.sqrt(3.0) * own.translation_sd < 0.01
+        # All that is seen of this arm turns with its first joint.
+        assert found.rotation_sd * np.sqrt(3.0) == pytest.approx(np.radians(0.5), rel=0.2)
         assert all(frame.iou > 0.99 for frame in found.frames)
 
     def test_a_wrong_frame_is_an_outlier(self, model, body):

@@ -2,17 +2,20 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 from scipy.special import chdtrc
 
 from drake_pose.arrays import Array
+from drake_pose.body import TARGET_POSITIONS
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError, RegistrationError
 from drake_pose.files.records import BADLY_EXPLAINED
 from drake_pose.files.settings import percent
+from drake_pose.fit.judge import LEVEL
 from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.jobs.registration.readings import likeliest_reading
 from drake_pose.registration.diagnosis import DIAGNOSIS
@@ -34,6 +37,7 @@ from drake_pose.registration.register import (
     RegisteredCamera,
     RegistrationBody,
     evenly_spaced,
+    fits_better,
     frame_misfits,
     overlap_areas,
 )
@@ -45,27 +49,36 @@ Search = CameraSearch | TargetSearch
 """Finds a camera; `rough()` gives a faster search."""
 
 
-def explain_misfit(found: RegisteredCamera, min_inlier_ratio: float = 0.65) -> str | None:
-    """Return in words why a pose does not explain the masks; None: it does.
+def lack_of_evidence(
+    search: Search, found: RegisteredCamera, frames: Sequence[PosedFrame]
+) -> str | None:
+    """Return in words why a pose does not show that joint positions and masks belong together.
 
-    ``found``: the registered camera. ``min_inlier_ratio``: minimum mean inlier ratio of the two
-    best frames. A correct robot has 0.83 or more, even with holes and tools in the masks; mirrored
-    masks, another robot's masks or exchanged frames have 0.6 at most.
+    Too few frames for the judge (``fit.judge``) must fit significantly better than the same masks
+    with joint positions drawn at random, at the pose that fits these best.
+
+    Args:
+        search: searches roughly with other joint positions.
+        found: the camera at the pose that is judged.
+        frames: the frames that it was registered from.
+
+    Returns the reason; None: they belong together.
     """
-    inliers = [frame for frame in found.frames if frame.is_inlier]
-    left = left_over(found)
-    ratio = float(np.mean(np.sort([frame.inlier_ratio for frame in found.frames])[-2:]))
-    if len(found.frames) > 1 and len(inliers) < 2:
+    evidence = found.evidence
+    if evidence is not None and evidence.least <= LEVEL:
         return (
-            f"no two of its {len(found.frames)} frames agree on one; at best frame "
-            f"'{inliers[0].frame}' fits alone"
+            None
+            if evidence.holds
+            else (
+                "the joint positions of other frames fit them about as well as their own (p-value "
+                f"{evidence.p_value:.2g})"
+            )
         )
-    if left < BADLY_EXPLAINED and ratio >= min_inlier_ratio:
-        return None
-    return (
-        f"body and silhouettes differ by {percent(left)} of the silhouettes' area at best, and "
-        f"{percent(ratio)} of the contours fit"
-    )
+    with suppress(RegistrationError):
+        chance = search.rough().register(found.camera, with_random_rows(search.kinematics, frames))
+        if not fits_better(found.costs, chance.costs):
+            return "joint positions drawn at random fit them about as well"
+    return None
 
 
 def left_over(found: RegisteredCamera) -> float:
@@ -74,71 +87,103 @@ def left_over(found: RegisteredCamera) -> float:
 
 
 def require_explained(
-    search: Search, found: RegisteredCamera, frames: Sequence[PosedFrame], much_better: float = 0.6
+    search: Search, found: RegisteredCamera, frames: Sequence[PosedFrame]
 ) -> None:
-    """Refuse a pose that does not explain its best frames, see `explain_misfit`.
+    """Refuse a pose that is not evidence, see `lack_of_evidence`.
+
+    Causes with which some of the masks fit significantly better, and as well as with any other, are
+    named in the error.
 
     Args:
         search: searches again, roughly, with alternative causes of the misfit.
         found: the camera at the pose that is checked.
         frames: the frames that it was registered from.
-        much_better: maximum median E_total of the inlier frames with an alternative cause, over
-            that without it. Alternative causes are named in the error if they explain the masks.
 
-    Raises RegistrationError: states the misfit and alternative causes, or what to check.
+    Raises RegistrationError: states what is lacking, and alternative causes, or what to check.
     """
-    misfit = explain_misfit(found)
-    if misfit is None:
+    lack = lack_of_evidence(search, found, frames)
+    if lack is None:
         return
-    search, better = search.rough(), []
-    for text, camera, changed in _alternatives(found.camera, frames):
-        try:
-            other = search.register(camera, changed)
-        except RegistrationError:
-            continue
-        if explain_misfit(other) is None and left_over(other) < much_better * left_over(found):
-            better.append(text)
-    advice = (
+    tried = dict[str, Array]()
+    for text, camera, changed in _readings(found.camera, frames):
+        with suppress(RegistrationError):
+            costs = search.rough().register(camera, changed).costs
+            tried[text] = costs[..., ::-1] if text == MIRRORED else costs
+    best = min(tried.values(), key=np.sum, default=np.zeros(0))
+    given = tried.pop("", best)
+    as_good = [text for text, costs in tried.items() if not fits_better(best, costs)]
+    better = [text for text in as_good if fits_better(tried[text], given)]
+    advice = "; ".join(better) or (
         "are these masks of this robot or object, are the joint positions those of these frames, "
         "in radians and with the signs and zeros of the model's file, do focal length and "
         "principal point belong to this camera, are the pictures undistorted?"
     )
-    if better:
-        advice = f"{'; '.join(better)}."
-    raise RegistrationError(
-        f"camera '{found.camera.name}': no pose explains its masks: {misfit}; {advice} "
-        "Nothing was written"
+    raise unexplained_error(found.camera.name, f"{lack}; {advice}")
+
+
+def unexplained_error(camera: str, why: str) -> RegistrationError:
+    """Return the error for a camera, by name, whose masks no pose explains."""
+    return RegistrationError(
+        f"camera '{camera}': no pose explains its masks: {why}. Nothing was written"
     )
 
 
-def _alternatives(
+def mirrored_cameras(
+    search: CameraSearch,
+    found: Mapping[str, RegisteredCamera],
+    frames: Mapping[str, Sequence[PosedFrame]],
+) -> dict[str, RegistrationError]:
+    """Return an error for each camera whose masks fit significantly better when mirrored.
+
+    If the masks of all cameras together do, there is one for each camera.
+
+    Args:
+        search: of the body.
+        found: cameras at their poses, by name, whether these are evidence or not.
+        frames: their frames.
+    """
+    costs = {name: search.mirrored_costs(one, frames[name]) for name, one in found.items()}
+    together = (np.concatenate([k[m].ravel() for k in costs.values()]) for m in (1, 0))
+    all_are = bool(costs) and fits_better(*together)
+    return {
+        name: unexplained_error("', '".join(costs) if all_are else name, MIRRORED)
+        for name, (given, mirrored) in costs.items()
+        if all_are or fits_better(mirrored, given)
+    }
+
+
+MIRRORED = (
+    "they fit when they are mirrored: turn the pictures back, or change the sign of all joint "
+    "positions"
+)
+
+
+def _readings(
     camera: PinholeCamera, frames: Sequence[PosedFrame], most: int = 5
 ) -> Iterator[tuple[str, PinholeCamera, list[PosedFrame]]]:
-    """Yield alternative causes of a misfit: in words, the corrected camera, and corrected frames.
+    """Yield readings of at most `most` masks: the cause in words, the camera, and the frames.
 
-    most: maximum number of frames for each cause.
+    The first reading is that of the files, whose words are empty.
     """
-    sample = evenly_spaced(frames, most)
-    mirrored = [
-        PosedFrame(frame.name, frame.values, np.ascontiguousarray(frame.mask[:, ::-1]))
-        for frame in sample
-    ]
-    text = (
-        "they fit when they are mirrored: turn the pictures back, or change the sign of all joint "
-        "positions"
-    )
-    yield text, camera.mirrored(), mirrored
+    rows = evenly_spaced(range(len(frames)), most)
+    sample = [frames[k] for k in rows]
+    yield "", camera, sample
+    yield MIRRORED, camera.mirrored(), [frame.mirrored() for frame in sample]
     if len(frames) > 2:
-        pairs = list(pairwise(frames))[:most]
-        for which, moved in (
-            ("next", [PosedFrame(a.name, b.values, a.mask) for a, b in pairs]),
-            ("previous", [PosedFrame(b.name, a.values, b.mask) for a, b in pairs]),
-        ):
-            yield f"they fit with the joint positions of the {which} frame", camera, moved
-    for factor in (0.5, 0.7, 1.4, 2.0):
-        focal_x, focal_y = factor * camera.focal_x, factor * camera.focal_y
-        text = f"they fit with focal lengths near {focal_x:.0f}, {focal_y:.0f} pixels: calibrate it"
-        yield text, replace(camera, focal_x=focal_x, focal_y=focal_y), sample
+        for which, by in (("next", 1), ("previous", -1)):
+            values = [frames[(k + by) % len(frames)].values for k in rows]
+            shifted = [replace(one, values=q) for one, q in zip(sample, values, strict=True)]
+            yield f"they fit with the joint positions of the {which} frame", camera, shifted
+
+
+def with_random_rows(kinematics: TreeKinematics, frames: Sequence[PosedFrame]) -> list[PosedFrame]:
+    """Return frames with joint positions drawn within the limits, a turn or a metre at most."""
+    most = np.where(kinematics.is_angle, np.pi, 0.5)
+    # A calibration target stands still.
+    most[np.isin(kinematics.names, TARGET_POSITIONS)] = 0.0
+    lower, upper = np.maximum(kinematics.lower, -most), np.minimum(kinematics.upper, most)
+    rng = np.random.default_rng(0)
+    return [replace(one, values=rng.uniform(lower, np.maximum(lower, upper))) for one in frames]
 
 
 def require_seen_by(
@@ -249,23 +294,28 @@ def check_focal_length(
     log_ratio = math.log(camera.focal_x / given.focal_x)
     if abs(log_ratio) < max(off_by, off_by_sds * deviation):
         return found, 0.0, []
+    text = " A wrong focal length gives a wrong distance; calibrate it"
+    if abs(log_ratio) <= wrong_by:
+        shift = pose_difference(camera.X_WC, given.X_WC)
+        checked = replace(found, covariance=fitted.covariances[0] + np.outer(shift, shift))
+        is_new = 0.0
+    else:
+        posed = PosedFrames(body.kinematics, body.full, camera, frames)
+        fit = SharedFit([posed], [camera.X_CW])
+        ratios = fit.inlier_ratios(fit.start)
+        misfits = frame_misfits(posed, camera.X_CW, ratios, fit.inliers(ratios))
+        checked = replace(found, camera=camera, covariance=fitted.covariances[0], frames=misfits)
+        # The fit holds on to the focal length it starts from, so it is repeated from a new one.
+        checked, again, _ = check_focal_length(body, checked, frames)
+        deviation = is_new = again or deviation
+        text = " The camera was written with the focal length that was found"
+        camera = checked.camera
     text = (
         f"camera '{given.name}': its pictures determine a focal length of {camera.focal_x:.0f} "
         f"pixels (standard deviation {deviation * camera.focal_x:.0f}), but {given.focal_x:.0f} is "
-        "given; is it that of this camera, and of pictures of this size?"
+        f"given; is it that of this camera, and of pictures of this size?{text}"
     )
-    if abs(log_ratio) <= wrong_by:
-        shift = pose_difference(camera.X_WC, given.X_WC)
-        covariance = fitted.covariances[0] + np.outer(shift, shift)
-        text += " A wrong focal length gives a wrong distance; calibrate it"
-        return replace(found, covariance=covariance), 0.0, [text]
-    posed = PosedFrames(body.kinematics, body.full, camera, frames)
-    fit = SharedFit([posed], [camera.X_CW])
-    ratios = fit.inlier_ratios(fit.start)
-    misfits = frame_misfits(posed, camera.X_CW, ratios, fit.inliers(ratios))
-    text += " The camera was written with the focal length that was found"
-    checked = replace(found, camera=camera, covariance=fitted.covariances[0], frames=misfits)
-    return checked, deviation, [text]
+    return checked, is_new, [text]
 
 
 def compare_camera(
@@ -324,7 +374,7 @@ def compare_clock(
     given, found = recording.values_at(0.0)[rows], result.recording.values_at(clock.value)[rows]
     known = np.isfinite(given).all(axis=1)
     pixels = _picture_shift(body, (camera, given[known]), (camera, found[known]))
-    if pixels < DIAGNOSIS.min_joint_pixels:
+    if pixels < DIAGNOSIS.min_common_pixels:
         return []
     value, deviation = clock.value, clock.deviation
     if clock.drift and recording.times is not None:

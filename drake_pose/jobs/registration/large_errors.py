@@ -1,6 +1,6 @@
 """Find and correct large errors of a scene, and diagnose all frames with the corrections."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,13 +12,12 @@ from drake_pose.files.settings import percent
 from drake_pose.jobs.registration.diagnosis import (
     base_motion,
     compare_camera,
-    explain_misfit,
+    lack_of_evidence,
     last_before_change,
     require_seen_by,
 )
 from drake_pose.jobs.registration.inputs import RegistrationInputs
 from drake_pose.jobs.registration.readings import (
-    focal_correction,
     joint_exchanges,
     scene_corrections,
     shift_correction,
@@ -50,9 +49,10 @@ class SceneFit:
     """All frames fitted with the given scene, or with a corrected one."""
 
     cameras: tuple[Camera, ...]  # The corrected cameras.
-    # The corrections, in the order in which they are applied; () for none.
+    # Corrections of what is given, in the order in which they are applied; () for none.
     corrections: tuple[Correction, ...]
     fit: PerFrameFit  # Fits single frames with `cameras`.
+    at: Array  # (p,) the fit's corrections at which the frames were fitted.
     fits: tuple[FrameFit, ...]  # The fitted frames: all frames with a mask that is not empty.
     # By camera and frame name, excess and lack of the mask over its area, see
     # ``mask_excess_and_lack``; the excess of a black mask is NaN.
@@ -64,24 +64,9 @@ class SceneFit:
     warnings: tuple[str, ...] = ()  # For the user.
 
     def corrected(self, frame: MultiViewFrame) -> MultiViewFrame:
-        """Return a frame of the given scene with all corrections applied."""
-        return apply_corrections(self.corrections, frame)
-
-    def joint_off(self, name: str) -> Finding | None:
-        """Return the finding of a large offset of a joint, by name; None: it has no large offset.
-
-        Fits are linear: they should restart from a large offset.
-        """
-        offsets = [one for one in self.found.common if (one.kind, one.name) == ("joint", name)]
-        return next(
-            (one for one in offsets if abs(one.angle) > np.radians(LARGE.restart_angle)), None
-        )
-
-    @property
-    def focal_off(self) -> Finding | None:
-        """The finding of a large error of a focal length; None: none is large."""
-        findings = [finding for finding in self.found.common if finding.kind == "focal"]
-        return next((one for one in findings if abs(one.shift) > LARGE.restart_focal), None)
+        """Return a frame of the given scene with all corrections applied but those of lengths."""
+        frame = apply_corrections(self.corrections, frame)
+        return replace(frame, values=self.fit.values_at(frame.values, self.at))
 
     @property
     def joint_inlier_ratios(self) -> dict[str, float]:
@@ -180,18 +165,12 @@ class SceneComparison:
         return replace(self._compare(cameras, ()), findings=tuple(k for _, k in placed.values()))
 
     def _correct(self, now: SceneFit, most: int) -> SceneFit:
-        """Return the fit with up to `most` more corrections, which its findings record."""
+        """Return the fit with up to `most` more corrections, each fitted to its end."""
         for _ in range(most):
             correction = self._find_correction(now)
             if correction is None:
                 break
-            again = self._compare(correction.cameras, (*now.corrections, correction))
-            fitted = now.joint_off(correction.name) if correction.kind == "offset" else None
-            if correction.kind == "focal":
-                fitted = now.focal_off
-            if fitted is not None and (fitted.angle + fitted.shift) * correction.amount > 0.0:
-                now = self._record(now, again, correction, fitted)
-                continue
+            again = self._settle(self._corrected(now, correction))
             if again.inlier_ratio <= now.inlier_ratio:
                 break
             if not now.is_doubtful:
@@ -202,6 +181,38 @@ class SceneComparison:
                 if LARGE.outlier_reduction * (1.0 - after) > 1.0 - before:
                     break
             now = self._record(now, again, correction)
+        return self._settle(now)
+
+    def _corrected(self, now: SceneFit, correction: Correction) -> SceneFit:
+        """Return a scene's fit with one more correction."""
+        at, fit = now.at.copy(), now.fit
+        if correction.kind == "offset":
+            rows, amount = [fit.joints.index(correction.name)], correction.amount
+        elif correction.kind == "focal":
+            group = [
+                one.name
+                for one, other in zip(fit.cameras_at(at), correction.cameras, strict=True)
+                if one.kernel_parameters()[1] != other.kernel_parameters()[1]
+            ]
+            rows, amount = fit.rows(["log_focal"], group), float(np.log1p(correction.amount))
+        else:
+            return self._compare(correction.cameras, (*now.corrections, correction), at)
+        at[rows] += amount / fit.deviations[rows]
+        return self._compare(now.cameras, now.corrections, at)
+
+    def _settle(self, now: SceneFit, most: int = 8, least: float = 0.1) -> SceneFit:
+        """Return the fit at the corrections that it found: what is wrong is not linear.
+
+        most: maximum number of times that frames are fitted again. least: how far outlines move at
+            least [pixel].
+        """
+        for _ in range(most):
+            if now.is_doubtful or now.found.remaining < least:
+                break
+            again = self._compare(now.cameras, now.corrections, now.found.corrections)
+            if again.is_doubtful:
+                break
+            now = replace(again, findings=now.findings, warnings=now.warnings)
         return now
 
     def _finish(self, now: SceneFit) -> SceneFit:
@@ -211,13 +222,10 @@ class SceneComparison:
         bases.
         """
         found = now.found
-        remaining = {(finding.kind, finding.name): finding for finding in found.common}
-        findings = [
-            _add_remaining(one, remaining.pop((one.kind, one.name), None)) for one in now.findings
-        ]
+        findings = [*now.findings]
         # A joint searched in each frame is known only to the search's step: drop its fitted offset.
-        by_search = {("joint", finding.name) for finding in now.findings if finding.kind == "log"}
-        common = tuple(one for key, one in remaining.items() if key not in by_search)
+        by_search = {("joint", finding.name) for finding in findings if finding.kind == "log"}
+        common = tuple(one for one in found.common if (one.kind, one.name) not in by_search)
         found = replace(found, common=common)
         known = {finding.link for finding in findings if finding.link}
         for k, ratio in () if now.is_doubtful else mismatched_links(now.fits):
@@ -265,11 +273,11 @@ class SceneComparison:
                 continue
             rows = [group[k] for k in np.flatnonzero(wrong)]
             last = found.frames[group[before]].frame
-            again = diagnose_frames(now.fit, [now.fits[k] for k in rows], moved=True)
+            again = diagnose_frames(now.fit, [now.fits[k] for k in rows], now.at, moved=True)
             motions, names = list(again.common), [*{frame.frame for frame in again.frames}]
             if again.outliers or any(motion.kind not in ("camera", "base") for motion in motions):
                 frames = [now.corrected(self._inputs.read(found.frames[k].frame)) for k in rows]
-                given = [camera for camera in now.cameras if camera.name in cameras]
+                given = [one for one in now.fit.cameras_at(now.at) if one.name in cameras]
                 placed = self._register(frames, given)
                 motions = [off for _, off in placed.values()]
                 base = base_motion(
@@ -311,7 +319,7 @@ class SceneComparison:
             except RegistrationError:
                 continue
             inliers = len(found.frames) - len(found.outliers)
-            if explain_misfit(found) is not None or 2 * inliers <= len(posed):
+            if lack_of_evidence(search, found, posed) is not None or 2 * inliers <= len(posed):
                 continue
             values = np.array([one.values for one in posed])
             shift = compare_camera(self.body, camera, found, values, len(cameras) == 1)
@@ -356,10 +364,15 @@ class SceneComparison:
                     texts.append(f"camera '{camera}': {said}")
         return texts
 
-    def _compare(self, cameras: Sequence[Camera], corrections: tuple[Correction, ...]) -> SceneFit:
+    def _compare(
+        self,
+        cameras: Sequence[Camera],
+        corrections: tuple[Correction, ...],
+        at: Array | None = None,
+    ) -> SceneFit:
         """Return all frames fitted and diagnosed with corrections.
 
-        cameras: the corrected cameras.
+        cameras: the corrected cameras. at: (p,) corrections of the fit; None: 0.
 
         Raises MaskError: no mask shows the body.
         """
@@ -371,55 +384,42 @@ class SceneComparison:
         body, sample = self.body, [apply_corrections(corrections, frame) for frame in self._sample]
         mask_areas = dict[tuple[str, str], tuple[float, float]]()
         fit = PerFrameFit(body.kinematics, (body.medium, body.full), cameras, sample)
+        at = np.zeros(len(fit.names)) if at is None else at
+        placed = fit.cameras_at(at)
         for done, name in enumerate(inputs.audited_frames, 1):
             frame = inputs.read(name)
             if frame.masks:
                 frame = apply_corrections(corrections, frame)
-                fitted.append(fit.fit(frame))
-                for camera in cameras:
+                fitted.append(fit.fit(frame, at))
+                values = fit.values_at(frame.values, at)
+                for camera in placed:
                     mask = frame.masks.get(camera.name)
                     if mask is None and (camera.name, name) in inputs.scene.masks:
                         mask = np.zeros((camera.height, camera.width), bool)
                     if mask is not None:
-                        own = mask_excess_and_lack(body, camera, frame.values, mask, fit.size)
+                        own = mask_excess_and_lack(body, camera, values, mask, fit.size)
                         mask_areas[camera.name, name] = own if mask.any() else (np.nan, own[1])
             else:
                 empty.append(name)
-            if self._on_frame is not None and not corrections:
+            if self._on_frame is not None and not corrections and not at.any():
                 self._on_frame(done)
-        requested = [(_KINDS[one.kind], one.name) for one in corrections if one.kind in _KINDS]
-        found = diagnose_frames(fit, fitted, requested)
+        found = diagnose_frames(fit, fitted, at)
         return SceneFit(
-            tuple(cameras), corrections, fit, tuple(fitted), mask_areas, tuple(empty), found
+            tuple(cameras), corrections, fit, at, tuple(fitted), mask_areas, tuple(empty), found
         )
 
     def _find_correction(self, now: SceneFit) -> Correction | None:
         """Return one more correction for a fit; None: nothing is doubtful, or none is found."""
         sample = [now.corrected(frame) for frame in self._sample]
+        cameras, joints = now.fit.cameras_at(now.at), now.fit.joints
         if now.is_doubtful:
-            of_scene = not now.corrections
-            return self._search(now.cameras, now.fit.joints, LARGE.max_remaining, sample, of_scene)
-        large = [name for name in now.fit.joints if now.joint_off(name) is not None]
+            of_scene = not now.corrections and not now.at.any()
+            return self._search(cameras, joints, LARGE.max_remaining, sample, of_scene)
         ratios = now.joint_inlier_ratios.items()
-        doubted = [
-            name for name, ratio in ratios if ratio < LARGE.min_joint_inlier_ratio or name in large
-        ]
-        if doubted:
-            correction = self._search(
-                now.cameras, doubted, LARGE.max_remaining_of_joint, sample, False, large
-            )
-            if correction is not None:
-                return correction
-        # Fits are linear: they restart from a large offset or focal length that they estimated.
-        if large:
-            size = next(finding.angle for finding in now.found.common if finding.name == large[0])
-            search = LargeErrorSearch(self.body, now.cameras, sample)
-            return search.joint_correction("offset", large[0], 1.0, size, 0.0)
-        lens = now.focal_off
-        if lens is None or any(correction.kind == "focal" for correction in now.corrections):
+        doubted = [name for name, ratio in ratios if ratio < LARGE.min_joint_inlier_ratio]
+        if not doubted:
             return None
-        group = [camera.name for camera in now.cameras if f"'{camera.name}'" in lens.name]
-        return focal_correction(now.cameras, group, lens.name, 1.0 + lens.shift)
+        return self._search(cameras, doubted, LARGE.max_remaining_of_joint, sample, False)
 
     def _search(
         self,
@@ -428,13 +428,12 @@ class SceneComparison:
         left: float = LARGE.max_remaining,
         sample: Sequence[MultiViewFrame] | None = None,
         scene: bool = True,
-        likely: Collection[str] = (),
     ) -> Correction | None:
         """Return the correction found by ``LargeErrorSearch.find``, or None.
 
         Args:
             cameras: the cameras as corrected so far.
-            joints, left, likely: `joints`, `max_remaining` and `likely` of that function.
+            joints, left: `joints` and `max_remaining` of that function.
             sample: frames as corrected so far; None: as given.
             scene: whether ``scene_corrections`` are tried, too; with pictures they never are.
         """
@@ -446,51 +445,25 @@ class SceneComparison:
             known = self.body.kinematics.names
             corrections += joint_exchanges(cameras, joints, [known.index(one) for one in joints])
         search = LargeErrorSearch(self.body, cameras, sample or self._sample)
-        return search.find(corrections, joints, left, likely)
+        return search.find(corrections, joints, left)
 
-    def _record(
-        self, before: SceneFit, now: SceneFit, correction: Correction, fitted: Finding | None = None
-    ) -> SceneFit:
+    def _record(self, before: SceneFit, now: SceneFit, correction: Correction) -> SceneFit:
         """Return the fit `now` with its last correction recorded as a finding, or as a warning.
 
-        Args:
-            before: the fit without the correction.
-            now: the fit with the correction.
-            correction: the correction.
-            fitted: the finding of `before` whose estimate is the correction; None: the correction
-                was searched.
+        before: the fit without the correction. correction: offsets and focal lengths are among the
+            fit's findings.
         """
-        kind, name = _KINDS.get(correction.kind, correction.kind), correction.name
-        warnings = before.warnings
-        finding = Finding(kind, name, 0.0, 0.0, 0.0, 0.0, self._pixels(before, now), 0.0)
-        if correction.kind in _KINDS:
-            size, of_focal = correction.amount, correction.kind == "focal"
-            if not of_focal and self._turns(name):
-                finding = replace(finding, angle=size, angle_sd=float(np.radians(LARGE.fine_step)))
-                if fitted is not None and abs(size - fitted.angle) < 1e-9:
-                    finding = fitted
+        kind, name, warnings = correction.kind, correction.name, before.warnings
+        findings = before.findings
+        if kind not in ("offset", "focal"):
+            finding = Finding(kind, name, 0.0, 0.0, 0.0, 0.0, self._pixels(before, now), 0.0)
+            if kind in ("sign", "log"):
+                finding = self._differing(finding, before, correction)
             else:
-                step = LARGE.reach_focal if of_focal else LARGE.reach_shift
-                finding = replace(finding, shift=size, shift_sd=step)
-                if fitted is not None and abs(size - fitted.shift) < 1e-9:
-                    finding = fitted
-        elif kind in ("sign", "log"):
-            finding = self._differing(finding, before, correction)
-        else:
-            ratio, given = percent(now.inlier_ratio), percent(before.inlier_ratio)
-            warnings = (*warnings, f"{name}; so {ratio} of the contours fit, as given {given}")
-        findings = list(before.findings)
-        earlier = [
-            one for one in findings if (one.kind, one.name) == (kind, name) == ("joint", name)
-        ]
-        if earlier:
-            findings.remove(earlier[0])
-            finding = replace(
-                finding,
-                angle=finding.angle + earlier[0].angle,
-                alternatives=earlier[0].alternatives,
-            )
-        return replace(now, findings=(*findings, finding), warnings=warnings)
+                ratio, given = percent(now.inlier_ratio), percent(before.inlier_ratio)
+                warnings = (*warnings, f"{name}; so {ratio} of the contours fit, as given {given}")
+            findings = (*findings, finding)
+        return replace(now, findings=findings, warnings=warnings)
 
     def _turns(self, joint: str) -> bool:
         """Return whether the positions of a joint, given by name, are angles."""
@@ -529,7 +502,8 @@ class SceneComparison:
         squares, kinematics = list[Array](), self.body.kinematics
         for frame in self._sample:
             X = [kinematics.poses(one.corrected(frame).values) for one in (before, now)]
-            for one, other in zip(before.cameras, now.cameras, strict=True):
+            placed = (one.fit.cameras_at(one.at) for one in (before, now))
+            for one, other in zip(*placed, strict=True):
                 places = [
                     camera.project(placed_points(self.body.coarse, X_WN))[0]
                     for camera, X_WN in zip((one, other), X, strict=True)
@@ -539,24 +513,3 @@ class SceneComparison:
         moved = np.concatenate(squares)
         moved = moved[moved > 0.01]
         return float(np.sqrt(moved.mean())) if len(moved) else 0.0
-
-
-def _add_remaining(finding: Finding, rest: Finding | None) -> Finding:
-    """Return a correction's finding, to which the error that remained with it is added.
-
-    Angles and shifts are added, factors of focal lengths multiplied. Standard deviations are those
-    of the remaining error.
-
-    finding: the correction's. rest: of the same kind and name; None: no error remained.
-    """
-    if rest is None:
-        return finding
-    shift = finding.shift + rest.shift
-    if finding.kind == "focal":
-        shift = (1.0 + finding.shift) * (1.0 + rest.shift) - 1.0
-    angle = finding.angle + rest.angle
-    total = replace(rest, angle=angle, shift=shift, pixels=finding.pixels)
-    return replace(total, p_value=finding.p_value, alternatives=finding.alternatives)
-
-
-_KINDS = {"offset": "joint", "focal": "focal"}

@@ -15,11 +15,13 @@ from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError, RegistrationError, noted_warnings
 from drake_pose.files.folder import write_file, writes_folder
 from drake_pose.files.settings import RegistrationSettings
+from drake_pose.fit.judge import LEVEL
 from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.registration.diagnosis import (
     Search,
     check_focal_length,
     known_camera_warnings,
+    mirrored_cameras,
     require_determined,
     require_explained,
 )
@@ -50,6 +52,7 @@ from drake_pose.jobs.registration.tracks import (
 )
 from drake_pose.jobs.registration.words import (
     common_outlier_warnings,
+    few_frames_warning,
     likely_offset_warnings,
     lost_frames_warning,
     mode_warnings,
@@ -57,6 +60,7 @@ from drake_pose.jobs.registration.words import (
     outlier_warnings,
     parameter_warnings,
     target_warnings,
+    zero_warnings,
 )
 from drake_pose.person.pose_tracker import shape_parts, shape_values
 from drake_pose.registration.joint_offsets import calibrate_joints
@@ -291,7 +295,12 @@ class _Registration:
         try:
             yield
         except RegistrationError as error:
-            self.refused[name] = error
+            self._refuse({name: error})
+
+    def _refuse(self, errors: Mapping[str, RegistrationError]) -> None:
+        """Refuse cameras by name."""
+        self.refused |= errors
+        for name in errors:
             for results in (self.registered, self.pictures, self.target_pictures, self.tracks):
                 results.pop(name, None)
 
@@ -309,14 +318,17 @@ class _Registration:
         """
         inputs, target, target_pose = self.inputs, self.inputs.target, None
         search: Search = CameraSearch(self.body) if target is None else TargetSearch(target)
+        tried = dict[str, RegisteredCamera]()
         for camera in (one for one in inputs.searched_cameras if one.name not in self.refused):
             start, frames, found = time.perf_counter(), inputs.of(camera.name), None
             with self._refusing(camera.name):
-                found = search.register(camera, frames)
+                found = tried[camera.name] = search.register(camera, frames)
                 if not inputs.positions.is_estimate:
                     require_explained(search, found, frames)
             if found is None or camera.name in self.refused:
                 continue
+            if found.evidence is None or found.evidence.least > LEVEL:
+                self.warnings.append(few_frames_warning(found))
             if target is not None:
                 if found.target is not None:
                     target_pose, self.body = found.target, target.body(found.target.X_WT)
@@ -324,6 +336,9 @@ class _Registration:
                     self.warnings += target_warnings(target_pose)
                 found = replace(found, target=target_pose)
             self._note(found, start)
+        if target is None and not inputs.positions.is_estimate:
+            by_name = {name: inputs.of(name) for name in tried}
+            self._refuse(mirrored_cameras(CameraSearch(self.body), tried, by_name))
         self.inputs = replace(inputs, tree=self.body.tree)
 
     def _note(self, found: RegisteredCamera, start: float) -> None:
@@ -442,6 +457,8 @@ class _Registration:
                     require_determined(found)
                 self.warnings += outlier_warnings(found, from_pictures)
                 self.warnings += mode_warnings(body, found, inputs.of(name))
+                if not inputs.offset_joints and self._settings.on is None:
+                    self.warnings += zero_warnings(body, found, inputs.of(name))
         if joint and len(self.refused) > before:
             raise list(self.refused.values())[before]
         self._require_registered()

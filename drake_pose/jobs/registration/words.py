@@ -10,17 +10,24 @@ from pydrake.multibody.tree import BodyIndex
 
 from drake_pose.errors import RegistrationError
 from drake_pose.files.settings import percent
+from drake_pose.fit.base_edges import joint_rotation
 from drake_pose.jobs.registration.diagnosis import last_before_change, left_over
 from drake_pose.registration.findings import Finding, FrameDiagnosis
 from drake_pose.registration.joint_offsets import JointCalibration
-from drake_pose.registration.posed_frames import LAST_SPACING, PosedFrame, PosedFrames
+from drake_pose.registration.online_registration import pose_difference, squared_distance
+from drake_pose.registration.posed_frames import (
+    LAST_SPACING,
+    PosedFrame,
+    PosedFrames,
+    joints_like_cameras,
+)
 from drake_pose.registration.register import (
     RegisteredCamera,
     RegistrationBody,
     TargetPose,
     evenly_spaced,
 )
-from drake_pose.registration.shared_fit import SHARED, SharedFit
+from drake_pose.registration.shared_fit import OFFSET_UNITS, SHARED, SharedFit
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.scoring import draw_mask
 
@@ -30,15 +37,16 @@ def shift_unit(kind: str) -> tuple[str, float]:
 
     The factor converts ``Finding.shift``, which is in m, s or pixels, or relative.
     """
-    units = {"focal": ("percent", 100.0), "center": ("px", 1.0), "clock": ("ms", 1e3)}
-    return (units | {"rate": ("percent", 100.0)}).get(kind, ("mm", 1e3))
+    units = dict.fromkeys(("focal", "length", "rate"), ("percent", 100.0))
+    return (units | {"center": ("px", 1.0), "clock": ("ms", 1e3)}).get(kind, ("mm", 1e3))
 
 
 def describe_error(finding: Finding, verb: str = "off") -> str:
     """Return in words what is wrong, by how much, with standard deviations, and alternatives.
 
-    ``finding``: of kind "joint", "camera", "base", "focal", "center", "clock" or "rate". ``verb``:
-    before the amount, such as "off" or "is off"; used for kinds "camera", "base" and "center" only.
+    ``finding``: of kind "joint", "length", "camera", "base", "focal", "center", "clock" or "rate".
+    ``verb``: before the amount, such as "off" or "is off"; used for kinds "camera", "base" and
+    "center" only.
     """
     if finding.kind == "clock":
         word = "later" if finding.shift > 0.0 else "earlier"
@@ -51,6 +59,7 @@ def describe_error(finding: Finding, verb: str = "off") -> str:
         return describe_drift(finding.name, finding.shift, finding.shift_sd)
     name = "the base" if finding.kind == "base" else f"{finding.kind} '{finding.name}'"
     name = f"the {finding.name}" if finding.kind in ("focal", "center") else name
+    name = f"link '{finding.name}'" if finding.kind == "length" else name
     if finding.alternatives:
         name += f" (or {', '.join(finding.alternatives)}: the masks do not distinguish them)"
     angle, angle_sd = np.degrees([finding.angle, finding.angle_sd]).tolist()
@@ -59,7 +68,7 @@ def describe_error(finding: Finding, verb: str = "off") -> str:
     if finding.kind == "joint":
         reading = (angle, angle_sd, "deg") if finding.angle_sd > 0.0 else (shift, shift_sd, unit)
         return f"{name} {describe_reading(*reading)}"
-    if finding.kind == "focal":
+    if finding.kind in ("focal", "length"):
         # The shift is the correction, so a positive one means too short.
         word, many = "short" if shift > 0.0 else "long", finding.name.startswith("focal lengths")
         verb = "are" if many else "is"
@@ -312,6 +321,29 @@ def outlier_warnings(found: RegisteredCamera, from_pictures: bool = False) -> li
     return texts
 
 
+def zero_warnings(
+    body: RegistrationBody, found: RegisteredCamera, frames: Sequence[PosedFrame]
+) -> list[str]:
+    """Return a warning of a joint that turns a camera, and whose zero silhouettes do not show.
+
+    ``found``: a camera that was registered with the logged zeros. ``frames``: of the camera.
+    """
+    values, camera = np.array([one.values for one in frames]), found.camera
+    shown = np.array([len(one.vertices) > 0 for one in body.full])
+    for name in joints_like_cameras(body.kinematics, values, shown):
+        joint = body.kinematics.names.index(name)
+        X = joint_rotation(body.kinematics, values[0], joint, OFFSET_UNITS[0])
+        off = pose_difference(X @ camera.X_WC, camera.X_WC)
+        if squared_distance(off, found.covariance) < 1.0:
+            return [
+                f"camera '{camera.name}': it is known relative to the zero of joint '{name}', on "
+                "which all depends that is seen and not round: if this joint reads a degree too "
+                "high, the camera is turned by a degree about its axis. The standard deviations "
+                f"allow for half a degree; --zeros {name} allows for more"
+            ]
+    return []
+
+
 def mode_warnings(
     body: RegistrationBody, found: RegisteredCamera, frames: Sequence[PosedFrame]
 ) -> list[str]:
@@ -405,6 +437,15 @@ def target_warnings(pose: TargetPose) -> list[str]:
             "summary.json; the camera's pose does not depend on it"
         )
     return texts
+
+
+def few_frames_warning(found: RegisteredCamera) -> str:
+    """Return the warning of a camera with too few frames to prove its pose (``fit.judge``)."""
+    needed = 6 if found.evidence is None else found.evidence.needed
+    return (
+        f"camera '{found.camera.name}': its pose rests on how well its {len(found.frames)} frames "
+        f"fit; to prove that joint positions and masks belong together takes {needed}"
+    )
 
 
 def common_outlier_warnings(

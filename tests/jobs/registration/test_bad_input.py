@@ -107,7 +107,7 @@ def test_unknown_names_are_refused(arm_scene: ArmScene, tmp_path: Path, out: Pat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("factor", [0.9, 1.15])
+@pytest.mark.parametrize("factor", [0.4, 0.9, 1.15])
 def test_wrong_focal_length_is_corrected(factor: float, own_arm: ArmScene, out: Path) -> None:
     given = own_arm.cameras["left"]
     own_arm.edit_cameras("left", focal_x=factor * given.focal_x, focal_y=factor * given.focal_y)
@@ -127,11 +127,10 @@ class TestNoPoseExplains:
         ("spoil", "part"),
         [
             (change_masks(lambda mask: mask[:, ::-1]), "they fit when they are mirrored"),
-            (edit("left", focal_x=120.0, focal_y=120.0), "they fit with focal lengths near"),
             (change_rows(to_next), "they fit with the joint positions of the previous frame"),
             (change_masks(lambda mask: cv2.circle(0 * mask, (150, 110), 60, 255, -1)), "robot"),
         ],
-        ids=["mirrored", "focal length", "one row off", "something else"],
+        ids=["mirrored", "one row off", "something else"],
     )
     def test_nothing_is_written(self, spoil, part, own_arm, out):
         spoil(own_arm)

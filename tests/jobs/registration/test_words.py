@@ -13,10 +13,11 @@ from scipy.stats import chi2
 from drake_pose.body import load_model
 from drake_pose.errors import RegistrationError
 from drake_pose.files.overlay import EXCESS_RGB
+from drake_pose.fit.judge import Evidence
 from drake_pose.jobs.registration.diagnosis import (
     compare_camera,
     compare_clock,
-    explain_misfit,
+    lack_of_evidence,
     require_determined,
 )
 from drake_pose.jobs.registration.result import (
@@ -31,6 +32,7 @@ from drake_pose.jobs.registration.words import (
     lost_frames_warning,
     mode_warnings,
     outlier_warnings,
+    zero_warnings,
 )
 from drake_pose.registration.findings import Finding
 from drake_pose.registration.joint_offsets import KinematicParameter, undetermined
@@ -80,12 +82,28 @@ def registered(*agreeing: float, E: float = 0.1, **more: Any) -> RegisteredCamer
     return RegisteredCamera(arm_cameras()[0], 1e-6 * np.eye(6), frames, **more)
 
 
-def test_poses_that_explain_little_are_told_why() -> None:
-    assert explain_misfit(registered(0.6, 0.71, 0.3)) is None
-    assert "64.50 %" in (explain_misfit(registered(0.6, 0.69, 0.3)) or "")
-    assert "500.00 %" in (explain_misfit(registered(0.9, 0.9, E=5.0)) or "")
-    assert "frame '0' fits alone" in (explain_misfit(registered(0.9, -0.9, -0.9)) or "")
-    assert explain_misfit(registered(0.9)) is None
+def test_frames_that_fit_other_rows_are_no_evidence() -> None:
+    """With too few frames for the judge, they must fit better than with random rows."""
+    fits, frames = np.ones((1, 9, 9)), [PosedFrame("0", np.zeros(2), np.ones((4, 4), bool))]
+    chance = registered(0.4, costs=3.0 * fits)
+    search = SimpleNamespace(
+        kinematics=SimpleNamespace(
+            names=("a", "b"),
+            lower=np.array([-np.inf, 0.1]),
+            upper=np.array([np.inf, 0.1]),
+            is_angle=np.ones(2, bool),
+        )
+    )
+    search.rough = lambda: search
+    search.register = lambda camera, frames: chance
+    assert lack_of_evidence(search, registered(0.9, costs=fits), frames) is None
+    assert "drawn at random" in lack_of_evidence(search, chance, frames)
+    for p_value, said in ((0.02, "p-value 0.02"), (0.004, "")):
+        told = Evidence(0.5, 0.4, p_value, 0.004, 6, 5)
+        assert said in (lack_of_evidence(search, registered(0.9, evidence=told), frames) or "")
+        assert (lack_of_evidence(search, registered(0.9, evidence=told), frames) is None) != bool(
+            said
+        )
 
 
 def test_outliers_are_named_and_refused_where_they_are_many() -> None:
@@ -277,6 +295,16 @@ def test_parameters_are_summarised_in_their_units() -> None:
     assert told["zeros"]["slide"]["sd_mm"] == pytest.approx(2.0)
     leg = told["lengths"]["leg"]
     assert leg["high_percent"] is leg["value_percent"] is None
+
+
+def test_a_zero_that_nothing_shows_is_named(body: RegistrationBody) -> None:
+    """A first joint, if half a degree of it is within the camera's standard deviation."""
+    rng, names = np.random.default_rng(3), body.kinematics.names
+    frames = [PosedFrame(f"{k}", rng.normal(size=len(names)), np.ones((2, 2), bool)) for k in "ab"]
+    known, found = registered(), replace(registered(), covariance=np.eye(6))
+    assert zero_warnings(body, known, frames) == []
+    (text,) = zero_warnings(body, found, frames)
+    assert re.search(rf"'left'.* zero of joint '{names[0]}'.* --zeros {names[0]} ", text)
 
 
 def test_several_poses_name_the_joint_that_tells_them_apart_best(body: RegistrationBody) -> None:

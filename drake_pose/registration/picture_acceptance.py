@@ -308,7 +308,7 @@ def evaluate_pictures(
     *,
     most: int = 300,
     at_once: int = 20,
-    shown: float = 0.01,
+    shown: float = 0.1,
     min_overlap: float = 0.9,
     around: float = 0.3,
 ) -> tuple[tuple[PosedFrame, ...], tuple[FrameMisfit, ...], tuple[str, ...]]:
@@ -319,7 +319,8 @@ def evaluate_pictures(
         one: the registration from some of them.
         found: the camera at its final pose.
         most, at_once: maximum number of pictures, evenly spaced, and of those in memory together.
-        shown: minimum fraction of the picture that the body covers; other pictures are skipped.
+        shown: minimum area of the body, as a fraction of the median of the fitted frames' masks;
+            other pictures are skipped.
         min_overlap: a frame is an inlier, too, if its intersection over union is at least this
             fraction of the fit's median: dark and blurred contours fit badly even in correct poses.
         around: pictures are segmented up to this distance from the body [square root of its area].
@@ -329,6 +330,7 @@ def evaluate_pictures(
     """
     count = len(one.recording.names)
     rows = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
+    least_area = shown * float(np.median([np.count_nonzero(k.mask) for k in one.frames]))
     overlaps = [frame.iou for frame in one.found.frames if frame.is_inlier]
     min_iou = min_overlap * float(np.median(overlaps))
     least = inlier_threshold(one.fit.ratios)
@@ -338,7 +340,7 @@ def evaluate_pictures(
 
     def segment(posed: PosedPicture) -> tuple[str, PosedFrame | None] | None:
         covered = draw_mask(outlines, camera.X_CW @ body.kinematics.poses(posed.values), camera)
-        if covered.mean() < shown:
+        if np.count_nonzero(covered) < least_area:
             return None
         gain = estimate_gain(posed.picture, known.colours)
         return posed.name, segment_picture(posed, known, gain, covered, around)

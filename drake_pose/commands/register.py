@@ -243,8 +243,8 @@ def _say_clock(one: Mapping[str, Any]) -> str:
         ]
     else:
         texts = [
-            f"its pose explains {percent(one['explained'])} of the changes in its pictures, and "
-            f"chance {percent(one['explained_by_chance'])} (p-value {one['p_value']:.1g})"
+            f"its pose explains {percent(one['explained'])} of the changes in its pictures (by "
+            f"chance: p-value {one['p_value']:.1g})"
         ]
     if one["time_offset_s"] is not None:
         value, deviation = 1e3 * one["time_offset_s"], 1e3 * one["time_offset_sd_s"]

@@ -317,6 +317,20 @@ class KnownBackground:
             unseen=self.unseen[part],
         )
 
+    def resized(self, width: int, height: int) -> "KnownBackground":
+        """Return the background in pictures of another size [pixel]."""
+        size, unseen = (width, height), self.unseen.view(np.uint8)
+        return replace(
+            self,
+            colours=np.asarray(
+                cv2.resize(self.colours, size, interpolation=cv2.INTER_AREA), np.float32
+            ),
+            deviations=np.asarray(
+                cv2.resize(self.deviations, size, interpolation=cv2.INTER_AREA), np.float32
+            ),
+            unseen=cv2.resize(unseen, size, interpolation=cv2.INTER_NEAREST).astype(np.bool_),
+        )
+
     def foreground(self, picture: Picture, gain: Floats, window: Window) -> tuple[Floats, Floats]:
         """Return (h, w) and (H, W) log-odds that each pixel of an image shows the body.
 

@@ -6,12 +6,12 @@ picture agrees better with its own row than with others. Rows that are correlate
 their neighbours, too, so whole blocks of rows are exchanged (a block permutation test).
 """
 
-from math import factorial
+from math import factorial, perm
 from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.arrays import Array, Mask
+from drake_pose.arrays import Array, Floats, Mask
 
 LEVEL = 0.01
 """Significance level of all tests that decide what is true."""
@@ -29,11 +29,25 @@ class Evidence(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether the rows belong to the frames, at LEVEL."""
-        return self.p_value <= LEVEL
+        """Whether the rows belong to the frames, at LEVEL, and the body explains their pixels."""
+        return self.p_value <= LEVEL and self.gain > 0.0
+
+    def __str__(self) -> str:
+        if self.least > LEVEL:
+            return (
+                f"{self.frames} frames are too few to tell whether the joint positions are theirs: "
+                f"{self.needed} frames that are as different are needed"
+            )
+        if self.gain <= 0.0:
+            return "without the body the frames are explained better than with it"
+        return (
+            "with the joint positions of other frames, frames agree "
+            f"{'less' if self.holds else 'about as well'} (p-value {self.p_value:.2g}, at most "
+            f"{LEVEL:g} is expected)"
+        )
 
 
-def paired_gains(silhouettes: Mask, log_odds: Array) -> Array:
+def paired_gains(silhouettes: Mask, log_odds: Array | Floats) -> Array:
     """Return the log-likelihood gains (n, n) of n pictures with the silhouettes of n rows.
 
     Args:
@@ -54,24 +68,27 @@ def paired_evidence(gains: Array, rows: Array, *, draws: int = 5000) -> Evidence
     a frequency of 1 to 4 %.
 
     Args:
-        gains: (n, n) gain of frame i with the joint positions of row j. The camera was not fitted
-            to these frames.
+        gains: (n, n) gain of frame i with the joint positions of row j; 0 for frames to which the
+            camera was fitted.
         rows: (n, d) joint positions, or places of the links, in the order of time.
         draws: number of random permutations.
     """
     count, length = len(rows), correlation_length(rows)
     length = length if length == 1 else 2 * length
+    tested = np.count_nonzero(gains.any(axis=1)) / max(count, 1)
 
     def smallest(frames: int) -> float:
         """Return the smallest p-value of a number of frames: one over that of permutations."""
         blocks = min(max(1, frames // length), 12)
-        orders = factorial(blocks) * (1.0 if length == 1 else 2.0**blocks * frames)
-        return max(1.0 / orders, 1.0 / (draws + 1.0))
+        several = factorial(blocks) * 2.0**blocks * frames
+        if length == 1:
+            several = perm(min(frames, 60), round(tested * min(frames, 60)))
+        return max(1.0 / several, 1.0 / (draws + 1.0))
 
-    needed = next(k for k in range(2, 200) if smallest(k) <= LEVEL)
+    needed = next((k for k in range(2, 200) if smallest(k) <= LEVEL), 200)
     own = float(np.trace(gains)) / max(count, 1)
     mean = (float(gains.sum()) / max(count, 1) - own) / max(count - 1, 1)
-    if count < 2:
+    if count < 2 or not tested:
         return Evidence(own, mean, 1.0, 1.0, count, needed)
     cuts = np.array_split(np.arange(count), max(1, count // length))
     rng, orders = np.random.default_rng(0), np.empty((draws, count), np.int64)

@@ -1,19 +1,17 @@
-"""Accept a camera that was fitted to pictures, and evaluate all its pictures.
-
-The evidence is compared with what chance explains, and with what mirrored pictures explain.
-"""
+"""Accept a camera that was fitted to pictures, and evaluate all its pictures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import cv2
 import numpy as np
-from scipy.special import ndtr
 
 from drake_pose.arrays import Array, Picture
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
-from drake_pose.fit.background import estimate_gain
+from drake_pose.fit.background import MODEL, estimate_gain
+from drake_pose.fit.judge import Evidence, paired_evidence, paired_gains
 from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.fit.problem import TIME_OFFSET
 from drake_pose.fit.surfaces import simplify_or_hull
@@ -22,6 +20,7 @@ from drake_pose.registration.picture_search import (
     PictureSearch,
     PosedPicture,
     RoughPose,
+    node_places,
     segment_picture,
 )
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, joints_like_cameras
@@ -31,6 +30,7 @@ from drake_pose.registration.register import (
     FrameMisfit,
     RegisteredCamera,
     RegistrationBody,
+    evenly_spaced,
     frame_misfits,
 )
 from drake_pose.registration.shared_fit import SHARED, SharedFit, inlier_threshold
@@ -51,7 +51,7 @@ class PictureRegistration:
     focal_deviation: float  # Relative standard deviation of the focal length; 0: it was not fitted.
     recording: Recording  # The recording, with the drift of its clock removed.
     joint_offsets: Array  # (m,) added to the frames' values for their masks and log-odds.
-    by_chance: float  # Fraction that a search explained with the joint positions of other pictures.
+    evidence: Evidence  # Of pictures that were not fitted.
     runner_up: tuple[Array, float] | None  # As of ``PictureStart``.
 
     @property
@@ -61,18 +61,12 @@ class PictureRegistration:
         names = [frame.name for frame in posed.frames]
         return dict(zip(names, self.fit.ratios.tolist(), strict=True))
 
-    @property
-    def p_value(self) -> float:
-        """Probability that as much is explained by chance, see ``p_value_of``."""
-        return p_value_of(self.fit.explained, self.by_chance)
-
 
 class PictureStart(NamedTuple):
     """Result of a search.
 
     camera: at its approximate pose. rows: indices of the recording's pictures to fit. clock: the
     time offset. alternatives: other poses X_CW (4, 4) that explain the pictures about as well.
-    by_chance: fraction that a search explained with the joint positions of other pictures.
     joint_offsets: (m,) approximate ones [rad or m]; None: 0. search: a search in the pictures to
     fit, whose backgrounds are used again; None: they are estimated. runner_up: X_CW (4, 4) of the
     best pose found elsewhere, and by how much less of the contours fits there (``ratio_margin``
@@ -83,7 +77,6 @@ class PictureStart(NamedTuple):
     rows: Sequence[int]
     clock: TimeOffset
     alternatives: Sequence[Array]
-    by_chance: float
     joint_offsets: Array | None = None
     search: PictureSearch | None = None
     runner_up: tuple[Array, float] | None = None
@@ -94,7 +87,7 @@ class PictureStart(NamedTuple):
         rows = [one.recording.names.index(frame.name) for frame in one.frames]
         others = [np.linalg.inv(X) for X in one.found.alternatives]
         clock = one.time_offset or NO_CLOCK
-        return cls(one.found.camera, rows, clock, others, one.by_chance, one.joint_offsets)
+        return cls(one.found.camera, rows, clock, others, one.joint_offsets)
 
 
 def coarse_fits(searches: Sequence[PictureSearch], X_CW: Sequence[Array]) -> list[RoughPose]:
@@ -109,41 +102,6 @@ def coarse_fits(searches: Sequence[PictureSearch], X_CW: Sequence[Array]) -> lis
 def best_first(poses: Sequence[RoughPose]) -> list[RoughPose]:
     """Return poses sorted by their agreement with the pictures, see ``RoughPose``."""
     return sorted(poses, key=lambda one: -one.agreement)
-
-
-def explained_by_chance(
-    search: PictureSearch,
-    *,
-    rounds: Sequence[tuple[int, int, int, float]] = (
-        (64, 80, 24, 0.25),
-        (64, 30, 30, 0.15),
-        (80, 12, 50, 0.1),
-        (160, 4, 80, 0.06),
-    ),
-    rotations: int = 600,
-    least_width: int = 0,
-) -> float:
-    """Return the fraction that a search explains with the joint positions of other pictures.
-
-    Args:
-        search: a search with the pictures' own joint positions.
-        rounds, rotations, least_width: as of ``PictureSearch.search``. With a third of the usual
-            hypotheses the fractions have the same distribution: over 15 drawn rooms their
-            logarithms differ by 0.04 in the mean, with a standard deviation of 0.17.
-    """
-    exchanged = search.with_frames(exchange_values(search.frames))
-    best = exchanged.search(rounds, rotations, least_width, others=0)[:1]
-    found = coarse_fits([exchanged] * len(best), best)
-    return max((one.explained for one in found), default=0.0)
-
-
-def exchange_values(pictures: Sequence[PosedPicture], shift: int = 5) -> list[PosedPicture]:
-    """Return pictures with the values of others: each gets those `shift` places ahead."""
-    count = len(pictures)
-    return [
-        replace(one, values=pictures[(k + min(shift, count // 2)) % count].values, rates=None)
-        for k, one in enumerate(pictures)
-    ]
 
 
 def opposite_pose(
@@ -165,59 +123,86 @@ def opposite_pose(
     return mirrored.coarse_fit(improved[0])
 
 
-def p_value_of(
-    explained: float, by_chance: float, *, floor: float = 0.05, deviation: float = 0.5
-) -> float:
-    """Return the probability that a pose explains a fraction of the pictures by chance.
-
-    The logarithm of the ratio of both fractions is normally distributed around 0, if the joint
-    positions do not belong to the pictures.
-
-    Args:
-        explained: fraction of the possible log-likelihood gain that the pose explains.
-        by_chance: that of the best pose for joint positions of other pictures.
-        floor: added to both fractions; small ones are uncertain.
-        deviation: standard deviation of the logarithm, chosen on searches with the joint positions
-            of other episodes and of other robots.
-    """
-    ratio = (max(explained, 0.0) + floor) / (max(by_chance, 0.0) + floor)
-    return float(ndtr(-np.log(ratio) / deviation))
+def depth_reversed(best: RoughPose) -> RoughPose | None:
+    """Return the best pose near the depth twin of a pose; None: the body leaves the pictures."""
+    level = best.search.compared
+    _, improved = level.improve([level.depth_twin(best.camera.X_CW)] * 4, 80, 0.2)
+    return best.search.coarse_fit(improved[0])
 
 
 class AcceptanceSettings(NamedTuple):
     """What a fit must reach to be accepted.
 
     Args:
-        max_p_value: maximum of `p_value_of`. 33 of 36 correct poses have 0.07 or less; the others
-            belong to arms that cover the same pixels in most frames.
-        min_ratio: minimum mean inlier ratio of all frames. Where the joint positions of other
-            episodes or models of other robots explain much, it is 0.4 at most.
-        min_sum: minimum sum of this ratio and the explained fraction. Wrong poses, those in
-            mirrored pictures included, have 0.72 at most; right ones 1 in drawn rooms and 1.1 in
-            DROID's episodes at least.
-        sufficient_ratio, min_explained: with this inlier ratio and explained fraction, the p-value
-            does not matter. Wrong poses have a ratio of 0.62 at most, and then explain nothing.
         max_sd: maximum standard deviation of the pose [distance from the body; rad], with the
             first joint's offset held. Correct poses have 0.01.
         max_clock_sd: a time offset with a larger standard deviation is not determined [s].
         guessed_lens_error: relative error of focal lengths that pictures alone determine, which
             enlarges the covariance. Simulated ones err by 1 %, real ones by 2 to 50 %.
+        rows: maximum number of rows whose pairing with pictures is tested.
     """
 
-    max_p_value: float = 0.15
-    min_ratio: float = 0.4
-    min_sum: float = 0.75
-    sufficient_ratio: float = 0.75
-    min_explained: float = 0.12
     max_sd: float = 0.04
     max_clock_sd: float = 0.1
     guessed_lens_error: float = 0.25
+    rows: int = 60
 
 
 ACCEPTANCE = AcceptanceSettings()
 
 
+def picture_evidence(
+    body: RegistrationBody,
+    best: PictureFit,
+    recording: Recording,
+    offset: float,
+    joint_offsets: Array,
+) -> Evidence:
+    """Test whether pictures that were not fitted belong to their joint positions.
+
+    Args:
+        body: the robot's surfaces.
+        best: the camera's fit.
+        recording: with the drift of its clock removed.
+        offset: time offset [s].
+        joint_offsets: (m,) added to the recording's values [rad or m].
+    """
+    values = recording.values_at(offset) + joint_offsets
+    known = np.flatnonzero(np.isfinite(values).all(axis=1))
+    fitted = [recording.names.index(frame.name) for frame in best.fit.views[0].frames]
+    others = np.setdiff1d(known, fitted)
+    # Rows of fitted pictures are exchanged, too, where there are few others.
+    rows = others if len(others) >= ACCEPTANCE.rows else known
+    tested = evenly_spaced(rows.tolist(), ACCEPTANCE.rows)
+    width = min(PICTURES.compare_width, best.camera.width)
+    camera = best.camera.resized(
+        width, max(8, round(best.camera.height * width / best.camera.width))
+    )
+    background = best.background.resized(camera.width, camera.height)
+    outlines = simplify_or_hull(body.coarse, PICTURES.triangles[-1])
+    covered = np.array(
+        map_ordered(
+            lambda k: draw_mask(outlines, camera.X_CW @ body.kinematics.poses(values[k]), camera),
+            tested,
+        )
+    )
+    # The background is unknown where the body covers it in all frames.
+    covered &= ~covered.all(axis=0)
+
+    log_odds, size = np.zeros(covered.shape, np.float32), (camera.width, camera.height)
+    for k, row in enumerate(tested):
+        if row not in fitted:
+            resized = cv2.resize(recording.read(row), size, interpolation=cv2.INTER_AREA)
+            picture = np.asarray(resized, np.uint8)
+            gain = estimate_gain(picture, background.colours)
+            found = background.foreground(picture, gain, (slice(0), slice(0)))[1]
+            log_odds[k] = np.clip(found, -MODEL.max_log_odds, MODEL.max_log_odds)
+    gains = paired_gains(covered, log_odds)
+    return paired_evidence(gains, node_places(body, values[tested]).reshape(len(tested), -1))
+
+
 def accept_fit(
+    body: RegistrationBody,
     best: PictureFit,
     recording: Recording,
     start: PictureStart,
@@ -226,23 +211,19 @@ def accept_fit(
 ) -> PictureRegistration:
     """Return the registration of a fit, if it explains the pictures.
 
-    The first four arguments are what `_fit_until_stable` returns.
+    The arguments after the robot's surfaces are what `_fit_until_stable` returns.
 
     ``focal``: prior standard deviation of the focal length's logarithm; 0: it was not fitted.
-    Raises RegistrationError: a criterion of ACCEPTANCE is not met.
+    Raises RegistrationError: the joint positions of other pictures explain the pictures as well; no
+    more than half of the fitted frames agree; or the pose is not determined.
     """
     fit, (posed,) = best.fit, best.fit.views
-    p_value, ratio = p_value_of(best.explained, start.by_chance), float(best.ratios.mean())
-    fits = ratio >= ACCEPTANCE.sufficient_ratio and best.explained >= ACCEPTANCE.min_explained
-    least = max(ACCEPTANCE.min_ratio, ACCEPTANCE.min_sum - max(best.explained, 0.0))
-    if not fits and (p_value > ACCEPTANCE.max_p_value or ratio < least):
+    evidence = picture_evidence(body, best, recording, start.clock.value, joint_offsets)
+    agreeing, count = int(np.count_nonzero(best.inliers)), len(posed.frames)
+    if not evidence.holds or 2 * agreeing <= count:
         raise unexplained_error(
             start.camera,
-            f"the best one explains {max(best.explained, 0.0):.0%} of all changes, and one fitted "
-            f"with the joint positions of other pictures {max(start.by_chance, 0.0):.0%} (p-value "
-            f"{p_value:.2g}, at most {ACCEPTANCE.max_p_value:g}); {ratio:.0%} of the contours fit "
-            f"(minimum {least:.0%} at this explained fraction; less is usual for the model of "
-            "another robot)",
+            f"{evidence}; the contours of {agreeing} of {count} fitted frames agree on one",
         )
     deviations = np.sqrt(np.diag(best.covariance))
     pose = fit.camera_covariances(best.found, best.covariance)[0]
@@ -286,7 +267,7 @@ def accept_fit(
         float(deviations[focal_index]) if focal else 0.0,
         recording,
         joint_offsets,
-        start.by_chance,
+        evidence,
         start.runner_up,
     )
 

@@ -7,7 +7,6 @@ frames and the fastest ones.
 """
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -21,16 +20,13 @@ from drake_pose.fit.base_edges import BASE, joint_rotation, locate_base
 from drake_pose.fit.covariance import vuong_statistic
 from drake_pose.fit.problem import TIME_OFFSET
 from drake_pose.registration.picture_acceptance import (
-    ACCEPTANCE,
     PictureRegistration,
     PictureStart,
     accept_fit,
     best_first,
     coarse_fits,
-    exchange_values,
-    explained_by_chance,
+    depth_reversed,
     opposite_pose,
-    p_value_of,
     unexplained_error,
 )
 from drake_pose.registration.picture_search import (
@@ -50,6 +46,7 @@ from drake_pose.registration.recording import (
     mean_time,
     posed_pictures,
     scan_time_offsets,
+    stuck_pictures,
 )
 from drake_pose.registration.register import SEARCH, RegistrationBody
 from drake_pose.registration.shared_fit import SHARED
@@ -79,7 +76,7 @@ def register_pictures(
     Raises RegistrationError: there are too few pictures with joint positions, the robot does not
         move, or no pose explains the pictures; the message says so if mirrored pictures fit.
     """
-    frames = choose_pictures(body, camera, recording)
+    frames = _leave_some(recording, *choose_pictures(body, camera, recording))
     return _register(
         _Task(body, camera, recording, frames, focal, tuple(offset_joints), guessed_lens)
     )
@@ -89,26 +86,33 @@ def register_near(
     body: RegistrationBody,
     camera: PinholeCamera,
     recording: Recording,
-    by_chance: float,
     focal: float,
     offset_joints: Sequence[str],
 ) -> PictureRegistration:
-    """As register_pictures, but begin at the camera's pose, and search only if it does not fit.
-
-    by_chance: what a search explained by chance in other pictures of this camera.
-    """
+    """As register_pictures, but begin at the camera's pose, and search only if it does not fit."""
     try:
-        rows = [row for some in choose_pictures(body, camera, recording) for row in some]
+        frames = _leave_some(recording, *choose_pictures(body, camera, recording))
+        rows = [row for some in frames for row in some]
         search = PictureSearch(body, camera, posed_pictures(recording, rows, 0.0))
         clock = NO_CLOCK
         if recording.times is not None:
             clock = scan_time_offsets(search, camera, recording)
-        exchanged = search.with_frames(exchange_values(search.frames))
-        here = exchanged.compared.explained(camera.X_CW)[0]
-        start = PictureStart(camera, rows, clock, (), max(by_chance, here), None, search)
+        start = PictureStart(camera, rows, clock, (), None, search)
         return fit_pictures(body, start, recording, focal, offset_joints)
     except RegistrationError:
         return register_pictures(body, camera, recording, focal, offset_joints)
+
+
+def _leave_some(
+    recording: Recording, slow: Sequence[int], fast: Sequence[int]
+) -> tuple[list[int], list[int]]:
+    """Return the first of the chosen pictures, so that a third of all is left for judging a fit.
+
+    ``slow``, ``fast``: as of ``choose_pictures``. At most half of the pictures are slow ones.
+    """
+    known = int(np.isfinite(recording.values_at(0.0)).all(axis=1).sum())
+    kept = [*slow[: (known + 1) // 2]]
+    return kept, [*fast[: max(0, known - known // 3 - len(kept))]]
 
 
 class _Task(NamedTuple):
@@ -123,72 +127,63 @@ class _Task(NamedTuple):
     guessed_lens: bool
 
 
-def _register(task: _Task) -> PictureRegistration:
-    """As register_pictures. Where no pose is accepted, the search is repeated from other starts."""
+def _register(
+    task: _Task, searches: Sequence[tuple[int, int]] = ((1200, 0), (1700, 150)), well: float = 0.75
+) -> PictureRegistration:
+    """As register_pictures.
+
+    Args:
+        task: the arguments.
+        searches: number of rotations and minimum width of the pictures [pixel] of a first search,
+            and of a second one where no pose is accepted. Larger pictures show thin links.
+        well: where a smaller fraction of the contours fits, mirrored pictures are searched, too.
+    """
     begun = PictureSearch(
         task.body, task.camera, posed_pictures(task.recording, task.frames[0], 0.0)
     )
-    poses = begun.search()
-    near = _fit_near(begun, poses, task)
-    if not near:
-        raise unexplained_error(task.camera, "no pose shows the body in two pictures")
-    by_chance, found = explained_by_chance(near[0].search), None
-    mirrored = [opposite_pose(near[0])]
-    if p_value_of(near[0].explained, by_chance) <= ACCEPTANCE.max_p_value:
-        with suppress(RegistrationError):
-            found = _fit(task, near[0], by_chance, *_other_poses(near, poses))
-    if found is None:
-        first = near[0]
-        _require_unmirrored(task, first, mirrored, by_chance, least=SEARCH.significance)
-        more, near, others = _search_again(task, begun, near)
-        if near[0] is not first:
-            mirrored = [opposite_pose(near[0])]
-        mirrored += others
-        by_chance = max(by_chance, explained_by_chance(near[0].search, least_width=150))
+    poses, near, mirrored = list[Array](), list[RoughPose](), list[RoughPose]()
+    refused = unexplained_error(task.camera, "no pose shows the body in two pictures")
+    for rotations, width in searches:
+        more = begun.search(rotations=rotations, least_width=width)
+        poses += more
+        near += _fit_near(begun, more, task)
+        if width and not task.offset_joints:
+            search = begun.mirrored()
+            mirrored += _rough_fits(
+                search, search.search(rotations=rotations, least_width=width, others=0)
+            )
+            # In mirrored pictures a pose may be found more easily; the right one is opposite.
+            near += filter(None, map(opposite_pose, mirrored))
+        if not near:
+            continue
+        near = best_first(near)
+        near = best_first([*near, *filter(None, [depth_reversed(near[0])])])
+        mirrored += filter(None, [opposite_pose(near[0])])
         try:
-            found = _fit(task, near[0], by_chance, *_other_poses(near, [*poses, *more]))
-        except RegistrationError:
-            _require_unmirrored(task, near[0], mirrored, by_chance)
-            raise
-    elif found.fit.ratios.mean() < ACCEPTANCE.sufficient_ratio:
-        # A wrong pose in mirrored pictures need not be opposite the right one.
-        search = near[0].search.mirrored()
-        mirrored += _rough_fits(search, search.search(others=0))
-    _require_unmirrored(task, near[0], mirrored, by_chance, found)
-    return found
-
-
-def _search_again(
-    task: _Task, begun: PictureSearch, near: Sequence[RoughPose]
-) -> tuple[list[Array], list[RoughPose], list[RoughPose]]:
-    """Search from other starts in larger pictures, which show thin links.
-
-    This finds poses that a first search missed, as it did in 2 of 3 drawn rooms with an SO-100.
-
-    ``begun``: the first search. ``near``: its roughly fitted poses. Returns the poses X_CW (4, 4)
-    of this search; all roughly fitted poses, the best first; and those in mirrored pictures, none
-    if joint offsets are fitted.
-    """
-    again = partial(PictureSearch.search, rotations=1700, least_width=150)
-    more, seen = again(begun), list[RoughPose]()
-    if not task.offset_joints:
-        search = begun.mirrored()
-        seen = _rough_fits(search, again(search, others=0))
-    # In mirrored pictures a pose may be found more easily; the right one is opposite.
-    opposite = [pose for one in seen if (pose := opposite_pose(one)) is not None]
-    return more, best_first([*near, *_fit_near(begun, more, task), *opposite]), seen
+            found = _fit(task, near[0], *_other_poses(near, poses))
+        except RegistrationError as error:
+            _require_unmirrored(task, near[0], mirrored)
+            refused = error
+            continue
+        if found.fit.ratios.mean() < well:
+            # A wrong pose in mirrored pictures need not be opposite the right one.
+            search = near[0].search.mirrored()
+            mirrored += _rough_fits(search, search.search(others=0))
+        _require_unmirrored(task, near[0], mirrored, found)
+        return found
+    stuck = stuck_pictures(task.recording)
+    raise RegistrationError(f"{refused}; {stuck}") if stuck else refused
 
 
 def _fit(
     task: _Task,
     pose: RoughPose,
-    by_chance: float,
     alternatives: Sequence[Array] = (),
     runner_up: tuple[Array, float] | None = None,
 ) -> PictureRegistration:
     """Return the registration from a roughly fitted pose.
 
-    by_chance, alternatives, runner_up: as of ``PictureStart``.
+    alternatives, runner_up: as of ``PictureStart``.
 
     Raises RegistrationError: the pose does not explain the pictures.
     """
@@ -197,17 +192,14 @@ def _fit(
     fitted = pose.search.with_frames(posed_pictures(corrected, rows, 0.0, pose.search.frames))
     if task.recording.times is not None:
         clock = scan_time_offsets(fitted, pose.camera, corrected)
-    start = PictureStart(
-        pose.camera, rows, clock, alternatives, by_chance, offsets, fitted, runner_up
-    )
+    start = PictureStart(pose.camera, rows, clock, alternatives, offsets, fitted, runner_up)
     return fit_pictures(task.body, start, task.recording, task.focal, task.offset_joints)
 
 
 def _require_unmirrored(
     task: _Task,
     best: RoughPose,
-    mirrored: Sequence[RoughPose | None],
-    by_chance: float,
+    mirrored: Sequence[RoughPose],
     found: PictureRegistration | None = None,
     *,
     least: float = -3.0,
@@ -217,19 +209,18 @@ def _require_unmirrored(
     Args:
         best: the roughly fitted pose in the pictures as they are.
         mirrored: those in mirrored pictures.
-        by_chance: as of ``PictureStart``.
         found: the registration from `best`; None: it was refused.
         least: the best of `mirrored` is fitted to the end if it is better than `best` by more than
             this margin (``ratio_margin``). Where `best` was right the margin was -5 to -20; while
             the time offset is unknown it says little.
     """
-    rivals = [(ratio_margin(one.ratios, best.ratios), one) for one in mirrored if one is not None]
+    rivals = [(ratio_margin(one.ratios, best.ratios), one) for one in mirrored]
     margin, rival = max(rivals, key=lambda one: one[0], default=(-np.inf, best))
     if margin <= least:
         return
     recording, camera = task.recording.mirrored(), task.camera.mirrored()
     try:
-        other = _fit(task._replace(recording=recording, camera=camera), rival, by_chance)
+        other = _fit(task._replace(recording=recording, camera=camera), rival)
     except RegistrationError:
         return
     if found is None or ratio_margin(other.ratios, found.ratios) > SEARCH.significance:
@@ -366,7 +357,7 @@ def fit_pictures(
     fit = partial(_fit_until_stable, body, recording, focal, offset_joints)
     steady = best, as_now, start, assumed = fit(without)
     if recording.times is None:
-        return accept_fit(*steady, focal)
+        return accept_fit(body, *steady, focal)
     if scanned_drift:
         clock = replace(without.clock, drift=scanned_drift)
         best, as_now, start, assumed = fit(without._replace(clock=clock))
@@ -384,7 +375,7 @@ def fit_pictures(
         clock = replace(clock, drift=clock.drift + more)
         best, as_now, start, assumed = fit(start._replace(clock=clock))
     drifts = abs(start.clock.drift) > drift_sds * start.clock.drift_deviation
-    return accept_fit(*((best, as_now, start, assumed) if drifts else steady), focal)
+    return accept_fit(body, *((best, as_now, start, assumed) if drifts else steady), focal)
 
 
 def _fit_until_stable(
@@ -419,7 +410,7 @@ def _fit_until_stable(
             search = PictureSearch(body, camera, frames)
         search = search.with_camera(camera).with_frames(frames)
         best = search.with_offsets(joint_offsets).fit(camera, constants, focal)
-        if best is None:
+        if best is None or not best.ratios.any():
             raise unexplained_error(camera, "the body leaves the pictures")
         found = dict(zip(best.fit.names, best.found.shared.tolist(), strict=True))
         camera, by = best.camera, found.get(TIME_OFFSET, 0.0)

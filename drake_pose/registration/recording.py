@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from drake_pose.arrays import Array, Picture
@@ -149,6 +150,25 @@ def choose_pictures(
     rest = np.setdiff1d(np.argsort(-speed)[: max(moving, len(known) // 4)], chosen)
     fast = rest[choose_frames(places[rest], moving)] if len(rest) else rest
     return known[chosen].tolist(), known[fast].tolist()
+
+
+def stuck_pictures(recording: Recording, least: int = 5, noise: int = 2) -> str:
+    """Return in words which pictures are the same although the joints move; "": there are few.
+
+    ``least``: minimum number of successive pictures that are the same. ``noise``: maximum
+    difference of two that are [of 255]; encoders change copies by this much.
+    """
+    same, before = [0], recording.read(0)
+    for k in range(1, len(recording.names)):
+        picture = recording.read(k)
+        is_same = cv2.absdiff(picture, before).max() <= noise
+        same.append(same[-1] + 1 if is_same else 0)
+        before = picture
+    last = int(np.argmax(same))
+    if same[last] < least:
+        return ""
+    names = recording.names[last - same[last]], recording.names[last]
+    return f"pictures '{names[0]}' to '{names[1]}' are the same: is the recording stuck?"
 
 
 def posed_pictures(

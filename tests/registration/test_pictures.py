@@ -1,6 +1,5 @@
 """Cameras registered from pictures alone, of an arm of boxes painted over Drake's label images."""
 
-from contextlib import nullcontext
 from dataclasses import replace
 
 import cv2
@@ -21,9 +20,7 @@ from drake_pose.registration.picture_acceptance import (
     accept_fit,
     best_first,
     evaluate_pictures,
-    exchange_values,
     opposite_pose,
-    p_value_of,
 )
 from drake_pose.registration.picture_registration import (
     fit_pictures,
@@ -297,7 +294,7 @@ def near(camera, degrees):
 def registered(episode, recording) -> PictureRegistration:
     """From a camera rotated by a degree, and a time offset wrong by ten milliseconds."""
     clock = TimeOffset(LATE - 0.01, np.inf, np.zeros((0, 2)))
-    start = PictureStart(near(episode.camera, 1.0), range(0, 16, 3), clock, (), 0.05)
+    start = PictureStart(near(episode.camera, 1.0), range(0, 16, 3), clock, ())
     return fit_pictures(episode.body, start, recording(), 0.0, ())
 
 
@@ -318,33 +315,22 @@ def test_time_offset_and_camera_are_fitted_within_their_deviations(registered, e
     assert registered.focal_deviation == 0.0
     # A registration has the logged values, without the offsets that its frames were fitted with.
     offsets = np.arange(5.0)
-    again = accept_fit(
-        registered.fit, registered.recording, PictureStart.of(registered), offsets, 0.0
+    logged = replace(
+        registered.recording,
+        values_at=lambda offset: registered.recording.values_at(offset) - offsets,
     )
+    start = PictureStart.of(registered)
+    again = accept_fit(episode.body, registered.fit, logged, start, offsets, 0.0)
     np.testing.assert_allclose([one.values for one in again.frames], values - offsets)
-
-
-@pytest.mark.parametrize(
-    ("ratio", "explained", "by_chance", "why"),
-    [
-        # Ratio and explained fraction must be sufficient together.
-        (0.46, 0.27, 0.05, r"46% .*minimum 48%"),
-        (0.46, 0.30, 0.05, None),
-        # Neither replaces the other one.
-        (0.39, 0.60, 0.05, r"minimum 40%"),
-        (0.60, 0.30, 0.20, r"p-value 0\.2"),
-        (0.74, 0.005, 0.0, r"p-value 0\.4"),
-        # So many contours fit in no wrong pose that explains something.
-        (0.76, 0.13, 0.20, None),
-        (0.76, 0.11, 0.20, r"p-value"),
-    ],
-)
-def test_poses_are_accepted_by_two_numbers_together(registered, ratio, explained, by_chance, why):
-    fit = replace(registered.fit, explained=explained)
-    vars(fit)["ratios"] = ratio + 0.1 * np.cos(np.pi * np.arange(len(registered.frames)))
-    start = PictureStart.of(replace(registered, by_chance=by_chance))
-    with nullcontext() if why is None else pytest.raises(RegistrationError, match=why):
-        accept_fit(fit, registered.recording, start, np.zeros(5), 0.0)
+    assert again.evidence == registered.evidence
+    # A fit in which no more than half of the frames agree is refused; so is one to other rows.
+    doubtful = replace(registered.fit)
+    vars(doubtful)["inliers"] = np.arange(6) < 3
+    with pytest.raises(RegistrationError, match="3 of 6 fitted frames agree"):
+        accept_fit(episode.body, doubtful, logged, start, offsets, 0.0)
+    other = replace(logged, values_at=lambda offset: logged.values_at(offset)[::-1])
+    with pytest.raises(RegistrationError, match=r"about as well \(p-value 0\.|explained better"):
+        accept_fit(episode.body, registered.fit, other, start, offsets, 0.0)
 
 
 def test_pictures_are_evaluated_with_the_registered_camera(registered, episode) -> None:
@@ -468,25 +454,6 @@ def test_mirrored_pictures_and_joints_of_another_episode_are_refused(episode, re
         wrong = recording(values_at=lambda offset: -0.7 * episode.values_at(2.0 * episode.times))
     with pytest.raises(RegistrationError, match=said):
         register_pictures(episode.body, episode.camera, wrong)
-
-
-def test_p_value_is_even_at_chance_and_falls_with_what_is_explained():
-    assert p_value_of(0.1, 0.1) == pytest.approx(0.5)
-    values = [p_value_of(explained, 0.1) for explained in (0.05, 0.15, 0.3, 0.6)]
-    assert values == sorted(values, reverse=True)
-    assert values[1] > 0.15 > values[2]
-    # Without anything explained by chance, a trifle is no evidence.
-    assert p_value_of(0.02, 0.0) > 0.15
-    assert p_value_of(-0.2, -0.1) == pytest.approx(0.5)
-
-
-def test_each_picture_gets_the_joint_positions_of_another(episode, recording):
-    pictures = posed_pictures(recording(), range(0, 16, 3), 0.0)
-    exchanged = exchange_values(pictures)
-    assert [one.name for one in exchanged] == [one.name for one in pictures]
-    before, after = (np.array([k.values for k in own]) for own in (pictures, exchanged))
-    assert (np.abs(before - after).max(axis=1) > 0.1).all()
-    np.testing.assert_allclose(np.sort(before, axis=0), np.sort(after, axis=0))
 
 
 def test_the_margin_of_inlier_ratios_holds_its_level():

@@ -279,17 +279,14 @@ def _find_cameras(
     return updated, _Pictures(pictures, tuple(findings), names)
 
 
-def _found_poses(folder: Path) -> dict[str, tuple[Array, float]]:
-    """Return, by camera, X_WC (4, 4) as found by an audit, and the fraction explained by chance.
+def _found_poses(folder: Path) -> dict[str, Array]:
+    """Return, by camera, X_WC (4, 4) as found by an audit.
 
     The result is empty if the folder has no result.
     """
     try:
         found = read_summary(folder)["found_cameras"]
-        return {
-            name: (np.array(one["X_WC"]), float(one["explained_by_chance"]))
-            for name, one in found.items()
-        }
+        return {name: np.array(one["X_WC"]) for name, one in found.items()}
     except (DrakePoseError, KeyError):
         return {}
 

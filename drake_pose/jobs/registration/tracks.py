@@ -95,7 +95,7 @@ def register_recordings(
     focal: Collection[str] = (),
     offset_joints: Sequence[str] = (),
     before: Mapping[str, PictureRegistration] | None = None,
-    near: Mapping[str, tuple[Array, float]] | None = None,
+    near: Mapping[str, Array] | None = None,
 ) -> Iterator[PictureRegistration]:
     """Register cameras of an episode, one after another.
 
@@ -107,9 +107,8 @@ def register_recordings(
         focal: names of cameras whose focal length is fitted; an unknown focal length always is.
         offset_joints: names of joints whose offsets are fitted.
         before: earlier registrations by camera, from which fits start; None: poses are searched.
-        near: by camera, X_WC (4, 4) as found in another episode, and the fraction explained by
-            chance there. A fit starts at the pose; if it fails, the pose is searched. None: all
-            poses are searched.
+        near: by camera, X_WC (4, 4) as found in another episode. A fit starts at the pose; if it
+            fails, the pose is searched. None: all poses are searched.
 
     Raises RegistrationError: every camera is refused.
     """
@@ -125,9 +124,8 @@ def register_recordings(
                 start = PictureStart.of(before[name])
                 result = fit_pictures(body, start, recording, prior, offset_joints)
             elif near is not None and name in near:
-                X_WC, by_chance = near[name]
-                begun = replace(camera, X_WC=X_WC)
-                result = register_near(body, begun, recording, by_chance, prior, offset_joints)
+                begun = replace(camera, X_WC=near[name])
+                result = register_near(body, begun, recording, prior, offset_joints)
             else:
                 result = register_pictures(body, camera, recording, prior, offset_joints, guessed)
         except RegistrationError as error:
@@ -172,8 +170,7 @@ def describe_pictures(result: PictureRegistration | None, found: bool = False) -
         "time_drift_sd": drifting and drifting.drift_deviation,
         "time_offset_scores": [] if offset is None else offset.scores.round(4).tolist(),
         "explained": result.fit.explained,
-        "explained_by_chance": result.by_chance,
-        "p_value": result.p_value,
+        "p_value": result.evidence.p_value,
         "contour": result.fit.contour,
         "runner_up": runner_up,
     }

@@ -20,7 +20,7 @@ def summary(**camera):
         "modes": [{}], "mean_iou": 0.9, "seconds": 1.0, "outliers": [], "zeros": {},
         "lengths": {}, "masks": "found", "focal_px": 500.0, "focal_sd_px": None,
         "time_offset_s": None, "time_offset_sd_s": None, "time_offset_scores": [],
-        "explained": 0.42, "explained_by_chance": 0.06, "p_value": 2e-6, "runner_up": None,
+        "explained": 0.42, "p_value": 2e-6, "runner_up": None,
         "frames": {"0000": {"agrees": True, "E_total": 0.1, "iou": 0.9, "inlier_ratio": 0.8}},
     }  # fmt: skip
     return {
@@ -54,7 +54,7 @@ def test_summary_of_time_offset_focal_length_and_runner_up(tmp_path):
     clock = TimeOffset(0.1, 0.02, scores, drift=1e-3, drift_deviation=1e-4)
     one = SimpleNamespace(
         found=SimpleNamespace(camera=camera), time_offset=clock, focal_deviation=0.01,
-        fit=SimpleNamespace(explained=0.3, contour=0.2), by_chance=0.1, p_value=1e-3,
+        fit=SimpleNamespace(explained=0.3, contour=0.2), evidence=SimpleNamespace(p_value=1e-3),
         runner_up=None,
     )  # fmt: skip
     told = describe_pictures(one)

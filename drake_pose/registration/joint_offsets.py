@@ -153,12 +153,15 @@ def calibrate_joints(
         PosedFrames(body.kinematics, body.full, one.camera, each)
         for one, each in zip(cameras, frames, strict=True)
     ]
-    requested, static = [*joints, *map(link_scale_name, links)], static or {}
+    requested = [*joints, *map(link_scale_name, links)]
+    # The mean of a measurement and the prior is where the fit begins.
+    prior, static = SHARED.constant_deviation, static or {}
+    static = {name: (value / (1.0 + (sd / prior) ** 2), sd) for name, (value, sd) in static.items()}
     target_positions = [name for name in body.kinematics.names if name in TARGET_POSITIONS]
     fit = SharedFit(
         views, [one.camera.X_CW for one in cameras], [*target_positions, *requested],
         offsets=carried_joints(body.tree, links), camera_unknowns=len(POSE_NAMES) + focal,
-        turned=static,
+        turned=static, expected={name: value for name, (value, _) in static.items()},
     )  # fmt: skip
     begin = fit.start
     begin.shared[:] = [(start or {}).get(name, 0.0) for name in fit.names]

@@ -10,7 +10,7 @@ import numpy as np
 from drake_pose.arrays import Array, Picture
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
-from drake_pose.fit.background import MODEL, estimate_gain
+from drake_pose.fit.background import MODEL, colour_slopes, estimate_gain, grown, largest
 from drake_pose.fit.judge import Evidence, paired_evidence, paired_gains
 from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.fit.problem import TIME_OFFSET
@@ -134,15 +134,12 @@ class AcceptanceSettings(NamedTuple):
     """What a fit must reach to be accepted.
 
     Args:
-        max_sd: maximum standard deviation of the pose [distance from the body; rad], with the
-            first joint's offset held. Correct poses have 0.01.
         max_clock_sd: a time offset with a larger standard deviation is not determined [s].
         guessed_lens_error: relative error of focal lengths that pictures alone determine, which
             enlarges the covariance. Simulated ones err by 1 %, real ones by 2 to 50 %.
         rows: maximum number of rows whose pairing with pictures is tested.
     """
 
-    max_sd: float = 0.04
     max_clock_sd: float = 0.1
     guessed_lens_error: float = 0.25
     rows: int = 60
@@ -160,6 +157,9 @@ def picture_evidence(
 ) -> Evidence:
     """Test whether pictures that were not fitted belong to their joint positions.
 
+    The colours of the pixels that the body covers are tested, and the edges along its outline. The
+    weaker evidence of both is returned.
+
     Args:
         body: the robot's surfaces.
         best: the camera's fit.
@@ -174,7 +174,7 @@ def picture_evidence(
     # Rows of fitted pictures are exchanged, too, where there are few others.
     rows = others if len(others) >= ACCEPTANCE.rows else known
     tested = evenly_spaced(rows.tolist(), ACCEPTANCE.rows)
-    width = min(PICTURES.compare_width, best.camera.width)
+    width = min(PICTURES.background_width, best.camera.width)
     camera = best.camera.resized(
         width, max(8, round(best.camera.height * width / best.camera.width))
     )
@@ -186,19 +186,28 @@ def picture_evidence(
             tested,
         )
     )
+    outlined = covered & grown(~covered, 1)
     # The background is unknown where the body covers it in all frames.
     covered &= ~covered.all(axis=0)
 
-    log_odds, size = np.zeros(covered.shape, np.float32), (camera.width, camera.height)
+    log_odds, size = np.zeros((2, *covered.shape), np.float32), (camera.width, camera.height)
+    noise = 4.0 * float(background.deviations.min())
     for k, row in enumerate(tested):
         if row not in fitted:
             resized = cv2.resize(recording.read(row), size, interpolation=cv2.INTER_AREA)
             picture = np.asarray(resized, np.uint8)
             gain = estimate_gain(picture, background.colours)
             found = background.foreground(picture, gain, (slice(0), slice(0)))[1]
-            log_odds[k] = np.clip(found, -MODEL.max_log_odds, MODEL.max_log_odds)
-    gains = paired_gains(covered, log_odds)
-    return paired_evidence(gains, node_places(body, values[tested]).reshape(len(tested), -1))
+            log_odds[0, k] = np.clip(found, -MODEL.max_log_odds, MODEL.max_log_odds)
+            slopes = np.hypot(
+                *(largest(np.abs(one)) for one in colour_slopes(picture.astype(np.float32)))
+            )
+            edges = cv2.dilate(np.minimum(1.0, slopes / noise), np.ones((3, 3), np.uint8))
+            log_odds[1, k] = edges - edges.mean()
+    places = node_places(body, values[tested]).reshape(len(tested), -1)
+    shown = zip((covered, outlined), log_odds, strict=True)
+    tests = [paired_evidence(paired_gains(*both), places) for both in shown]
+    return max(tests, key=lambda one: (not one.holds, one.p_value))
 
 
 def accept_fit(
@@ -240,7 +249,8 @@ def accept_fit(
     rows, C = [fit.names.index(k) for k in turning if k in fit.names], best.covariance
     held = C - C[:, rows] @ np.linalg.inv(C[np.ix_(rows, rows)]) @ C[rows]
     one = replace(found, covariance=fit.camera_covariances(best.found, held)[0])
-    if one.translation_sd > ACCEPTANCE.max_sd * distance or one.rotation_sd > ACCEPTANCE.max_sd:
+    most = SHARED.constant_deviation
+    if one.translation_sd > most * distance or one.rotation_sd > most:
         raise unexplained_error(
             start.camera,
             f"the best, {distance:.1f} m away, has a standard deviation of "

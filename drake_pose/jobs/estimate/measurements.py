@@ -378,11 +378,10 @@ def map_log(path: Path, joints: JointLog, tree: PoseTree, settings: EpisodeSetti
         )
     clipped = int(mapped.clipped.any(axis=1).sum())
     if clipped:
-        # Such a reading only bounds the position.
-        positions = np.where(mapped.clipped, np.nan, positions)
+        # Most joints are there: an arm rests against its stops.
         warnings.append(
-            f"{clipped} of {len(positions)} rows are not used: a reading is at an end of its "
-            "range, and the joint may be beyond it"
+            f"in {clipped} of {len(positions)} rows a reading is at an end of its range: the joint "
+            "may be beyond it"
         )
     default = kinematics.flatten(tree.default_values())[asked]
     missing = np.array([name in mapped.not_logged for name in names])

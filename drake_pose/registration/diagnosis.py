@@ -7,7 +7,7 @@ or the base. A frame is an outlier if its residual r = h - N x_common is signifi
 r^T Q^-1 r follows an F distribution.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import reduce
 from itertools import compress
@@ -26,7 +26,12 @@ from drake_pose.fit.covariance import (
 )
 from drake_pose.fit.parameters import CAMERA_NAMES, POSE_NAMES
 from drake_pose.registration.findings import Diagnosis, Finding, FrameDiagnosis
-from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit, explained_frames
+from drake_pose.registration.per_frame_fit import (
+    FrameFit,
+    PerFrameFit,
+    explained_frames,
+    likeliest_inliers,
+)
 from drake_pose.registration.shared_fit import SHARED
 
 
@@ -139,9 +144,30 @@ class _Residual(NamedTuple):
         """Return a cause with estimated amount, covariance and x, and with its p_value and gain."""
         M = cause.jacobian
         T, rank = _statistic(M.T @ self.r, M.T @ self.Q @ M, M.T @ self.N @ M)
-        # The rank penalises causes with several parameters.
-        p_value, gain = _p_value(T, rank, self.info.freedom), T - 2.0 * rank
+        # The number of parameters penalises causes that have several.
+        p_value, gain = (
+            _p_value(T, rank, self.info.freedom),
+            self.explained(M)[0] - 2.0 * M.shape[1],
+        )
         return self.together([cause._replace(p_value=p_value, gain=gain)])[0]
+
+    def explained(self, M: Array) -> tuple[float, int]:
+        """Return by how much errors x = M a raise twice the log-likelihood, and M's rank."""
+        known, turn = np.linalg.eigh(self.N)
+        turn = turn[:, known > DIAGNOSIS.min_information]
+        L = np.linalg.cholesky(turn.T @ self.Q @ turn)
+        A = np.linalg.solve(L, turn.T @ np.column_stack([self.N @ M, self.r]))
+        U, singular, _ = np.linalg.svd(A[:, :-1], full_matrices=False)
+        along = U[:, singular > 1e-6 * singular.max(initial=1e-6)].T @ A[:, -1]
+        return float(along @ along), len(along)
+
+    def is_explained_by(self, one: _Cause, other: _Cause) -> bool:
+        """Return whether a cause explains so much that another is not significant beside it."""
+        both, alone = (
+            self.explained(M) for M in (np.hstack([one.jacobian, other.jacobian]), one.jacobian)
+        )
+        more = both[0] - alone[0], both[1] - alone[1]
+        return _p_value(*more, self.info.freedom) > DIAGNOSIS.significance
 
     def together(self, causes: Sequence[_Cause], cameras: Sequence[_Cause] = ()) -> list[_Cause]:
         """Return the causes, estimated together and beside small errors of the cameras' poses.
@@ -225,11 +251,12 @@ class _Diagnoser:
         usual = 4.0 if self._moved else 0.4
         explained = explained_frames([one.inlier_ratios[1] for one in self._frames])
 
-        def evaluate(kept: Mask) -> tuple[Array, Array]:
-            """Return p-values (frames,) and common errors (p,) of a set, see likeliest_inliers."""
+        def evaluate(kept: Mask) -> tuple[Mask, Array]:
+            """Return which frames (frames,) fit to a set's common errors (p,), and these."""
             common = self._common(self._sum(kept))
             residuals = [self._residual(info, *common) for info in self._info]
-            return np.array([one.p_value for one in residuals]), common[0] - self._at
+            fits = np.array([one.p_value > DIAGNOSIS.significance for one in residuals])
+            return fits, common[0] - self._at
 
         # In the first pass inliers are unknown, so error sizes come from single frames.
         inliers, together = explained, 1
@@ -489,13 +516,11 @@ def _name(
         ]
         if not tests:
             break
-        most, level = max(tests, key=lambda one: one.gain), DIAGNOSIS.significance / len(left)
+        most = max(tests, key=lambda one: one.gain)
         enough = (
             one
             for one in tests
-            if one is most
-            or residual.pixels(one.x) < slack
-            or residual.without(one).test(most).p_value > level
+            if one is most or residual.pixels(one.x) < slack or residual.is_explained_by(one, most)
         )
         named.append(_best_first(enough))
         best = named[-1][0]
@@ -526,50 +551,6 @@ def _minimum_detectable(residual: _Residual, causes: Sequence[_Cause]) -> dict[s
         least = max(amount, DIAGNOSIS.min_common_pixels / pixels) if is_observable else np.inf
         found[cause.name] = float(least * cause.units[0])
     return found
-
-
-def likeliest_inliers(
-    explained: Mask,
-    evaluate: Callable[[Mask], tuple[Array, Array]],
-    usual_deviation: float,
-    *,
-    outlier_cost: float = 3.0,
-    max_iterations: int = 10,
-) -> Mask:
-    """Return the most likely set of inlier frames (frames,), by fixed-point iterations.
-
-    Iterations start from no frames, all frames, and single frames. Each computes the common errors
-    of a set, and makes the frames without a significant residual the next set.
-
-    Args:
-        explained: (frames,) which frames may be inliers.
-        evaluate: returns, for a set (frames,), the p-values (frames,) of all frames' residuals, and
-            the common errors x (p,) of the set.
-        usual_deviation: prior standard deviation of each element of x.
-        outlier_cost: negative log-likelihood of each outlier.
-        max_iterations: maximum number of iterations from a start, and of single frames as starts.
-    """
-    best, least = explained & False, np.inf
-    starts = [np.zeros(len(explained), bool), explained]
-    order = np.flatnonzero(explained)
-    count = min(len(order), max_iterations)
-    for k in order[np.linspace(0, len(order) - 1, count).astype(int)]:
-        starts.append(np.arange(len(explained)) == k)
-    for kept in starts:
-        for _ in range(max_iterations):
-            p_values, x = evaluate(kept)
-            now = explained & (p_values > DIAGNOSIS.significance)
-            if (now == kept).all():
-                break
-            kept = now
-        else:
-            x = evaluate(kept)[1]
-        # One cause may be far off: a Cauchy distribution.
-        off = float(np.log1p((x / usual_deviation) ** 2).sum())
-        unlikely = outlier_cost * np.count_nonzero(~kept) + off
-        if unlikely < least:
-            best, least = kept, unlikely
-    return best
 
 
 def is_half_pixel(offset: Array, covariance: Array, near: float = 0.25) -> bool:

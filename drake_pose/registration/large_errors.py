@@ -131,7 +131,9 @@ class LargeErrorSearch:
         self._body, self._cameras = body, tuple(cameras)
         self._frames = evenly_spaced(frames, LARGE.frame_count)
         self._scale = min(1.0, SEARCH.refined_side / common_size(cameras, self._frames))
+        # By identity of a mask or camera; it is kept alive, so that its id is not reused.
         self._sums = dict[int, tuple[Mask, NDArray[np.int32]]]()
+        self._small = dict[int, tuple[Camera, Camera]]()
 
     def find(
         self,
@@ -183,9 +185,11 @@ class LargeErrorSearch:
         X_WN = np.array([kinematics.poses(one) for one in values])
         for camera in self._cameras if cameras is None else cameras:
             if camera.name in frame.masks:
-                mask, small = frame.masks[camera.name], downscaled(camera, self._scale)
+                mask = frame.masks[camera.name]
+                if id(camera) not in self._small:
+                    self._small[id(camera)] = camera, downscaled(camera, self._scale)
+                small = self._small[id(camera)][1]
                 if id(mask) not in self._sums:
-                    # Keep the mask alive, so that its id is not reused.
                     self._sums[id(mask)] = mask, reduced_sums(mask, small)
                 sums = self._sums[id(mask)][1]
                 X_CN = camera.X_CW @ X_WN

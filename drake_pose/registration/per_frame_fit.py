@@ -5,7 +5,7 @@ frame. The given values are the start and the mean of the prior, and the residua
 returned as linear functions of the corrections. ``adjust_bundle`` has no given positions.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 
@@ -152,7 +152,8 @@ class PerFrameFit:
         held = self._full.parameters([given], change[None], nothing)[0]
         base, own = given._replace(values=held), np.zeros((1, np.count_nonzero(self.posed)))
         rounds, start = [AnnealingStage(scale, 0.02) for scale in scales], (own, nothing)
-        for part in (rounds, rounds[-2:]):
+        # Corrections that were found before are near.
+        for part in (rounds[-3 if change.any() else 0 :], rounds[-2:]):
             found = self._simplified.solve([base], part, (own, nothing), expected=start)
             own = found.own
             theta = self.with_boundary_biases(base, found.parameters[0])
@@ -277,6 +278,50 @@ def explained_frames(
         best = float(np.mean(own[-max(2, len(own) // 4) :]))
         limits[name] = max(of_best * best, least)
     return np.array([all(ratio >= limits[name] for name, ratio in one.items()) for one in ratios])
+
+
+def likeliest_inliers(
+    explained: Mask,
+    evaluate: Callable[[Mask], tuple[Mask, Array]],
+    usual_deviation: float,
+    *,
+    outlier_cost: float = 3.0,
+    max_iterations: int = 10,
+) -> Mask:
+    """Return the most likely set of inlier frames (frames,), by fixed-point iterations.
+
+    Iterations start from no frames, all frames, and single frames. Each computes the common errors
+    of a set, and makes the frames without a significant residual the next set.
+
+    Args:
+        explained: (frames,) which frames may be inliers.
+        evaluate: returns, for a set (frames,), which frames' residuals (frames,) are insignificant,
+            and the common errors x (p,) of the set.
+        usual_deviation: prior standard deviation of each element of x.
+        outlier_cost: negative log-likelihood of each outlier.
+        max_iterations: maximum number of iterations from a start, and of single frames as starts.
+    """
+    best, least = explained & False, np.inf
+    starts = [np.zeros(len(explained), bool), explained]
+    order = np.flatnonzero(explained)
+    count = min(len(order), max_iterations)
+    for k in order[np.linspace(0, len(order) - 1, count).astype(int)]:
+        starts.append(np.arange(len(explained)) == k)
+    for kept in starts:
+        for _ in range(max_iterations):
+            fits, x = evaluate(kept)
+            now = explained & fits
+            if (now == kept).all():
+                break
+            kept = now
+        else:
+            x = evaluate(kept)[1]
+        # One cause may be far off: a Cauchy distribution.
+        off = float(np.log1p((x / usual_deviation) ** 2).sum())
+        unlikely = outlier_cost * np.count_nonzero(~kept) + off
+        if unlikely < least:
+            best, least = kept, unlikely
+    return best
 
 
 def moved_links(kinematics: TreeKinematics) -> list[LinkVector]:

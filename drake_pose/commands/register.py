@@ -274,10 +274,8 @@ def _print_audit(result: SceneAudit) -> None:
     if not findings:
         but = ", but see the warnings" if result.warnings else ""
         say(f"drake-pose: no error found{but}")
-    if result.summary["minimum_detectable"]:
-        offsets = result.summary["minimum_detectable"].items()
-        limits = ", ".join(f"{k} {'-' if one is None else f'{one:.2g}'}" for k, one in offsets)
-        console.print(f"not detectable joint offsets below {limits} (deg or m)", soft_wrap=True)
+    if result.undetectable:
+        console.print(result.undetectable, soft_wrap=True)
     if result.folder is not None:
         print_files(("result", result.folder))
 

@@ -22,7 +22,7 @@ from drake_pose.files.folder import read_summary, write_summary, writes_folder
 from drake_pose.files.records import mask_digests, user_units
 from drake_pose.files.settings import AuditSettings, percent
 from drake_pose.jobs.estimate.measurements import left_out_warnings
-from drake_pose.jobs.registration.audit_page import write_audit_page
+from drake_pose.jobs.registration.audit_page import undetectable_offsets, write_audit_page
 from drake_pose.jobs.registration.diagnosis import compare_camera, compare_clock
 from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs, still_joints
 from drake_pose.jobs.registration.large_errors import SceneComparison
@@ -68,12 +68,14 @@ class SceneAudit:
         audit: the diagnosis of all frames, with the findings.
         summary: contents of summary.json.
         warnings: for the user.
+        undetectable: offsets of joints that would not have been named, in words.
         folder: the result's folder; None: nothing was written.
     """
 
     audit: Diagnosis
     summary: Mapping[str, Any]
     warnings: tuple[str, ...]
+    undetectable: str
     folder: Path | None
 
 
@@ -167,7 +169,9 @@ def audit_scene(
     }
     if folder is not None:
         _write_result(folder, inputs, found, pictures, overlay, summary)
-    return SceneAudit(found, summary, tuple(warnings), folder)
+    kinds = dict(zip(inputs.model.position_names, inputs.model.position_kinds, strict=True))
+    hidden = undetectable_offsets(summary["minimum_detectable"], kinds)
+    return SceneAudit(found, summary, tuple(warnings), hidden, folder)
 
 
 @dataclass(frozen=True, eq=False)

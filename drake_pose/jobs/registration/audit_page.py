@@ -102,12 +102,24 @@ def audit_answer(summary: Mapping[str, Any], kinds: Mapping[str, str]) -> str:
     )
 
 
+def undetectable_offsets(offsets: Mapping[str, float | None], kinds: Mapping[str, str]) -> str:
+    """Return in words which offsets would not have been named; "": there are no `offsets`.
+
+    offsets: by joint, as ``minimum_detectable`` of summary.json. kinds: as of `audit_answer`.
+    """
+    known = [f"{k} {detectable_offset(x, kinds[k])}" for k, x in offsets.items() if x is not None]
+    texts = [f"not detectable: joint offsets below {', '.join(known)}"] if known else []
+    if hidden := [name for name, offset in offsets.items() if offset is None]:
+        texts.append(f"not detectable at any size, as the masks hardly show them: {listed(hidden)}")
+    return "; ".join(texts)
+
+
 def detectable_offset(offset: float, kind: str) -> str:
-    """Return a joint offset, in deg or m as in summary.json, as text in deg or mm to a tenth.
+    """Return a joint offset, in deg or m as in summary.json, as text in deg or mm to two digits.
 
     kind: "angle" or "length".
     """
-    return f"{offset:.1f} deg" if kind == "angle" else f"{1e3 * offset:.1f} mm"
+    return f"{offset:.2g} deg" if kind == "angle" else f"{1e3 * offset:.2g} mm"
 
 
 def correction_row(finding: Mapping[str, Any]) -> dict[str, Any]:

@@ -245,15 +245,7 @@ class SceneComparison:
             found = replace(found, frames=tuple(frames))
         common = (*findings, *moved, *found.common)
         warnings = (*now.warnings, *self._mask_warnings(now))
-        # The minimum detectable offset is unknown where too little of the outlines fits.
-        ratios = now.joint_inlier_ratios
-        enough = LARGE.min_joint_inlier_ratio * max(ratios.values(), default=0.0)
-        detectable = {
-            name: least if ratios.get(name, 0.0) >= enough else np.inf
-            for name, least in found.minimum_detectable.items()
-        }
-        found = replace(found, common=common, minimum_detectable=detectable)
-        return replace(now, found=found, findings=(), warnings=warnings)
+        return replace(now, found=replace(found, common=common), findings=(), warnings=warnings)
 
     def _find_moved(self, now: SceneFit, found: Diagnosis) -> tuple[list[Finding], Diagnosis]:
         """Find cameras or a base that moved between two frames.

@@ -104,7 +104,7 @@ class TestAudit:
         assert high - low < 1.0
         for name, least in summary["minimum_detectable"].items():
             (row,) = (row for row in rows if row.startswith(f"<td>{name}</td>"))
-            assert ("none" if least is None else f"{least:.1f}") in row
+            assert ("none" if least is None else f"{least:.2g}") in row
         for camera in ("left", "right"):
             assert f"<td>{camera}</td>" in text
             places = out.glob(f"overlay_as_given/{camera}/*.png")

@@ -486,7 +486,9 @@ class _Diagnoser:
             for better, (_, *others_too) in zip(whole.together(own, free), found, strict=True):
                 pixels = info.pixels(better.x)
                 # A cause may vanish in the joint estimate.
-                if pixels >= DIAGNOSIS.min_common_pixels:
+                T = float(better.amount @ np.linalg.solve(better.covariance, better.amount))
+                p_value = _p_value(T, len(better.amount), info.freedom)
+                if max(p_value / DIAGNOSIS.significance, DIAGNOSIS.min_common_pixels / pixels) <= 1:
                     findings.append(self._finding([better, *others_too], pixels))
                     at += better.x
         undetected = [one for one in undetected if one.kind == "joint"]

@@ -5,7 +5,7 @@ compares the areas of body and silhouettes instead: over each joint's whole rang
 scene corrected in other ways (signs, conventions, focal lengths, exchanged cameras).
 """
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -42,8 +42,6 @@ class LargeErrorSettings(NamedTuple):
         equivalent_gain: a simpler correction is preferred if it gains this fraction of the best.
         constant_gain: positions that differ from the log by another amount in each frame are
             accepted only if no constant gains this fraction of what they gain.
-        restart_angle, restart_focal: fits restart from a fitted offset or focal length beyond this
-            [deg, relative].
         reach_angle, reach_shift, reach_focal: smaller errors are left to fits [deg, m, relative].
         frame_count: number of frames that are compared, evenly spaced.
         min_joint_inlier_ratio: a joint is searched if a smaller fraction of the outlines of all
@@ -65,8 +63,6 @@ class LargeErrorSettings(NamedTuple):
     min_improved_frames: float = 0.7
     equivalent_gain: float = 0.85
     constant_gain: float = 0.8
-    restart_angle: float = 2.0
-    restart_focal: float = 0.02
     reach_angle: float = 6.0
     reach_shift: float = 0.01
     reach_focal: float = 0.04
@@ -140,7 +136,6 @@ class LargeErrorSearch:
         corrections: Sequence[Correction],
         joints: Sequence[str],
         max_remaining: float = LARGE.max_remaining,
-        likely: Collection[str] = (),
     ) -> Correction | None:
         """Return the simplest correction that explains the silhouettes much better; None: none.
 
@@ -148,8 +143,6 @@ class LargeErrorSearch:
             corrections: candidates beside those of joints' positions, such as other cameras.
             joints: names of the joints whose positions may be wrong.
             max_remaining: maximum fraction of the area in body or silhouette alone that remains.
-            likely: joints with a fitted offset: for them any improvement is enough, in half of the
-                frames.
         """
         given = self.misfits(Correction("", "", self._cameras, unchanged))
         tried = [(one, self.misfits(one)) for one in corrections]
@@ -158,8 +151,8 @@ class LargeErrorSearch:
         explained = [
             (one, own.sum())
             for one, own in tried
-            if own.sum() <= (1.0 if one.name in likely else max_remaining) * given.sum()
-            and np.mean(own < given) >= (0.5 if one.name in likely else LARGE.min_improved_frames)
+            if own.sum() <= max_remaining * given.sum()
+            and np.mean(own < given) >= LARGE.min_improved_frames
             and not _is_near(self._body, one)
         ]
         constant = [one for one in explained if one[0].kind != "log"]

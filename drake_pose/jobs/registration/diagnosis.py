@@ -17,7 +17,7 @@ from drake_pose.files.records import BADLY_EXPLAINED
 from drake_pose.files.settings import percent
 from drake_pose.fit.judge import LEVEL
 from drake_pose.fit.parameters import POSE_NAMES
-from drake_pose.jobs.registration.readings import likeliest_reading
+from drake_pose.jobs.registration.readings import MIRRORED, likeliest_reading, other_rows
 from drake_pose.registration.diagnosis import DIAGNOSIS
 from drake_pose.registration.findings import Finding
 from drake_pose.registration.joint_offsets import calibrate_joints
@@ -152,12 +152,6 @@ def mirrored_cameras(
     }
 
 
-MIRRORED = (
-    "they fit when they are mirrored: turn the pictures back, or change the sign of all joint "
-    "positions"
-)
-
-
 def _readings(
     camera: PinholeCamera, frames: Sequence[PosedFrame], most: int = 5
 ) -> Iterator[tuple[str, PinholeCamera, list[PosedFrame]]]:
@@ -169,11 +163,8 @@ def _readings(
     sample = [frames[k] for k in rows]
     yield "", camera, sample
     yield MIRRORED, camera.mirrored(), [frame.mirrored() for frame in sample]
-    if len(frames) > 2:
-        for which, by in (("next", 1), ("previous", -1)):
-            values = [frames[(k + by) % len(frames)].values for k in rows]
-            shifted = [replace(one, values=q) for one, q in zip(sample, values, strict=True)]
-            yield f"they fit with the joint positions of the {which} frame", camera, shifted
+    for text, others in other_rows(frames):
+        yield text, camera, [replace(frames[k], values=others[k].values) for k in rows]
 
 
 def with_random_rows(kinematics: TreeKinematics, frames: Sequence[PosedFrame]) -> list[PosedFrame]:

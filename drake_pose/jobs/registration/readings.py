@@ -6,18 +6,27 @@ from dataclasses import replace
 from functools import partial
 from itertools import combinations, product
 from operator import methodcaller
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera, PinholeCamera, inverse_pose
+from drake_pose.fit.judge import LEVEL
 from drake_pose.registration.large_errors import Correction, unchanged
 from drake_pose.registration.online_registration import pose_difference
 from drake_pose.registration.posed_frames import MultiViewFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.scoring import draw_mask
+
+T = TypeVar("T")
+
+MIRRORED = (
+    "they fit when they are mirrored: turn the pictures back, or change the sign of all joint "
+    "positions"
+)
+"""What is wrong with the masks of a camera or of all, in words, as in `other_rows`."""
 
 
 def scene_corrections(
@@ -26,7 +35,7 @@ def scene_corrections(
     frames: Sequence[str],
     *,
     pairs: int = 10,
-    focal: Sequence[float] = (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 1.05, 1.1, 1.15, 1.2, 1.4, 2.0),
+    focal: Sequence[float] = (0.5, 0.6, 0.7, 0.8, 0.9, 1.1, 1.2, 1.4, 2.0),
     sizes: Sequence[float] = (0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 0.75, 1.5, 2.0, 3.0, 4.0),
 ) -> Iterator[Correction]:
     """Yield corrections of mistakes that users make; each is to be tried by itself.
@@ -73,7 +82,7 @@ def scene_corrections(
             yield Correction("reading", text, tuple(swapped), unchanged)
     for group in _groups(cameras):
         whose = "all cameras" if len(group) > 1 else f"camera '{group[0]}'"
-        text = f"the masks of {whose} seem to be mirrored: turn the pictures back"
+        text = f"the masks of {whose}: {MIRRORED}"
         yield Correction("reading", text, tuple(cameras), partial(mirrored, group))
         if not all(isinstance(camera, PinholeCamera) for camera in cameras if camera.name in group):
             continue
@@ -82,10 +91,21 @@ def scene_corrections(
         for factor in focal:
             yield focal_correction(cameras, group, text, factor)
         yield from _intrinsics_corrections(cameras, group, sizes)
-    for which, shift in (("next", 1), ("previous", -1)) if len(frames) > 2 else ():
-        rows = dict(zip(frames, np.roll(np.array(values), -shift, axis=0), strict=True))
-        text = f"the masks fit with the joint positions of the {which} frame"
-        yield Correction("reading", text, tuple(cameras), partial(with_row, rows))
+    for text, rows in other_rows(values):
+        shifted = dict(zip(frames, rows, strict=True))
+        yield Correction(
+            "reading", f"the masks: {text}", tuple(cameras), partial(with_row, shifted)
+        )
+
+
+def other_rows(rows: Sequence[T]) -> Iterator[tuple[str, list[T]]]:
+    """Yield rows shifted by one frame to either side, with words; nothing for two frames or less.
+
+    rows: joint positions, or what else the frames have, in order.
+    """
+    for which, by in (("next", 1), ("previous", -1)) if len(rows) > 2 else ():
+        text = f"they fit with the joint positions of the {which} frame"
+        yield text, [*rows[by:], *rows[:by]]
 
 
 def joint_exchanges(
@@ -336,14 +356,13 @@ def likeliest_reading(
     found: Array,
     distance: float,
     *,
-    significance: float = 0.01,
     much_nearer: float = 3.0,
     near: float = 0.15,
     least: float = 0.05,
 ) -> tuple[str, float, float] | None:
     """Return the reading of a given pose that brings it near the pose that was found.
 
-    A reading counts if it is much nearer than the pose as given, and hardly as near by chance, that
+    A reading counts if it is much nearer than the pose as given, and not as near by chance, that
     is, with a random rotation or position. Of the readings that count, the one with the fewest
     mistakes is returned, unless another reading is much nearer.
 
@@ -352,7 +371,6 @@ def likeliest_reading(
     Args:
         given, found: (4, 4) X_WC as given, and as found [m].
         distance: from the camera to the body [m].
-        significance: maximum probability that any reading is as near by chance.
         much_nearer: minimum size of the given pose's difference, over that of the reading's.
         near: maximum size of the reading's difference.
         least: size of the given pose's difference below which it needs no other reading.
@@ -385,7 +403,7 @@ def likeliest_reading(
             chance *= (shift / (shift + distance)) ** 3
         alike = sum(other.steps <= reading.steps for other in table)
         its_size = size((angle, shift))
-        if alike * chance < significance and its_size < min(near, as_given / much_nearer):
+        if alike * chance < LEVEL and its_size < min(near, as_given / much_nearer):
             counted.append((reading.steps, its_size, reading.text, (angle, shift)))
     if not counted:
         return None

@@ -197,7 +197,7 @@ def test_large_focal_length_error_is_measured(scene) -> None:
 def test_mirrored_masks_are_found(scene) -> None:
     masks(scene, lambda mask: mask[:, ::-1])
     (one,) = audit(scene).summary["findings"]
-    assert "masks of all cameras seem to be mirrored" in one["text"]
+    assert "masks of all cameras: they fit when they are mirrored" in one["text"]
 
 
 def test_moved_cameras_are_found_with_the_frame(scene) -> None:

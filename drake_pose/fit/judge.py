@@ -42,8 +42,8 @@ class Evidence(NamedTuple):
             return "without the body the frames are explained better than with it"
         return (
             "with the joint positions of other frames, frames agree "
-            f"{'less' if self.holds else 'about as well'} (p-value {self.p_value:.2g}, at most "
-            f"{LEVEL:g} is expected)"
+            f"{'less' if self.holds else 'about as well'}: p-value {self.p_value:.2g}, at most "
+            f"{LEVEL:g} is expected"
         )
 
 

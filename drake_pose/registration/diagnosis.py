@@ -382,6 +382,7 @@ class _Diagnoser:
             return causes
         for k, link in enumerate(fit.links, len(fit.names) - len(fit.links)):
             causes.append(cause("length", link, [k], 1.5))
+        flat = {one.name for one in fit.cameras if one.kernel_parameters()[0] == 1.0}
         groups = [("", names)] if len(names) > 1 else []
         groups += [(f" of camera '{name}'", (name,)) for name in names]
         for where, group in groups:
@@ -391,7 +392,7 @@ class _Diagnoser:
                 ("focal", f"focal length{many}{where}", CAMERA_NAMES[six:7], 1.0),
                 ("center", f"principal point{many}{where}", CAMERA_NAMES[7:], rank),
             ):
-                if kind == "focal" and any(fit.is_flat(name) for name in group):
+                if kind == "focal" and not flat.isdisjoint(group):
                     continue
                 single = [cause(kind, text, fit.rows(of, [name]), order) for name in group]
                 jacobian = np.sum([one.jacobian for one in single], axis=0)

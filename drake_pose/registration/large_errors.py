@@ -85,8 +85,9 @@ class Correction:
         name: of the joint, or words for the cameras or for what is wrong.
         cameras: the corrected cameras.
         apply: returns the corrected frame of a given one, which it leaves unchanged.
-        amount: what is added to a joint's positions [rad or m] or focal lengths [relative].
+        amount: what is added to a joint's positions [rad or m] or the logarithms of focal lengths.
         rank: of corrections that explain equally well, the one with the lowest rank is chosen.
+        fitted: names of the ``PerFrameFit``'s corrections that have this amount; (): none has.
     """
 
     kind: str
@@ -95,6 +96,7 @@ class Correction:
     apply: Callable[[MultiViewFrame], MultiViewFrame]
     amount: float = 0.0
     rank: float = 1.0
+    fitted: tuple[str, ...] = ()
 
 
 def unchanged(frame: MultiViewFrame) -> MultiViewFrame:
@@ -271,7 +273,8 @@ class LargeErrorSearch:
             values[j] = sign * values[j] + by
             return replace(frame, values=values)
 
-        return Correction(kind, name, self._cameras, changed, by, rank)
+        fitted = (name,) if kind == "offset" else ()
+        return Correction(kind, name, self._cameras, changed, by, rank, fitted)
 
     def _refound(
         self, j: int, grid: Array, beside: Array

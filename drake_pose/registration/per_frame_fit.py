@@ -38,8 +38,6 @@ from drake_pose.registration.posed_frames import MultiViewFrame, common_size, mi
 from drake_pose.registration.shared_fit import SHARED, pose_covariance
 from drake_pose.silhouette.outline import Outline
 
-_INTRINSICS = ("focal_x", "focal_y", "center_x", "center_y")
-
 
 @dataclass(frozen=True, eq=False)
 class FrameFit:
@@ -223,19 +221,14 @@ class PerFrameFit:
         if not change.any():
             return self.cameras
         X_CW, kernel, _ = CameraParameters(self.cameras, self._middle).place(change)
-        return tuple(
-            replace(
-                one.with_pose(np.linalg.inv(X)),
-                **dict(zip(_INTRINSICS, k[1:5].tolist(), strict=True)),
-            )
-            if isinstance(one, PinholeCamera)
-            else one.with_pose(np.linalg.inv(X))
-            for one, X, k in zip(self.cameras, X_CW, kernel, strict=True)
-        )
-
-    def is_flat(self, camera: str) -> bool:
-        """Return whether a camera, given by name, is a parallel one."""
-        return self.cameras[self.camera_names.index(camera)].kernel_parameters()[0] == 1.0
+        placed = list[Camera]()
+        for one, X, (_, *lens) in zip(self.cameras, X_CW, kernel.tolist(), strict=True):
+            moved = one.with_pose(np.linalg.inv(X))
+            if isinstance(moved, PinholeCamera):
+                x, y, center_x, center_y = lens[:4]
+                moved = replace(moved, focal_x=x, focal_y=y, center_x=center_x, center_y=center_y)
+            placed.append(moved)
+        return tuple(placed)
 
     def rows(self, names: Collection[str], cameras: Collection[str]) -> list[int]:
         """Return the indices of the corrections of some CAMERA_NAMES of some cameras."""

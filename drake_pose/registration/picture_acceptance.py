@@ -229,10 +229,16 @@ def accept_fit(
     fit, (posed,) = best.fit, best.fit.views
     evidence = picture_evidence(body, best, recording, start.clock.value, joint_offsets)
     agreeing, count = int(np.count_nonzero(best.inliers)), len(posed.frames)
-    if not evidence.holds or 2 * agreeing <= count:
+    if not evidence.holds:
+        raise unexplained_error(
+            start.camera, f"{evidence}. Are the joint positions those of another time or episode?"
+        )
+    if 2 * agreeing <= count:
         raise unexplained_error(
             start.camera,
-            f"{evidence}; the contours of {agreeing} of {count} fitted frames agree on one",
+            f"its pictures change as the joints move ({evidence}), but contours fit in only "
+            f"{agreeing} of {count} fitted frames: is it the model of another robot, or has a "
+            "joint the other sign?",
         )
     deviations = np.sqrt(np.diag(best.covariance))
     pose = fit.camera_covariances(best.found, best.covariance)[0]
@@ -254,7 +260,7 @@ def accept_fit(
         raise unexplained_error(
             start.camera,
             f"the best, {distance:.1f} m away, has a standard deviation of "
-            f"{1e3 * one.translation_sd:.0f} mm and {np.degrees(one.rotation_sd):.1f} degrees",
+            f"{1e3 * one.translation_sd:.0f} mm and {np.degrees(one.rotation_sd):.1f} degrees.",
         )
     focal_index = len(POSE_NAMES)
     if focal > SHARED.focal_deviation:
@@ -285,7 +291,7 @@ def accept_fit(
 def unexplained_error(camera: PinholeCamera, why: str) -> RegistrationError:
     """Return the error for pictures that no pose explains; why: words in its message."""
     return RegistrationError(
-        f"camera '{camera.name}': no pose explains its pictures: {why}. Does the camera stand "
+        f"camera '{camera.name}': no pose explains its pictures: {why} Does the camera stand "
         "still, does the robot move much in its view, are the joint positions those at the "
         "pictures' times (no picture dropped or repeated), in the model's zeros and signs, and is "
         "the focal length about right? Nothing was written"

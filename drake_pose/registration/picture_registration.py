@@ -142,7 +142,7 @@ def _register(
         task.body, task.camera, posed_pictures(task.recording, task.frames[0], 0.0)
     )
     poses, near, mirrored = list[Array](), list[RoughPose](), list[RoughPose]()
-    refused = unexplained_error(task.camera, "no pose shows the body in two pictures")
+    refused = unexplained_error(task.camera, "no pose shows the body in two pictures.")
     for rotations, width in searches:
         more = begun.search(rotations=rotations, least_width=width)
         poses += more
@@ -172,7 +172,7 @@ def _register(
         _require_unmirrored(task, near[0], mirrored, found)
         return found
     stuck = stuck_pictures(task.recording)
-    raise RegistrationError(f"{refused}; {stuck}") if stuck else refused
+    raise RegistrationError(f"{refused}: {stuck}") if stuck else refused
 
 
 def _fit(
@@ -411,7 +411,7 @@ def _fit_until_stable(
         search = search.with_camera(camera).with_frames(frames)
         best = search.with_offsets(joint_offsets).fit(camera, constants, focal)
         if best is None or not best.ratios.any():
-            raise unexplained_error(camera, "the body leaves the pictures")
+            raise unexplained_error(camera, "the body leaves the pictures.")
         found = dict(zip(best.fit.names, best.found.shared.tolist(), strict=True))
         camera, by = best.camera, found.get(TIME_OFFSET, 0.0)
         assumed, turn = joint_offsets, np.array([found.get(name, 0.0) for name in names])

@@ -168,7 +168,7 @@ def stuck_pictures(recording: Recording, least: int = 5, noise: int = 2) -> str:
     if same[last] < least:
         return ""
     names = recording.names[last - same[last]], recording.names[last]
-    return f"pictures '{names[0]}' to '{names[1]}' are the same: is the recording stuck?"
+    return f"pictures '{names[0]}' to '{names[1]}' are the same picture: is the recording stuck?"
 
 
 def posed_pictures(

@@ -44,6 +44,7 @@ from drake_pose.registration.recording import (
     choose_pictures,
     posed_pictures,
     scan_time_offsets,
+    stuck_pictures,
 )
 from tests.benchmarks.registration import pose_error
 from tests.camera.recordings import write_pictures
@@ -326,10 +327,10 @@ def test_time_offset_and_camera_are_fitted_within_their_deviations(registered, e
     # A fit in which no more than half of the frames agree is refused; so is one to other rows.
     doubtful = replace(registered.fit)
     vars(doubtful)["inliers"] = np.arange(6) < 3
-    with pytest.raises(RegistrationError, match="3 of 6 fitted frames agree"):
+    with pytest.raises(RegistrationError, match="in only 3 of 6 fitted frames"):
         accept_fit(episode.body, doubtful, logged, start, offsets, 0.0)
     other = replace(logged, values_at=lambda offset: logged.values_at(offset)[::-1])
-    with pytest.raises(RegistrationError, match=r"about as well \(p-value 0\.|explained better"):
+    with pytest.raises(RegistrationError, match=r"about as well: p-value 0\.|explained better"):
         accept_fit(episode.body, registered.fit, other, start, offsets, 0.0)
 
 
@@ -406,6 +407,12 @@ def test_drift_and_focal_length_are_fitted(episode, recording):
 def test_uninformative_recordings_are_refused_before_the_search(episode, recording, changes, words):
     with pytest.raises(RegistrationError, match=words):
         register_pictures(episode.body, episode.camera, recording(**changes))
+
+
+def test_a_recording_that_is_stuck_is_named(episode, recording):
+    assert stuck_pictures(recording()) == ""
+    stuck = recording(read=lambda k: episode.pictures[min(k, 9)])
+    assert stuck_pictures(stuck).startswith("pictures '0009' to '0015' are the same picture")
 
 
 @pytest.mark.slow

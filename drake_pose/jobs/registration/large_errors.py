@@ -170,7 +170,18 @@ class SceneComparison:
             correction = self._find_correction(now)
             if correction is None:
                 break
-            again = self._settle(self._corrected(now, correction))
+            at = now.at.copy()
+            rows = [now.fit.names.index(name) for name in correction.fitted]
+            at[rows] += correction.amount / now.fit.deviations[rows]
+            if correction.kind in ("sign", "log"):
+                # An offset was added before the sign was changed, and is part of other positions.
+                at[now.fit.names.index(correction.name)] *= (
+                    -1.0 if correction.kind == "sign" else 0.0
+                )
+            # Corrections of cameras are sought before others only.
+            cameras = now.cameras if rows or at.any() else correction.cameras
+            corrections = now.corrections if rows else (*now.corrections, correction)
+            again = self._settle(self._compare(cameras, corrections, at))
             if again.inlier_ratio <= now.inlier_ratio:
                 break
             if not now.is_doubtful:
@@ -182,23 +193,6 @@ class SceneComparison:
                     break
             now = self._record(now, again, correction)
         return self._settle(now)
-
-    def _corrected(self, now: SceneFit, correction: Correction) -> SceneFit:
-        """Return a scene's fit with one more correction."""
-        at, fit = now.at.copy(), now.fit
-        if correction.kind == "offset":
-            rows, amount = [fit.joints.index(correction.name)], correction.amount
-        elif correction.kind == "focal":
-            group = [
-                one.name
-                for one, other in zip(fit.cameras_at(at), correction.cameras, strict=True)
-                if one.kernel_parameters()[1] != other.kernel_parameters()[1]
-            ]
-            rows, amount = fit.rows(["log_focal"], group), float(np.log1p(correction.amount))
-        else:
-            return self._compare(correction.cameras, (*now.corrections, correction), at)
-        at[rows] += amount / fit.deviations[rows]
-        return self._compare(now.cameras, now.corrections, at)
 
     def _settle(self, now: SceneFit, most: int = 8, least: float = 0.1) -> SceneFit:
         """Return the fit at the corrections that it found: what is wrong is not linear.
@@ -447,7 +441,7 @@ class SceneComparison:
         """
         kind, name, warnings = correction.kind, correction.name, before.warnings
         findings = before.findings
-        if kind not in ("offset", "focal"):
+        if not correction.fitted:
             finding = Finding(kind, name, 0.0, 0.0, 0.0, 0.0, self._pixels(before, now), 0.0)
             if kind in ("sign", "log"):
                 finding = self._differing(finding, before, correction)

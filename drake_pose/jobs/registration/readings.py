@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera, PinholeCamera, inverse_pose
 from drake_pose.fit.judge import LEVEL
+from drake_pose.fit.parameters import CAMERA_NAMES
 from drake_pose.registration.large_errors import Correction, unchanged
 from drake_pose.registration.online_registration import pose_difference
 from drake_pose.registration.posed_frames import MultiViewFrame
@@ -200,17 +201,18 @@ def focal_correction(
 
     Args:
         cameras: all cameras.
-        group: names of the cameras that are corrected; empty: all. Parallel cameras stay.
+        group: names of the pinhole cameras that are corrected.
         text: the correction's name.
         factor: of the focal lengths.
     """
-    changed = [
+    changed = tuple(
         replace(camera, focal_x=factor * camera.focal_x, focal_y=factor * camera.focal_y)
-        if isinstance(camera, PinholeCamera) and (not group or camera.name in group)
+        if isinstance(camera, PinholeCamera) and camera.name in group
         else camera
         for camera in cameras
-    ]
-    return Correction("focal", text, tuple(changed), unchanged, factor - 1.0)
+    )
+    fitted = tuple(f"{name}.{CAMERA_NAMES[6]}" for name in group)
+    return Correction("focal", text, changed, unchanged, float(np.log(factor)), 1.0, fitted)
 
 
 def _groups(cameras: Sequence[Camera]) -> list[tuple[str, ...]]:

@@ -104,6 +104,19 @@ def paired_evidence(gains: Array, rows: Array, *, draws: int = 5000) -> Evidence
     return Evidence(own, mean, p_value, least, count, needed)
 
 
+def held_out(rows: Array) -> Mask:
+    """Return which frames (n,) a fit leaves for its judgement: every second block of rows.
+
+    Frames beside fitted ones show nearly the same, so that they agree with a wrong pose, too.
+    Blocks are twice as long as the rows' correlation time, and at most half of all rows.
+
+    ``rows``: (n, d) as of ``paired_evidence``.
+    """
+    length = correlation_length(rows)
+    length = 1 if length == 1 else min(2 * length, (len(rows) + 1) // 2)
+    return np.arange(len(rows)) // length % 2 == 1
+
+
 def correlation_length(rows: Array) -> int:
     """Return the lag from which rows (n, d) in the order of time are no longer correlated.
 

@@ -15,7 +15,7 @@ from scipy.linalg import block_diag
 
 from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera
-from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.errors import SettingsError, require_known
 from drake_pose.fit.background import foreground_of_colours
 from drake_pose.fit.colours import compare_lines
 from drake_pose.fit.contour_fit import (
@@ -164,9 +164,7 @@ class Problem:
         every = list(parameter_names(body, cameras))
         unknowns = sorted(unknowns, key=lambda one: one.shared)
         self.names = tuple(name for one in unknowns for name in one.names)
-        for name in self.names:
-            if name not in every:
-                raise UnknownNameError("parameter", name, every, "the fit")
+        require_known("parameter", self.names, every, "the fit")
         self.entries = np.array([every.index(name) for name in self.names], dtype=np.intp)
         self.own_count = sum(len(one.names) for one in unknowns if not one.shared)
         self._lower, self._upper, self.information = (

@@ -24,6 +24,7 @@ from drake_pose.fit.covariance import (
     distances_in_masks,
     estimate_sizes,
 )
+from drake_pose.fit.judge import LEVEL
 from drake_pose.fit.parameters import CAMERA_NAMES, POSE_NAMES
 from drake_pose.registration.findings import Diagnosis, Finding, FrameDiagnosis
 from drake_pose.registration.per_frame_fit import (
@@ -489,7 +490,7 @@ class _Diagnoser:
                 # A cause may vanish in the joint estimate.
                 T = float(better.amount @ np.linalg.solve(better.covariance, better.amount))
                 p_value = _p_value(T, len(better.amount), info.freedom)
-                if max(p_value / DIAGNOSIS.significance, DIAGNOSIS.min_common_pixels / pixels) <= 1:
+                if p_value <= LEVEL and pixels >= DIAGNOSIS.min_common_pixels:
                     findings.append(self._finding([better, *others_too], pixels))
                     at += better.x
         undetected = [one for one in undetected if one.kind == "joint"]

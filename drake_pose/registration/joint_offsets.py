@@ -17,7 +17,7 @@ from scipy.special import stdtr, stdtrit
 from drake_pose.arrays import Array, Mask
 from drake_pose.body import TARGET_POSITIONS, PoseTree
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.errors import RegistrationError, UnknownNameError
+from drake_pose.errors import RegistrationError, require_known
 from drake_pose.fit.parameters import POSE_NAMES, carried_joints, link_scale_name
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import RegisteredCamera, RegistrationBody
@@ -78,13 +78,9 @@ def require_parameters(tree: PoseTree, joints: Sequence[str], links: Sequence[st
     """Raise UnknownNameError for `joints` that are no positions, and `links` not scalable."""
     own = [name for node in tree.nodes for name in node.value_names]
     positions = [name for name in own if name not in TARGET_POSITIONS]
-    for what, names, known in (
-        ("joint", joints, positions),
-        ("link with a length", links, scalable_links(tree)),
-    ):
-        for name in names:
-            if name not in known:
-                raise UnknownNameError(what, name, known, str(tree.model.path))
+    where = str(tree.model.path)
+    require_known("joint", joints, positions, where)
+    require_known("link with a length", links, scalable_links(tree), where)
 
 
 def require_frame_count(count: int, joints: int, links: int) -> None:

@@ -234,7 +234,7 @@ class OnlineRegistration:
             found = self._search.register(self.camera, frames)
         except RegistrationError:
             return None
-        if found.evidence is None or not found.evidence.holds:
+        if not (found.agrees and found.evidence and found.evidence.holds):
             return None
         given, mirrored = self._search.mirrored_costs(found, frames)
         if fits_better(mirrored, given):

@@ -25,7 +25,13 @@ from drake_pose.registration.picture_search import (
 )
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, joints_like_cameras
 from drake_pose.registration.pyramid_level import PICTURES
-from drake_pose.registration.recording import NO_CLOCK, Recording, TimeOffset, posed_pictures
+from drake_pose.registration.recording import (
+    NO_CLOCK,
+    Recording,
+    TimeOffset,
+    left_out,
+    posed_pictures,
+)
 from drake_pose.registration.register import (
     FrameMisfit,
     RegisteredCamera,
@@ -70,7 +76,7 @@ class PictureStart(NamedTuple):
     joint_offsets: (m,) approximate ones [rad or m]; None: 0. search: a search in the pictures to
     fit, whose backgrounds are used again; None: they are estimated. runner_up: X_CW (4, 4) of the
     best pose found elsewhere, and by how much less of the contours fits there (``ratio_margin``
-    [sd]); None: there is none.
+    [sd]); None: there is none. evidence: of an earlier fit; None: the fit is judged.
     """
 
     camera: PinholeCamera
@@ -80,6 +86,7 @@ class PictureStart(NamedTuple):
     joint_offsets: Array | None = None
     search: PictureSearch | None = None
     runner_up: tuple[Array, float] | None = None
+    evidence: Evidence | None = None
 
     @classmethod
     def of(cls, one: PictureRegistration) -> "PictureStart":
@@ -87,7 +94,7 @@ class PictureStart(NamedTuple):
         rows = [one.recording.names.index(frame.name) for frame in one.frames]
         others = [np.linalg.inv(X) for X in one.found.alternatives]
         clock = one.time_offset or NO_CLOCK
-        return cls(one.found.camera, rows, clock, others, one.joint_offsets)
+        return cls(one.found.camera, rows, clock, others, one.joint_offsets, evidence=one.evidence)
 
 
 def coarse_fits(searches: Sequence[PictureSearch], X_CW: Sequence[Array]) -> list[RoughPose]:
@@ -142,7 +149,7 @@ class AcceptanceSettings(NamedTuple):
 
     max_clock_sd: float = 0.1
     guessed_lens_error: float = 0.25
-    rows: int = 60
+    rows: int = 90
 
 
 ACCEPTANCE = AcceptanceSettings()
@@ -152,7 +159,7 @@ def picture_evidence(
     body: RegistrationBody,
     best: PictureFit,
     recording: Recording,
-    offset: float,
+    start: PictureStart,
     joint_offsets: Array,
 ) -> Evidence:
     """Test whether pictures that were not fitted belong to their joint positions.
@@ -164,28 +171,23 @@ def picture_evidence(
         body: the robot's surfaces.
         best: the camera's fit.
         recording: with the drift of its clock removed.
-        offset: time offset [s].
+        start: with the fitted time offset.
         joint_offsets: (m,) added to the recording's values [rad or m].
     """
-    values = recording.values_at(offset) + joint_offsets
-    known = np.flatnonzero(np.isfinite(values).all(axis=1))
+    values = recording.values_at(start.clock.value) + joint_offsets
     fitted = [recording.names.index(frame.name) for frame in best.fit.views[0].frames]
-    others = np.setdiff1d(known, fitted)
-    # Rows of fitted pictures are exchanged, too, where there are few others.
-    rows = others if len(others) >= ACCEPTANCE.rows else known
-    tested = evenly_spaced(rows.tolist(), ACCEPTANCE.rows)
+    judging = np.setdiff1d(left_out(body, recording), fitted)
+    # Rows of all pictures are exchanged.
+    known = np.isfinite(values).all(axis=1)
+    tested = evenly_spaced(np.flatnonzero(known).tolist(), ACCEPTANCE.rows)
     width = min(PICTURES.background_width, best.camera.width)
     camera = best.camera.resized(
         width, max(8, round(best.camera.height * width / best.camera.width))
     )
     background = best.background.resized(camera.width, camera.height)
     outlines = simplify_or_hull(body.coarse, PICTURES.triangles[-1])
-    covered = np.array(
-        map_ordered(
-            lambda k: draw_mask(outlines, camera.X_CW @ body.kinematics.poses(values[k]), camera),
-            tested,
-        )
-    )
+    poses = [camera.X_CW @ body.kinematics.poses(values[k]) for k in tested]
+    covered = np.array(map_ordered(lambda X_CN: draw_mask(outlines, X_CN, camera), poses))
     outlined = covered & grown(~covered, 1)
     # The background is unknown where the body covers it in all frames.
     covered &= ~covered.all(axis=0)
@@ -193,7 +195,7 @@ def picture_evidence(
     log_odds, size = np.zeros((2, *covered.shape), np.float32), (camera.width, camera.height)
     noise = 4.0 * float(background.deviations.min())
     for k, row in enumerate(tested):
-        if row not in fitted:
+        if row in judging:
             resized = cv2.resize(recording.read(row), size, interpolation=cv2.INTER_AREA)
             picture = np.asarray(resized, np.uint8)
             gain = estimate_gain(picture, background.colours)
@@ -205,8 +207,8 @@ def picture_evidence(
             edges = cv2.dilate(np.minimum(1.0, slopes / noise), np.ones((3, 3), np.uint8))
             log_odds[1, k] = edges - edges.mean()
     places = node_places(body, values[tested]).reshape(len(tested), -1)
-    shown = zip((covered, outlined), log_odds, strict=True)
-    tests = [paired_evidence(paired_gains(*both), places) for both in shown]
+    gains = map(paired_gains, (covered, outlined), log_odds)
+    tests = [paired_evidence(one, places) for one in gains]
     return max(tests, key=lambda one: (not one.holds, one.p_value))
 
 
@@ -227,7 +229,7 @@ def accept_fit(
     more than half of the fitted frames agree; or the pose is not determined.
     """
     fit, (posed,) = best.fit, best.fit.views
-    evidence = picture_evidence(body, best, recording, start.clock.value, joint_offsets)
+    evidence = start.evidence or picture_evidence(body, best, recording, start, joint_offsets)
     agreeing, count = int(np.count_nonzero(best.inliers)), len(posed.frames)
     if not evidence.holds:
         raise unexplained_error(
@@ -255,8 +257,7 @@ def accept_fit(
     rows, C = [fit.names.index(k) for k in turning if k in fit.names], best.covariance
     held = C - C[:, rows] @ np.linalg.inv(C[np.ix_(rows, rows)]) @ C[rows]
     one = replace(found, covariance=fit.camera_covariances(best.found, held)[0])
-    most = SHARED.constant_deviation
-    if one.translation_sd > most * distance or one.rotation_sd > most:
+    if max(one.translation_sd / distance, one.rotation_sd) > SHARED.constant_deviation:
         raise unexplained_error(
             start.camera,
             f"the best, {distance:.1f} m away, has a standard deviation of "

@@ -7,6 +7,7 @@ frames and the fastest ones.
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -43,6 +44,7 @@ from drake_pose.registration.recording import (
     NO_CLOCK,
     Recording,
     choose_pictures,
+    left_out,
     mean_time,
     posed_pictures,
     scan_time_offsets,
@@ -60,87 +62,78 @@ def register_pictures(
     focal: float = 0.0,
     offset_joints: Sequence[str] = (),
     guessed_lens: bool = False,
+    near: bool = False,
 ) -> PictureRegistration:
     """Estimate a camera's pose and time offset from pictures of a moving robot.
 
     Args:
         body: the robot's surfaces and pose tree.
-        camera: the camera; its pose is not used.
+        camera: the camera.
         recording: the camera's pictures and the joint log.
         focal: prior standard deviation of the focal length's logarithm; 0: it is not fitted.
         offset_joints: joints whose offsets are fitted. Their significance is not tested here
             (``calibrate_joints`` does), but masks follow them.
         guessed_lens: whether the camera's focal length is a guess: others are tried, and ratios of
             the pixels' sides in pictures of unusual proportions.
+        near: whether a fit from the camera's pose is tried before a search.
 
     Raises RegistrationError: there are too few pictures with joint positions, the robot does not
         move, or no pose explains the pictures; the message says so if mirrored pictures fit.
     """
-    frames = _leave_some(recording, *choose_pictures(body, camera, recording))
-    return _register(
-        _Task(body, camera, recording, frames, focal, tuple(offset_joints), guessed_lens)
-    )
-
-
-def register_near(
-    body: RegistrationBody,
-    camera: PinholeCamera,
-    recording: Recording,
-    focal: float,
-    offset_joints: Sequence[str],
-) -> PictureRegistration:
-    """As register_pictures, but begin at the camera's pose, and search only if it does not fit."""
-    try:
-        frames = _leave_some(recording, *choose_pictures(body, camera, recording))
-        rows = [row for some in frames for row in some]
-        search = PictureSearch(body, camera, posed_pictures(recording, rows, 0.0))
-        clock = NO_CLOCK
-        if recording.times is not None:
-            clock = scan_time_offsets(search, camera, recording)
-        start = PictureStart(camera, rows, clock, (), None, search)
-        return fit_pictures(body, start, recording, focal, offset_joints)
-    except RegistrationError:
-        return register_pictures(body, camera, recording, focal, offset_joints)
-
-
-def _leave_some(
-    recording: Recording, slow: Sequence[int], fast: Sequence[int]
-) -> tuple[list[int], list[int]]:
-    """Return the first of the chosen pictures, so that a third of all is left for judging a fit.
-
-    ``slow``, ``fast``: as of ``choose_pictures``. At most half of the pictures are slow ones.
-    """
-    known = int(np.isfinite(recording.values_at(0.0)).all(axis=1).sum())
-    kept = [*slow[: (known + 1) // 2]]
-    return kept, [*fast[: max(0, known - known // 3 - len(kept))]]
+    slow, fast = choose_pictures(body, camera, recording)
+    some = choose_pictures(body, camera, recording.without(left_out(body, recording)))
+    joints = tuple(offset_joints)
+    task = _Task(body, camera, recording, some, [*slow, *fast], focal, joints, guessed_lens)
+    begun = PictureSearch(body, camera, posed_pictures(recording, some[0], 0.0))
+    if near:
+        with suppress(RegistrationError):
+            return _fit(task, RoughPose(begun, camera, 0.0, {}))
+    return _register(task, begun)
 
 
 class _Task(NamedTuple):
-    """Arguments of ``register_pictures``, and frames: indices as of ``choose_pictures``."""
+    """Arguments of ``register_pictures``, and indices as of ``choose_pictures``.
+
+    frames: of the pictures that are searched and judged with. every: of those of the last fit.
+    """
 
     body: RegistrationBody
     camera: PinholeCamera
     recording: Recording
     frames: tuple[list[int], list[int]]
+    every: list[int]
     focal: float
     offset_joints: tuple[str, ...]
     guessed_lens: bool
 
+    def fit(self, start: PictureStart) -> PictureRegistration:
+        """Fit and judge a camera from a start, then fit it to the pictures of the judge, too.
+
+        Raises RegistrationError: no pose explains the pictures.
+        """
+        fit = partial(
+            fit_pictures, self.body, recording=self.recording, focal=self.focal,
+            offset_joints=self.offset_joints,
+        )  # fmt: skip
+        again = PictureStart.of(fit(start))
+        return fit(again._replace(rows=self.every, runner_up=start.runner_up))
+
 
 def _register(
-    task: _Task, searches: Sequence[tuple[int, int]] = ((1200, 0), (1700, 150)), well: float = 0.75
+    task: _Task,
+    begun: PictureSearch,
+    searches: Sequence[tuple[int, int]] = ((1200, 0), (1700, 150)),
+    well: float = 0.75,
 ) -> PictureRegistration:
     """As register_pictures.
 
     Args:
         task: the arguments.
+        begun: a search in the pictures.
         searches: number of rotations and minimum width of the pictures [pixel] of a first search,
             and of a second one where no pose is accepted. Larger pictures show thin links.
         well: where a smaller fraction of the contours fits, mirrored pictures are searched, too.
     """
-    begun = PictureSearch(
-        task.body, task.camera, posed_pictures(task.recording, task.frames[0], 0.0)
-    )
     poses, near, mirrored = list[Array](), list[RoughPose](), list[RoughPose]()
     refused = unexplained_error(task.camera, "no pose shows the body in two pictures.")
     for rotations, width in searches:
@@ -193,7 +186,7 @@ def _fit(
     if task.recording.times is not None:
         clock = scan_time_offsets(fitted, pose.camera, corrected)
     start = PictureStart(pose.camera, rows, clock, alternatives, offsets, fitted, runner_up)
-    return fit_pictures(task.body, start, task.recording, task.focal, task.offset_joints)
+    return task.fit(start)
 
 
 def _require_unmirrored(

@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from drake_pose.arrays import Array, Picture
+from drake_pose.arrays import Array, Indices, Picture
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.fit.explain_kernel import Explained
+from drake_pose.fit.judge import held_out
 from drake_pose.registration.picture_search import (
     PictureSearch,
     PosedPicture,
@@ -53,6 +54,16 @@ class Recording:
     def with_offsets(self, joint_offsets: Array) -> "Recording":
         """Return the same recording with offsets (m,) [rad or m] added to all values."""
         return replace(self, values_at=lambda offset: self.values_at(offset) + joint_offsets)
+
+    def without(self, rows: Indices) -> "Recording":
+        """Return the same recording without joint positions at the pictures with indices `rows`."""
+
+        def values_at(offset: float | Array) -> Array:
+            values = self.values_at(offset).copy()
+            values[rows] = np.nan
+            return values
+
+        return replace(self, values_at=values_at)
 
     def with_drift(self, drift: float, since: float) -> "Recording":
         """Return the recording with time offsets that grow by `drift` [s/s], from 0 at `since` [s].
@@ -150,6 +161,13 @@ def choose_pictures(
     rest = np.setdiff1d(np.argsort(-speed)[: max(moving, len(known) // 4)], chosen)
     fast = rest[choose_frames(places[rest], moving)] if len(rest) else rest
     return known[chosen].tolist(), known[fast].tolist()
+
+
+def left_out(body: RegistrationBody, recording: Recording) -> Indices:
+    """Return indices of the pictures that judge a fit, and do not enter it, see ``held_out``."""
+    values = recording.values_at(0.0)
+    known = np.flatnonzero(np.isfinite(values).all(axis=1))
+    return known[held_out(node_places(body, values[known]).reshape(len(known), -1))]
 
 
 def stuck_pictures(recording: Recording, least: int = 5, noise: int = 2) -> str:

@@ -191,6 +191,7 @@ class RegisteredCamera(_UncertainPose):
     # Whether the joint positions belong to the frames, judged by frames to which the pose was not
     # fitted; None: not tested, as in a refinement, or with too few frames.
     evidence: Evidence | None = None
+    agrees: bool = True  # Whether no half of the frames is as likely at another pose of its own.
     # (frames, k, k) cost of each frame's contours in square image tiles.
     costs: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
 
@@ -233,18 +234,32 @@ class CameraSearch:
                 f"camera '{camera.name}': no frame shows the body; give masks and joint positions "
                 "of one or more frames"
             )
-        some, starts, evidence = evenly_spaced(frames, 24), list[Array](), None
+        some, starts = evenly_spaced(frames, 24), list[Array]()
         if factorial(len(some)) * LEVEL < 1.0:
-            # However well they fit, so few frames cannot be told from frames wrongly paired.
-            starts = self.search(camera, some)
-        else:
-            posed = PosedFrames(self._body.kinematics, self._body.coarse, camera, some)
-            gains = np.zeros((len(some), len(some)))
-            for k in range(2):
-                starts += (own := self.search(camera, some[k::2], 4))
-                gains[1 - k :: 2] = pairing_gains(posed, own[0])[1 - k :: 2]
-            evidence = paired_evidence(gains, posed.X_WN[:, :, :3, 3].reshape(len(some), -1))
-        return replace(self._fitted(camera, frames, starts), evidence=evidence)
+            return self._fitted(camera, frames, self.search(camera, some))
+        posed = PosedFrames(self._body.kinematics, self._body.coarse, camera, some)
+        gains, own = np.zeros((len(some), len(some))), list[Array]()
+        for k in range(2):
+            starts += (found := self.search(camera, some[k::2], 4))
+            own.append(found[0])
+            gains[1 - k :: 2] = pairing_gains(posed, own[k])[1 - k :: 2]
+        evidence = paired_evidence(gains, posed.X_WN[:, :, :3, 3].reshape(len(some), -1))
+        fitted = self._fitted(camera, frames, starts)
+        agrees = all(self._agrees(fitted, some[k::2], own[k]) for k in range(2))
+        return replace(fitted, evidence=evidence, agrees=agrees)
+
+    def _agrees(self, found: RegisteredCamera, frames: Sequence[PosedFrame], X_CW: Array) -> bool:
+        """Return whether at most 8 of some frames tell the found pose from a pose X_CW (4, 4).
+
+        A pose of a wrong body, or at wrong joint positions, is a compromise: to half of the frames,
+        the pose X_CW that was searched in them alone is as likely.
+        """
+        some = evenly_spaced(frames)
+        view = self._fine(found.camera, some)
+        (known, here), (other, there) = (_fine_costs(view, X) for X in (found.camera.X_CW, X_CW))
+        poses = [known, *map(np.linalg.inv, found.alternatives)]
+        apart = len(distinct_poses(view, [*poses, other])) > len(distinct_poses(view, poses))
+        return not apart or fits_better(here, there)
 
     def refine(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
         """Return the camera with its current pose refined, without alternatives.
@@ -258,12 +273,10 @@ class CameraSearch:
     def mirrored_costs(
         self, found: RegisteredCamera, frames: Sequence[PosedFrame]
     ) -> tuple[Array, Array]:
-        """Return the costs (n, k, k) of frames at a found pose, and of their mirror images.
+        """Return the costs (n, k, k) of at most 8 frames, as given and mirrored, in image tiles.
 
-        The mirror image of a silhouette is nearly the silhouette from the opposite side, from which
-        the camera of the mirrored frames is fitted. Costs are in the same image tiles.
-
-        ``frames``: of the found camera; at most 8 are compared.
+        The mirror image of a silhouette is nearly the silhouette from the opposite side of the
+        found pose, from which the camera of the mirrored frames is fitted.
         """
         body, some, X_CW = self._body, evenly_spaced(frames), found.camera.X_CW
         middle = PosedFrames(body.kinematics, body.coarse, found.camera, some).middle
@@ -271,21 +284,17 @@ class CameraSearch:
         opposite[:3, :3] = np.diag([-1.0, 1.0, -1.0]) @ X_CW[:3, :3]
         opposite[:3, 3] = (X_CW[:3, :3] @ middle + X_CW[:3, 3]) * [-1.0, 1.0, 1.0]
         opposite[:3, 3] -= opposite[:3, :3] @ middle
-        costs = []
-        for camera, own, start in (
-            (found.camera, some, X_CW),
-            (found.camera.mirrored(), [one.mirrored() for one in some], opposite),
-        ):
-            X = start
-            for outlines, spacing, rounds in (
-                (body.coarse, SEARCH.coarse_spacing, SEARCH.coarse),
-                (body.medium, SEARCH.fine_spacing, SEARCH.fine),
-            ):
-                view = PosedFrames(body.kinematics, outlines, camera, own, spacing)
-                X = fit_pose(view, X, rounds)
-            fit = SharedFit([view], [X], fit_biases=False)
-            costs.append(fit.tile_costs(fit.start, max(1.0, SEARCH.tile_side * view.size)))
-        return costs[0], costs[1][..., ::-1]
+        there = found.camera.mirrored()
+        mirrored = [one.mirrored() for one in some]
+        coarse = PosedFrames(body.kinematics, body.coarse, there, mirrored, SEARCH.coarse_spacing)
+        opposite = fit_pose(coarse, opposite, SEARCH.coarse)
+        costs = _fine_costs(self._fine(there, mirrored), opposite)[1]
+        return _fine_costs(self._fine(found.camera, some), X_CW)[1], costs[..., ::-1]
+
+    def _fine(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> PosedFrames:
+        """Return frames prepared for fits at the fine level."""
+        body = self._body
+        return PosedFrames(body.kinematics, body.medium, camera, frames, SEARCH.fine_spacing)
 
     def _fitted(
         self, camera: PinholeCamera, frames: Sequence[PosedFrame], starts: Sequence[Array]
@@ -295,12 +304,9 @@ class CameraSearch:
         At most 24 frames narrow the starts down; all frames enter the final fit.
         """
         kinematics, some = self._body.kinematics, evenly_spaced(frames, 24)
-        fine = PosedFrames(kinematics, self._body.medium, camera, some, SEARCH.fine_spacing)
+        fine = self._fine(camera, some)
         last = PosedFrames(kinematics, self._body.full, camera, some, LAST_SPACING)
-        halfway = map_ordered(partial(fit_pose, fine, rounds=SEARCH.fine), starts)
-        fits = [SharedFit([fine], [X], fit_biases=False) for X in halfway]
-        side = max(1.0, SEARCH.tile_side * fine.size)
-        costs = [fit.tile_costs(fit.start, side) for fit in fits]
+        halfway, costs = zip(*map_ordered(partial(_fine_costs, fine), starts), strict=True)
         order = np.argsort([one.sum() for one in costs], kind="stable")
         # Poses far worse than the best are dropped half-way.
         likely = [halfway[k] for k in order if vuong_statistic(costs[k], costs[order[0]]) <= 6.0]
@@ -344,6 +350,13 @@ class CameraSearch:
         twin = depth_twin(hypotheses[0], posed.some_points)
         twin = fit_pose(posed, twin, SEARCH.coarse)
         return distinct_poses(posed, best_first([*hypotheses, twin], SEARCH.refined_side))
+
+
+def _fine_costs(view: PosedFrames, X_CW: Array) -> tuple[Array, Array]:
+    """Return X_CW (4, 4) fitted at the fine level, and the frames' costs in image tiles there."""
+    fit = SharedFit([view], [fit_pose(view, X_CW, SEARCH.fine)], fit_biases=False)
+    costs = fit.tile_costs(fit.start, max(1.0, SEARCH.tile_side * view.size))
+    return fit.cameras(fit.start)[0].X_CW, costs
 
 
 def select_best(

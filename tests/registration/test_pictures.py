@@ -320,7 +320,7 @@ def test_time_offset_and_camera_are_fitted_within_their_deviations(registered, e
         registered.recording,
         values_at=lambda offset: registered.recording.values_at(offset) - offsets,
     )
-    start = PictureStart.of(registered)
+    start = PictureStart.of(registered)._replace(evidence=None)
     again = accept_fit(episode.body, registered.fit, logged, start, offsets, 0.0)
     np.testing.assert_allclose([one.values for one in again.frames], values - offsets)
     assert again.evidence == registered.evidence

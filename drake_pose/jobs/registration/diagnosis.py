@@ -15,7 +15,6 @@ from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError, RegistrationError
 from drake_pose.files.records import BADLY_EXPLAINED
 from drake_pose.files.settings import percent
-from drake_pose.fit.judge import LEVEL
 from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.jobs.registration.readings import MIRRORED, likeliest_reading, other_rows
 from drake_pose.registration.diagnosis import DIAGNOSIS
@@ -54,8 +53,8 @@ def lack_of_evidence(
 ) -> str | None:
     """Return in words why a pose does not show that joint positions and masks belong together.
 
-    Too few frames for the judge (``fit.judge``) must fit significantly better than the same masks
-    with joint positions drawn at random, at the pose that fits these best.
+    A pose that was not judged by other frames (``fit.judge``) must fit significantly better than
+    the same masks with joint positions drawn at random, at the pose that fits these best.
 
     Args:
         search: searches roughly with other joint positions.
@@ -65,15 +64,17 @@ def lack_of_evidence(
     Returns the reason; None: they belong together.
     """
     evidence = found.evidence
-    if evidence is not None and evidence.least <= LEVEL:
-        return (
-            None
-            if evidence.holds
-            else (
+    if evidence is not None:
+        # A single wrong frame of as few as needed hides the evidence.
+        if not evidence.holds and evidence.frames > evidence.needed:
+            return (
                 "the joint positions of other frames fit them about as well as their own (p-value "
                 f"{evidence.p_value:.2g})"
             )
-        )
+        # Half of the frames and more that fit no common pose are outliers, which are named.
+        if found.agrees or (evidence.holds and 2 * len(found.outliers) >= len(found.frames)):
+            return None
+        return "half of the frames fit as well at another pose of their own"
     with suppress(RegistrationError):
         chance = search.rough().register(found.camera, with_random_rows(search.kinematics, frames))
         if not fits_better(found.costs, chance.costs):

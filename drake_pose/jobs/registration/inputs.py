@@ -21,7 +21,14 @@ from drake_pose.camera.episode import EpisodeCamera
 from drake_pose.camera.episode_files import JOINT_TABLE, open_episode, require_recording
 from drake_pose.camera.joint_map import MappedJoints
 from drake_pose.camera.models import Camera, Lens, PinholeCamera
-from drake_pose.errors import CameraError, MaskError, SceneError, SettingsError, UnknownNameError
+from drake_pose.errors import (
+    CameraError,
+    MaskError,
+    SceneError,
+    SettingsError,
+    UnknownNameError,
+    require_known,
+)
 from drake_pose.files.settings import ALL, AuditSettings, EstimateSettings, RegistrationSettings
 from drake_pose.jobs.estimate.inputs import make_tree, missing_for_person
 from drake_pose.jobs.estimate.measurements import (
@@ -440,9 +447,7 @@ def _select_cameras(
                 f"{path}: camera '{name}' rides on link '{link}': register it with --on {link}, or "
                 "take it out of the file"
             )
-    for name in wanted:
-        if name not in file.cameras:
-            raise UnknownNameError("camera", name, file.cameras, str(scene.path))
+    require_known("camera", wanted, file.cameras, str(scene.path))
     if not wanted and not unplaced:
         raise SceneError(
             f"{path}: every camera has an X_WC; name those that are to be registered anew: "

@@ -201,10 +201,10 @@ class SceneComparison:
             least [pixel].
         """
         for _ in range(most):
-            if now.is_doubtful or now.found.remaining < least:
+            if now.found.remaining < least:
                 break
             again = self._compare(now.cameras, now.corrections, now.found.corrections)
-            if again.is_doubtful:
+            if again.is_doubtful and again.inlier_ratio <= now.inlier_ratio:
                 break
             now = replace(again, findings=now.findings, warnings=now.warnings)
         return now

@@ -15,7 +15,6 @@ from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError, RegistrationError, noted_warnings
 from drake_pose.files.folder import write_file, writes_folder
 from drake_pose.files.settings import RegistrationSettings
-from drake_pose.fit.judge import LEVEL
 from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.registration.diagnosis import (
     Search,
@@ -327,7 +326,7 @@ class _Registration:
                     require_explained(search, found, frames)
             if found is None or camera.name in self.refused:
                 continue
-            if found.evidence is None or found.evidence.least > LEVEL:
+            if found.evidence is None or not found.evidence.holds:
                 self.warnings.append(few_frames_warning(found))
             if target is not None:
                 if found.target is not None:

@@ -22,7 +22,6 @@ from drake_pose.registration.camera_motion import PictureMotion, find_camera_mot
 from drake_pose.registration.picture_acceptance import PictureRegistration, PictureStart
 from drake_pose.registration.picture_registration import (
     fit_pictures,
-    register_near,
     register_pictures,
 )
 from drake_pose.registration.picture_search import rotation_between
@@ -123,11 +122,12 @@ def register_recordings(
             if before is not None:
                 start = PictureStart.of(before[name])
                 result = fit_pictures(body, start, recording, prior, offset_joints)
-            elif near is not None and name in near:
-                begun = replace(camera, X_WC=near[name])
-                result = register_near(body, begun, recording, prior, offset_joints)
             else:
-                result = register_pictures(body, camera, recording, prior, offset_joints, guessed)
+                X_WC = (near or {}).get(name)
+                begun = camera if X_WC is None else replace(camera, X_WC=X_WC)
+                result = register_pictures(
+                    body, begun, recording, prior, offset_joints, guessed, X_WC is not None
+                )
         except RegistrationError as error:
             refused[name] = error
             continue

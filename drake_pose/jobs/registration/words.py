@@ -332,6 +332,8 @@ def zero_warnings(
     shown = np.array([len(one.vertices) > 0 for one in body.full])
     for name in joints_like_cameras(body.kinematics, values, shown):
         joint = body.kinematics.names.index(name)
+        if not body.kinematics.is_angle[joint]:
+            continue
         X = joint_rotation(body.kinematics, values[0], joint, OFFSET_UNITS[0])
         off = pose_difference(X @ camera.X_WC, camera.X_WC)
         if squared_distance(off, found.covariance) < 1.0:

@@ -78,7 +78,7 @@ def test_correct_scene_gives_no_findings(right: ArmScene) -> None:
 
 
 @pytest.mark.parametrize(
-    ("joint", "degrees"), [("hand_turn", 25.0), ("hand_turn", -70.0), ("elbow_turn", 40.0)]
+    ("joint", "degrees"), [("hand_turn", 25.0), ("turret_turn", -20.0), ("elbow_turn", 40.0)]
 )
 def test_large_joint_offset_is_measured(scene, joint, degrees) -> None:
     change(scene, joint, lambda q: q + np.radians(degrees))
@@ -89,6 +89,18 @@ def test_large_joint_offset_is_measured(scene, joint, degrees) -> None:
     assert abs(off["angle_deg"] + degrees) < max(4.0 * off["angle_sd_deg"], 0.3)
     assert off["angle_sd_deg"] < 1.0
     assert result.summary["agreeing_count"] == COUNT
+
+
+def test_short_link_is_measured(scene, tmp_path) -> None:
+    """The model's shoulder carries the next joint at 315 mm, not at 350."""
+    text = scene.model.read_text()
+    assert text.count('xyz="0 0 0.35"') == 1
+    short = tmp_path / "short.urdf"
+    short.write_text(text.replace('xyz="0 0 0.35"', 'xyz="0 0 0.315"'))
+    result = audit(replace(scene, model=short))
+    assert told(result) == [("length", "shoulder")]
+    off = result.summary["findings"][0]
+    assert abs(off["shift_percent"] - 100.0 / 9.0) < 3.0 * off["shift_sd_percent"] < 3.0
 
 
 @pytest.mark.parametrize("joint", ["hand_turn", "shoulder_turn"])

@@ -98,12 +98,14 @@ def test_frames_that_fit_other_rows_are_no_evidence() -> None:
     search.register = lambda camera, frames: chance
     assert lack_of_evidence(search, registered(0.9, costs=fits), frames) is None
     assert "drawn at random" in lack_of_evidence(search, chance, frames)
-    for p_value, said in ((0.02, "p-value 0.02"), (0.004, "")):
-        told = Evidence(0.5, 0.4, p_value, 0.004, 6, 5)
-        assert said in (lack_of_evidence(search, registered(0.9, evidence=told), frames) or "")
-        assert (lack_of_evidence(search, registered(0.9, evidence=told), frames) is None) != bool(
-            said
-        )
+    for p_value, needed, agrees, said in (
+        (0.02, 5, True, "p-value 0.02"), (0.02, 6, True, ""), (0.004, 5, True, ""),
+        (0.004, 5, False, "half of the frames"),
+    ):  # fmt: skip
+        evidence = Evidence(0.5, 0.4, p_value, 0.004, 6, needed)
+        found = registered(0.9, costs=fits, evidence=evidence, agrees=agrees)
+        assert said in (told := lack_of_evidence(search, found, frames) or "")
+        assert bool(told) == bool(said)
 
 
 def test_outliers_are_named_and_refused_where_they_are_many() -> None:

@@ -193,7 +193,6 @@ def picture_evidence(
     covered &= ~covered.all(axis=0)
 
     log_odds, size = np.zeros((2, *covered.shape), np.float32), (camera.width, camera.height)
-    noise = 4.0 * float(background.deviations.min())
     for k, row in enumerate(tested):
         if row in judging:
             resized = cv2.resize(recording.read(row), size, interpolation=cv2.INTER_AREA)
@@ -201,10 +200,9 @@ def picture_evidence(
             gain = estimate_gain(picture, background.colours)
             found = background.foreground(picture, gain, (slice(0), slice(0)))[1]
             log_odds[0, k] = np.clip(found, -MODEL.max_log_odds, MODEL.max_log_odds)
-            slopes = np.hypot(
-                *(largest(np.abs(one)) for one in colour_slopes(picture.astype(np.float32)))
-            )
-            edges = cv2.dilate(np.minimum(1.0, slopes / noise), np.ones((3, 3), np.uint8))
+            u, v = (largest(np.abs(k)) for k in colour_slopes(picture.astype(np.float32)))
+            strength = np.minimum(1.0, np.hypot(u, v) / (4.0 * background.deviations.min()))
+            edges = cv2.dilate(strength, np.ones((3, 3), np.uint8))
             log_odds[1, k] = edges - edges.mean()
     places = node_places(body, values[tested]).reshape(len(tested), -1)
     gains = map(paired_gains, (covered, outlined), log_odds)

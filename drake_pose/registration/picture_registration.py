@@ -82,8 +82,7 @@ def register_pictures(
     """
     slow, fast = choose_pictures(body, camera, recording)
     some = choose_pictures(body, camera, recording.without(left_out(body, recording)))
-    joints = tuple(offset_joints)
-    task = _Task(body, camera, recording, some, [*slow, *fast], focal, joints, guessed_lens)
+    task = _Task(body, camera, recording, some, slow + fast, focal, offset_joints, guessed_lens)
     begun = PictureSearch(body, camera, posed_pictures(recording, some[0], 0.0))
     if near:
         with suppress(RegistrationError):
@@ -103,7 +102,7 @@ class _Task(NamedTuple):
     frames: tuple[list[int], list[int]]
     every: list[int]
     focal: float
-    offset_joints: tuple[str, ...]
+    offset_joints: Sequence[str]
     guessed_lens: bool
 
     def fit(self, start: PictureStart) -> PictureRegistration:

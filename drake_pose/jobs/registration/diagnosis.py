@@ -53,7 +53,7 @@ def lack_of_evidence(
 ) -> str | None:
     """Return in words why a pose does not show that joint positions and masks belong together.
 
-    A pose that was not judged by other frames (``fit.judge``) must fit significantly better than
+    A pose for which other frames are no evidence (``fit.judge``) must fit significantly better than
     the same masks with joint positions drawn at random, at the pose that fits these best.
 
     Args:
@@ -72,9 +72,14 @@ def lack_of_evidence(
                 f"{evidence.p_value:.2g})"
             )
         # Half of the frames and more that fit no common pose are outliers, which are named.
-        if found.agrees or (evidence.holds and 2 * len(found.outliers) >= len(found.frames)):
+        if not found.agrees and not (evidence.holds and 2 * len(found.outliers) >= len(frames)):
+            return "half of the frames fit as well at another pose of their own"
+        if evidence.holds and left_over(found) < BADLY_EXPLAINED:
             return None
-        return "half of the frames fit as well at another pose of their own"
+        if evidence.holds:
+            return (
+                f"the joints move as in them, but {percent(left_over(found))} of their area is off"
+            )
     with suppress(RegistrationError):
         chance = search.rough().register(found.camera, with_random_rows(search.kinematics, frames))
         if not fits_better(found.costs, chance.costs):

@@ -10,7 +10,7 @@ import numpy as np
 from drake_pose.arrays import Array, Picture
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
-from drake_pose.fit.background import MODEL, colour_slopes, estimate_gain, grown, largest
+from drake_pose.fit.background import MODEL, estimate_gain
 from drake_pose.fit.judge import Evidence, paired_evidence, paired_gains
 from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.fit.problem import TIME_OFFSET
@@ -141,12 +141,15 @@ class AcceptanceSettings(NamedTuple):
     """What a fit must reach to be accepted.
 
     Args:
+        min_ratio: minimum mean inlier ratio of all frames. Where joint positions of other episodes
+            or models of other robots explain much, it is 0.4 at most.
         max_clock_sd: a time offset with a larger standard deviation is not determined [s].
         guessed_lens_error: relative error of focal lengths that pictures alone determine, which
             enlarges the covariance. Simulated ones err by 1 %, real ones by 2 to 50 %.
         rows: maximum number of rows whose pairing with pictures is tested.
     """
 
+    min_ratio: float = 0.4
     max_clock_sd: float = 0.1
     guessed_lens_error: float = 0.25
     rows: int = 90
@@ -163,9 +166,6 @@ def picture_evidence(
     joint_offsets: Array,
 ) -> Evidence:
     """Test whether pictures that were not fitted belong to their joint positions.
-
-    The colours of the pixels that the body covers are tested, and the edges along its outline. The
-    weaker evidence of both is returned.
 
     Args:
         body: the robot's surfaces.
@@ -188,26 +188,19 @@ def picture_evidence(
     outlines = simplify_or_hull(body.coarse, PICTURES.triangles[-1])
     poses = [camera.X_CW @ body.kinematics.poses(values[k]) for k in tested]
     covered = np.array(map_ordered(lambda X_CN: draw_mask(outlines, X_CN, camera), poses))
-    outlined = covered & grown(~covered, 1)
     # The background is unknown where the body covers it in all frames.
     covered &= ~covered.all(axis=0)
 
-    log_odds, size = np.zeros((2, *covered.shape), np.float32), (camera.width, camera.height)
+    log_odds, size = np.zeros(covered.shape, np.float32), (camera.width, camera.height)
     for k, row in enumerate(tested):
         if row in judging:
             resized = cv2.resize(recording.read(row), size, interpolation=cv2.INTER_AREA)
             picture = np.asarray(resized, np.uint8)
             gain = estimate_gain(picture, background.colours)
             found = background.foreground(picture, gain, (slice(0), slice(0)))[1]
-            log_odds[0, k] = np.clip(found, -MODEL.max_log_odds, MODEL.max_log_odds)
-            u, v = (largest(np.abs(k)) for k in colour_slopes(picture.astype(np.float32)))
-            strength = np.minimum(1.0, np.hypot(u, v) / (4.0 * background.deviations.min()))
-            edges = cv2.dilate(strength, np.ones((3, 3), np.uint8))
-            log_odds[1, k] = edges - edges.mean()
+            log_odds[k] = np.clip(found, -MODEL.max_log_odds, MODEL.max_log_odds)
     places = node_places(body, values[tested]).reshape(len(tested), -1)
-    gains = map(paired_gains, (covered, outlined), log_odds)
-    tests = [paired_evidence(one, places) for one in gains]
-    return max(tests, key=lambda one: (not one.holds, one.p_value))
+    return paired_evidence(paired_gains(covered, log_odds), places)
 
 
 def accept_fit(
@@ -233,11 +226,12 @@ def accept_fit(
         raise unexplained_error(
             start.camera, f"{evidence}. Are the joint positions those of another time or episode?"
         )
-    if 2 * agreeing <= count:
+    ratio = float(best.ratios.mean())
+    if 2 * agreeing <= count or ratio < ACCEPTANCE.min_ratio:
         raise unexplained_error(
             start.camera,
-            f"its pictures change as the joints move ({evidence}), but contours fit in only "
-            f"{agreeing} of {count} fitted frames: is it the model of another robot, or has a "
+            f"its pictures change as the joints move ({evidence}), but {ratio:.0%} of the contours "
+            f"fit, in {agreeing} of {count} frames: is it the model of another robot, or has a "
             "joint the other sign?",
         )
     deviations = np.sqrt(np.diag(best.covariance))

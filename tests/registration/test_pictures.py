@@ -327,7 +327,7 @@ def test_time_offset_and_camera_are_fitted_within_their_deviations(registered, e
     # A fit in which no more than half of the frames agree is refused; so is one to other rows.
     doubtful = replace(registered.fit)
     vars(doubtful)["inliers"] = np.arange(6) < 3
-    with pytest.raises(RegistrationError, match="in only 3 of 6 fitted frames"):
+    with pytest.raises(RegistrationError, match="fit, in 3 of 6 frames"):
         accept_fit(episode.body, doubtful, logged, start, offsets, 0.0)
     other = replace(logged, values_at=lambda offset: logged.values_at(offset)[::-1])
     with pytest.raises(RegistrationError, match=r"about as well: p-value 0\.|explained better"):

@@ -67,9 +67,9 @@ def test_fit_to_all_silhouettes_is_more_accurate_and_pictures_are_saved(tmp_path
     assert set(figures["as_found"]) == set(MOTIONS)
     assert set(figures["motions"]) == set(MOTIONS)
     # The captured silhouette covers the person in the picture.
-    for sample in result.samples.values():
-        limbs, body = sample.captured["silhouette"]
-        assert np.linalg.norm(limbs - sample.limbs, axis=-1).max() < 5.0
+    for _, true, captured in result.samples.values():
+        limbs, body = captured["silhouette"]
+        assert np.linalg.norm(limbs - true, axis=-1).max() < 5.0
         assert 0.01 < body.mean() < 0.3
     save_captures(result, tmp_path)
     drawn = cv2.imread(str(tmp_path / "figure_07.png"))[..., ::-1]

@@ -63,19 +63,18 @@ def test_a_nudged_camera_is_refused_with_the_frames_of_each_part(nudged, command
 
 
 @pytest.mark.slow
-def test_each_named_part_of_a_nudged_recording_gives_its_pose(nudged):
-    scene, painted, R = nudged
-    turned = painted.camera.X_WC.copy()
-    turned[:3, :3] @= R
-    for frames, true in (("0000:0017", painted.camera.X_WC), ("0018:0029", turned)):
-        settings = RegistrationSettings(cameras="camera", frames=frames)
-        found = register_scene(scene, painted.path, settings=settings)
-        assert not [one for one in found.warnings if "moved" in one]
-        camera = found.registered["camera"]
-        error = pose_error(camera.camera.X_WC, true)
-        assert np.degrees(np.linalg.norm(error[:3])) < 0.5
-        assert np.linalg.norm(error[3:]) < 0.015
-        assert (np.abs(error) < 4.0 * np.sqrt(np.diag(camera.covariance))).all()
+def test_a_named_part_of_a_nudged_recording_gives_its_pose(nudged):
+    scene, painted, _ = nudged
+    settings = RegistrationSettings(cameras="camera", frames="0000:0017")
+    found = register_scene(scene, painted.path, settings=settings)
+    assert not [one for one in found.warnings if "moved" in one]
+    camera = found.registered["camera"]
+    error = pose_error(camera.camera.X_WC, painted.camera.X_WC)
+    assert np.degrees(np.linalg.norm(error[:3])) < 0.5
+    assert np.linalg.norm(error[3:]) < 0.015
+    assert (np.abs(error) < 4.0 * np.sqrt(np.diag(camera.covariance))).all()
+    with pytest.raises(RegistrationError, match=r"12 frames are too few .* 13 frames"):
+        register_scene(scene, painted.path, settings=replace(settings, frames="0018:0029"))
 
 
 def test_every_nudge_is_told_with_its_size_and_every_part_with_its_frames() -> None:

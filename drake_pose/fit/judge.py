@@ -17,7 +17,7 @@ LEVEL = 0.01
 """Significance level of all tests that decide what is true."""
 
 
-class Evidence(NamedTuple):
+class PairedEvidence(NamedTuple):
     """Result of a block permutation test, see ``paired_evidence``."""
 
     gain: float  # Mean gain of the frames with their own rows.
@@ -59,7 +59,7 @@ def paired_gains(silhouettes: Mask, log_odds: Array | Floats) -> Array:
     return np.asarray(log_odds.reshape(count, -1).astype(np.float32) @ covered.T, np.float64)
 
 
-def paired_evidence(gains: Array, rows: Array, *, draws: int = 5000) -> Evidence:
+def paired_evidence(gains: Array, rows: Array, *, draws: int = 5000) -> PairedEvidence:
     """Test whether frames agree better with their own rows than with those of other frames.
 
     The rows are shifted cyclically, and cut into blocks twice as long as their correlation time.
@@ -89,7 +89,7 @@ def paired_evidence(gains: Array, rows: Array, *, draws: int = 5000) -> Evidence
     own = float(np.trace(gains)) / max(count, 1)
     mean = (float(gains.sum()) / max(count, 1) - own) / max(count - 1, 1)
     if count < 2 or not tested:
-        return Evidence(own, mean, 1.0, 1.0, count, needed)
+        return PairedEvidence(own, mean, 1.0, 1.0, count, needed)
     cuts = np.array_split(np.arange(count), max(1, count // length))
     rng, orders = np.random.default_rng(0), np.empty((draws, count), np.int64)
     for k in range(draws):
@@ -101,7 +101,7 @@ def paired_evidence(gains: Array, rows: Array, *, draws: int = 5000) -> Evidence
     reached = gains[np.arange(count), orders[other]].mean(axis=1) >= own - 1e-9 * abs(own)
     least = smallest(count)
     p_value = least + (1.0 - least) * float(reached.mean())
-    return Evidence(own, mean, p_value, least, count, needed)
+    return PairedEvidence(own, mean, p_value, least, count, needed)
 
 
 def held_out(rows: Array) -> Mask:
@@ -125,11 +125,17 @@ def correlation_length(rows: Array) -> int:
     off = rows - rows.mean(axis=0)
     variance = float((off**2).sum())
     for lag in range(1, len(rows)):
-        # Each lag has fewer products.
-        scale = len(rows) / (len(rows) - lag)
+        scale = len(rows) / (len(rows) - lag)  # Each lag has fewer products.
         if scale * float((off[lag:] * off[:-lag]).sum()) < variance / np.e:
             return lag
     return max(1, len(rows))
+
+
+def opposite_side(X_CW: Array, middle: Array) -> Array:
+    """Return X_CW (4, 4) opposite, as far from `middle` (3,), from where mirror images are seen."""
+    X = np.diag([-1.0, 1.0, -1.0, 1.0]) @ X_CW
+    X[2, 3] += 2.0 * float(X_CW[2, :3] @ middle + X_CW[2, 3])
+    return X
 
 
 def depth_twin(X_CW: Array, points: Array) -> Array:
@@ -142,8 +148,7 @@ def depth_twin(X_CW: Array, points: Array) -> Array:
     ``points``: (n, 3) of the parts that move, in all frames together, in the world [m].
     """
     middle = points.mean(axis=0)
-    _, axes = np.linalg.eigh(np.cov((points - middle).T))
-    u = axes[:, 0]  # The axis along which they spread least.
+    u = np.linalg.eigh(np.cov((points - middle).T))[1][:, 0]  # They spread least along this axis.
     p_C = X_CW[:3, :3] @ middle + X_CW[:3, 3]
     ray = p_C / np.linalg.norm(p_C)
     D, S = (np.eye(3) - 2.0 * np.outer(one, one) for one in (ray, u))

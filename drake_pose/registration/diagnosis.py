@@ -163,7 +163,7 @@ class _Residual(NamedTuple):
         return float(along @ along), len(along)
 
     def is_explained_by(self, one: _Cause, other: _Cause) -> bool:
-        """Return whether a cause explains so much that another is not significant beside it."""
+        """Return whether another cause is not significant beside a cause."""
         both, alone = (
             self.explained(M) for M in (np.hstack([one.jacobian, other.jacobian]), one.jacobian)
         )

@@ -11,7 +11,7 @@ from drake_pose.arrays import Array, Picture
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.fit.background import MODEL, estimate_gain
-from drake_pose.fit.judge import Evidence, paired_evidence, paired_gains
+from drake_pose.fit.judge import PairedEvidence, paired_evidence, paired_gains
 from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.fit.problem import TIME_OFFSET
 from drake_pose.fit.surfaces import simplify_or_hull
@@ -23,7 +23,12 @@ from drake_pose.registration.picture_search import (
     node_places,
     segment_picture,
 )
-from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, joints_like_cameras
+from drake_pose.registration.posed_frames import (
+    PosedFrame,
+    PosedFrames,
+    downscaled,
+    joints_like_cameras,
+)
 from drake_pose.registration.pyramid_level import PICTURES
 from drake_pose.registration.recording import (
     NO_CLOCK,
@@ -57,7 +62,7 @@ class PictureRegistration:
     focal_deviation: float  # Relative standard deviation of the focal length; 0: it was not fitted.
     recording: Recording  # The recording, with the drift of its clock removed.
     joint_offsets: Array  # (m,) added to the frames' values for their masks and log-odds.
-    evidence: Evidence  # Of pictures that were not fitted.
+    evidence: PairedEvidence  # Of pictures that were not fitted.
     runner_up: tuple[Array, float] | None  # As of ``PictureStart``.
 
     @property
@@ -86,7 +91,7 @@ class PictureStart(NamedTuple):
     joint_offsets: Array | None = None
     search: PictureSearch | None = None
     runner_up: tuple[Array, float] | None = None
-    evidence: Evidence | None = None
+    evidence: PairedEvidence | None = None
 
     @classmethod
     def of(cls, one: PictureRegistration) -> "PictureStart":
@@ -164,7 +169,7 @@ def picture_evidence(
     recording: Recording,
     start: PictureStart,
     joint_offsets: Array,
-) -> Evidence:
+) -> PairedEvidence:
     """Test whether pictures that were not fitted belong to their joint positions.
 
     Args:
@@ -180,17 +185,13 @@ def picture_evidence(
     # Rows of all pictures are exchanged.
     known = np.isfinite(values).all(axis=1)
     tested = evenly_spaced(np.flatnonzero(known).tolist(), ACCEPTANCE.rows)
-    width = min(PICTURES.background_width, best.camera.width)
-    camera = best.camera.resized(
-        width, max(8, round(best.camera.height * width / best.camera.width))
-    )
+    camera = downscaled(best.camera, min(1.0, PICTURES.background_width / best.camera.width))
     background = best.background.resized(camera.width, camera.height)
     outlines = simplify_or_hull(body.coarse, PICTURES.triangles[-1])
     poses = [camera.X_CW @ body.kinematics.poses(values[k]) for k in tested]
     covered = np.array(map_ordered(lambda X_CN: draw_mask(outlines, X_CN, camera), poses))
     # The background is unknown where the body covers it in all frames.
     covered &= ~covered.all(axis=0)
-
     log_odds, size = np.zeros(covered.shape, np.float32), (camera.width, camera.height)
     for k, row in enumerate(tested):
         if row in judging:

@@ -24,7 +24,7 @@ from drake_pose.fit.explain_kernel import (
     explain_poses,
     make_words,
 )
-from drake_pose.fit.judge import depth_twin
+from drake_pose.fit.judge import depth_twin, opposite_side
 from drake_pose.registration.posed_frames import placed_points
 from drake_pose.registration.register import uniform_rotations
 from drake_pose.registration.shared_fit import SHARED
@@ -420,9 +420,7 @@ class PyramidLevel:
 
     def opposite(self, X_CW: Array) -> Array:
         """Return X_CW (4, 4) of an opposite camera, as far away, which sees mirror images."""
-        X = np.diag([-1.0, 1.0, -1.0, 1.0]) @ X_CW
-        X[2, 3] += 2.0 * float(X_CW[2, :3] @ self._middle + X_CW[2, 3])
-        return X
+        return opposite_side(X_CW, self._middle)
 
     def depth_twin(self, X_CW: Array) -> Array:
         """Return X_CW (4, 4) reversed in depth, see ``judge.depth_twin``."""

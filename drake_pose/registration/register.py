@@ -28,7 +28,7 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.fit.covariance import vuong_statistic
-from drake_pose.fit.judge import LEVEL, Evidence, depth_twin, paired_evidence
+from drake_pose.fit.judge import LEVEL, PairedEvidence, depth_twin, opposite_side, paired_evidence
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import FEW, VERY_FEW, simplify_surfaces, with_radius_scales
 from drake_pose.registration.posed_frames import (
@@ -190,7 +190,7 @@ class RegisteredCamera(_UncertainPose):
     common: Array = field(default_factory=lambda: np.zeros((6, 6)))
     # Whether the joint positions belong to the frames, judged by frames to which the pose was not
     # fitted; None: not tested, as in a refinement, or with too few frames.
-    evidence: Evidence | None = None
+    evidence: PairedEvidence | None = None
     agrees: bool = True  # Whether no half of the frames is as likely at another pose of its own.
     # (frames, k, k) cost of each frame's contours in square image tiles.
     costs: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
@@ -280,14 +280,10 @@ class CameraSearch:
         """
         body, some, X_CW = self._body, evenly_spaced(frames), found.camera.X_CW
         middle = PosedFrames(body.kinematics, body.coarse, found.camera, some).middle
-        opposite = np.eye(4)
-        opposite[:3, :3] = np.diag([-1.0, 1.0, -1.0]) @ X_CW[:3, :3]
-        opposite[:3, 3] = (X_CW[:3, :3] @ middle + X_CW[:3, 3]) * [-1.0, 1.0, 1.0]
-        opposite[:3, 3] -= opposite[:3, :3] @ middle
         there = found.camera.mirrored()
         mirrored = [one.mirrored() for one in some]
         coarse = PosedFrames(body.kinematics, body.coarse, there, mirrored, SEARCH.coarse_spacing)
-        opposite = fit_pose(coarse, opposite, SEARCH.coarse)
+        opposite = fit_pose(coarse, opposite_side(X_CW, middle), SEARCH.coarse)
         costs = _fine_costs(self._fine(there, mirrored), opposite)[1]
         return _fine_costs(self._fine(found.camera, some), X_CW)[1], costs[..., ::-1]
 

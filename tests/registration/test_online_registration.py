@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, SettingsError
-from drake_pose.fit.judge import Evidence
+from drake_pose.fit.judge import PairedEvidence
 from drake_pose.registration.online_registration import (
     CameraStatus,
     OnlineRegistration,
@@ -73,7 +73,7 @@ class ScriptedSearch:
         alternatives = np.tile(np.eye(4), (others, 1, 1))
         return RegisteredCamera(
             camera_at(PLACES[place]), covariance, tuple(misfits), alternatives,
-            evidence=Evidence(0.9, 0.4, self.p_value, 0.001, len(frames), 5),
+            evidence=PairedEvidence(0.9, 0.4, self.p_value, 0.001, len(frames), 5),
         )  # fmt: skip
 
     def mirrored_costs(

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from drake_pose.body import load_model
 from drake_pose.errors import RegistrationError
 from drake_pose.files.overlay import EXCESS_RGB
-from drake_pose.fit.judge import Evidence
+from drake_pose.fit.judge import PairedEvidence
 from drake_pose.jobs.registration.diagnosis import (
     compare_camera,
     compare_clock,
@@ -102,7 +102,7 @@ def test_frames_that_fit_other_rows_are_no_evidence() -> None:
         (0.02, 5, True, "p-value 0.02"), (0.02, 6, True, ""), (0.004, 5, True, ""),
         (0.004, 5, False, "half of the frames"),
     ):  # fmt: skip
-        evidence = Evidence(0.5, 0.4, p_value, 0.004, 6, needed)
+        evidence = PairedEvidence(0.5, 0.4, p_value, 0.004, 6, needed)
         found = registered(0.9, costs=fits, evidence=evidence, agrees=agrees)
         assert said in (told := lack_of_evidence(search, found, frames) or "")
         assert bool(told) == bool(said)

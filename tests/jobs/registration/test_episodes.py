@@ -153,17 +153,6 @@ def test_unusable_episodes_are_refused(episode, tmp_path, spoil, words):
         read(tmp_path, painted)
 
 
-def test_missing_masks_or_pictures_are_refused(episode, tmp_path):
-    _, painted = episode
-    with pytest.raises(DrakePoseError, match=r"has no folder masks.* no pictures"):
-        register_scene(tmp_path, painted.path, tmp_path / "joints.csv")
-    (tmp_path / "masks").mkdir()
-    with pytest.raises(DrakePoseError, match=r"has no cameras\.yaml"):
-        register_scene(tmp_path, painted.path, tmp_path / "joints.csv")
-    with pytest.raises(DrakePoseError, match="needs the positions of all joints"):
-        audit_scene(tmp_path, painted.path)
-
-
 @pytest.mark.slow
 def test_an_episode_becomes_a_calibrated_scene(episode, out):
     _, painted = episode

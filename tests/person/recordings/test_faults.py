@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.camera.models import Camera, circle_of_cameras
-from drake_pose.errors import CameraError, MaskError, SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.person.faults import (
@@ -18,7 +17,6 @@ from drake_pose.person.faults import (
     FrameEdges,
     find_rig_fault,
     first_moved_frame,
-    require_person,
 )
 from drake_pose.person.figures import (
     Figure,
@@ -336,23 +334,3 @@ class TestOthers:
         # A figure above the person belongs to the person.
         assert not is_separate(someone(0.0, 90.0, 3.0), [first])
         assert not is_separate(someone(2.1, 90.0), [first, someone(2.0)])
-
-
-class TestRecord:
-    def test_masks_and_cameras_that_show_no_person_are_refused(self, four):
-        nothing = {name: np.zeros((120, 160), bool) for name in four.cameras}
-        inverted = {name: ~mask for name, mask in four.masks[0].items()}
-        small = {}
-        for name, camera in four.cameras.items():
-            X_WC = camera.X_WC * np.array([1.0, 1.0, 1.0, 0.01])
-            X_WC[3, 3] = 1.0
-            small[name] = camera.with_pose(X_WC)
-        for cameras, masks, error, words in (
-            (four.cameras, nothing, SettingsError, "two cameras see no person in any of 1 frames"),
-            (four.cameras, inverted, MaskError, "in 100 % of the masks"),
-            (small, four.masks[0], CameraError, "m tall by the cameras' calibration"),
-        ):
-            with pytest.raises(error, match=words):
-                require_person(PersonRecording(cameras, lambda k, m=masks: m, 1, True), 1)
-        sound = require_person(PersonRecording(four.cameras, lambda k: four.masks[0], 1, True), 1)
-        assert (sound.seen, sound.covering) == ([0], 0.0)

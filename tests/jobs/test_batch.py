@@ -194,13 +194,6 @@ def test_a_server_that_is_not_a_scheduler_is_refused_in_time(words, caplog, capf
     assert caplog.text == capfd.readouterr().err == ""
 
 
-def test_workers_do_not_return_each_freed_array_to_the_system(cluster):
-    """Dask's setting made a third of a batch's time system time."""
-    found = cluster.submit(lambda: {**os.environ}).result()
-    assert "MALLOC_TRIM_THRESHOLD_" not in found
-    assert found["OPENBLAS_NUM_THREADS"] == "1"
-
-
 @pytest.mark.parametrize("address", ["foo", "10.0.0.7:8786", "tcp://foo", "htp://x:1"])
 def test_a_bad_scheduler_address_is_named(address):
     message = f"'{address}' is not a scheduler's address"

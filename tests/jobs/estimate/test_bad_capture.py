@@ -14,14 +14,6 @@ import yaml
 from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import Camera, circle_of_cameras
-from drake_pose.jobs.estimate.person import (
-    describe_camera,
-    describe_fit,
-    describe_rig,
-    describe_views,
-)
-from drake_pose.person.faults import CameraFault, CameraMotion, RigFault
-from drake_pose.person.figures import ViewFaults
 from tests.cli import run_to_end
 from tests.jobs.scenes import read_rows
 from tests.person.persons_in_view import see, stepping
@@ -170,31 +162,3 @@ def test_recordings_with_impossible_cameras_are_refused(spoiled, parts, walk, tm
     result = run_to_end("capture", scene, "--model", walk.person.path, "--out", out, status=1)
     for part in parts:
         assert part in result.stderr
-
-
-def test_warnings_name_frames_and_cameras():
-    names, views = "0123", ViewFaults((3,), {"a": (1,)}, {"a": (0, 1), "b": (1,)}, {"b": (1,)})
-    motion = CameraMotion(np.eye(4), np.array([3.0, -4.0]), 5.0, 0.07, 0.1, 0.5, 0.9)
-    moved = CameraFault("a", motion, True, (), 0.95, 2, True)
-    unclear = CameraFault("a", motion, False, ("b",), 0.95)
-    told = [*describe_views(views, names), *describe_fit([0.0, 0.5, 0.7, 0.3])]
-    told += [describe_camera(one, names) for one in (moved, unclear)]
-    for rig in (("a",), ()), ((), ("a", "b")), ((), ()):
-        told += describe_rig(RigFault(*rig, {"a": 0.6, "b": 0.8}))
-    for text, parts in zip(
-        told,
-        (
-            ("frame 3:",),
-            ("'a'", "frame 1,"),
-            ("frame 0-1:", "'a' and 'b'", "camera 'b'", "(frame 1)"),
-            ("only 50 %",),
-            ("'a' has moved since frame 2", "3.0 to the right, 4.0 up", "left out since frame 2"),
-            ("'a' or 'b' is inconsistent", "50 %", "still used"),
-            ("60 % of camera 'a'", "mirrored"),
-            ("60 % of camera 'a'", "exchanged"),
-            ("60 % of camera 'a'", "cameras.yaml"),
-        ),
-        strict=True,
-    ):
-        assert all(part in text for part in parts), text
-    assert describe_fit([0.0, 0.9, 0.7]) == ()

@@ -110,11 +110,6 @@ class TestAudit:
             places = out.glob(f"overlay_as_given/{camera}/*.png")
             assert {path.stem for path in places} >= {"0003", "0004"}
 
-    def test_without_out_the_table_is_printed(self, audited) -> None:
-        result = run(audited, "--frame", "0:4")
-        assert "frame '0002'" in result.stdout
-        assert "4 of 5 frames are consistent" in result.stdout
-
     def test_wrong_camera_pose_is_found(self, audited, tmp_path: Path) -> None:
         """The given pose of one camera is off by 2 cm."""
         left = audited.cameras["left"]

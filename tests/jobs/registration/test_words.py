@@ -22,20 +22,15 @@ from drake_pose.jobs.registration.diagnosis import (
 )
 from drake_pose.jobs.registration.result import (
     body_drawer,
-    describe_camera,
-    describe_parameters,
 )
 from drake_pose.jobs.registration.tracks import draw_tracks
 from drake_pose.jobs.registration.words import (
     common_outlier_warnings,
     describe_error,
-    lost_frames_warning,
     mode_warnings,
-    outlier_warnings,
     zero_warnings,
 )
 from drake_pose.registration.findings import Finding
-from drake_pose.registration.joint_offsets import KinematicParameter, undetermined
 from drake_pose.registration.picture_matches import Sightings
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.recording import Recording, TimeOffset
@@ -43,7 +38,6 @@ from drake_pose.registration.register import (
     FrameMisfit,
     RegisteredCamera,
     RegistrationBody,
-    TargetPose,
 )
 from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
@@ -106,21 +100,6 @@ def test_frames_that_fit_other_rows_are_no_evidence() -> None:
         found = registered(0.9, costs=fits, evidence=evidence, agrees=agrees)
         assert said in (told := lack_of_evidence(search, found, frames) or "")
         assert bool(told) == bool(said)
-
-
-def test_outliers_are_named_and_refused_where_they_are_many() -> None:
-    assert outlier_warnings(registered(0.9, 0.9)) == []
-    (text,) = outlier_warnings(registered(0.9, 0.9, 0.9, -0.2, -0.2))
-    assert re.search(r"'left': 2 of 5 .* 3-4; .* moved after frame '2'", text)
-    assert "FEWER" not in text
-    assert "moved" not in outlier_warnings(registered(0.9, -0.2, 0.9, -0.2, 0.9))[0]
-    half = registered(0.9, 0.9, -0.2, -0.2)
-    with pytest.raises(RegistrationError, match=r"2 of 4: 2-3\. Were .*, 0-1, agree by chance"):
-        outlier_warnings(half)
-    (text,) = outlier_warnings(half, from_pictures=True)
-    assert re.search("FEWER.* 2 of 4: 0-1;", text)
-    lost = lost_frames_warning("c", ["1", "2", "4"], [*"01234"], "gripper")
-    assert re.search("'c'.* gripper .* 1-2, 4:", lost)
 
 
 @pytest.mark.parametrize(
@@ -262,41 +241,6 @@ def test_points_are_drawn_in_the_worst_pictures(tmp_path: Any) -> None:
     assert not pictures["2"].any()
     draw_tracks(tmp_path / "few", tracked, most=1)
     assert [path.stem for path in (tmp_path / "few").glob("overlay/left/*.png")] == ["1"]
-
-
-def test_a_camera_is_summarised_with_deviations_and_misfits() -> None:
-    other, C = np.eye(4), np.zeros((6, 6))
-    C[:3, :3], C[3:, 3:] = DEGREE**2 * np.diag([1.0, 4.0, 9.0]), 1e-6 * np.diag([4.0, 4.0, 16.0])
-    one = replace(registered(0.9, -0.3, E=0.2, alternatives=other[None]), covariance=C)
-    told = describe_camera(one, 2.5)
-    assert told["translation_sd_mm"] == pytest.approx(np.sqrt(24.0 / 3.0))
-    assert told["rotation_sd_deg"] == pytest.approx(np.sqrt(14.0 / 3.0))
-    assert [mode["X_WC"] for mode in told["modes"]] == [one.camera.X_WC.tolist(), other.tolist()]
-    assert (told["outliers"], told["mean_iou"]) == (["1"], pytest.approx(0.8))
-    assert told["frames"]["1"] == {
-        "agrees": False, "E_total": 0.2, "iou": pytest.approx(0.8), "inlier_ratio": 0.3
-    }  # fmt: skip
-    unknown = replace(one, frames=(FrameMisfit("0", np.nan, np.nan, 0.5, True),))
-    assert describe_camera(unknown, 0.0)["frames"]["0"]["iou"] is None
-    target = TargetPose(other, C, other[None], np.array([[0.0, 0.0, 1.0]]))
-    told = describe_camera(replace(one, target=target), 0.0)["target"]
-    assert (told["determined"], len(told["modes"])) == (False, 2)
-    assert told["translation_sd_mm"] == pytest.approx(np.sqrt(8.0))
-
-
-def test_parameters_are_summarised_in_their_units() -> None:
-    kinematics = SimpleNamespace(names=("turn", "slide"), is_angle=np.array([True, False]))
-    angle = KinematicParameter("turn", DEGREE, 2 * DEGREE, -DEGREE, 3 * DEGREE, True, ("x",))
-    length = KinematicParameter("slide", 0.001, 0.002, 0.003, 0.004, False)
-    told = describe_parameters([angle, length], [undetermined("leg", ())], kinematics)
-    assert told["zeros"]["turn"] == {
-        "determined": True, "significant": True, "value_deg": pytest.approx(1.0),
-        "sd_deg": pytest.approx(2.0), "low_deg": pytest.approx(-1.0),
-        "high_deg": pytest.approx(3.0), "gauge": ["x"],
-    }  # fmt: skip
-    assert told["zeros"]["slide"]["sd_mm"] == pytest.approx(2.0)
-    leg = told["lengths"]["leg"]
-    assert leg["high_percent"] is leg["value_percent"] is None
 
 
 def test_a_zero_that_nothing_shows_is_named(body: RegistrationBody) -> None:

@@ -220,51 +220,6 @@ def _pack_tree(tree: PoseTree, firsts: np.ndarray) -> PackedTree:
 
 
 @compiled
-def _write_twist(X_WA: np.ndarray, M: np.ndarray, twist: np.ndarray) -> None:
-    """Write the twist (omega, v) (6,) in the world of a twist matrix M (3, 4) in frame A.
-
-    ``X_WA``: (3 or 4, 4) pose of A in the world. M = ([omega]x, v).
-    """
-    w0, w1, w2 = M[2, 1], M[0, 2], M[1, 0]
-    for i in range(3):
-        twist[i] = X_WA[i, 0] * w0 + X_WA[i, 1] * w1 + X_WA[i, 2] * w2
-        twist[3 + i] = X_WA[i, 0] * M[0, 3] + X_WA[i, 1] * M[1, 3] + X_WA[i, 2] * M[2, 3]
-    p0, p1, p2 = X_WA[0, 3], X_WA[1, 3], X_WA[2, 3]
-    twist[3] += p1 * twist[2] - p2 * twist[1]
-    twist[4] += p2 * twist[0] - p0 * twist[2]
-    twist[5] += p0 * twist[1] - p1 * twist[0]
-
-
-@compiled
-def _write_free_rotation(
-    X_WA: np.ndarray, r: np.ndarray, X: np.ndarray, twists: np.ndarray
-) -> None:
-    """Write the rotation X (3, 4) of a rotation vector r (3,) [rad] and the twists (3, 6) of r.
-
-    ``X_WA``: (4, 4) pose of the frame before the rotation in the world, which the twists are in.
-    """
-    # Rodrigues's formula R = I + a K + b K^2, and the left Jacobian of SO(3), J = I + b K + c K^2.
-    angle = math.sqrt(r[0] ** 2 + r[1] ** 2 + r[2] ** 2)
-    if angle > 1e-4:
-        a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
-        c = (1.0 - a) / angle**2
-    else:
-        a, b, c = 1.0 - angle**2 / 6.0, 0.5 - angle**2 / 24.0, 1.0 / 6.0 - angle**2 / 120.0
-    J, M = np.empty((3, 3)), np.zeros((3, 4))
-    for i in range(3):
-        for j in range(3):
-            # K is the cross product matrix of r; K^2 = r r^T - |r|^2 I.
-            K = 0.0 if i == j else (r[3 - i - j] if (i - j) % 3 == 1 else -r[3 - i - j])
-            KK = r[i] * r[j] - (angle**2 if i == j else 0.0)
-            X[i, j] = (1.0 if i == j else 0.0) + a * K + b * KK
-            J[i, j] = (1.0 if i == j else 0.0) + b * K + c * KK
-        X[i, 3] = 0.0
-    for k in range(3):
-        M[2, 1], M[0, 2], M[1, 0] = J[0, k], J[1, k], J[2, k]
-        _write_twist(X_WA, M, twists[k])
-
-
-@compiled
 def find_motions(packed: PackedTree, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the poses X_WN (n, 4, 4) of all nodes, and the twist (omega, v) (m, 6) of each value.
 
@@ -273,7 +228,7 @@ def find_motions(packed: PackedTree, values: np.ndarray) -> tuple[np.ndarray, np
     count, steps = packed.parents.shape[0], packed.steps
     X_WN, twists = np.zeros((count, 4, 4)), np.zeros((values.shape[0], 6))
     basis, Y, dT = np.empty((3, 4)), np.empty((3, 4)), np.empty((3, 4))
-    M, product = np.empty((3, 4)), np.empty((3, 4))
+    M, product, J = np.empty((3, 4)), np.empty((3, 4)), np.empty((3, 3))
     world = np.eye(4)
     for node in range(count):
         parent, X, value = packed.parents[node], X_WN[node], packed.value_starts[node]
@@ -283,12 +238,33 @@ def find_motions(packed: PackedTree, values: np.ndarray) -> tuple[np.ndarray, np
         if packed.free[node]:
             first -= 1  # The free rotation precedes the joints.
         for step in range(first, end):
-            if step < packed.step_starts[node]:
-                _write_free_rotation(X, values[value:], Y, twists[value:])
-                value += 3
+            is_free = step < packed.step_starts[node]
+            if is_free:
+                # A rotation vector r: Rodrigues's formula R = I + a K + b K^2, and the left
+                # Jacobian of SO(3), J = I + b K + c K^2, with K the cross product matrix of r.
+                r = values[value:]
+                angle = math.sqrt(r[0] ** 2 + r[1] ** 2 + r[2] ** 2)
+                if angle > 1e-4:
+                    a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
+                    c = (1.0 - a) / angle**2
+                else:
+                    a, b = 1.0 - angle**2 / 6.0, 0.5 - angle**2 / 24.0
+                    c = 1.0 / 6.0 - angle**2 / 120.0
+                for i in range(3):
+                    for j in range(3):
+                        K = 0.0 if i == j else (r[3 - i - j] if (i - j) % 3 == 1 else -r[3 - i - j])
+                        KK = r[i] * r[j] - (angle**2 if i == j else 0.0)
+                        Y[i, j] = (1.0 if i == j else 0.0) + a * K + b * KK
+                        J[i, j] = (1.0 if i == j else 0.0) + b * K + c * KK
+                    Y[i, 3] = 0.0
             else:
                 evaluate_joint(steps, step, values[value:], 1.0, -1, basis, Y)
-                for k in range(steps.sizes[step]):
+            size = 3 if is_free else steps.sizes[step]
+            for k in range(size):
+                if is_free:
+                    M[:] = 0.0
+                    M[2, 1], M[0, 2], M[1, 0] = J[0, k], J[1, k], J[2, k]
+                else:
                     evaluate_joint(steps, step, values[value:], 1.0, k, basis, dT)
                     # Twist matrix: dT T^-1 with T = Y, or inverted -T^-1 dT with T^-1 = Y.
                     for i in range(3):
@@ -301,8 +277,15 @@ def find_motions(packed: PackedTree, values: np.ndarray) -> tuple[np.ndarray, np
                                     M[i, j] += dT[i, n] * Y[j, n]
                         if not steps.inverted[step]:
                             M[i, 3] -= M[i, 0] * Y[0, 3] + M[i, 1] * Y[1, 3] + M[i, 2] * Y[2, 3]
-                    _write_twist(X, M, twists[value + k])
-                value += steps.sizes[step]
+                # The twist in the world of M = ([omega]x, v).
+                twist, p0, p1, p2 = twists[value + k], X[0, 3], X[1, 3], X[2, 3]
+                for i in range(3):
+                    twist[i] = X[i, 0] * M[2, 1] + X[i, 1] * M[0, 2] + X[i, 2] * M[1, 0]
+                    twist[3 + i] = X[i, 0] * M[0, 3] + X[i, 1] * M[1, 3] + X[i, 2] * M[2, 3]
+                twist[3] += p1 * twist[2] - p2 * twist[1]
+                twist[4] += p2 * twist[0] - p0 * twist[2]
+                twist[5] += p0 * twist[1] - p1 * twist[0]
+            value += size
             multiply(X, Y, product)
             for i in range(3):
                 for j in range(4):

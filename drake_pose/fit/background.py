@@ -22,7 +22,6 @@ import numpy as np
 from scipy.ndimage import convolve1d
 
 from drake_pose.arrays import Array, Floats, Mask, Picture
-from drake_pose.compiled import compiled
 from drake_pose.fit.colours import COLOURS, Colour, colour_numbers
 from drake_pose.fit.explain_kernel import PixelSums
 from drake_pose.workers import map_ordered
@@ -204,47 +203,13 @@ class Backgrounds:
         The colour must be within MODEL.match_deviations of that background's, and the pixel more
         than MODEL.margin from the approximate silhouettes ``covered`` (f, H, W).
         """
-        sums, shows = self.sums, np.empty(covered.shape, np.bool_)
-        _compare_likeliest(
-            sums.visible, sums.covered, covered, self.pictures, self.colours, self.deviations,
-            MODEL.match_deviations, shows,
-        )  # fmt: skip
-        return shows & ~grown(covered, MODEL.margin)
-
-
-@compiled
-def _compare_likeliest(
-    visible: Floats,
-    sums: Floats,
-    covered: Mask,
-    pictures: Floats,
-    colours: Floats,
-    deviations: Floats,
-    most: float,
-    shows: Mask,
-) -> None:
-    """Write (f, H, W) whether frames look like the likeliest background of a pixel.
-
-    ``visible``, ``sums``: `visible` and `covered` of ``PixelSums``. ``covered``: (f, H, W) the
-    body. ``most``: maximum deviation [standard deviations]. ``shows``: the output. Others:
-    ``Backgrounds``.
-    """
-    frames, height, width = covered.shape
-    for row in range(height):
-        for column in range(width):
-            a, b, c = visible[row, column]
-            for f in range(frames):
-                if covered[f, row, column]:
-                    a += sums[row, column, f, 0]
-                    b += sums[row, column, f, 1]
-                    c += sums[row, column, f, 2]
-            best = 0 if a >= b and a >= c else 1 if b >= c else 2
-            for f in range(frames):
-                off = np.float32(0.0)
-                for k in range(3):
-                    own = pictures[f, row, column, k] - colours[best, row, column, k]
-                    off = max(off, abs(own))
-                shows[f, row, column] = off / deviations[row, column] < most
+        likelihoods = self.sums.visible.copy()
+        for f, own in enumerate(covered):
+            likelihoods += np.where(own[:, :, None], self.sums.covered[:, :, f], np.float32(0.0))
+        best = likelihoods.argmax(axis=2)[None, :, :, None]
+        colours = np.take_along_axis(self.colours, best, axis=0)[0]
+        off = [largest(np.abs(picture - colours)) / self.deviations for picture in self.pictures]
+        return (np.array(off) < MODEL.match_deviations) & ~grown(covered, MODEL.margin)
 
 
 @dataclass(frozen=True, eq=False)
@@ -483,7 +448,7 @@ def log_frequencies(numbers: Array) -> Floats:
     Args:
         numbers: (COLOURS,) number of pixels of each colour.
     """
-    counts = numbers.reshape(16, 16, 16)
+    counts = numbers.reshape((16,) * 3)
     for axis in range(3):
         counts = convolve1d(counts, [0.25, 0.5, 0.25], axis, mode="nearest")
     times = COLOURS * counts.ravel() / max(float(counts.sum()), 1.0)

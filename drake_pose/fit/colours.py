@@ -32,7 +32,6 @@ from drake_pose.fit.kernel import (
     Sum,
     accumulate_residuals,
     add_residual,
-    poses_in_camera,
     robust_weight,
 )
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
@@ -288,7 +287,7 @@ def compare_lines(
         bias_terms: (nodes, 13) derivatives of b and of half the cost by the bias, added to.
         bias: boundary bias: the image shows the body wider by this on all sides [pixel].
     """
-    contour = sample_contour(packed, poses_in_camera(camera[0], X_WN), camera[1], weights[2])
+    contour = sample_contour(packed, X_WN, camera, weights[2])
     uv, normals, lengths, nodes, p_N, clearances = contour
     noise = (weights[1] / 2.5) ** 2
     point_sums = np.zeros((len(uv), 7))
@@ -434,8 +433,7 @@ def learn_colours(
         rare: added to frequencies, so that rarer colours count as unobserved [fraction of pixels].
         fewest: minimum number of pixels on a side of a node's contour for an update.
     """
-    X_CN = poses_in_camera(camera[0], X_WN)
-    uv, normals, _, nodes, _, clearances = sample_contour(packed, X_CN, camera[1], spacing)
+    uv, normals, _, nodes, _, clearances = sample_contour(packed, X_WN, camera, spacing)
     counts = np.zeros((len(histograms), 2, COLOURS), dtype=np.float32)
     totals = np.zeros((len(histograms), 2))
     scratch = np.empty((3, 2 * LINES.blocks + 2))

@@ -11,13 +11,13 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_pose.arrays import Array, Floats, Mask
-from drake_pose.compiled import compiled
+from drake_pose.compiled import compiled, multiply
 from drake_pose.silhouette.outline import PackedOutlines
 from drake_pose.silhouette.span_kernel import Rows, fill_rows, find_spans, make_rows
 
 
 class PixelSums(NamedTuple):
-    """Log-likelihoods of each pixel, from which ``explain`` scores poses."""
+    """Log-likelihoods of each pixel, from which ``explain_pose`` scores poses."""
 
     visible: Floats  # (H, W, 3) log-likelihoods of the three backgrounds if no frame is covered.
     covered: Floats  # (H, W, f, 3) change of each log-likelihood if a frame is covered.
@@ -26,7 +26,7 @@ class PixelSums(NamedTuple):
 
 
 class Explained(IntEnum):
-    """Indices of the sums of ``explain``.
+    """Indices of the sums of ``explain_pose``.
 
     GAIN: log-likelihood minus that without a body. CONTOUR: edge strength along the outlines, minus
     its expectation. OUTLINE: length of the outlines [pixel]. AREA: area of the bodies [pixel].
@@ -78,71 +78,62 @@ def make_words(packed: PackedOutlines, camera: Array) -> tuple[Words, np.ndarray
 
 
 @compiled
-def _cover(
-    packed: PackedOutlines,
-    X_CN: Array,
-    is_static: Mask,
-    camera: Array,
-    scratch: Words,
-    crossings: np.ndarray,
-) -> tuple[int, int, np.ndarray]:
-    """Set the bits of all covered pixels, and the ends of their rows.
+def explain_pose(
+    packed: PackedOutlines, X_CW: Array, X_WN: Array, is_static: Mask, camera: Array,
+    sums: PixelSums, X_CN: Array, totals: Array, tiles: Array, side: float, scratch: Words,
+    crossings: np.ndarray, always_covered: float = 0.3,
+) -> np.ndarray:  # fmt: skip
+    """Write the sums (4,) by ``Explained`` of one pose of the camera into ``totals``.
 
-    The arguments are those of ``explain``, and scratch of ``make_words``.
+    Args:
+        packed: surfaces of the nodes.
+        X_CW: (3, 4) pose of the world in the camera.
+        X_WN: (f, nodes, 3, 4) poses of the nodes in the world.
+        is_static: (nodes,) whether a node belongs to the background; only its outline is scored.
+        camera: (8,) `Camera.kernel_parameters`.
+        sums: log-likelihoods and edges of the f frames' images.
+        X_CN: (f, nodes, 3, 4) scratch.
+        totals, tiles: (4,) the sums, and (t, t) to which the gain of each tile (row, column) is
+            added, with indices taken modulo t; t = 0: there are no tiles.
+        side: side of a tile [pixel].
+        scratch, crossings: of ``make_words``.
+        always_covered: factor of the positive gain of pixels that the body covers in all frames,
+            whose background is unknown; a negative gain there counts 0.
 
-    Returns:
-        the first row with words, the row after the last, and the crossings, reallocated if need be.
+    Returns the crossings, reallocated if need be.
     """
-    words, ends, rows, one = scratch.words, scratch.ends, scratch.rows, np.uint64(1)
-    frames, top, bottom = X_CN.shape[0], words.shape[0], 0
-    for node in range(X_CN.shape[1]):
+    words, ends, rows, positions = scratch.words, scratch.ends, scratch.rows, scratch.positions
+    one, zero, frames = np.uint64(1), np.uint64(0), X_WN.shape[0]
+    every = (one << np.uint64(frames)) - one
+    top, bottom, count = words.shape[0], 0, tiles.shape[0]
+    # Set the bits of all covered pixels, and the ends of their rows.
+    for node in range(X_WN.shape[1]):
         if packed.starts[node, 1] == packed.starts[node + 1, 1]:
             continue
         # A node that stands in all frames is drawn once.
         stands = True
-        for f in range(1, frames):
+        for f in range(frames):
             for i in range(3):
                 for j in range(4):
-                    stands &= X_CN[f, node, i, j] == X_CN[0, node, i, j]
+                    stands &= X_WN[f, node, i, j] == X_WN[0, node, i, j]
+            multiply(X_CW, X_WN[f, node], X_CN[f, node])
         for f in range(1 if stands else frames):
             crossings = fill_rows(packed, node, node + 1, X_CN[f], camera, crossings, rows)
             top, bottom = min(top, rows.row_range[0]), max(bottom, rows.row_range[1])
-            bit = (one << np.uint64(frames)) - one if stands else one << np.uint64(f)
+            bit = every if stands else one << np.uint64(f)
             if is_static[node]:  # Static nodes use the upper bits.
                 bit <<= np.uint64(frames)
             for row in range(rows.row_range[0], rows.row_range[1]):
-                count = find_spans(row, crossings, rows.counts, rows.changes, rows.spans)
-                if count == 0:
+                found = find_spans(row, crossings, rows.counts, rows.changes, rows.spans)
+                if found == 0:
                     continue
                 ends[row, 0] = min(ends[row, 0], rows.spans[0, 0])
-                ends[row, 1] = max(ends[row, 1], rows.spans[count - 1, 1])
-                for k in range(count):
+                ends[row, 1] = max(ends[row, 1], rows.spans[found - 1, 1])
+                for k in range(found):
                     for column in range(rows.spans[k, 0], rows.spans[k, 1]):
                         words[row, column] |= bit
-    return top, bottom, crossings
-
-
-@compiled
-def _sum_up(
-    frames: int,
-    sums: PixelSums,
-    top: int,
-    bottom: int,
-    scratch: Words,
-    side: float,
-    totals: Array,
-    tiles: Array,
-    always_covered: float = 0.3,
-) -> None:
-    """Add a body's sums to ``totals`` (4,) and ``tiles`` (t, t), and clear its words.
-
-    ``always_covered``: factor of the positive gain of pixels that the body covers in all frames,
-    whose background is unknown; a negative gain there counts 0. The other arguments are those of
-    ``explain``, and rows and scratch of ``_cover``.
-    """
-    words, ends, positions, one = scratch.words, scratch.ends, scratch.positions, np.uint64(1)
-    zero, last, lowest = np.uint64(0), words.shape[1] - 1, words.shape[0] - 1
-    every = (one << np.uint64(frames)) - one
+    last, lowest = words.shape[1] - 1, words.shape[0] - 1
+    totals[:] = 0.0
     for row in range(top, bottom):
         for column in range(ends[row, 0], ends[row, 1]):
             word = words[row, column]
@@ -164,7 +155,6 @@ def _sum_up(
                 if covered == every:
                     gain = always_covered * max(gain, 0.0)
                 totals[Explained.GAIN] += gain
-                count = tiles.shape[0]
                 if count > 0:
                     tiles[int(row / side) % count, int(column / side) % count] += gain
             left_of = words[row, column - 1] if column > 0 else word
@@ -187,79 +177,6 @@ def _sum_up(
     for row in range(top, bottom):
         words[row, ends[row, 0] : ends[row, 1]] = zero
         ends[row, 0], ends[row, 1] = words.shape[1], 0
-
-
-@compiled
-def explain(
-    packed: PackedOutlines,
-    X_CN: Array,
-    is_static: Mask,
-    camera: Array,
-    sums: PixelSums,
-    side: float,
-    tiles_per_side: int,
-) -> tuple[Array, Array]:
-    """Score the poses of a body in all frames by sums over the pixels.
-
-    Args:
-        packed: surfaces of the nodes.
-        X_CN: (f, nodes, 3, 4) poses of the nodes in the frames.
-        is_static: (nodes,) whether a node is static in all frames. Static nodes belong to the
-            background; only their outline is scored.
-        camera: (8,) `Camera.kernel_parameters`.
-        sums: log-likelihoods and edges of the f frames' images.
-        side: side of a tile in which the gain is also summed [pixel].
-        tiles_per_side: t, number of tiles per row and column, to which their indices are taken
-            modulo; 0: there are no tiles.
-
-    Returns (4,) sums by ``Explained``, and (t, t) the gain of each tile (row, column).
-    """
-    totals, tiles = np.zeros(4), np.zeros((tiles_per_side, tiles_per_side))
-    scratch, crossings = make_words(packed, camera)
-    top, bottom, _ = _cover(packed, X_CN, is_static, camera, scratch, crossings)
-    _sum_up(X_CN.shape[0], sums, top, bottom, scratch, side, totals, tiles)
-    return totals, tiles
-
-
-@compiled
-def explain_pose(
-    packed: PackedOutlines,
-    X_CW: Array,
-    X_WN: Array,
-    is_static: Mask,
-    camera: Array,
-    sums: PixelSums,
-    X_CN: Array,
-    totals: Array,
-    scratch: Words,
-    crossings: np.ndarray,
-) -> np.ndarray:
-    """Write the sums (4,) of ``explain`` for one pose of the camera into ``totals``.
-
-    Args:
-        X_CW: (3, 4) pose of the world in the camera.
-        X_WN: (f, nodes, 3, 4) poses of the nodes in the world.
-        X_CN: (f, nodes, 3, 4) scratch.
-        scratch, crossings: of ``make_words``.
-
-    The other arguments are those of ``explain``.
-
-    Returns the crossings, reallocated if need be.
-    """
-    frames = X_WN.shape[0]
-    for f in range(frames):
-        for node in range(X_WN.shape[1]):
-            for i in range(3):
-                a, b, c = X_CW[i, 0], X_CW[i, 1], X_CW[i, 2]
-                for j in range(4):
-                    X_CN[f, node, i, j] = (
-                        a * X_WN[f, node, 0, j] + b * X_WN[f, node, 1, j] + c * X_WN[f, node, 2, j]
-                    )
-                X_CN[f, node, i, 3] += X_CW[i, 3]
-    totals[:] = 0.0
-    top, bottom, crossings = _cover(packed, X_CN, is_static, camera, scratch, crossings)
-    none = np.zeros((0, 0))
-    _sum_up(frames, sums, top, bottom, scratch, 1.0, totals, none)
     return crossings
 
 
@@ -271,12 +188,22 @@ def explain_poses(
     is_static: Mask,
     camera: Array,
     sums: PixelSums,
-) -> Array:
-    """Return the sums (n, 4) of ``explain`` for poses X_CW (n, 3, 4), see ``explain_pose``."""
-    totals, X_CN = np.zeros((X_CW.shape[0], 4)), np.empty_like(X_WN)
+    side: float,
+    tiles_per_side: int,
+) -> tuple[Array, Array]:
+    """Score poses of a camera by sums over the pixels of a body's pictures.
+
+    ``X_CW``: (n, 3, 4) the poses. ``side``: side of a tile in which the gain is also summed
+    [pixel]. ``tiles_per_side``: t; 0: there are no tiles. The rest as of ``explain_pose``.
+
+    Returns (n, 4) sums by ``Explained``, and (t, t) the gain of each tile, summed over the poses.
+    """
+    totals, tiles = np.zeros((X_CW.shape[0], 4)), np.zeros((tiles_per_side, tiles_per_side))
+    X_CN = np.empty_like(X_WN)
     scratch, crossings = make_words(packed, camera)
     for n in range(X_CW.shape[0]):
         crossings = explain_pose(
-            packed, X_CW[n], X_WN, is_static, camera, sums, X_CN, totals[n], scratch, crossings
-        )
-    return totals
+            packed, X_CW[n], X_WN, is_static, camera, sums, X_CN, totals[n], tiles, side, scratch,
+            crossings,
+        )  # fmt: skip
+    return totals, tiles

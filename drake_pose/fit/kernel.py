@@ -14,7 +14,7 @@ from enum import IntEnum
 import numpy as np
 
 from drake_pose.arrays import Array, Indices
-from drake_pose.compiled import compiled, multiply
+from drake_pose.compiled import compiled
 from drake_pose.fit.evidence import Evidence
 from drake_pose.silhouette.contour_points import sample_contour
 from drake_pose.silhouette.outline import PackedOutlines
@@ -151,7 +151,7 @@ def compare_contours(
         camera, own_sums, own_weights = (cameras[0][c], cameras[1][c]), sums[c], weights[c]
         unit, scale, spacing = weights[c, 0], weights[c, 1], weights[c, 2]
         length_weight = weights[c, 3]
-        contour = sample_contour(packed, poses_in_camera(camera[0], X_WN), camera[1], spacing)
+        contour = sample_contour(packed, X_WN, camera, spacing)
         # Local names avoid numba's reference counting in the inner loop.
         uv, normals, lengths, owners = contour.uv, contour.normals, contour.lengths, contour.nodes
         edge_uv, edge_normals = edges.uv[begin:end], edges.normals[begin:end]
@@ -190,16 +190,6 @@ def compare_contours(
             A[c], b[c], bias_terms[c], X_WN, camera, contour.p_N, owners, owners, point_sums
         )
     return A, b, sums, tiles, bias_terms
-
-
-@compiled
-def poses_in_camera(X_CW: Array, X_WN: Array) -> Array:
-    """Return X_CN (nodes, 4, 4), the poses of nodes in a camera, of X_CW (4, 4) and X_WN."""
-    X_CN = np.zeros_like(X_WN)
-    for node in range(len(X_WN)):
-        multiply(X_CW, X_WN[node], X_CN[node])
-        X_CN[node, 3, 3] = 1.0
-    return X_CN
 
 
 @compiled

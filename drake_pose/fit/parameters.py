@@ -15,7 +15,6 @@ from drake_pose.arrays import Array, Indices
 from drake_pose.body import TARGET_POSITIONS, PoseTree, chain_transforms
 from drake_pose.body.tree_kinematics import LinkVector, TreeKinematics, link_vectors
 from drake_pose.camera.models import Camera
-from drake_pose.compiled import compiled
 from drake_pose.silhouette.outline import (
     Outline,
     PackedOutlines,
@@ -300,7 +299,6 @@ class CameraParameters:
         return X_CW, kernel, motions
 
 
-@compiled
 def affine_motions(twists: Array) -> Array:
     """Return affine motions (m, 12), the rows of (M v), of twists.
 
@@ -309,12 +307,8 @@ def affine_motions(twists: Array) -> Array:
             each: dp = w x p + s p + v.
     """
     affine = np.zeros((len(twists), 12))
-    for k in range(len(twists)):
-        own, twist = affine[k], twists[k]
-        own[9], own[2], own[4] = twist[0], twist[1], twist[2]
-        own[6], own[8], own[1] = -twist[0], -twist[1], -twist[2]
-        own[3], own[7], own[11] = twist[3], twist[4], twist[5]
-        own[0] = own[5] = own[10] = twist[6]
+    affine[:, [9, 2, 4]], affine[:, [6, 8, 1]] = twists[:, :3], -twists[:, :3]
+    affine[:, 3::4], affine[:, ::5] = twists[:, 3:6], twists[:, 6:]
     return affine
 
 

@@ -16,13 +16,8 @@ import numpy as np
 
 from drake_pose.arrays import Array, Indices, Mask
 from drake_pose.compiled import compiled
-from drake_pose.fit.kernel import accumulate_residuals, add_residual, poses_in_camera
-from drake_pose.silhouette.contour_points import (
-    Segments,
-    find_crossings,
-    find_line_spans,
-    find_segments,
-)
+from drake_pose.fit.kernel import accumulate_residuals, add_residual
+from drake_pose.silhouette.contour_points import find_crossings, find_segments
 from drake_pose.silhouette.outline import PackedOutlines
 
 
@@ -80,27 +75,17 @@ def find_border(mask: Mask) -> Border:
 
 @compiled
 def compare_raster(
-    packed: PackedOutlines,
-    skin: tuple[Array, Indices],
-    X_WN: Array,
-    is_moving: Mask,
-    camera: tuple[Array, Array],
-    static_border: Border,
-    border: Border,
-    lines: tuple[int, int],
-    scale: float,
-    slack: float,
-    A: Array,
-    b: Array,
-) -> tuple[float, float, float]:
+    packed: PackedOutlines, skin: tuple[Array, Indices], X_WN: Array, is_moving: Mask,
+    camera: tuple[Array, Array], static_border: Border, border: Border, lines: tuple[int, int],
+    scale: float, slack: float, A: Array, b: Array,
+) -> tuple[float, float, float]:  # fmt: skip
     """Add one camera's quadratic cost of the nodes' affine motions to A and b.
 
     Args:
         packed: surfaces of the nodes.
-        skin: (v,) fraction by which each vertex follows its own node rather than that
-            node's parent; (nodes,) indices of the parents.
-        X_WN: (nodes, 4, 4) poses of the nodes.
-        is_moving: (nodes,) whether a node moves.
+        skin: (v,) fraction by which each vertex follows its own node rather than that node's
+            parent; (nodes,) indices of the parents.
+        X_WN, is_moving: (nodes, 4, 4) poses of the nodes, and (nodes,) whether a node moves.
         camera: X_CW (4, 4) and `Camera.kernel_parameters` (8,).
         static_border: border of the union of all other nodes, see `find_body_border`.
         border: border of the silhouette.
@@ -114,11 +99,9 @@ def compare_raster(
     Returns number of pixels covered by exactly one of body and silhouette, estimated from the rows;
     sum of all weights; weighted sum of squared residuals.
     """
-    stride, offset = lines
-    segments = find_segments(packed, poses_in_camera(camera[0], X_WN), camera[1], is_moving)
-    ends = segments.ends
+    segments = find_segments(packed, X_WN, camera, is_moving)
+    ends, (stride, offset) = segments.ends, lines
     differing, total, squares = 0.0, 0.0, 0.0
-    spans = np.empty((ends.shape[0] + 1, 2), dtype=np.int64)
     most = 2 * ends.shape[0] + 2 + max(len(static_border.rows[1]), len(static_border.columns[1]))
     chosen = np.empty(most, dtype=np.int64)
     places, slopes = np.empty(most), np.empty(most)
@@ -129,31 +112,31 @@ def compare_raster(
         still_starts, still_places = static_border[across]
         extent = camera[1][6 + across] - 0.5
         count = (int(camera[1][7 - across]) - 1 - offset) // stride + 1
-        crossings = find_crossings(segments, across, float(offset), float(stride), count)
+        found_crossings = find_crossings(segments, across, float(offset), float(stride), count)
+        starts, moving, owners = found_crossings
         # One entry per crossing, and a second one where skin follows two nodes.
-        p_N, point_sums = np.empty((2 * len(crossings[1]), 3)), np.zeros((2 * len(crossings[1]), 7))
-        labels = np.empty((2, len(point_sums)), dtype=np.int64)
-        entry_count = 0
+        p_N, point_sums = np.empty((2 * len(moving), 3)), np.zeros((2 * len(moving), 7))
+        nodes = np.empty(len(point_sums), dtype=np.int64)
+        followed = np.empty_like(nodes)
+        entries = 0
         for line in range(count):
             at = offset + line * stride
             first, end = border_starts[at], border_starts[at + 1]
-            moving = find_line_spans(segments, across, *crossings, line, spans)
-            if moving == 0 and across == 1:
+            is_crossed = starts[line] < starts[line + 1]
+            if not is_crossed and across == 1:
                 continue
             found = _unite_line(
-                spans, moving, crossings[1], still_places, still_starts[at], still_starts[at + 1],
-                places, chosen,
+                moving, owners, starts[line], starts[line + 1], still_places, still_starts[at],
+                still_starts[at + 1], places, chosen,
             )  # fmt: skip
             if across == 0:
-                differing += _pixels_apart(
-                    places, found, border_places, first, end, int(extent + 1.0)
-                )
-            if first == end or moving == 0:
+                width = int(extent + 1.0)
+                differing += _pixels_apart(places, found, border_places, first, end, width)
+            if first == end or not is_crossed:
                 continue
             for k in range(found):
-                slopes[k] = 1.0
-                if chosen[k] >= 0:
-                    chosen[k] = s = crossings[2][chosen[k]]
+                slopes[k], s = 1.0, chosen[k]
+                if s >= 0:
                     du, dv = ends[s, 2] - ends[s, 0], ends[s, 3] - ends[s, 1]
                     slopes[k] = abs(dv if across == 0 else du) / math.sqrt(du * du + dv * dv)
             _compare_line(
@@ -167,76 +150,32 @@ def compare_raster(
                 weight, residual = stride * weights[k], residuals[k] / weights[k]
                 total += weight
                 squares += weight * residual * residual
-                entry_count = _add_crossing(
-                    packed, skin, segments, s, at, across, weight, residual, p_N, labels,
-                    point_sums, entry_count,
-                )  # fmt: skip
-        nodes, owners = labels
+                low, high = ends[s, 1 - across], ends[s, 3 - across]
+                along = (at - low) / (high - low)
+                near, far = segments.depths[s, 0], segments.depths[s, 1]
+                along = along * near / (along * near + (1.0 - along) * far)  # Perspective.
+                i, j = segments.vertices[s, 0], segments.vertices[s, 1]
+                du, dv = ends[s, 2] - ends[s, 0], ends[s, 3] - ends[s, 1]
+                size = math.sqrt(du * du + dv * dv)  # Its sign turns the normal as residuals go.
+                size = size if (high > low) == (across == 0) else -size
+                # Split the weight: the gradient is exact, and the curvature an upper bound.
+                own_fraction = (1.0 - along) * skin[0][i] + along * skin[0][j]
+                for part in range(2 if own_fraction < 1.0 else 1):
+                    nodes[entries] = node = segments.nodes[s]
+                    followed[entries] = node if part == 0 else skin[1][node]
+                    for axis in range(3):
+                        begin, after = packed.points[axis, i], packed.points[axis, j]
+                        p_N[entries, axis] = (1.0 - along) * begin + along * after
+                    share = weight * (own_fraction if part == 0 else 1.0 - own_fraction)
+                    add_residual(point_sums, entries, dv / size, -du / size, -residual, share)
+                    entries += 1
         accumulate_residuals(
-            A, b, bias_terms, X_WN, camera, p_N, nodes[:entry_count], owners[:entry_count],
-            point_sums[:entry_count],
+            A, b, bias_terms, X_WN, camera, p_N, nodes[:entries], followed[:entries],
+            point_sums[:entries],
         )  # fmt: skip
     return stride * differing, total, squares
 
 
-@compiled
-def _add_crossing(
-    packed: PackedOutlines,
-    skin: tuple[Array, Indices],
-    segments: Segments,
-    s: int,
-    at: int,
-    across: int,
-    weight: float,
-    residual: float,
-    p_N: Array,
-    labels: Indices,
-    point_sums: Array,
-    count: int,
-) -> int:
-    """Add the residual of the crossing of segment s with a row or column to the entries.
-
-    Args:
-        packed, skin: as of ``compare_raster``.
-        segments: the body's contour.
-        s: index of the segment.
-        at: the row, or column if `across` is 1 [pixel].
-        across: 0: the crossing is in a row; 1: in a column.
-        weight, residual: of the crossing; the residual [pixel].
-        p_N: (n, 3), written: the point of each entry in its node's frame [m].
-        labels: (2, n), written: the node of each entry's point, and the node that it moves.
-        point_sums: (n, 7), written: see ``add_residual``.
-        count: number of entries before; an entry is added for each node that the point follows.
-
-    Returns the number of entries.
-    """
-    node, ends = segments.nodes[s], segments.ends
-    low, high = ends[s, 1 - across], ends[s, 3 - across]
-    along = (at - low) / (high - low)
-    # Perspective-correct interpolation along the edge.
-    near, far = segments.depths[s, 0], segments.depths[s, 1]
-    along = along * near / (along * near + (1.0 - along) * far)
-    i, j = segments.vertices[s, 0], segments.vertices[s, 1]
-    # The normal points in the direction of the line, as residuals do.
-    du, dv = ends[s, 2] - ends[s, 0], ends[s, 3] - ends[s, 1]
-    size = math.sqrt(du * du + dv * dv)
-    size = size if (high > low) == (across == 0) else -size
-    # Split the weight among the nodes that the point follows: the gradient is exact, and the
-    # curvature an upper bound.
-    own_fraction = (1.0 - along) * skin[0][i] + along * skin[0][j]
-    for part in range(2 if own_fraction < 1.0 else 1):
-        labels[0, count] = node
-        labels[1, count] = node if part == 0 else skin[1][node]
-        for axis in range(3):
-            begin, after = packed.points[axis, i], packed.points[axis, j]
-            p_N[count, axis] = (1.0 - along) * begin + along * after
-        fraction = own_fraction if part == 0 else 1.0 - own_fraction
-        add_residual(point_sums, count, dv / size, -du / size, -residual, fraction * weight)
-        count += 1
-    return count
-
-
-@compiled
 def find_body_border(
     packed: PackedOutlines, X_WN: Array, is_moving: Mask, camera: tuple[Array, Array]
 ) -> Border:
@@ -248,54 +187,42 @@ def find_body_border(
         is_moving: (nodes,) whether a node belongs to the union.
         camera: X_CW (4, 4) and `Camera.kernel_parameters` (8,).
     """
-    segments = find_segments(packed, poses_in_camera(camera[0], X_WN), camera[1], is_moving)
-    spans = np.empty((segments.ends.shape[0] + 1, 2), dtype=np.int64)
-    borders = []
-    for across in range(2):
-        lines = int(camera[1][7 - across])
-        starts, places, owners = find_crossings(segments, across, 0.0, 1.0, lines)
-        kept, kept_starts = np.empty_like(places), np.zeros(lines + 1, dtype=np.int64)
-        count = 0
-        for line in range(lines):
-            found = find_line_spans(segments, across, starts, places, owners, line, spans)
-            for k in range(2 * found):
-                kept[count] = places[spans[k // 2, k % 2]]
-                count += 1
-            kept_starts[line + 1] = count
-        borders.append((kept_starts, kept[:count].copy()))
-    return Border(borders[0], borders[1])
+    segments = find_segments(packed, X_WN, camera, is_moving)
+    sizes = (int(camera[1][7]), int(camera[1][6]))
+    found = (find_crossings(segments, k, 0.0, 1.0, lines) for k, lines in enumerate(sizes))
+    return Border(*((starts, places) for starts, places, _ in found))
 
 
 @compiled
 def _unite_line(
-    spans: Indices, found: int, moving: Array, static_border: Array, first: int, end: int,
-    places: Array, chosen: Indices,
+    moving: Array, owners: Indices, begin: int, after: int, static_border: Array, first: int,
+    end: int, places: Array, chosen: Indices,
 ) -> int:  # fmt: skip
     """Write where a line enters and leaves the union of moving and static surfaces.
 
     Args:
-        spans: (k, 2) spans of moving surfaces, as indices of crossings, from ``find_line_spans``;
-            the first ``found`` rows are used.
-        found: number of spans.
-        moving: positions of the moving surfaces' crossings along their lines [pixel].
+        moving: positions of the moving surfaces' crossings along their lines [pixel], alternately
+            entering and leaving.
+        owners: the crossings' edges.
+        begin, after: range of this line's moving crossings.
         static_border: positions of the static surfaces' crossings, likewise.
         first, end: range of this line's static crossings.
         places, chosen: output (count,): positions along the line, ascending and alternately
-            entering and leaving [pixel], and index of the moving crossing, or -1 if it is static.
+            entering and leaving [pixel], and the edge of the moving crossing, or -1 if it is
+            static.
 
     Returns number of positions; the rest of the output is unchanged.
     """
-    count, depth, i, j = 0, 0, 0, first
-    while i < 2 * found or j < end:
-        k = spans[i // 2, i % 2] if i < 2 * found else -1
-        if j >= end or (k >= 0 and moving[k] < static_border[j]):
-            place, step = moving[k], 1 - 2 * (i % 2)
+    count, depth, i, j = 0, 0, begin, first
+    while i < after or j < end:
+        if j >= end or (i < after and moving[i] < static_border[j]):
+            place, owner, step = moving[i], owners[i], 1 - 2 * ((i - begin) % 2)
             i += 1
         else:
-            k, place, step = -1, static_border[j], 1 - 2 * ((j - first) % 2)
+            place, owner, step = static_border[j], -1, 1 - 2 * ((j - first) % 2)
             j += 1
         if depth == 0 or depth + step == 0:
-            places[count], chosen[count] = place, k
+            places[count], chosen[count] = place, owner
             count += 1
         depth += step
     return count

@@ -287,10 +287,11 @@ def load_or_make(
 def _read(path: Path) -> Outline | None:
     """Return a stored surface; None if there is no file, or its content was altered."""
     try:
-        content = path.read_bytes()
-        if hashlib.sha256(content[32:]).digest() != content[:32]:
+        with path.open("rb") as file:
+            digest, content = file.read(32), file.read()
+        if hashlib.sha256(content).digest() != digest:
             return None
-        with np.load(io.BytesIO(content[32:]), allow_pickle=False) as arrays:
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             outline = outline_of_triangles(arrays["vertices"], arrays["triangles"])
     except (OSError, ValueError, KeyError):
         return None

@@ -39,7 +39,7 @@ from drake_pose.files.writer import ResultWriter
 from drake_pose.input_files import csv_text
 from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.estimate.person import FOLLOWED
-from drake_pose.person.capture import capture_person
+from drake_pose.person.capture import SHAPE_FRAMES, capture_person
 from drake_pose.person.date.features import (
     RegisteredPose,
     learn_recorded_faces,
@@ -54,7 +54,6 @@ from drake_pose.person.pose_tracker import (
     shape_values,
     tracker_of_person,
 )
-from drake_pose.person.search import LENIENT
 from drake_pose.person.views import shows_somebody
 from drake_pose.silhouette.pictures.masks import compare_masks
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
@@ -350,7 +349,7 @@ def _fit_first_frames(
             regions = {name: view.region for name, view in views.items() if shows_somebody(view)}
             if len(regions) >= 2:
                 frames.append(regions)
-        return len(frames) >= LENIENT.shape_frames
+        return len(frames) >= SHAPE_FRAMES
 
     look_until(builder.Build(), sensors, look, on_report)
     # Other people in view are removed from the masks.

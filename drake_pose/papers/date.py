@@ -251,7 +251,7 @@ class SilhouetteTrack(_Track):
     def place(self, q: Array) -> None:
         """Set the person's positions to q (nq,)."""
         person: PersonTracker = self._capture.estimator
-        state = self._tracker.start(self._tracker.values(q))
+        state = self._tracker.start(self._tracker.values(q), is_known=True)
         person.set_person(person.GetMyMutableContextFromRoot(self.context), state)
 
 

@@ -31,15 +31,19 @@ from drake_pose.person.faults import (
 from drake_pose.person.figures import PersonRecording, ReadFrame, ViewFaults
 from drake_pose.person.pose_tracker import (
     NOISE,
+    PersonBelief,
     PersonPoseTracker,
     PersonShape,
-    TrackState,
     fit_shape,
     shape_values,
     tracker_of_person,
 )
+from drake_pose.person.search import SIGNIFICANT
 from drake_pose.person.views import FrameViews, SilhouetteView, edge_spacing, see_silhouette
 from drake_pose.silhouette.outline import Outline
+
+SHAPE_FRAMES = 40
+"""Number of first frames from which a person's shape is fitted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +69,7 @@ class PersonCapture:
         return PersonCapture(q, np.zeros(count), shape, fit.outlines, fit.tree, q.copy())
 
     def store(
-        self, frame: int, tracker: PersonPoseTracker, state: TrackState, seen: FrameViews
+        self, frame: int, tracker: PersonPoseTracker, state: PersonBelief, seen: FrameViews
     ) -> None:
         """Store pose and deviations of a tracker's state, fitted to views `seen`, in a row."""
         lengths = None if self.shape is None else self.shape.covariance
@@ -106,7 +110,7 @@ def capture_person(
     tracker = capture.tracker
     captured = PersonCapture.empty(count or len(frames), shape, tracker.fit)
 
-    def finish(frame: int, state: TrackState | None, seen: FrameViews) -> None:
+    def finish(frame: int, state: PersonBelief | None, seen: FrameViews) -> None:
         if state is not None:
             captured.store(frame, tracker, state, seen)
         if on_frame is not None:
@@ -153,7 +157,7 @@ class _Capture:
 
     def measure_shape(
         self, frames: Sequence[int], fitted: int = 10
-    ) -> tuple[PersonShape | None, dict[int, TrackState]]:
+    ) -> tuple[PersonShape | None, dict[int, PersonBelief]]:
         """Fit the shape to `fitted` of the first frames, and give it to the tracker.
 
         Returns the shape, and the tracker states in the fitted frames by frame; None and {} where
@@ -161,7 +165,7 @@ class _Capture:
         """
         if not self._has_shape:
             return None, {}
-        frames = frames[: self.tracker.settings.shape_frames]
+        frames = frames[:SHAPE_FRAMES]
         for frame in frames:
             self._kept[frame] = {
                 camera.name: (np.packbits(view.region, axis=1), view.edge)
@@ -176,7 +180,7 @@ class _Capture:
             poses = {k: own[0][0].values for k, own in explained.items() if own}
         shape, self.tracker = self._fit_shape(list(poses), list(poses.values()))
         states = zip(poses, shape.poses, strict=True)
-        return shape, {k: self.tracker.start(pose) for k, pose in states}
+        return shape, {k: self.tracker.start(pose, is_known=True) for k, pose in states}
 
     def _fit_shape(
         self, frames: Sequence[int], poses: Sequence[Array]
@@ -187,73 +191,54 @@ class _Capture:
         shape = fit_shape(fit, views, np.array(poses))
         return shape, tracker_of_person(fit.kinematics, shape, self.tracker.plan)
 
-    def find_explanations(
-        self, frame: int, start: PoseFit | None = None
-    ) -> list[tuple[PoseFit, PersonPoseTracker]]:
+    def find_explanations(self, frame: int) -> list[tuple[PoseFit, PersonPoseTracker]]:
         """Return distinct poses that explain a frame, with trackers of their shapes, best first.
 
-        The list is empty if no person is visible.
-
-        Where the shape is unknown, the shape of a first fit is used in the search, and each
-        explanation gets its own shape before they are compared: in a body of other proportions a
-        wrong pose may fit better than the right one. Explanations that fit nearly as well as the
-        best one are stored in `alternatives`.
-
-        ``start``: the first fit; None: the best fresh start of a search.
+        The list is empty if no person is visible. Explanations that are not worse than the best one
+        by more than noise are stored in `alternatives`.
         """
-        seen, tracker = self._see(frame), self.tracker
-        if self._has_shape:
-            start = start or next(iter(tracker.search.find_starts(seen)), None)
-            if start is None:
-                return []
-            _, tracker = self._fit_shape([frame], [start.values])
-        fits = tracker.search.find_explanations(seen)
-        least = fits[0].closeness - tracker.settings.alternative_margin if fits else 0.0
-        found = [(one, tracker) for one in fits if one.closeness > least]
-        if self._has_shape:
-            for k, (fit, _) in enumerate(found):
-                shape, shaped = self._fit_shape([frame], [fit.values])
-                refined = shaped.search.refine(shape.poses[0], seen)
-                found[k] = shaped.search.improve_limbs(refined, seen), shaped
-        ranked = {id(one[0]): one for one in found}
-        distinct = tracker.search.distinct(fit for fit, _ in found)
-        found = [ranked[id(fit)] for fit in distinct]
-        self.alternatives[frame] = tuple(
-            (shaped.positions(fit.values), shaped.deviations(fit.values, seen))
-            for fit, shaped in found[1:]
-            if fit.closeness > distinct[0].closeness - tracker.settings.ambiguity_margin
-        )
+        seen = self._see(frame)
+
+        def shaped(values: Array) -> tuple[PoseFit, PersonPoseTracker]:
+            shape, tracker = self._fit_shape([frame], [values])
+            refined = tracker.search.refine(shape.poses[0], seen)
+            return tracker.search.improve_limbs(refined, seen), tracker
+
+        found = self.tracker.find_explanations(seen, None, shaped if self._has_shape else None)
+        if found:
+            best, tracker = found[0]
+            self.alternatives[frame] = tuple(
+                (own.positions(fit.values), own.deviations(fit.values, seen))
+                for fit, own in found[1:]
+                if tracker.search.advantage(best, fit, seen, own=own.search) <= SIGNIFICANT
+            )
         return found
 
     def follow_all(
         self,
         frames: Sequence[int],
-        known: Mapping[int, TrackState],
-        finish: Callable[[int, TrackState | None, FrameViews], None] | None = None,
-    ) -> dict[int, TrackState | None]:
+        known: Mapping[int, PersonBelief],
+        finish: Callable[[int, PersonBelief | None, FrameViews], None] | None = None,
+    ) -> dict[int, PersonBelief | None]:
         """Track the person; return the state of each frame, None where no person is found.
 
         A sequence is tracked from its first known frame, or the best-fitting one of a few, forwards
         to the end, then from there backwards. Otherwise each frame is refined from its known state,
         or searched by itself.
 
-        ``frames``: indices in order; after a gap the person is also searched anew. ``known``:
-        states by frame that are known before; {}: none. ``finish``: called with index, state and
-        views of each frame that is done, if not None.
+        ``frames``: indices in order. ``known``: beliefs by frame that are known before; {}: none.
+        ``finish``: called with index, belief and views of each frame that is done, if not None.
         """
-        found: dict[int, TrackState | None] = {}
+        found: dict[int, PersonBelief | None] = {}
 
-        def follow(state: TrackState | None, frame: int, last: int) -> TrackState | None:
+        def follow(state: PersonBelief | None, frame: int, last: int) -> PersonBelief | None:
             """Find and keep the state of a frame, from the state of the frame `last` before it."""
             seen = self._see(frame)
-            if state is None and not self._is_sequence:
+            if state is None:
                 found[frame] = self._search_frame(frame, known.get(frame))
             else:
-                found[frame] = self.tracker.follow(state, seen)
-            if state is not None and abs(frame - last) > 1:
-                anew = self.tracker.follow(None, seen)
-                found[frame] = max(
-                    found[frame], anew, key=lambda one: one.inlier_ratio if one else 0.0
+                found[frame] = self.tracker.update(
+                    self.tracker.predict(state, abs(frame - last)), seen
                 )
             if finish is not None:
                 finish(frame, found[frame], seen)
@@ -270,47 +255,46 @@ class _Capture:
         index = list(frames).index(begin)
         # Forwards from the start, then backwards.
         for ordered in (frames[index:], frames[:index][::-1]):
-            state: TrackState | None = start
+            state: PersonBelief | None = start
             last = begin
             for frame in ordered:
                 state, last = follow(state, frame, last), frame
         return found
 
-    def _search_frame(self, frame: int, known: TrackState | None) -> TrackState | None:
-        """Return a frame's own state, refined from `known` or searched; None: no person."""
+    def _search_frame(self, frame: int, known: PersonBelief | None) -> PersonBelief | None:
+        """Return a still's belief, refined from `known` or searched; None: no person."""
         if known is None:
             explained = self.find_explanations(frame)
             if not explained:
                 return None
             fit, own = explained[0]
             if own is self.tracker:
-                return self.tracker.start(fit.values, fit.inlier_ratio)
+                return replace(self.tracker.start(fit.values), inlier_ratio=fit.inlier_ratio)
             known = self.tracker.start(self.tracker.with_held(fit.values))
         seen, search = self._see(frame), self.tracker.search
         fit = search.improve_limbs(search.refine(known.values, seen), seen)
-        return self.tracker.start(fit.values, fit.inlier_ratio)
+        return replace(self.tracker.start(fit.values), inlier_ratio=fit.inlier_ratio)
 
-    def _best_start(
-        self, frames: Sequence[int], tried: int = 3, enough: float = 0.97
-    ) -> tuple[int, TrackState]:
-        """Return the index and the state of the frame with the best-fitting fresh start.
+    def _best_start(self, frames: Sequence[int], tried: int = 3) -> tuple[int, PersonBelief]:
+        """Return the index and the belief of the first of a few frames without alternatives.
 
-        Of `frames`, `tried` are tried until an inlier ratio exceeds `enough`. The tracker gets the
-        shape that fits the best one. Raises SettingsError: two cameras see a person in none.
+        If all have some, it is the frame that is explained best. The tracker gets the shape that
+        fits it. Raises SettingsError: two cameras see a person in none of `tried` frames.
         """
-        best: tuple[int, PoseFit] | None = None
+        found = {}
         for frame in spread_over(frames, tried):
-            for one in self.tracker.search.find_starts(self._see(frame)):
-                if best is None or one.closeness > best[1].closeness:
-                    best = frame, one
-            if best is not None and best[1].inlier_ratio > enough:
-                break
-        if best is None:
+            if explained := self.find_explanations(frame):
+                found[frame] = explained[0]
+                if not self.alternatives[frame]:
+                    break
+        if not found:
             raise SettingsError(
                 f"two cameras see no person in any of {tried} frames: give masks that show one"
             )
-        fit, self.tracker = self.find_explanations(*best)[0]
-        return best[0], self.tracker.start(fit.values, fit.inlier_ratio)
+        clear = [k for k in found if not self.alternatives[k]]
+        best = clear[0] if clear else max(found, key=lambda k: found[k][0].closeness)
+        fit, self.tracker = found[best]
+        return best, self.tracker.start(fit.values, is_known=True)
 
 
 def spread_over(frames: Sequence[int], count: int) -> list[int]:

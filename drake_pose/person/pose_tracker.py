@@ -1,7 +1,8 @@
 """Tracking of a person by all silhouettes at once, with a search for lost limbs or persons.
 
-Every frame is fitted from the pose that the last frames predict. Limbs that do not fit are searched
-again where silhouettes are unexplained; a lost person is searched in all headings in turn.
+Every frame is fitted from the pose that the last frames predict. Where noise does not explain the
+contours, limbs are searched again where silhouettes are unexplained, then the person in all
+headings; poses are compared by likelihood.
 
 `pose_uncertainty` estimates two variance components by restricted maximum likelihood (Patterson and
 Thompson 1971): the noise of the contours' distances, and the error of each part's surface. Values
@@ -11,7 +12,8 @@ A person's shape is lengths (shape joints) and radius scales (of parts, across t
 `fit_shape` fits one shape to the silhouettes of several frames, together with each frame's pose.
 """
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -22,14 +24,29 @@ from drake_pose.body import PoseTree
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
 from drake_pose.errors import ModelError
-from drake_pose.fit.contour_fit import Comparison, ContourFit, Noise, Prior, pack_views, symmetric
+from drake_pose.fit.contour_fit import (
+    Comparison,
+    ContourFit,
+    Noise,
+    PoseFit,
+    Prior,
+    pack_views,
+    symmetric,
+)
 from drake_pose.fit.covariance import surface_deformations
 from drake_pose.fit.evidence import NO_EDGE, EdgePoints, Observation, pack_evidence
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import RADIUS_SCALE_PREFIX, BodyParameters
 from drake_pose.fit.problem import Problem, Unknowns
 from drake_pose.fit.surfaces import with_radius_scales
-from drake_pose.person.search import EXACT, LENIENT, BodyPlan, PersonSearch, PersonSettings
+from drake_pose.person.search import (
+    EXACT,
+    LENIENT,
+    SIGNIFICANT,
+    BodyPlan,
+    PersonSearch,
+    PersonSettings,
+)
 from drake_pose.person.views import FrameViews
 from drake_pose.silhouette.outline import Outline
 
@@ -137,22 +154,31 @@ def _noise(A: Array, b: Array, Q: Array, assumed: float = 4.0) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class TrackState:
-    """Tracker state: what is known of a person after a frame."""
+class PersonBelief:
+    """What is known of a person after a frame."""
 
-    # values, step: (m,) values of the pose tree, and their change since the last frame [rad, m].
+    # values, step: (m,) values of the pose tree, and their change in a frame [rad, m].
     values: Array
     step: Array
-    inlier_ratio: float  # Inlier ratio of the contours, 0 to 1.
-    usual_ratio: float  # The usual one: a running mean that follows higher ratios at once.
-    # Number of successive frames with a low inlier ratio. Negative: the person was found anew, and
-    # the remaining headings are tried in as many frames.
+    inlier_ratio: float = 1.0  # Inlier ratio of the contours, 0 to 1.
+    misfit: float = 1.0  # Cost over what noise gives.
+    usual_misfit: float = 1.0  # The lowest so far, or a running mean if that is higher.
+    # Number of successive frames that are explained worse than usual by more than noise.
     troubled_frames: int = 0
+    # Sum of the pose's advantages over the next best one [standard deviations], and their number;
+    # 0: nothing speaks for another pose.
+    evidence: float = 0.0
+    judged: int = 0
+    ahead: float = 0.0  # Time for which the values are predicted [frames].
 
     @property
     def is_lost(self) -> bool:
-        """Whether the inlier ratio is too low for the pose to be valid."""
-        return self.inlier_ratio < PersonSettings.lost_below * self.usual_ratio
+        """Whether another pose explains the frames as well, at the judge's LEVEL."""
+        return self.judged > 0 and self.evidence <= SIGNIFICANT * math.sqrt(self.judged)
+
+
+Shaped = Callable[[Array], "tuple[PoseFit, PersonPoseTracker]"]
+"""Fits a shape and pose from values (m,); returns the fit, and the tracker of the shape."""
 
 
 class PersonPoseTracker:
@@ -191,12 +217,10 @@ class PersonPoseTracker:
         self._rest = rest
         self.search = PersonSearch(fit, self.plan, settings, self._information, self._held, rest)
 
-    def start(self, values: Array, inlier_ratio: float = 1.0) -> TrackState:
-        """Return the state of a motionless person at values (m,), with the usual ratio."""
-        still = np.zeros(len(values))
-        return TrackState(
-            np.array(values, dtype=np.float64), still, inlier_ratio, self.settings.usual_ratio
-        )
+    def start(self, values: Array, is_known: bool = False) -> PersonBelief:
+        """Return the belief in a motionless person at values (m,), to be judged unless known."""
+        values = np.array(values, dtype=np.float64)
+        return PersonBelief(values, np.zeros(len(values)), judged=int(not is_known))
 
     def with_held(self, values: Array) -> Array:
         """Return values (m,) with the held ones replaced by the tracker's."""
@@ -234,59 +258,141 @@ class PersonPoseTracker:
         deviations[self._order] = np.sqrt(np.diag(covariance))
         return deviations
 
-    def follow(self, last: TrackState | None, frame: FrameViews) -> TrackState | None:
-        """Return the state after a frame of silhouettes.
+    def predict(self, belief: PersonBelief, frames: float = 1.0) -> PersonBelief:
+        """Return the belief some frames later; motion fades away."""
+        ahead = belief.ahead + frames
+        moved = self._persisting(ahead) - self._persisting(belief.ahead)
+        return replace(belief, values=belief.values + moved * belief.step, ahead=ahead)
 
-        The frame is fitted from the predicted pose. Where the inlier ratio is `retry_below` under
-        the usual one, doubtful limbs are searched again, in the first four of such frames and then
-        in every eighth. Below `lost_below` of the usual ratio, where the limbs' search does not
-        help after the first frame, and while a newly found person is unconfirmed, the person is
-        also searched anew in a few headings, and replaced if that fits better.
+    def _persisting(self, ahead: float) -> float:
+        """Return the number of a frame's steps in `ahead` frames."""
+        return -self.settings.persistence * math.expm1(-ahead / self.settings.persistence)
 
-        ``last``: state after the last frame; None: the person is searched in all headings.
-        ``frame``: silhouettes of the frame. Returns the state; None if `last` is None and fewer
-        than two cameras see a person.
+    def update(self, belief: PersonBelief | None, frame: FrameViews) -> PersonBelief | None:
+        """Return the belief after a frame of silhouettes.
+
+        The frame is fitted from the predicted pose. Where it is explained worse than usual, or than
+        noise does, at the judge's LEVEL, doubtful limbs are searched again, and then the person in
+        all headings: at first, and ever more rarely while that does not help. The pose with the
+        highest likelihood is taken. It is lost if a distinct one is not worse by more than noise.
+
+        ``belief``: predicted for the frame; None: the person is searched. Returns None if `belief`
+        is None and fewer than two cameras see a person.
         """
-        settings = self.settings
-        if last is None:
-            found = self.search.find_person(frame, range(settings.headings))
-            return None if found is None else self.start(found.values, found.inlier_ratio)
-        expected = last.values + settings.step_fraction * last.step
-        prior = Prior(expected, self._information)
-        compare = partial(frame.compare, self.fit)
-        fitted = self.fit.fit(compare, expected, settings.follow, prior, self._held)
-        enough = last.usual_ratio - settings.retry_below
-        lost = fitted.inlier_ratio < settings.lost_below * last.usual_ratio
-        # Limbs are searched again in the first four troubled frames, then in every eighth.
-        is_due = 0 <= last.troubled_frames < 4 or last.troubled_frames % 8 == 0
-        due = fitted.inlier_ratio < enough and is_due
-        if due and not lost:
-            first, limbs = last.troubled_frames * settings.limbs_per_frame, settings.limbs_per_frame
-            fitted = self.search.improve_limbs(fitted, frame, enough, first, limbs)
-        ratio, is_unconfirmed = fitted.inlier_ratio, last.troubled_frames < 0
-        state = TrackState(
-            fitted.values,
-            fitted.values - last.values
-            if last.troubled_frames == 0
-            else np.zeros(len(last.values)),
-            ratio,
-            max(ratio, last.usual_ratio + (ratio - last.usual_ratio) / settings.memory),
-            last.troubled_frames + 1 if is_unconfirmed or ratio < enough else 0,
-        )
-        is_hopeless = due and ratio < enough and last.troubled_frames > 0
-        if not (lost or is_unconfirmed or is_hopeless):
-            return state
-        # The person is searched anew in some headings, and replaced if that fits better.
-        headings = settings.headings_of(last.troubled_frames)
-        found = self.search.find_person(frame, headings, last.values, last.usual_ratio)
-        if found is None or found.inlier_ratio <= ratio:
-            return state
-        remaining = last.troubled_frames + 1 if is_unconfirmed else 1 - settings.cycle
+        settings, search = self.settings, self.search
+        if belief is None:
+            found = [fit for fit, _ in self.find_explanations(frame)]
+            if not found:
+                return None
+            best, *others = found
+            misfit = float(search.misfit(best.sums.sum(axis=0))[0])
+            return replace(
+                self.start(best.values),
+                inlier_ratio=best.inlier_ratio,
+                misfit=misfit,
+                usual_misfit=min(misfit, 1.0),
+                evidence=self._evidence(best, others, frame, None),
+            )
+        compare, prior = partial(frame.compare, self.fit), Prior(belief.values, self._information)
+        fitted = self.fit.fit(compare, belief.values, settings.follow, prior, self._held)
+        before = belief.values - self._persisting(belief.ahead) * belief.step
+        ahead = belief.ahead
+        step = (fitted.values - before) / (ahead or np.inf)
+        belief = replace(belief, step=step, ahead=0.0)
+        excess, change = self._excess(fitted, belief)
+        # What is seen has changed: searches begin anew. At first only limbs are searched, but not
+        # after a gap.
+        first = min(round(ahead), 2)
+        troubled = first if abs(change) > SIGNIFICANT else belief.troubled_frames + 1
+        if excess <= SIGNIFICANT and not belief.is_lost:
+            troubled = 0
+        elif troubled & (troubled - 1) == 0 or troubled % 8 == 0:
+            belief, fitted = self._search_again(
+                replace(belief, troubled_frames=troubled), fitted, frame
+            )
+            excess, _ = self._excess(fitted, belief)
+            if excess <= SIGNIFICANT and not belief.is_lost:
+                troubled = 0
+        misfit = float(search.misfit(fitted.sums.sum(axis=0))[0])
+        usual = belief.usual_misfit + (misfit - belief.usual_misfit) / settings.memory
         return replace(
-            self.start(found.values, found.inlier_ratio),
-            usual_ratio=state.usual_ratio,
-            troubled_frames=remaining,
+            belief,
+            values=fitted.values,
+            inlier_ratio=fitted.inlier_ratio,
+            misfit=misfit,
+            usual_misfit=min(misfit, usual, 1.0),
+            troubled_frames=troubled,
         )
+
+    def _excess(self, fitted: PoseFit, belief: PersonBelief) -> tuple[float, float]:
+        """Return by how many standard deviations a misfit exceeds the usual and the last one."""
+        misfit, deviation = self.search.misfit(fitted.sums.sum(axis=0))
+        return (
+            float((misfit - belief.usual_misfit) / deviation),
+            float((misfit - belief.misfit) / deviation),
+        )
+
+    def _search_again(
+        self, belief: PersonBelief, fitted: PoseFit, frame: FrameViews
+    ) -> tuple[PersonBelief, PoseFit]:
+        """Search limbs and then the person again; return the belief, judged anew, and the fit."""
+        expected = None if belief.is_lost else belief.values
+        fits = [self.search.improve_limbs(fitted, frame)]
+        is_limb = self._excess(fits[0], belief)[0] <= SIGNIFICANT or belief.troubled_frames == 1
+        if belief.is_lost or not is_limb:
+            fits += [fit for fit, _ in self.find_explanations(frame, belief.values)]
+        best = max(fits, key=lambda one: one.closeness)
+        if self.search.advantage(best, fitted, frame, expected) > SIGNIFICANT:
+            belief = replace(belief, step=np.zeros(len(belief.step)), evidence=0.0, judged=0)
+        else:
+            best = fitted
+        if len(fits) > 1:
+            found = belief.evidence + self._evidence(best, [fitted, *fits], frame, expected)
+            belief = replace(belief, evidence=found, judged=belief.judged + 1)
+            if not belief.is_lost:
+                belief = replace(belief, evidence=0.0, judged=0)
+        return belief, best
+
+    def _evidence(
+        self, best: PoseFit, others: Sequence[PoseFit], frame: FrameViews, expected: Array | None
+    ) -> float:
+        """Return the smallest advantage of a fit over distinct others; large if there are none."""
+        rivals = [one for one in others if len(self.search.distinct([best, one])) > 1]
+        advantages = [self.search.advantage(best, one, frame, expected) for one in rivals]
+        return min(advantages, default=2.0 * SIGNIFICANT)
+
+    def find_explanations(
+        self, frame: FrameViews, known: Array | None = None, shaped: Shaped | None = None
+    ) -> "list[tuple[PoseFit, PersonPoseTracker]]":
+        """Return distinct poses that explain a frame, with trackers of their shapes, best first.
+
+        The list is empty if fewer than two cameras see a person.
+
+        Args:
+            frame: silhouettes.
+            known: (m,) values from which held ones are taken; None: the person's at rest.
+            shaped: returns a better fit from values (m,), and the tracker of the shape it has; in
+                a body of other proportions a wrong pose may fit better than the right one. None:
+                the shape is known.
+        """
+
+        def improve(values: Array) -> tuple[PoseFit, PersonPoseTracker]:
+            return self.search.improve_limbs(self.search.refine(values, frame), frame), self
+
+        shaped = shaped or improve
+        starts = self.search.find_starts(frame, known)
+        found, best = [shaped(one.values) for one in starts[:3]], None
+        while found and best is not (leading := max(found, key=lambda one: one[0].closeness)):
+            best, (fit, own) = leading, leading
+            similar = [
+                own.search.refine(one, frame) for one in own.search.similar_poses(fit.values)
+            ]
+            similar.sort(key=lambda one: -one.closeness)
+            found += [shaped(one.values) for one in similar]
+        if best is not None:
+            found.append((best[1].search.improve_limbs(best[0], frame, every=True), best[1]))
+        ranked = {id(one[0]): one for one in found}
+        return [ranked[id(fit)] for fit in self.search.distinct(fit for fit, _ in found)]
 
 
 Frames = Sequence[tuple[Sequence[Camera], Sequence[EdgePoints]]]

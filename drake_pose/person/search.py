@@ -6,21 +6,27 @@ are fitted to all cameras.
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import ndtri
 
 from drake_pose.arrays import Array, Indices, Mask, halton_sequence
 from drake_pose.body import landmarks_of_nodes, load_landmarks
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.errors import ModelError
 from drake_pose.fit.contour_fit import ContourFit, PoseFit, Prior
+from drake_pose.fit.covariance import vuong_statistic
+from drake_pose.fit.judge import LEVEL
 from drake_pose.fit.kernel import Sum
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.person.views import FrameViews, sum_at_points
 from drake_pose.silhouette.scoring import draw_mask
+
+SIGNIFICANT = float(ndtri(1.0 - LEVEL))
+"""Number of standard deviations from which a difference is no noise."""
 
 PERSON_LANDMARKS = (
     "neck",
@@ -40,46 +46,16 @@ class PersonSettings:
     # follow, search: stages of a frame's fit from the predicted pose, and from a coarse guess.
     follow: tuple[AnnealingStage, ...]
     search: tuple[AnnealingStage, ...]
-    step_fraction: float = 0.7  # Fraction of the last frame's step that is predicted for the next.
-    # angle_deviation, length_deviation: standard deviations of the prediction [rad, m].
+    persistence: float = 1.3  # Of a motion [frames].
+    # angle_deviation, length_deviation: standard deviations of the prediction [rad, m]; the first
+    # also of waist, clavicles, wrists and ankles about rest, in a search.
     angle_deviation: float = 0.3
     length_deviation: float = 0.15
-    # Limbs are searched again where the inlier ratio is below the usual one by this.
-    retry_below: float = 0.03
-    lost_below: float = 0.75  # The person is lost below this fraction of the usual inlier ratio.
-    memory: float = 60.0  # Number of frames over which the usual inlier ratio is averaged.
-    usual_ratio: float = 0.95  # Usual inlier ratio at the start.
-    shape_frames: int = 40  # Number of first frames from which a person's shape is fitted.
-    headings: int = 12  # Number of headings, evenly spread, in which a lost person is searched.
-    headings_per_frame: int = 3  # Number of them in each frame of a sequence.
-    limbs_per_frame: int = 2  # Number of doubtful limbs searched in each frame of a sequence.
-    min_limb_ratio: float = 0.8  # A limb is doubtful below this inlier ratio of its contour.
-    # Fraction of the fresh starts that is fitted, the most promising first.
-    fitted_fraction: float = 0.5
-    searched_starts: int = 3  # Number of fresh starts whose doubtful limbs are searched.
-    # Limb poses with tips farther apart than this are distinct [m].
+    memory: float = 60.0  # Number of frames over which the usual misfit is averaged.
+    headings: int = 12  # Number of headings, evenly spread, in which a person is searched.
+    searched_starts: int = 6  # Number of them in which doubtful limbs are searched.
+    # Poses are distinct if a landmark, or a limb's end, is farther apart than this [m].
     distinct_distance: float = 0.25
-    # Limb poses with no point farther apart than this are about the same [m].
-    same_distance: float = 0.15
-    # The limbs of an alternative pose are searched before it is compared if its closeness is lower
-    # by at most this.
-    alternative_margin: float = 0.15
-    # An alternative pose is as good if its closeness is lower by at most this; chosen on 36 drawn
-    # persons of other measures and clothes before four cameras.
-    ambiguity_margin: float = 0.02
-    ranking_stages: int = 3  # Number of fit stages after which guesses are ranked.
-    ranking_spacing: float = 1.5  # Factor on the spacing of contour points in these stages.
-
-    @property
-    def cycle(self) -> int:
-        """Number of frames in which all headings are tried."""
-        return self.headings // self.headings_per_frame
-
-    def headings_of(self, frame: int) -> list[int]:
-        """Return the indices of headings tried in troubled `frame` (modulo `cycle`), all around."""
-        # The bit-reversed order puts neighbouring headings late.
-        order = sorted(range(self.cycle), key=lambda k: f"{k:032b}"[::-1])
-        return list(range(order[frame % self.cycle], self.headings, self.cycle))
 
 
 def _stages(*pairs: tuple[float, float]) -> tuple[AnnealingStage, ...]:
@@ -107,11 +83,14 @@ LENIENT = PersonSettings(
 class PlannedLimb(NamedTuple):
     """An arm or leg of a pose tree."""
 
+    base: int  # Index of the node that the limb hangs on.
     nodes: Indices  # (j,) indices of the nodes that only this limb has.
-    values: Indices  # (k,) indices of the pose tree's values that move these nodes alone.
+    # (k,) indices of the pose tree's angles that move the limb's end, but not its root.
+    values: Indices
     joints: Indices  # (3,) indices of root, middle joint and end among the landmarks.
     poses: Array  # (n, k) these values in n poses between their limits; the first is at rest [rad].
-    samples_T: Array  # (n, m, 3) points along the limb in the trunk's frame in each pose [m].
+    # (n, m, 3) points along the limb in each pose [m], from its root along the base's axes.
+    samples_B: Array
     weights: Array  # (n, m) weights of the points.
 
 
@@ -121,7 +100,6 @@ class BodyPlan:
     Attributes:
         along: places of the points on a limb: 0 at the root, 1 at the middle joint, 2 at the end;
             the middle of a hand or foot lies beyond 2.
-        trunk: index of the node that the limbs hang on.
         heading: index of the value that turns the whole body about the vertical; None: none does.
 
     Raises:
@@ -141,7 +119,15 @@ class BodyPlan:
                 "of a person by its silhouettes needs"
             )
         self.landmarks = landmarks_of_nodes(tree, landmarks)
-        self.trunk = self._node("neck")
+        # Whether each value bends the waist, a clavicle, wrist or ankle: no limb and no root (m,).
+        motions = kinematics.motions(kinematics.flatten(tree.default_values()))
+        self.is_posture = kinematics.is_angle & ~motions.moves[self._node("neck")]
+        for limb in self.limbs.values():
+            self.is_posture[limb.values] = False
+        # Whether each angle tilts a part that is no limb (m,): its axis is horizontal at rest.
+        self.tilts = kinematics.is_angle & (np.abs(motions.twists[: len(self.is_posture), 2]) < 0.5)
+        for limb in self.limbs.values():
+            self.tilts[limb.values] = False
         free = np.flatnonzero(kinematics.covers_full_turn)
         self.heading = int(free[0]) if len(free) else None
 
@@ -172,20 +158,26 @@ class BodyPlan:
         """
         kinematics, tree = self.kinematics, self.kinematics.tree
         rest = kinematics.flatten(tree.default_values())
-        moves = kinematics.motions(rest).moves
-        end = self._node(names[2])
-        own = moves[end] & ~moves[self._node("neck")]
-        free = kinematics.is_angle & (kinematics.upper > kinematics.lower)
-        values = np.flatnonzero(own & free)
+        lower, upper = kinematics.local_limits(rest)
+        # At rest, stretched, an axis along the limb may not move its end.
+        bent = kinematics.motions(np.where(kinematics.is_angle, 0.5 * (lower + upper), rest))
+        joints = np.array([self.landmarks.names.index(name) for name in names])
+        places = self.landmarks.positions(bent.X_WN)[joints]
+        turning, shift = bent.twists[: len(rest), :3], bent.twists[: len(rest), 3:6]
+        moves = bent.moves[:, : len(rest)]
+        moved = [
+            moves[node] & (np.linalg.norm(np.cross(turning, p) + shift, axis=1) > 1e-6)
+            for node, p in zip(self.landmarks.nodes[joints], places, strict=True)
+        ]
+        own = moved[2] & ~moved[0] & kinematics.is_angle & (kinematics.upper > kinematics.lower)
+        values = np.flatnonzero(own)
         nodes = np.flatnonzero((moves & own).any(axis=1))
         fractions = halton_sequence(count, len(values))
-        lower, upper = (ends[values] for ends in kinematics.local_limits(rest))
-        poses = np.clip(rest[values], lower, upper) * np.ones((count, 1))
-        poses[1:] = lower + fractions[1:] * (upper - lower)
+        poses = np.clip(rest[values], lower[values], upper[values]) * np.ones((count, 1))
+        poses[1:] = lower[values] + fractions[1:] * (upper - lower)[values]
         # People stretch their limbs more often than uniformly drawn angles do.
-        stretched = np.flatnonzero(kinematics.value_nodes[values] == end)
+        stretched = np.flatnonzero(~moved[1][values])
         poses[np.ix_(np.arange(count // 8), stretched)] = poses[0, stretched]
-        joints = np.array([self.landmarks.names.index(name) for name in names])
         posed = np.tile(rest, (count, 1))
         posed[:, values] = poses
         each = [own.T for own in kinematics.split(posed.T)]
@@ -193,11 +185,16 @@ class BodyPlan:
         for node in nodes.tolist():
             X_PN = tree.relative_transforms(node, each[tree.source(node)])
             X_WN[:, node] = X_WN[:, tree.nodes[node].parent] @ X_PN
-        X_WT = X_WN[0, self.trunk]
-        samples_W = self._samples(joints, X_WN).reshape(-1, 3)
-        samples_T = ((samples_W - X_WT[:3, 3]) @ X_WT[:3, :3]).reshape(count, -1, 3)
-        weights = crowding_weights(samples_T)
-        return PlannedLimb(nodes, values, joints, poses, samples_T, weights)
+        base = tree.nodes[nodes[0]].parent
+        root = self.landmarks.positions(X_WN[0])[joints[0]]
+        samples_B = (self._samples(joints, X_WN) - root) @ X_WN[0, base, :3, :3]
+        return PlannedLimb(
+            base, nodes, values, joints, poses, samples_B, crowding_weights(samples_B)
+        )
+
+    def frame(self, limb: PlannedLimb, X_WN: Array) -> tuple[Array, Array]:
+        """Return R_WB (3, 3) of a limb's base and its root (3,) in the world [m]."""
+        return X_WN[limb.base, :3, :3], self.landmarks.positions(X_WN)[limb.joints[0]]
 
     def samples(self, limb: PlannedLimb, X_WN: Array) -> Array:
         """Return points (m, 3) along a limb in the world [m], nodes at X_WN (nodes, 4, 4)."""
@@ -223,7 +220,7 @@ def crowding_weights(samples: Array, apart: float = 0.08) -> Array:
 
 
 class PersonSearch:
-    """Searches limbs and persons by fits from coarse guesses.
+    """Searches limbs and persons by fits from coarse guesses, and compares fits by likelihood.
 
     Args:
         fit: the person's body with the noise of its contours.
@@ -246,105 +243,83 @@ class PersonSearch:
         self._fit, self._plan, self._settings = fit, plan, settings
         self._information, self._held, self._rest = information, held, rest
 
-    def improve_limbs(
+    def misfit(self, sums: Array) -> tuple[Array, Array]:
+        """Return costs (...,) over what noise gives, and their standard deviations by noise.
+
+        ``sums``: (..., 6) by ``Sum``. Along each of both contours, errors are independent at
+        intervals of the correlation length, so costs have a chi-squared distribution.
+        """
+        count = 0.5 * sums[..., Sum.COMPARED] / np.mean(self._fit.noise.correlation)
+        count = np.maximum(count, 1.0)
+        return sums[..., Sum.COST] / count, np.sqrt(2.0 / count)
+
+    def advantage(
         self,
-        fitted: PoseFit,
+        one: PoseFit,
+        other: PoseFit,
         frame: FrameViews,
-        enough: float = math.inf,
-        first: int = 0,
-        limbs: int | None = None,
-    ) -> PoseFit:
-        """Refine a fit and search its doubtful limbs again; keep what is better.
+        expected: Array | None = None,
+        own: "PersonSearch | None" = None,
+    ) -> float:
+        """Return by how many standard deviations of noise a fit explains a frame better than other.
 
-        Args:
-            fitted, frame: fit to begin with, and the silhouettes.
-            enough: the search ends at this inlier ratio.
-            first: index of the doubtful limb to begin with, modulo their number; 0 is the worst.
-            limbs: number of limbs searched; None: all doubtful ones.
+        ``expected``: (m,) values that the last frames predict, which count, too; None: none.
+        ``own``: has the other's shape; None: it is the same.
         """
+        step, pairs = self._settings.search[-1], ((own or self, other), (self, one))
+        more, less = (frame.tile_costs(s._fit, fit.values, step) for s, fit in pairs)
+        known = 0.0
+        if expected is not None:
+            off = np.array([fit.values - expected for fit in (one, other)]) ** 2 @ self._information
+            known = float(off[1] - off[0])
+        scatter = math.sqrt(float(((more - less) ** 2).sum()))
+        return vuong_statistic(more, less) + known / max(scatter, 1.0)
+
+    def improve_limbs(self, fitted: PoseFit, frame: FrameViews, every: bool = False) -> PoseFit:
+        """Refine a fit and search its doubtful limbs, or every one, again; keep what is better."""
         best = _better(fitted, self.refine(fitted.values, frame))
-        if best.inlier_ratio >= enough:
-            return best
-        doubtful = self._doubtful_limbs(best, frame)
-        begin = first % len(doubtful)
-        chosen = (doubtful[begin:] + doubtful[:begin])[:limbs]
-        return self._search_limbs(best, chosen, frame, enough)
-
-    def _search_limbs(
-        self, best: PoseFit, limbs: Iterable[PlannedLimb], frame: FrameViews, enough: float
-    ) -> PoseFit:
-        """Search limbs again, one after another, until the inlier ratio is `enough`.
-
-        `best` is the fit to begin with; the fit with the highest closeness is returned.
-        """
-        for limb in limbs:
+        misfit, whole = self.misfit(best.sums[:-1])[0], self.misfit(best.sums.sum(axis=0))[0]
+        limbs = []
+        for limb in self._plan.limbs.values():
+            scores, now = self._score_poses(best.values, limb, frame)
+            limbs.append((float(scores.max()) - now, misfit[limb.nodes].max() > whole, limb))
+        limbs.sort(key=lambda one: -one[0])
+        for k, (_, is_doubtful, limb) in enumerate(limbs):
+            # The limb that would explain most elsewhere is always searched.
+            if k and not every and not is_doubtful:
+                continue
             scores, _ = self._score_poses(best.values, limb, frame)
             guesses = self._distinct_poses(best.values, limb, scores, 2)
             # It may be bent the wrong way: try it at rest, and the most relaxed pose nearby.
             X_WN = self._fit.kinematics.poses(best.values)
             distances = self._distances(best.values, limb, self._plan.samples(limb, X_WN))
-            near = limb.poses[distances < self._settings.same_distance]
+            near = limb.poses[distances < 0.5 * self._settings.distinct_distance]
             effort = np.abs(near - limb.poses[0]).sum(axis=1)
             for pose in (limb.poses[0], *near[np.argsort(effort, kind="stable")[:1]]):
                 guesses.append(best.values.copy())
                 guesses[-1][limb.values] = pose
             for values in guesses:
                 best = _better(best, self.refine(values, frame))
-            if best.inlier_ratio >= enough:
-                break
         return best
 
-    def find_person(
-        self,
-        frame: FrameViews,
-        headings: Sequence[int],
-        known: Array | None = None,
-        enough: float = math.inf,
-    ) -> PoseFit | None:
-        """Return the best fit from fresh starts; None where fewer than two cameras see a person.
-
-        Args:
-            frame: silhouettes.
-            headings: indices of headings, out of the settings' number evenly spread. If not all,
-                only the best start's limbs are searched, and no similar poses.
-            known: (m,) values from which held ones are taken; None: the person's at rest.
-            enough: inlier ratio at which no more limbs are searched, if not all headings are.
-        """
-        if len(headings) == self._settings.headings:
-            return next(iter(self.find_explanations(frame, known)), None)
-        starts = self._fresh_starts(frame, headings, known)
-        limbs = self._settings.limbs_per_frame
-        return self.improve_limbs(starts[0], frame, enough, limbs=limbs) if starts else None
-
-    def find_explanations(self, frame: FrameViews, known: Array | None = None) -> list[PoseFit]:
-        """Return distinct poses that explain a frame, best first.
-
-        The doubtful limbs of each are searched before they are compared. Empty where fewer than
-        two cameras see a person; `known` as in `find_person`.
-        """
-        found, best = self.find_starts(frame, known), None
-        while found and best is not (leading := max(found, key=lambda one: one.closeness)):
-            best = leading
-            others = [self.refine(values, frame) for values in self._similar_poses(best.values)]
-            least = best.closeness - self._settings.alternative_margin
-            found += [self.improve_limbs(one, frame) for one in others if one.closeness > least]
-        if best is not None:
-            found.append(self._search_limbs(best, self._plan.limbs.values(), frame, math.inf))
-        return self.distinct(found)
-
     def find_starts(self, frame: FrameViews, known: Array | None = None) -> list[PoseFit]:
-        """Return the best fresh starts of all headings, after a search of their doubtful limbs.
+        """Return distinct fits from all headings, after a search of the best ones' doubtful limbs.
 
-        At most `searched_starts`; [] where fewer than two cameras see a person.
+        ``known``: (m,) values from which held ones are taken; None: the person's at rest. The list
+        is empty where fewer than two cameras see a person.
         """
-        starts = self._fresh_starts(frame, range(self._settings.headings), known)
-        return [self.improve_limbs(one, frame) for one in starts[: self._settings.searched_starts]]
+        middle = frame.middle()
+        if middle is None:
+            return []
+        rest = self._rest if known is None else np.where(self._held, known, self._rest)
+        headings = range(self._settings.headings)
+        fits = [self.refine(self._guess(frame, k, middle, rest).values, frame) for k in headings]
+        fits.sort(key=lambda one: -one.closeness)
+        chosen = fits[: self._settings.searched_starts]
+        return self.distinct(self.improve_limbs(one, frame) for one in chosen)
 
     def distinct(self, fits: Iterable[PoseFit]) -> list[PoseFit]:
-        """Return the fits that differ from all better ones, best first.
-
-        From each better one some landmark must be more than `distinct_distance` away.
-        """
+        """Return the fits that differ from all better ones, best first."""
         found: list[PoseFit] = []
         kept: list[Array] = []
         for one in sorted(fits, key=lambda one: -one.closeness):
@@ -355,31 +330,13 @@ class PersonSearch:
                 kept.append(places)
         return found
 
-    def _fresh_starts(
-        self, frame: FrameViews, headings: Sequence[int], known: Array | None
-    ) -> list[PoseFit]:
-        """Fit the most promising fresh starts with some headings (indices), best first.
-
-        Arguments as of `find_person`. [] where fewer than two cameras see a person.
-        """
-        middle = frame.middle()
-        if middle is None:
-            return []
-        guesses = [self._guess(frame, heading, middle, known) for heading in headings]
-        guesses.sort(key=lambda one: -one.closeness)
-        promising = guesses[: math.ceil(self._settings.fitted_fraction * len(guesses))]
-        fitted = [self.refine(one.values, frame) for one in promising]
-        return sorted(fitted, key=lambda one: -one.closeness)
-
-    def _guess(
-        self, frame: FrameViews, heading: int, middle: Array, known: Array | None
-    ) -> PoseFit:
+    def _guess(self, frame: FrameViews, heading: int, middle: Array, rest: Array) -> PoseFit:
         """Guess a pose in a heading: fit the trunk roughly, then place each limb.
 
         `heading` is its index out of `headings`; `middle` (3,) is where the trunk's middle is put
-        first [m]; `known` as in `find_person`.
+        first [m]; `rest` (m,) are the values at rest.
         """
-        values = self._rest.copy() if known is None else np.where(self._held, known, self._rest)
+        values = rest.copy()
         if self._plan.heading is not None:
             values[self._plan.heading] = 2.0 * np.pi * heading / self._settings.headings
         values = self._fit_coarsely(self._move_trunk(values, middle), frame).values
@@ -393,32 +350,24 @@ class PersonSearch:
         return self._fit_coarsely(values, frame)
 
     def _fit_coarsely(self, values: Array, frame: FrameViews) -> PoseFit:
-        """Fit from values (m,) to the scoring cameras, by a few stages with fewer points."""
-        prior, coarser = Prior(values, 0.1 * self._information), self._settings.ranking_spacing
-        ranking = self._settings.search[: self._settings.ranking_stages]
-        stages = [replace(one, spacing=coarser * one.spacing) for one in ranking]
-        return self._fit.fit(frame.scoring_edges, values, stages, prior, self._held)
+        """Fit from values (m,) to the scoring cameras, by the coarse half of the stages."""
+        stages = self._settings.search[: len(self._settings.search) // 2]
+        held = self._held | self._plan.is_posture
+        return self._fit.fit(frame.scoring_edges, values, stages, self._prior(values), held)
 
     def refine(self, values: Array, frame: FrameViews) -> PoseFit:
-        """Fit a frame from a coarse guess (m,), with a weak prior about it."""
-        prior, stages = Prior(values, 0.1 * self._information), self._settings.search
-        return self._fit.fit(partial(frame.compare, self._fit), values, stages, prior, self._held)
+        """Fit a frame from a coarse guess (m,); the last stage also bends waist and shoulders."""
+        prior, stages = self._prior(values), self._settings.search
+        compare, held = partial(frame.compare, self._fit), self._held | self._plan.is_posture
+        if self._plan.is_posture.any():
+            values = self._fit.fit(compare, values, stages[:-1], prior, held).values
+            stages = stages[-1:]
+        return self._fit.fit(compare, values, stages, prior, self._held)
 
-    def _doubtful_limbs(self, fitted: PoseFit, frame: FrameViews) -> list[PlannedLimb]:
-        """Return the limbs that fit badly, those that would cover more elsewhere first.
-
-        The worst limb is always among them. `fitted` is a fit to `frame`.
-        """
-        lengths, fitting = fitted.sums[:, [Sum.COMPARED, Sum.FITTING]].T
-        ratios = np.where(lengths > 0.0, fitting / np.maximum(lengths, 1e-9), 1.0)
-        found = []
-        for limb in self._plan.limbs.values():
-            ratio = ratios[limb.nodes].min()
-            scores, now = self._score_poses(fitted.values, limb, frame)
-            gain = float(scores.max() - now)
-            found.append((ratio >= self._settings.min_limb_ratio, ratio - gain, limb))
-        found.sort(key=lambda one: one[:2])
-        return [limb for k, (good, _, limb) in enumerate(found) if k == 0 or not good]
+    def _prior(self, guess: Array) -> Prior:
+        """Return the prior about a coarse guess (m,), which says nothing of the posture."""
+        mean = np.where(self._plan.is_posture, self._rest, guess)
+        return Prior(mean, np.where(self._plan.is_posture, 1.0, 0.1) * self._information)
 
     def _score_poses(
         self, values: Array, limb: PlannedLimb, frame: FrameViews, placed: Mask | None = None
@@ -433,9 +382,8 @@ class PersonSearch:
         others = np.ones(len(X_WN), dtype=np.bool_) if placed is None else placed.copy()
         others[limb.nodes] = False
         outlines = [self._fit.outlines[node] for node in np.flatnonzero(others)]
-        X_WT = X_WN[self._plan.trunk]
-        placed = limb.samples_T.reshape(-1, 3) @ X_WT[:3, :3].T + X_WT[:3, 3]
-        places = np.asarray(placed.reshape(limb.samples_T.shape))
+        R_WB, root = self._plan.frame(limb, X_WN)
+        places = np.ascontiguousarray(limb.samples_B @ R_WB.T + root)
         here = self._plan.samples(limb, X_WN)[None]
         scores, now, weights = np.zeros(len(places)), 0.0, crowding_weights(here)
         for camera, region in zip(*frame.scoring_regions, strict=True):
@@ -444,7 +392,8 @@ class PersonSearch:
             pixel_scores[region & draw_mask(outlines, camera.X_CW @ X_WN[others], camera)] = 0
             scores += sum_at_points(camera, pixel_scores, places, limb.weights)[0]
             now += float(sum_at_points(camera, pixel_scores, here, weights)[0][0])
-        return scores / len(frame.scoring), now / len(frame.scoring)
+        count = max(len(frame.scoring), 1)
+        return scores / count, now / count
 
     def _distinct_poses(
         self, values: Array, limb: PlannedLimb, scores: Array, count: int
@@ -456,7 +405,7 @@ class PersonSearch:
         found: list[Array] = []
         tips: list[Array] = []
         for index in np.argsort(-scores):
-            tip = limb.samples_T[index, -1]
+            tip = limb.samples_B[index, -1]
             distances = [np.linalg.norm(tip - other) for other in tips]
             if min(distances, default=math.inf) > self._settings.distinct_distance:
                 tips.append(tip)
@@ -466,14 +415,16 @@ class PersonSearch:
                     break
         return found
 
-    def _similar_poses(self, values: Array) -> list[Array]:
-        """Return values (m,) of similar silhouettes: arms, legs, or front and back exchanged."""
+    def similar_poses(self, values: Array) -> list[Array]:
+        """Return look-alikes (m,) of a pose: arms, legs, or front and back exchanged."""
         plan, found = self._plan, []
         X_WN = self._fit.kinematics.poses(values)
         for turn, parts in ((0.0, ("arm",)), (0.0, ("leg",)), (math.pi, ("arm", "leg"))):
             other = values.copy()
             if turn and plan.heading is not None:
+                # Turned about its own axis, a leaning trunk leans to its other side.
                 other[plan.heading] += turn
+                other[plan.tilts] *= -1.0
                 other = self._move_trunk(other, plan.trunk_middle(X_WN))
             for part in parts:
                 for side, other_side in (("left", "right"), ("right", "left")):
@@ -489,12 +440,12 @@ class PersonSearch:
     def _distances(self, values: Array, limb: PlannedLimb, samples_W: Array) -> Array:
         """Return the largest distance (n,) [m] of points in each pose of a limb from given points.
 
-        `values` is the pose that places the trunk; `samples_W` (m, 3) are the given points in the
+        `values` is the pose that places the base; `samples_W` (m, 3) are the given points in the
         world, from the root to the end of any limb [m].
         """
-        X_WT = self._fit.kinematics.poses(values)[self._plan.trunk]
-        samples_T = (samples_W - X_WT[:3, 3]) @ X_WT[:3, :3]
-        return np.asarray(np.linalg.norm(limb.samples_T - samples_T, axis=2).max(axis=1))
+        R_WB, root = self._plan.frame(limb, self._fit.kinematics.poses(values))
+        samples_B = (samples_W - root) @ R_WB
+        return np.asarray(np.linalg.norm(limb.samples_B - samples_B, axis=2).max(axis=1))
 
     def _move_trunk(self, values: Array, middle: Array) -> Array:
         """Shift and return values (m,), so that the trunk's middle is at `middle` (3,) [m]."""

@@ -20,6 +20,7 @@ from drake_pose.fit.contour_fit import (
     Views,
     compare_views,
     pack_views,
+    pixels_per_metre,
 )
 from drake_pose.fit.evidence import EdgePoints, find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
@@ -85,6 +86,16 @@ class FrameViews:
         """
         weights = fit.weights(self._packed.cameras, placement, step)
         return compare_views(self._packed, placement, weights)
+
+    def tile_costs(self, fit: ContourFit, values: Array, step: AnnealingStage) -> Array:
+        """Return the cost (cameras, 64, 64) of a pose (m,) in image tiles without prior.
+
+        A tile's side is twice the length over which the errors of silhouettes are correlated.
+        """
+        place = fit.body.place(values).X_WN[0, :3, 3]
+        size = float(pixels_per_metre(self._packed.cameras, place).mean())
+        side = max(1.0, 2.0 * float(np.mean(fit.noise.correlation)) * size)
+        return fit.tile_costs(self._packed, values, step, side)
 
     @cached_property
     def _packed(self) -> Views:

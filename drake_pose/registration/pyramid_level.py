@@ -19,7 +19,6 @@ from drake_pose.fit.explain_kernel import (
     Explained,
     PixelSums,
     Words,
-    explain,
     explain_pose,
     explain_poses,
     make_words,
@@ -49,6 +48,13 @@ class ScoredPictures(NamedTuple):
     sums: PixelSums
     middle: Array
     scales: Array
+
+    def explain(self, X_CW: Array, side: float = 1.0, squares: int = 0) -> tuple[Array, Array]:
+        """Return ``explain_poses`` of poses X_CW (n, 3, 4), with tiles (squares, squares)."""
+        sums, tiles = explain_poses(
+            self.packed, X_CW, self.X_WN, self.is_static, self.camera, self.sums, side, squares
+        )
+        return np.asarray(sums), np.asarray(tiles)
 
 
 @compiled
@@ -115,7 +121,7 @@ def _cost(
     move_pose(X_CW, pictures.middle, x, moved)
     crossings = explain_pose(
         pictures.packed, moved, pictures.X_WN, pictures.is_static, pictures.camera, pictures.sums,
-        X_CN, totals, scratch, crossings,
+        X_CN, totals, np.zeros((0, 0)), 1.0, scratch, crossings,
     )  # fmt: skip
     scales = pictures.scales
     contour = totals[Explained.CONTOUR] / (totals[Explained.OUTLINE] + scales[1])
@@ -148,9 +154,18 @@ def search_simplexes(
             cost_of[k], crossings = _cost(
                 pictures, start, corner[k], moved, X_CN, totals, scratch, crossings
             )
-        _sort(corner, cost_of)
         count = 7
-        while count < evaluations:
+        while True:
+            # Sort the corners by their costs, stably.
+            for i in range(1, 7):
+                k = i
+                while k > 0 and cost_of[k] < cost_of[k - 1]:
+                    cost_of[k], cost_of[k - 1] = cost_of[k - 1], cost_of[k]
+                    for j in range(6):
+                        corner[k, j], corner[k - 1, j] = corner[k - 1, j], corner[k, j]
+                    k -= 1
+            if count >= evaluations:
+                break
             for i in range(6):
                 centre[i] = 0.0
                 for k in range(6):
@@ -182,19 +197,6 @@ def search_simplexes(
                             pictures, start, corner[k], moved, X_CN, totals, scratch, crossings
                         )
                         count += 1
-            _sort(corner, cost_of)
-
-
-@compiled
-def _sort(corners: Array, costs: Array) -> None:
-    """Sort the corners (7, 6) of a simplex by their costs (7,), stably."""
-    for i in range(1, 7):
-        k = i
-        while k > 0 and costs[k] < costs[k - 1]:
-            costs[k], costs[k - 1] = costs[k - 1], costs[k]
-            for j in range(6):
-                corners[k, j], corners[k - 1, j] = corners[k - 1, j], corners[k, j]
-            k -= 1
 
 
 class PictureSettings(NamedTuple):
@@ -297,10 +299,9 @@ class PyramidLevel:
 
         X_WN: (f, nodes, 4, 4) poses of the nodes; None: those of the level.
         """
-        X_CN = X_CW[:3] @ (self._X_WN if X_WN is None else X_WN)
-        return explain(
-            self._packed, X_CN, self._static, self._parameters, self.backgrounds.sums, 1.0, 0
-        )[0]
+        placed = np.ascontiguousarray((self._X_WN if X_WN is None else X_WN)[:, :, :3])
+        (totals,), _ = self._scored()._replace(X_WN=placed).explain(X_CW[None, :3])
+        return np.asarray(totals)
 
     def explained(self, X_CW: Array) -> tuple[float, float]:
         """Return a pose's `explained` fraction and mean `contour`, as of ``PictureFit``."""
@@ -314,15 +315,10 @@ class PyramidLevel:
 
     def scores(self, X_CW: Sequence[Array] | Array, frames: int | None = None) -> Array:
         """Return scores (n,), see `evidence`, of poses (4, 4) in the first `frames`, or all."""
-        pictures, poses = self._scored(frames), np.asarray(X_CW)[:, :3]
+        pictures, poses = self._scored(frames), np.ascontiguousarray(np.asarray(X_CW)[:, :3])
 
         def sums(chunk: Array) -> Array:
-            return np.asarray(
-                explain_poses(
-                    pictures.packed, chunk, pictures.X_WN, pictures.is_static, pictures.camera,
-                    pictures.sums,
-                )
-            )  # fmt: skip
+            return pictures.explain(chunk)[0]
 
         totals = np.concatenate(
             map_ordered(sums, (poses[k : k + 100] for k in range(0, len(poses), 100)))
@@ -350,11 +346,7 @@ class PyramidLevel:
     def tile_gains(self, X_CW: Array, squares: int = 16) -> Array:
         """Return a pose's log-likelihood gain [nat] by square image tiles (squares, squares)."""
         side = max(self.camera.width, self.camera.height) / squares
-        _, gains = explain(
-            self._packed, X_CW[:3] @ self._X_WN, self._static, self._parameters,
-            self.backgrounds.sums, side, squares,
-        )  # fmt: skip
-        return gains
+        return self._scored().explain(X_CW[None, :3], side, squares)[1]
 
     def starts(self, rotations: int) -> list[Array]:
         """Return poses X_CW (4, 4) from which a search starts.

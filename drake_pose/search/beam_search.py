@@ -3,10 +3,9 @@
 J is the area in which projected body and silhouette differ, summed over the views [pixel].
 
 Nodes are placed one after another, and after each the hypotheses with the least expected objective
-are kept. The first stages allow only the tolerance outside the silhouette and end at a pose with J
-within it, which is exact. If they fail, a branch and bound enumerates all exact poses. Later stages
-allow more area outside, weighted against the newly covered area (5). Finally the limbs of the best
-pose are searched again.
+are kept. Branch and bounds, the first ones with few hypotheses, search poses with J within the
+tolerance, which are exact. If there are none, beam searches weight area outside the silhouette
+against newly covered area (5), and search the limbs of the best pose again.
 """
 
 import copy
@@ -14,6 +13,7 @@ import itertools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -47,21 +47,13 @@ class Stage:
     """
 
     hypotheses: int
-    outside_fraction: float = 0.0
-    outside_weight: int = 1
+    outside_fraction: float
+    outside_weight: int
     limb_by_limb: bool = False
 
     def __post_init__(self) -> None:
         require_at_least(1, hypotheses=self.hypotheses, outside_weight=self.outside_weight)
         require_at_least(0, outside_fraction=self.outside_fraction)
-
-
-EXACT_STAGES = (Stage(20), Stage(160))
-"""Stages for a model that fits the object exactly. If no pose fits exactly, they end early; if they
-find none, a branch and bound enumerates all poses within the tolerance."""
-
-TOLERANT_STAGES = (Stage(80, 0.3, 5), Stage(300, 1.0, 2))
-"""Stages for a model that fits the object only approximately."""
 
 
 @dataclass(frozen=True)
@@ -71,9 +63,7 @@ class BeamSearchSettings(GridSettings):
     Args:
         tolerance: a pose with J up to this counts as exact [pixel]; None: the difference between
             two renderers (``renderer_tolerance``).
-        stages: the passes, run one after another until J is within the tolerance. Where
-            ``outside_fraction`` is 0 the tolerance limits the area outside; after these stages a
-            branch and bound enumerates all poses within the tolerance.
+        stages: the passes, run one after another until J is within the tolerance.
         research_hypotheses: beam width when limbs of the best pose are searched again; 0: limbs are
             not searched again.
         time_limit: time after which the best pose found is returned [s]; None: no limit.
@@ -83,7 +73,7 @@ class BeamSearchSettings(GridSettings):
     """
 
     tolerance: float | None = None
-    stages: tuple[Stage, ...] = EXACT_STAGES + TOLERANT_STAGES
+    stages: tuple[Stage, ...] = (Stage(80, 0.3, 5), Stage(300, 1.0, 2))
     research_hypotheses: int = 30
     time_limit: float | None = None
 
@@ -101,9 +91,8 @@ def grow(
     node: int,
     width: int,
     outside_weight: int,
-    limit: float = np.inf,
     spare: int = 4,
-) -> tuple[PartialPoses | None, bool]:
+) -> PartialPoses | None:
     """Place one more node in every partial pose and keep the best results.
 
     Args:
@@ -113,12 +102,9 @@ def grow(
         node: index of the node that is placed.
         width: beam width: greatest number of partial poses that are kept.
         outside_weight: cost of a pixel outside, relative to the gain of a newly covered one.
-        limit: partial poses are dropped if no completion can have an objective up to this [pixel];
-            infinite: none is dropped for it.
         spare: number of candidates from which distinct ones are chosen, as a multiple of ``width``.
 
-    Returns the new partial poses, best first, or None if there is none within the limit; and
-    whether a partial pose within the limit may have been dropped.
+    Returns the new partial poses, best first; None if there is none.
     """
     pairs = store.pairs(partial, node)
     areas, added = store.score(partial, node, pairs)
@@ -129,29 +115,18 @@ def grow(
             more = nothing[1:][np.diff(pairs[nothing, 0]) == 0]
             pairs, areas, added = (np.delete(one, more, axis=0) for one in (pairs, areas, added))
     if len(pairs) == 0:
-        return None, False
-    beyond = store.nodes[node].areas[pairs[:, 1], 2]
-    outside = partial.outside[pairs[:, 0]] + areas[:, 1] + beyond
+        return None
+    outside = partial.outside[pairs[:, 0]] + areas[:, 1] + store.nodes[node].areas[pairs[:, 1], 2]
     costs = outside_weight * outside - partial.covered[pairs[:, 0]] - areas[:, 0]
     # The smallest costs; equal costs keep their order.
-    most, lost = spare * width, False
-    ordered = np.arange(len(costs))
-    if len(costs) > most:
-        ordered, lost = np.flatnonzero(costs <= np.partition(costs, most - 1)[most - 1]), True
-    ordered = ordered[np.argsort(costs[ordered], kind="stable")[:most]]
-    made = store.make(partial, node, pairs[ordered], (areas[ordered], added[ordered]))
-    pairs = pairs[ordered]
+    most = min(spare * width, len(costs))
+    best = np.flatnonzero(costs <= np.partition(costs, most - 1)[most - 1])
+    best = best[np.argsort(costs[best], kind="stable")[:most]]
+    pairs, scores = pairs[best], (areas[best], added[best])
     # The unreachable area is known only after placing the node: place more, and rank again.
-    grown = width if limit < np.inf else 2 * width
-    chosen, made, examined = store.choose(partial, made, node, pairs, grown, limit)
-    lost = lost or len(examined) < len(pairs)
-    if limit == np.inf:
-        best = np.argsort(made.costs(outside_weight), kind="stable")[:width]
-        lost = lost or len(best) < len(made)
-        chosen, made = chosen[best], made.chosen(best)
-    if len(made) == 0:
-        return None, lost
-    return store.with_masks(partial, made, node, pairs[chosen]), lost
+    chosen, made, _ = store.place(partial, node, pairs, scores, 2 * width)
+    best = np.argsort(made.costs(outside_weight), kind="stable")[:width]
+    return store.with_masks(partial, made.chosen(best), node, pairs[chosen[best]])
 
 
 class BeamSearch:
@@ -216,8 +191,8 @@ class BeamSearch:
     ) -> list[list[np.ndarray]]:
         """Return the best whole poses that differ visibly, best first.
 
-        This is slower than :meth:`match`: after an exact pose is found, the first stage that allows
-        area outside the silhouette is still run.
+        This is slower than :meth:`match`: after an exact pose is found, the first stage is still
+        run.
 
         Args:
             views: the silhouettes, one per camera.
@@ -275,8 +250,6 @@ class _BeamRun:
         self._tolerance = renderer_tolerance(views) if given is None else given
         self.scoring = Scoring(self._body.sampled, views)
         self._collected: list[tuple[np.ndarray, np.ndarray]] = []
-        self._bits: dict[bool, SilhouetteBits] = {}
-        self._stores: dict[float, PoseStore] = {}
         self._samples: np.ndarray | None = None
         self._J, self._first_J = np.inf, np.nan
         self._runs, self._stopped_by = 0, ""
@@ -284,34 +257,21 @@ class _BeamRun:
 
     def search(self) -> None:
         """Run the stages until J is within the tolerance or time is up, and improve the result."""
-        if self._all and self._search_within():
-            self._stopped_by = "exact"
-            return
-        stages = self._settings.stages
-        exact = [stage for stage in stages if stage.outside_fraction == 0.0]
-        tolerant = [stage for stage in stages if stage.outside_fraction != 0.0]
-        for stage in exact:
-            if self._run_stage(stage) or self._stopped_by or self._is_matched:
-                break
-        if not (self._all or self._collect or self._stopped_by or self._is_matched):
+        if not self._collect:
             self._search_within()
-        for k, stage in enumerate(tolerant):
-            enough = self._is_matched and not (self._collect and k == 0)
-            if self._stopped_by or enough:
+        for k, stage in enumerate(self._settings.stages):
+            if self._stopped_by or (self._is_matched and not (self._collect and k == 0)):
                 break
             self._run_stage(stage)
         if self._samples is None:
             # No stage found a pose: search one without a limit on the area outside, with a single
             # hypothesis if the time is up.
             width = 1 if self._stopped_by else self._settings.stages[-1].hypotheses
-            store = self._store(np.inf)
-            start, order = store.start(), self._body.order
-            last, _ = self._grow_all(store, start, order, width, 2, limited=False)
-            if last is not None:
-                best = int(np.argmin(self._score(store, last)))
-                self._keep_if_better(store.samples(last.poses[best]))
-        elif self._settings.research_hypotheses and not (self._stopped_by or self._is_matched):
-            self._turn_single_nodes(self._samples)
+            store = PoseStore(self._body, self._bits)
+            whole = self._grow_all(store, store.start(), self._body.order, width, 2, limited=False)
+            if whole is not None:
+                best = int(np.argmin(self._score(store, whole)))
+                self._keep_if_better(store.samples(whole.poses[best]))
         self._stopped_by = "exact" if self._is_matched else self._stopped_by or "end"
 
     @property
@@ -319,52 +279,32 @@ class _BeamRun:
         """Whether the best pose counts as exact."""
         return self._J <= self._tolerance
 
-    def _search_within(self) -> bool:
-        """Enumerate the poses within the tolerance and keep the best; return whether any exists."""
-        left = self._deadline - time.perf_counter()
-        limits = BoundLimits(time_limit=max(left, 0.0) if left < np.inf else None)
-        found = branch_and_bound(self._body, self._views, self._tolerance, limits)
-        if not found.graph.size:
-            return False
-        if self._all:
-            self.within = found
-        self._keep_if_better(found.graph.central())
-        return True
+    def _search_within(self) -> None:
+        """Enumerate poses within the tolerance, all if need be, and keep the best."""
+        everything = BoundLimits().states
+        for states in (everything,) if self._all else (20, 160, everything):
+            left = self._deadline - time.perf_counter()
+            limits = BoundLimits(
+                states=states, time_limit=max(left, 0.0) if left < np.inf else None
+            )
+            found = branch_and_bound(self._body, self._views, self._tolerance, limits)
+            self._runs += len(self._body.order)
+            if found.graph.size:
+                self.within = found if self._all else None
+                self._keep_if_better(found.graph.central())
+            if time.perf_counter() >= self._deadline:
+                self._stopped_by = "time_limit"
+            if found.graph.size or found.complete or self._stopped_by:
+                return
 
-    def _bits_of(self, exact: bool, coarse_pixels: int = 6000) -> SilhouetteBits:
-        """Return the silhouettes as bit masks, full ones if ``exact``, or of ``coarse_pixels``.
+    @cached_property
+    def _bits(self, coarse_pixels: int = 6000) -> SilhouetteBits:
+        """The silhouettes as bit masks of ``coarse_pixels``.
 
-        The best pose of a stage that is not exact is scored at full resolution.
+        The best pose of a stage is scored at full resolution.
         """
-        if exact not in self._bits:
-            if exact:
-                views, band = self._views, int(self._tolerance)
-                self._bits[exact] = SilhouetteBits(self._body, views, band, in_full=True)
-            else:
-                views = tuple(coarsen(view, coarse_pixels) for view in self._views)
-                self._bits[exact] = SilhouetteBits(self._body, views)
-        return self._bits[exact]
-
-    def _store(self, outside_fraction: float) -> PoseStore:
-        """Return the store of nodes' poses whose area outside is within a limit; stores are cached.
-
-        ``outside_fraction``: the limit as a fraction of a node's mean projected area; 0: the limit
-        is the tolerance, at full resolution.
-        """
-        if outside_fraction not in self._stores:
-            exact = outside_fraction == 0.0
-            limit = self._tolerance if exact else None
-            bits = self._bits_of(exact)
-            store = PoseStore(self._body, bits, outside_fraction, limit)
-            self._stores[outside_fraction] = store
-        return self._stores[outside_fraction]
-
-    def _proceed(self) -> bool:
-        """Count one more placed node, and return whether there is time left."""
-        self._runs += 1
-        if time.perf_counter() >= self._deadline:
-            self._stopped_by = "time_limit"
-        return not self._stopped_by
+        views = tuple(coarsen(view, coarse_pixels) for view in self._views)
+        return SilhouetteBits(self._body, views)
 
     def _grow_all(
         self,
@@ -374,53 +314,43 @@ class _BeamRun:
         width: int,
         outside_weight: int,
         limited: bool = True,
-        limit: float = np.inf,
-    ) -> tuple[PartialPoses | None, bool]:
+    ) -> PartialPoses | None:
         """Place nodes one after another.
 
         ``store``: the poses of nodes. ``partial``: the partial poses that are extended. ``order``:
         the nodes, in the order in which they are placed. ``width``: beam width: greatest number of
         partial poses kept after each node. ``outside_weight``: cost of a pixel outside, relative to
-        the gain of a newly covered one. ``limit``: greatest objective of completions, beyond which
-        partial poses are dropped [pixel]. ``limited``: whether the time limit ends the search.
+        the gain of a newly covered one. ``limited``: whether the time limit ends the search.
 
-        Returns the partial poses with all nodes placed (None: none was left, or the time is up),
-        and whether certainly no partial pose within the limit was dropped.
+        Returns the partial poses with all nodes placed; None: none was left, or the time is up.
         """
-        complete = True
         for node in order:
-            grown, lost = grow(store, partial, node, width, outside_weight, limit)
-            complete = complete and not lost
-            if grown is None:
-                return None, complete
-            if limited and not self._proceed():
-                return None, False
+            grown = grow(store, partial, node, width, outside_weight)
+            if grown is None or (limited and not self._proceed()):
+                return None
             partial = grown
-        return partial, complete
+        return partial
 
-    def _run_stage(self, stage: Stage) -> bool:
-        """Run one stage and keep its best pose.
+    def _proceed(self) -> bool:
+        """Count one more placed node, and return whether there is time left."""
+        self._runs += 1
+        if time.perf_counter() >= self._deadline:
+            self._stopped_by = "time_limit"
+        return not self._stopped_by
 
-        Returns whether certainly no partial pose within the stage's limit was dropped, so that an
-        exact stage without a result proves that there is no exact pose.
-        """
-        exact = stage.outside_fraction == 0.0
-        store = self._store(stage.outside_fraction)
+    def _run_stage(self, stage: Stage) -> None:
+        """Run one stage and keep its best pose."""
+        store = PoseStore(self._body, self._bits, stage.outside_fraction)
         order = self._body.limb_order if stage.limb_by_limb else self._body.order
-        last, complete = self._grow_all(
-            store, store.start(), order, stage.hypotheses, stage.outside_weight,
-            limit=self._tolerance if exact else np.inf,
-        )  # fmt: skip
-        if last is None:
-            return complete
-        Js = self._score(store, last)
+        whole = self._grow_all(store, store.start(), order, stage.hypotheses, stage.outside_weight)
+        if whole is None:
+            return
+        Js = self._score(store, whole)
         best = int(np.argmin(Js))
-        self._keep_if_better(store.samples(last.poses[best]))
-        width = self._settings.research_hypotheses
-        if width and (not self._is_matched or (self._collect and not exact)):
-            better = self._search_limbs_again(store, order, last.poses[best], float(Js[best]))
+        self._keep_if_better(store.samples(whole.poses[best]))
+        if self._settings.research_hypotheses and (self._collect or not self._is_matched):
+            better = self._search_limbs_again(store, order, whole.poses[best], float(Js[best]))
             self._keep_if_better(store.samples(better))
-        return complete
 
     def _search_limbs_again(
         self, store: PoseStore, order: Sequence[int], poses: np.ndarray, J: float
@@ -450,7 +380,7 @@ class _BeamRun:
             part = [node for node in order if node in again]
             # A limb placed last may cover silhouette that it had left to later nodes before.
             start = store.without(poses, again)
-            last, _ = self._grow_all(store, start, part, width, 2)
+            last = self._grow_all(store, start, part, width, 2)
             if last is None:
                 break
             Js = self._score(store, last)
@@ -461,46 +391,6 @@ class _BeamRun:
             if unchanged >= len(choices):
                 break
         return poses
-
-    def _turn_single_nodes(self, current: np.ndarray, scored: int = 4) -> None:
-        """Improve a pose by changing single nodes, which move their descendants along.
-
-        The result is kept by ``_keep_if_better``.
-
-        ``current``: (nodes,) samples of the pose. ``scored``: number of a node's samples, the best
-        at coarse resolution, that are scored at full resolution.
-        """
-        scoring, bits = self.scoring, self._bits_of(exact=False)
-        sampled, words = scoring.sampled, int(bits.part_starts[-1])
-        silhouettes = int(bits.part_starts[len(bits.views)])
-        J, unchanged = float(scoring.J(current[None])[0]), 0
-        sources = np.array([sampled.tree.source(i) for i in range(len(current))])
-        nodes = np.flatnonzero(sources == np.arange(len(current))).tolist()
-        for node in itertools.cycle(nodes):
-            if not self._proceed():
-                break
-            tried = np.repeat(current[None], len(sampled.values[node]), axis=0)
-            tried[:, sources == node] = np.arange(len(tried))[:, None]
-            X_WN, moving = sampled.poses(tried), sampled.tree.subtrees[node]
-            far = np.zeros(len(tried), dtype=np.int64)
-            still = np.zeros((1, words), dtype=np.uint64)
-            for i in set(range(len(current))).difference(moving):
-                far += bits.draw_node(i, tried[:1, i], X_WN[:1, i], still)[0, 2]
-            masks = np.repeat(still, len(tried), axis=0)
-            for i in moving:
-                far += bits.draw_node(i, tried[:, i], X_WN[:, i], masks)[:, 2]
-            ones = np.bitwise_count(masks).astype(np.int64)
-            outside, covered = ones[:, silhouettes:].sum(axis=1), ones[:, :silhouettes].sum(axis=1)
-            order = np.argsort(bits.area - covered + outside + far, kind="stable")
-            tried = tried[order[:scored]]
-            Js = scoring.J(tried)
-            best = int(np.argmin(Js))
-            unchanged += 1
-            if Js[best] < J:
-                J, current, unchanged = float(Js[best]), tried[best], 1
-            if unchanged >= len(nodes):
-                break
-        self._keep_if_better(current)
 
     def _score(self, store: PoseStore, whole: PartialPoses) -> np.ndarray:
         """Return J (n,) of whole poses at the store's resolution [pixel].
@@ -568,7 +458,7 @@ class _BeamRun:
         Returns (n, nodes, W) uint64 bit masks of the nodes, (n, nodes) their areas [pixel], and (n,
         nodes) bool whether the other nodes of the pose cover all of a node's projection.
         """
-        bits, X_WN = self._bits_of(exact=False), self.scoring.sampled.poses(samples)
+        bits, X_WN = self._bits, self.scoring.sampled.poses(samples)
         poses, nodes = samples.shape
         by_node = np.zeros((nodes, poses, int(bits.part_starts[-1])), dtype=np.uint64)
         drawn = [

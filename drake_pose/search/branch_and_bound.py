@@ -1,12 +1,13 @@
 """Enumerate all poses of a grid whose objective J is at most a limit, by branch and bound.
 
-Nodes are placed one after another. The area outside the silhouette stays outside, and silhouette
-that no later node can reach stays uncovered, so the sum of these two areas is a lower bound of J of
-all completions of a partial pose. A partial pose is dropped only if this bound exceeds the limit,
-or if there are too many, which is reported. The result may hold very many poses and is stored as a
-layered graph of partial poses.
+Nodes are placed in the order of the beam search. The area outside the silhouette stays outside, and
+silhouette that no later node can reach stays uncovered, so the sum of these two areas is a lower
+bound of J of all completions of a partial pose. A partial pose is dropped only if this bound
+exceeds the limit, or if there are too many, which is reported. The result may hold very many poses
+and is stored as a layered graph of partial poses.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -163,11 +164,7 @@ class PosesWithin:
 
 
 def branch_and_bound(
-    body: SampledBody,
-    views: Sequence[View],
-    J_limit: float,
-    limits: BoundLimits | None = None,
-    kept_samples: np.ndarray | None = None,
+    body: SampledBody, views: Sequence[View], J_limit: float, limits: BoundLimits | None = None
 ) -> PosesWithin:
     """Find all poses of the grid whose objective is at most a limit.
 
@@ -179,189 +176,60 @@ def branch_and_bound(
         views: the silhouettes, one per camera.
         J_limit: the greatest objective [pixel].
         limits: limits of time, memory and size; None: the defaults.
-        kept_samples: (nodes,) samples (indices in the nodes' grids) of a pose that is kept even if
-            there are too many; None: no pose is preferred.
     """
-    return _BranchAndBound(body, views, J_limit, limits or BoundLimits(), kept_samples).run()
-
-
-class _BranchAndBound:
-    """One run of ``branch_and_bound``, which has the same arguments."""
-
-    def __init__(
-        self,
-        body: SampledBody,
-        views: Sequence[View],
-        J_limit: float,
-        limits: BoundLimits,
-        kept_samples: np.ndarray | None,
-    ) -> None:
-        self.order = body.limb_order
-        self.J_limit, self.limits = J_limit, limits
-        # Bands as wide as the limit, so that no pose within the limit has area beyond them. They
-        # are narrowed, but not below 8 pixels, if masks would have more words than this.
-        most_words, least_band = 2000, 8
-        sides = (view.mask.shape[i] for view in views for i in (0, 1))
-        band = max(1, int(min(J_limit, max(sides)))) if J_limit >= 1.0 else 0
-        self.bits = SilhouetteBits(body, views, band, in_full=True)
-        while band > least_band and self.bits.part_starts[-1] > most_words:
-            band //= 2
-            self.bits = SilhouetteBits(body, views, band, in_full=True)
-        self.store = PoseStore(body, self.bits, outside_limit=J_limit, limits=limits)
-        self.nodes = self.store.tree_nodes
-        self.reaches = _SubtreeReaches(self.store)
-        self._layers: list[Layer] = []
-        self._complete = True
-        self._limited = False
-        self._lower_bound = np.inf
-        # Index of the partial pose that the pose to be kept extends; -1: none.
-        self._kept = -1 if kept_samples is None else 0
-        self._kept_samples = np.zeros(0) if kept_samples is None else kept_samples
-
-    def run(self) -> PosesWithin:
-        """Place all nodes and return the poses found."""
-        partial = self.store.start()
-        while len(self._layers) < len(self.nodes):
-            try:
-                self.store.reserve(0)
-                partial, node, pairs = self._choose(partial)
-                partial = self._place(partial, node, pairs)
-            except LimitReached:
-                left = float(partial.bounds.min()) if len(partial) else np.inf
-                bound = min(self._lower_bound, left)
-                nothing = np.zeros(0, dtype=np.int64)
-                layers = [Layer(i, nothing, nothing, nothing) for i in range(len(self.nodes))]
-                graph = PartialPoseGraph(layers, np.zeros(0))
-                return PosesWithin(self.J_limit, graph, False, True, bound)
-        # All nodes are placed: the bounds are the objectives, except for areas beyond the bands.
-        # There the bound contains only the largest area of a node, and ``highs`` their sum.
-        highs = partial.bounds + partial.beyond[:, 1] - partial.beyond[:, 0]
-        graph = PartialPoseGraph(self._layers, highs).up_to(self.J_limit)
-        self._drop(partial.bounds[highs > self.J_limit])
-        bound = min(self._lower_bound, float(np.floor(self.J_limit)) + 1.0)
-        return PosesWithin(self.J_limit, graph, self._complete, self._limited, bound)
-
-    def _drop(self, bounds: np.ndarray, limited: bool = False) -> None:
-        """Record bounds (n,) of dropped partial poses; ``limited``: for a limit of the search."""
-        if len(bounds):
-            self._complete = False
-            self._limited = self._limited or limited
-            self._lower_bound = min(self._lower_bound, float(bounds.min()))
-
-    def _choose(self, partial: PartialPoses) -> tuple[PartialPoses, int, np.ndarray]:
-        """Choose the node to place next.
-
-        Returns the partial poses, perhaps fewer; the node; and (p, 2) int32 pairs of a partial pose
-        and a pose of the node that are to be evaluated.
-        """
-        placed = {layer.node for layer in self._layers}
-        waiting = [
-            i for i in self.order if i not in placed and self.nodes[i].parent in (-1, *placed)
-        ]
-        forks = [i for i in waiting if self.store.body.forked[i]]
-        if forks or len(partial) == 0:
-            node = (forks or waiting)[0]
-            partial = self._fit_pairs(partial, node)
-            return partial, node, self.store.pairs(partial, node)
-        totals = [int(np.diff(self.store.groups(partial, node)).sum()) for node in waiting]
-        node = waiting[int(np.argmin(totals))]
-        partial = self._fit_pairs(partial, node)
-        pairs = self.store.pairs(partial, node)
-        # With more pairs than this it is faster to prune them by what later nodes can cover.
-        if min(totals) > 300:
-            for other in waiting:
-                if np.diff(self.store.groups(partial, other)).sum() <= self.limits.pairs:
-                    pruned = self._pruned_pairs(partial, other, waiting)
-                    if len(pruned) < len(pairs):
-                        node, pairs = other, pruned
-        return partial, node, pairs
-
-    def _pruned_pairs(self, partial: PartialPoses, node: int, waiting: Sequence[int]) -> np.ndarray:
-        """Return the pairs of partial pose and node's pose that can still lead to the limit of J.
-
-        Unlike the bound of a partial pose, this uses the poses that the waiting nodes can take: all
-        that can be placed next. The pairs are (p, 2) int32, as of ``PoseStore.pairs``.
-        """
-        pairs = self.store.pairs(partial, node)
-        below = self.reaches.child_rows(node, pairs[:, 1])
-        reaches, parents = self.reaches, self.store.parents
-        others = [reaches.rows(k, parents(partial.poses, k)) for k in waiting if k != node]
-        table, all_pixels = self.reaches.table, self.bits.all_pixels
-        uncovered = all_pixels & ~partial.masks[:, : len(all_pixels)]
-        for rows in others:
-            uncovered &= ~table[rows]
-        room = np.floor(self.J_limit - partial.least_outside).astype(np.int64)
-        stored, views = self.store.nodes[node], len(self.bits.views)
-        good = prune_pairs(uncovered, room, pairs, stored.runs, stored.words, views, below, table)
-        return pairs[good]
-
-    def _place(self, partial: PartialPoses, node: int, pairs: np.ndarray) -> PartialPoses:
-        """Place a node at the pairs (p, 2) of partial pose and node's pose, and add the layer.
-
-        Returns the distinct partial poses, with masks, which are the states after the layer.
-        """
-        store = self.store
-        made = store.make(partial, node, pairs, store.score(partial, node, pairs))
-        firsts, made, numbers = store.choose(
-            partial, made, node, pairs, len(pairs), keep_beyond=True
-        )
-        samples = store.nodes[node].samples[pairs[:, 1]].astype(np.int64)
-        if self._kept >= 0:
-            own = np.flatnonzero(
-                (pairs[:, 0] == self._kept) & (samples == self._kept_samples[node])
+    limits, order = limits or BoundLimits(), body.order
+    # Bands as wide as the limit, so that no pose within the limit has area beyond them. They are
+    # narrowed, but not below 8 pixels, if masks would have more words than this.
+    most_words, least_band = 2000, 8
+    sides = (view.mask.shape[i] for view in views for i in (0, 1))
+    band = max(1, int(min(J_limit, max(sides)))) if J_limit >= 1.0 else 0
+    bits = SilhouetteBits(body, views, band, in_full=True)
+    while band > least_band and bits.part_starts[-1] > most_words:
+        band //= 2
+        bits = SilhouetteBits(body, views, band, in_full=True)
+    store = PoseStore(body, bits, outside_limit=J_limit, limits=limits)
+    reaches, partial, layers = _SubtreeReaches(store), store.start(), list[Layer]()
+    room = max(1, min(limits.states, limits.memory // (4 * 8 * store.words)))
+    # Least bound of the partial poses that were left out.
+    least, limited = np.inf, False
+    try:
+        for node, following in itertools.zip_longest(order, order[1:]):
+            store.reserve(0)
+            pairs = reaches.pairs(partial, node, J_limit)
+            scores = store.score(partial, node, pairs)
+            firsts, made, numbers = store.place(
+                partial, node, pairs, scores, len(pairs), keep_beyond=True
             )
-            self._kept = int(numbers[own[0]]) if len(own) else -1
-        room = min(self.limits.states, self.limits.memory // (4 * 8 * store.words))
-        kept = self._keep(made, np.ones(len(made)), max(1, room))
-        places = np.cumsum(kept) - 1
-        edges = kept[numbers]
-        origins = pairs[edges, 0].astype(np.int64)
-        layer = Layer(node, origins, samples[edges], places[numbers[edges]])
-        self._layers.append(layer.chosen(np.lexsort((layer.samples, layer.origins))))
-        if self._kept >= 0:
-            self._kept = int(places[self._kept]) if kept[self._kept] else -1
-        return store.with_masks(partial, made.chosen(kept), node, pairs[firsts[kept]])
-
-    def _fit_pairs(self, partial: PartialPoses, node: int) -> PartialPoses:
-        """Return the best partial poses, whose pairs with the node are within ``limits.pairs``.
-
-        The last layer's edges to the other partial poses are removed.
-        """
-        counts = np.diff(self.store.groups(partial, node)).ravel()
-        kept = self._keep(partial, counts, self.limits.pairs)
-        if kept.all():
-            return partial
-        places = np.cumsum(kept) - 1
-        if self._layers:
-            last = self._layers[-1].chosen(kept[self._layers[-1].ends])
-            self._layers[-1] = replace(last, ends=places[last.ends])
-        if self._kept >= 0:
-            self._kept = int(places[self._kept])
-        return partial.chosen(kept)
-
-    def _keep(self, partial: PartialPoses, counts: np.ndarray, limit: float) -> np.ndarray:
-        """Return which partial poses are kept, (B,) bool.
-
-        Those whose bound exceeds the limit of J are dropped. If the others' sum of ``counts``
-        exceeds ``limit``, only the best are kept, up to this sum but at least one.
-
-        ``partial``: the B partial poses. ``counts``: (B,) number of pairs, or 1, that each needs.
-        ``limit``: greatest sum of the counts.
-        """
-        alive = partial.bounds <= self.J_limit
-        if counts[alive].sum() <= limit:
-            return np.asarray(alive)
-        # The area outside has weight 2, since it stays outside, while uncovered silhouette may be
-        # covered by a later node.
-        costs = np.where(alive, partial.costs(2), np.iinfo(np.int64).max)
-        if self._kept >= 0:
-            costs[self._kept] = np.iinfo(np.int64).min
-        order = np.argsort(costs, kind="stable")
-        room = max(1, int(np.searchsorted(np.cumsum(counts[order]), limit, side="right")))
-        kept = np.zeros(len(alive), dtype=np.bool_)
-        kept[order[:room]] = True
-        self._drop(partial.bounds[alive & ~kept], limited=True)
-        return np.asarray(alive & kept)
+            # The area outside has weight 2, since it stays outside, while uncovered silhouette may
+            # be covered by a later node.
+            alive = np.flatnonzero(made.bounds <= J_limit)
+            best = alive[np.argsort(made.costs(2)[alive], kind="stable")][:room]
+            if following is not None:
+                counts = np.diff(store.groups(made.chosen(best), following)).ravel()
+                fitting = np.searchsorted(np.cumsum(counts), limits.pairs, side="right")
+                best = best[: max(1, int(fitting))]
+            kept = np.zeros(len(made), dtype=np.bool_)
+            kept[best] = True
+            least = min(least, made.bounds[alive[~kept[alive]]].min(initial=np.inf))
+            limited = bool(least < np.inf)
+            edges, places = kept[numbers], np.cumsum(kept) - 1
+            samples = store.nodes[node].samples[pairs[edges, 1]].astype(np.int64)
+            origins = pairs[edges, 0].astype(np.int64)
+            layer = Layer(node, origins, samples, places[numbers[edges]])
+            layers.append(layer.chosen(np.lexsort((samples, origins))))
+            partial = store.with_masks(partial, made.chosen(kept), node, pairs[firsts[kept]])
+    except LimitReached:
+        least = float(min(least, partial.bounds.min(initial=np.inf)))
+        nothing = np.zeros(0, dtype=np.int64)
+        layers = [Layer(i, nothing, nothing, nothing) for i in order]
+        return PosesWithin(J_limit, PartialPoseGraph(layers, np.zeros(0)), False, True, least)
+    # All nodes are placed: the bounds are the objectives, except for areas beyond the bands. There
+    # the bound contains only the largest area of a node, and ``highs`` their sum.
+    highs = partial.bounds + partial.beyond[:, 1] - partial.beyond[:, 0]
+    graph = PartialPoseGraph(layers, highs).up_to(J_limit)
+    least = min(least, partial.bounds[highs > J_limit].min(initial=np.inf))
+    bound = float(min(least, np.floor(J_limit) + 1.0))
+    return PosesWithin(J_limit, graph, bool(np.isinf(least)), limited, bound)
 
 
 class _SubtreeReaches:
@@ -376,6 +244,33 @@ class _SubtreeReaches:
         self.table = np.zeros((256, len(store.bits.all_pixels)), dtype=np.uint64)
         self._used = 0
         self._rows = [RowTable(1) for _ in store.tree_nodes]
+
+    def pairs(
+        self, partial: PartialPoses, node: int, J_limit: float, many: int = 5000
+    ) -> np.ndarray:
+        """Return the pairs of partial pose and node's pose that can lead to J up to a limit.
+
+        More pairs than ``many`` are pruned; unlike the bound of a partial pose, this uses the poses
+        that the other nodes can take that can be placed next. They are (p, 2) int32, as of
+        ``PoseStore.pairs``.
+        """
+        store, bits = self._store, self._store.bits
+        pairs = store.pairs(partial, node)
+        if len(pairs) <= many:
+            return pairs
+        placed = frozenset(np.flatnonzero(partial.poses[0] >= 0).tolist())
+        below, uncovered = self.child_rows(node, pairs[:, 1]), bits.all_pixels
+        uncovered = uncovered & ~partial.masks[:, : len(uncovered)]
+        waiting = (one for one in store.body.frontier(placed)[1] if one != node)
+        others = [self.rows(one, store.parents(partial.poses, one)) for one in waiting]
+        for rows in others:
+            uncovered &= ~self.table[rows]
+        room, own = np.floor(J_limit - partial.least_outside).astype(np.int64), store.nodes[node]
+        return pairs[
+            prune_pairs(
+                uncovered, room, pairs, own.runs, own.words, len(bits.views), below, self.table
+            )
+        ]
 
     def rows(self, node: int, parents: np.ndarray, tries: int = 5000) -> np.ndarray:
         """Return the rows (n,) of ``table`` of a node, for poses ``parents`` (n,) of its parent.

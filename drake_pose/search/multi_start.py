@@ -28,7 +28,7 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import simplify_outlines, simplify_surfaces
-from drake_pose.search.beam_search import TOLERANT_STAGES, BeamSearch, BeamSearchSettings
+from drake_pose.search.beam_search import BeamSearch, BeamSearchSettings
 from drake_pose.search.coarse_search import CoarsePoses, CoarseSearch
 from drake_pose.search.estimates import PoseEstimate, View, require_views
 from drake_pose.search.exact_search import ExactPose, ExactSearch
@@ -116,7 +116,7 @@ class MultiStartSearch:
     @cached_property
     def beam(self) -> BeamSearch:
         """The beam search that gives further starts."""
-        return BeamSearch(self.tree, BeamSearchSettings(stages=TOLERANT_STAGES))
+        return BeamSearch(self.tree)
 
     @cached_property
     def exact(self) -> ExactSearch:
@@ -451,8 +451,10 @@ class _MultiStartRun:
 def small_match() -> tuple[PoseTree, View]:
     """Return a small body and a view, with which all kernels are compiled quickly."""
     tree = load_model(bundled_model("two_finger_hand"), check=False).pose_tree()
-    camera = ParallelCamera("warm-up", 64, 64, 300.0, 32.0, 32.0, np.eye(4))
-    return tree, View(camera, cv2.circle(np.zeros((64, 64), np.uint8), (32, 32), 16, 1, -1) > 0)
+    half = 32
+    mask = cv2.circle(np.zeros((2 * half, 2 * half), np.uint8), (half, half), half // 2, 1, -1) > 0
+    camera = ParallelCamera("warm-up", 2 * half, 2 * half, 300.0, half, half, np.eye(4))
+    return tree, View(camera, mask)
 
 
 @functools.cache

@@ -117,10 +117,7 @@ def choose_pairs(
     all_pixels: np.ndarray,
     reachable: ReachablePixels,
     width: int,
-    state_hashes: np.ndarray,
-    frontier_hashes: np.ndarray,
-    outside: np.ndarray,
-    limit: float,
+    states: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Choose the first distinct pairs, and compute the area that no later node can cover.
 
@@ -132,25 +129,17 @@ def choose_pairs(
             a mask's W words.
         reachable: the pixels that the nodes still to be placed can cover.
         width: greatest number of pairs that are chosen.
-        state_hashes: (p,) uint64 hashes, equal for pairs after which the search goes on alike.
-        frontier_hashes: (p,) uint64 hashes of the poses of nodes with children still to be placed.
-            If it is not empty, pairs beyond the limit are dropped, and so are dominated ones: those
-            whose frontier hash equals that of an earlier pair that covers a superset of the
-            silhouette and has no more area outside. (0,): neither is dropped.
-        outside: (p,) int64 area outside the silhouettes of each pair [pixel].
-        limit: greatest sum of the area outside and the unreachable area [pixel].
+        states: (p,) uint64 hashes, equal for pairs after which the search goes on alike.
 
     Returns:
         chosen: (n,) int64 indices of the chosen pairs.
         unreachable: (n,) int64 silhouette area that no later node can cover after each [pixel].
         places: (e,) int64 for each of the first e pairs, which were examined, the index in
-            ``chosen`` of the pair with its state (itself or an earlier one); -1 if it was dropped.
+            ``chosen`` of the pair with its state (itself or an earlier one).
     """
     made = min(width, pairs.shape[0])
     chosen, unreachable = np.empty(made, dtype=np.int64), np.empty(made, dtype=np.int64)
-    prunes = frontier_hashes.shape[0] > 0
-    covered = np.empty((made if prunes else 1, masks.shape[1]), dtype=np.uint64)
-    rest = np.empty_like(all_pixels)
+    own, rest = np.empty(masks.shape[1], dtype=np.uint64), np.empty_like(all_pixels)
     bits = 4
     while 1 << bits < 2 * pairs.shape[0]:
         bits += 1
@@ -161,16 +150,14 @@ def choose_pairs(
     while examined < pairs.shape[0] and count < made:
         i = examined
         examined += 1
-        slot = np.int64((state_hashes[i] * _MIX) >> np.uint64(64 - bits))
-        while slots[slot] >= 0 and state_hashes[slots[slot]] != state_hashes[i]:
+        slot = np.int64((states[i] * _MIX) >> np.uint64(64 - bits))
+        while slots[slot] >= 0 and states[slots[slot]] != states[i]:
             slot = (slot + 1) & last
         if slots[slot] >= 0:
             places[i] = places[slots[slot]]
             continue
         slots[slot] = i
-        places[i] = -1
         h, c = pairs[i, 0], pairs[i, 1]
-        own = covered[count if prunes else 0]
         copy_into(own, masks[h])
         for part in range(runs.shape[1]):
             begin, place = runs[c, part, 0], runs[c, part, 2]
@@ -187,21 +174,8 @@ def choose_pairs(
         unreached = np.uint64(0)
         for k in range(all_pixels.shape[0]):
             unreached += count_bits(rest[k])
-        dropped = prunes and outside[i] + np.int64(unreached) > limit
-        for other in range(count if prunes else 0):
-            if dropped:
-                break
-            if (
-                frontier_hashes[chosen[other]] == frontier_hashes[i]
-                and outside[chosen[other]] <= outside[i]
-            ):
-                k = 0
-                while k < all_pixels.shape[0] and own[k] & ~covered[other, k] == np.uint64(0):
-                    k += 1
-                dropped = k == all_pixels.shape[0]
-        if not dropped:
-            chosen[count], unreachable[count], places[i] = i, np.int64(unreached), count
-            count += 1
+        chosen[count], unreachable[count], places[i] = i, np.int64(unreached), count
+        count += 1
     return chosen[:count], unreachable[:count], places[:examined]
 
 

@@ -44,7 +44,7 @@ class BoundLimits:
         SettingsError: if a value is out of its range.
     """
 
-    states: int = 20_000  # Greatest number of partial poses kept after each node.
+    states: int = 40_000  # Greatest number of partial poses kept after each node.
     # Greatest number of pairs of a partial pose and a pose of the next node that are evaluated for
     # one node.
     pairs: int = 1_000_000
@@ -229,8 +229,8 @@ class PartialPoses:
 
     @property
     def bounds(self) -> np.ndarray:
-        """(B,) int64 lower bound of the objective of all completions [pixel]."""
-        return np.asarray(self.least_outside + self.unreachable)
+        """(B,) float64 lower bound of the objective of all completions [pixel]."""
+        return np.asarray(self.least_outside + self.unreachable, dtype=np.float64)
 
     def costs(self, outside_weight: int) -> np.ndarray:
         """Return (B,) int64 the costs by which partial poses are ranked [pixel].
@@ -243,8 +243,8 @@ class PartialPoses:
 class PoseStore:
     """The poses of nodes whose area outside is within a limit, drawn when first needed.
 
-    A pose of a node is given by its index in the store. The methods ``pairs``, ``score``, ``make``,
-    ``choose`` and ``with_masks``, in this order, place one node in partial poses.
+    A pose of a node is given by its index in the store. The methods ``pairs``, ``score``, ``place``
+    and ``with_masks``, in this order, place one node in partial poses.
 
     Attributes:
         nodes: for each node its drawn poses.
@@ -488,81 +488,58 @@ class PoseStore:
         stored, views = self.nodes[node], len(self.bits.views)
         return score_pairs(partial.masks, pairs, stored.runs, stored.words, views, self._mask_keys)
 
-    def make(
+    def place(
         self,
         partial: PartialPoses,
         node: int,
         pairs: np.ndarray,
         scores: tuple[np.ndarray, np.ndarray],
-    ) -> PartialPoses:
-        """Return the p partial poses made by pairs, with masks (p, 0) and ``unreachable`` 0.
+        width: int,
+        keep_beyond: bool = False,
+    ) -> tuple[np.ndarray, PartialPoses, np.ndarray]:
+        """Place a node at pairs, and choose the first distinct partial poses.
 
         Args:
             partial: the partial poses before the node is placed.
             node: index of the node.
-            pairs: (p, 2) pairs of partial pose and node's pose, as ``pairs`` returns.
+            pairs: (p, 2) pairs of partial pose and node's pose, as ``pairs`` returns, best first.
             scores: the pairs' result of ``score``.
+            width: greatest number that is chosen.
+            keep_beyond: whether partial poses that differ only in the area beyond the bands are
+                kept apart.
+
+        Returns indices (n,) of the chosen pairs; their partial poses, with masks (n, 0); and for
+        each examined pair its index among the chosen ones.
         """
         areas, added = scores
-        origins, added_beyond = pairs[:, 0], self.nodes[node].areas[pairs[:, 1], 2]
-        poses = partial.poses[origins]
+        origins, own = pairs[:, 0], self.nodes[node].areas[pairs[:, 1], 2]
+        poses, beyond = partial.poses[origins], partial.beyond[origins]
         poses[:, node] = pairs[:, 1]
-        beyond = partial.beyond[origins]
-        np.maximum(beyond[:, 0], added_beyond, out=beyond[:, 0])
-        beyond[:, 1] += added_beyond
-        return PartialPoses(
+        beyond = np.column_stack([np.maximum(beyond[:, 0], own), beyond[:, 1] + own])
+        made = PartialPoses(
             masks=np.zeros((len(pairs), 0), dtype=np.uint64),
             poses=poses,
             hashes=partial.hashes[origins] + added,
             covered=partial.covered[origins] + areas[:, 0],
-            outside=partial.outside[origins] + areas[:, 1] + added_beyond,
+            outside=partial.outside[origins] + areas[:, 1] + own,
             beyond=beyond,
             unreachable=np.zeros(len(pairs), dtype=np.int64),
         )
-
-    def choose(
-        self,
-        partial: PartialPoses,
-        made: PartialPoses,
-        node: int,
-        pairs: np.ndarray,
-        width: int,
-        limit: float = np.inf,
-        keep_beyond: bool = False,
-    ) -> tuple[np.ndarray, PartialPoses, np.ndarray]:
-        """Choose the first distinct partial poses that were made by pairs (p, 2).
-
-        Args:
-            partial: the partial poses before the node was placed.
-            made: those made by the pairs, in their order, as ``make`` returns.
-            node: index of the node.
-            pairs: (p, 2) the pairs of partial pose and pose of the node.
-            width: greatest number that is chosen.
-            limit: if it is finite, a partial pose is dropped if its lower bound of the objective
-                exceeds it [pixel], or if an earlier one dominates it (see ``choose_pairs``).
-            keep_beyond: whether partial poses that differ only in the area beyond the bands are
-                kept apart.
-
-        Returns indices (n,) of the chosen pairs; their partial poses, without masks; and for each
-        examined pair its index among the chosen ones, -1 if it was dropped.
-        """
         placed = np.flatnonzero(partial.poses[0] >= 0).tolist() if len(partial) else ()
         open_nodes, waiting = self.body.frontier(frozenset((*placed, node)))
-        frontier_hashes = made.poses[:, open_nodes].astype(np.uint64) @ self._node_keys[open_nodes]
-        state_hashes = made.hashes + frontier_hashes
+        # Partial poses with equal sums of hashes go on alike.
+        states = made.hashes + poses[:, open_nodes].astype(np.uint64) @ self._node_keys[open_nodes]
         if keep_beyond:
-            state_hashes += made.beyond.astype(np.uint64) @ self._beyond_keys
+            states += beyond.astype(np.uint64) @ self._beyond_keys
         # The pixels that later nodes can reach.
         rows = np.empty((len(waiting), len(pairs)), dtype=np.int64)
         for i, other in enumerate(waiting if len(pairs) else ()):
-            own = self.tree_nodes[other].parent == node
-            parents = pairs[:, 1] if own else self.parents(partial.poses, other)[pairs[:, 0]]
-            rows[i] = self.reach_rows(other, parents)
+            rows[i] = self.reach_rows(other, self.parents(poses, other))
         stored = self.nodes[node]
+        reachable = ReachablePixels(self.reach_runs, self.reach_words, rows)
         chosen, unreachable, places = choose_pairs(
-            partial.masks, pairs, stored.runs, stored.words, self.bits.all_pixels,
-            ReachablePixels(self.reach_runs, self.reach_words, rows), width, state_hashes,
-            frontier_hashes if limit < np.inf else frontier_hashes[:0], made.least_outside, limit,
+            partial.masks, pairs, stored.runs, stored.words, self.bits.all_pixels, reachable,
+            width, states,
         )  # fmt: skip
         return chosen, replace(made.chosen(chosen), unreachable=unreachable), places
 

@@ -293,7 +293,7 @@ class RootPlacementSearch:
         places, hypotheses = chosen // len(self.sampled.X_PN[0]), store.start()
         for node in self.body.order:
             spare = settings.spare * factor * width
-            grown, _ = grow(store, hypotheses, node, spare, settings.outside_weight)
+            grown = grow(store, hypotheses, node, spare, settings.outside_weight)
             if grown is None:
                 return []
             groups = places[store.nodes[0].samples[grown.poses[:, 0]]]

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from drake_pose.compiled import compiled, grow_rows, multiply
-from drake_pose.silhouette.contour_points import CelledOutline, find_cell
+from drake_pose.silhouette.contour_points import CELLS_PER_SIDE, CelledOutline
 from drake_pose.silhouette.outline import bend, viewpoint_in_node
 from drake_pose.silhouette.span_kernel import (
     BIAS,
@@ -27,9 +27,6 @@ from drake_pose.silhouette.span_kernel import (
 WORD = 64
 """Number of bits of a word."""
 
-NEAREST_STRIDE = 32768
-"""Row stride of the pixel numbers in ``BitView.nearest``."""
-
 
 class BitView(NamedTuple):
     """A silhouette and the margin around it, cropped to a window of the image."""
@@ -41,9 +38,6 @@ class BitView(NamedTuple):
     inside: np.ndarray
     # (h, w + 1) int32 the same for the pixels of the margin; (0, 0) without a margin.
     margin: np.ndarray
-    # (h, w) int32 for each silhouette pixel, about the nearest pixel outside the silhouette, as row
-    # * NEAREST_STRIDE + column in the image; -1 where there is none.
-    nearest: np.ndarray
     # (h + 1, w + 1) int32 number of silhouette pixels above and left of each corner.
     sums: np.ndarray
 
@@ -77,7 +71,6 @@ def make_bit_view(
         window=np.array([top, left, *pixels.shape], dtype=np.int64),
         inside=_number_pixels(pixels),
         margin=margin,
-        nearest=_find_nearest(pixels, int(top), int(left)),
         sums=cv2.integral(pixels),
     )
 
@@ -86,19 +79,6 @@ def _number_pixels(mask: np.ndarray) -> np.ndarray:
     """Return (h, w + 1) int32, the number of set pixels of a mask (h, w) uint8 before each."""
     ends = np.cumsum(mask, dtype=np.int32).reshape(mask.shape)
     return np.concatenate([ends[:, :1] - mask[:, :1], ends], axis=1)
-
-
-def _find_nearest(mask: np.ndarray, top: int, left: int) -> np.ndarray:
-    """Return ``BitView.nearest`` of a mask (h, w) uint8 whose window begins at (top, left)."""
-    if mask.all():
-        return np.full(mask.shape, -1, dtype=np.int32)
-    _, labels = cv2.distanceTransformWithLabels(
-        mask, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    rows, columns = np.nonzero(mask == 0)
-    places = np.full(labels.max() + 1, -1, dtype=np.int32)
-    places[labels[rows, columns]] = (top + rows) * NEAREST_STRIDE + left + columns
-    return np.where(mask, places[labels], np.int32(-1))
 
 
 @compiled
@@ -175,20 +155,15 @@ def draw_bits(
 
 @compiled
 def _walk_cell(
-    celled: CelledOutline,
-    X: np.ndarray,
-    camera: np.ndarray,
-    crossings: np.ndarray,
-    rows: Rows,
+    celled: CelledOutline, X: np.ndarray, camera: np.ndarray, crossings: np.ndarray, rows: Rows,
     scratch: tuple[np.ndarray, np.ndarray],
-) -> bool:
+) -> bool:  # fmt: skip
     """Append the crossings of a surface's contour edges, found by the viewing direction's cell.
 
     The skin band is left out. The crossings equal those of the span kernel.
 
     Args:
-        celled: the surface.
-        X: (3, 4) pose of the surface in the camera.
+        celled, X: the surface, and its (3, 4) pose in the camera.
         camera: (8,) ``Camera.kernel_parameters()``.
         crossings: (height, capacity) output, as in ``add_surface``.
         rows: scratch of the span kernel; ``counts`` and ``row_range`` are updated.
@@ -208,27 +183,34 @@ def _walk_cell(
         depth = c0 * ball[0] + c1 * ball[1] + c2 * ball[2] + c3
         if depth - 1.000001 * ball[3] < camera[5] or ball[3] > celled.max_sine[0] * distance:
             return False
-    cell = find_cell(d0, d1, d2)
+    # The face of the cube that the direction meets, and its cell on it.
+    a0, a1, a2 = abs(d0), abs(d1), abs(d2)
+    if a0 >= a1 and a0 >= a2:
+        face, s, t = 0, d1 / d0, d2 / d0
+    elif a1 >= a2:
+        face, s, t = 1, d0 / d1, d2 / d1
+    else:
+        face, s, t = 2, d0 / d2, d1 / d2
+    column = min(int((s + 1.0) * 0.5 * CELLS_PER_SIDE), CELLS_PER_SIDE - 1)
+    row = min(int((t + 1.0) * 0.5 * CELLS_PER_SIDE), CELLS_PER_SIDE - 1)
+    cell = (face * CELLS_PER_SIDE + row) * CELLS_PER_SIDE + column
     begin, end = celled.cell_starts[cell], celled.cell_starts[cell + 1]
-    width, height, capacity = camera[6], camera[7], crossings.shape[1]
-    fx, fy = camera[1], camera[2]
+    fx, fy, width, height = camera[1], camera[2], camera[6], camera[7]
     a0, a1, a2, a3 = fx * X[0, 0], fx * X[0, 1], fx * X[0, 2], fx * X[0, 3]
     b0, b1, b2, b3 = fy * X[1, 0], fy * X[1, 1], fy * X[1, 2], fy * X[1, 3]
     if parallel:
         a3, b3 = a3 + cx, b3 + cy
     planes, edges, points, listed = celled.planes, celled.edges, celled.points, celled.cell_edges
-    # The first two of three passes are free of unpredictable branches: a mispredicted branch costs
-    # as much as all the arithmetic of an edge.
-    contour, weights = scratch[0][0], scratch[0][1]
+    # The first two of three passes have no unpredictable branches, each as dear as an edge.
+    contour, weights, number, crossing = scratch[0][0], scratch[0][1], 0, 0
     firsts, lasts, lines = scratch[0][2], scratch[0][3], scratch[1]
-    number, crossing = 0, 0
     for k in range(begin, end):
         e = listed[k]
-        t = edges[e, 2]
-        side = planes[t, 0] * e0 + planes[t, 1] * e1 + planes[t, 2] * e2 - planes[t, 3] * w
+        p = edges[e, 2]
+        side = planes[p, 0] * e0 + planes[p, 1] * e1 + planes[p, 2] * e2 - planes[p, 3] * w
         weight = int(side > 0.0) - int(side < 0.0)
-        t = edges[e, 3]
-        side = planes[t, 0] * e0 + planes[t, 1] * e1 + planes[t, 2] * e2 - planes[t, 3] * w
+        p = edges[e, 3]
+        side = planes[p, 0] * e0 + planes[p, 1] * e1 + planes[p, 2] * e2 - planes[p, 3] * w
         weight += edges[e, 4] * (int(side > 0.0) - int(side < 0.0))
         contour[number], weights[number] = e, weight
         number += weight != 0
@@ -255,7 +237,7 @@ def _walk_cell(
         firsts[crossing], lasts[crossing] = first, last
         weights[crossing] = weights[k] if down else -weights[k]
         crossing += first < last
-    lowest, highest = row_range[0], row_range[1]
+    lowest, highest, capacity = row_range[0], row_range[1], crossings.shape[1]
     for k in range(crossing):
         u0, v0 = lines[k, 0], lines[k, 1]
         slope = (lines[k, 2] - u0) / (lines[k, 3] - v0)
@@ -391,7 +373,7 @@ def prune_by_balls(
         pairs: (m, 2) int32 indices of a parent pose and a sample.
         limit: largest area outside the silhouette [pixel].
     """
-    camera, window, X_CW = view.camera, view.window, view.X_CW
+    camera, window, X_CW, sums = view.camera, view.window, view.X_CW, view.sums
     kept = np.ones(pairs.shape[0], dtype=np.bool_)
     scale, parallel = min(camera[1], camera[2]), camera[0] == 1.0
     X_CP = np.empty((3, 4))
@@ -416,41 +398,19 @@ def prune_by_balls(
                 radius /= depth
             if not (-0.5 < u < camera[6] - 0.5 and -0.5 < v < camera[7] - 0.5):
                 continue
-            if limit < 1.0:
-                # The disc leaves the silhouette if it contains the nearest pixel outside.
-                row, column = round(v), round(u)
-                r, c = row - window[0], column - window[1]
-                if 0 <= r < window[2] and 0 <= c < window[3] and view.nearest[r, c] >= 0:
-                    row = view.nearest[r, c] // NEAREST_STRIDE
-                    column = view.nearest[r, c] % NEAREST_STRIDE
-                outside = (u - column) ** 2 + (v - row) ** 2 < max(0.0, radius - 1e-6) ** 2
-            else:
-                outside = _square_outside(view.sums, window, camera, u, v, 0.7071 * radius) > limit
-            if outside:
+            # Pixels of the square in the disc that are in the image and not in the silhouette.
+            half = 0.7071 * radius
+            a, b = max(0, math.ceil(u - half)), min(int(camera[6]), math.ceil(u + half))
+            c, d = max(0, math.ceil(v - half)), min(int(camera[7]), math.ceil(v + half))
+            area = max(b - a, 0) * max(d - c, 0)
+            a, b = max(0, a - window[1]), min(window[3], b - window[1])
+            c, d = max(0, c - window[0]), min(window[2], d - window[0])
+            if a < b and c < d:
+                area -= sums[d, b] - sums[c, b] - sums[d, a] + sums[c, a]
+            if area > limit:
                 kept[i] = False
                 break
     return kept
-
-
-@compiled
-def _square_outside(
-    sums: np.ndarray, window: np.ndarray, camera: np.ndarray, u: float, v: float, half: float
-) -> int:
-    """Return the number of image pixels in a square that are outside the silhouette.
-
-    ``sums``, ``window``, ``camera``: the silhouette's fields of ``BitView``. ``u``, ``v``: middle
-    of the square [pixel]. ``half``: half its side [pixel].
-    """
-    a, b = max(0, int(np.ceil(u - half))), min(int(camera[6]), int(np.ceil(u + half)))
-    c, d = max(0, int(np.ceil(v - half))), min(int(camera[7]), int(np.ceil(v + half)))
-    if a >= b or c >= d:
-        return 0
-    area = (b - a) * (d - c)
-    a, b = max(0, a - window[1]), min(window[3], b - window[1])
-    c, d = max(0, c - window[0]), min(window[2], d - window[0])
-    if a >= b or c >= d:
-        return area
-    return area - (sums[d, b] - sums[c, b] - sums[d, a] + sums[c, a])
 
 
 @compiled

@@ -18,15 +18,14 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_pose.body import TriangleMesh
-from drake_pose.compiled import compiled, grow_rows
+from drake_pose.compiled import compiled, grow_rows, multiply
 from drake_pose.silhouette.outline import (
     Outline,
     PackedOutlines,
-    find_facings,
     mutable_copy,
     outline_of_triangles,
     pack,
-    project,
+    place_surface,
 )
 from drake_pose.silhouette.span_kernel import make_rows
 
@@ -52,7 +51,10 @@ class Segments(NamedTuple):
 
 @compiled
 def find_segments(
-    packed: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray, selected: np.ndarray
+    packed: PackedOutlines,
+    X_WN: np.ndarray,
+    view: tuple[np.ndarray, np.ndarray],
+    selected: np.ndarray,
 ) -> Segments:
     """Return the projected contour edges of surfaces.
 
@@ -60,22 +62,25 @@ def find_segments(
 
     Args:
         packed: the surfaces of all nodes, each in its node's frame N.
-        X_CN: (nodes, 4, 4) poses of the nodes in the camera.
-        camera: (8,) ``Camera.kernel_parameters()``.
+        X_WN: (nodes, 4, 4) poses of the nodes; rotations may be scaled uniformly for a parallel
+            camera.
+        view: X_CW (4, 4) and ``Camera.kernel_parameters()`` (8,) of the camera.
         selected: (nodes,) bool, whether each node's edges are returned.
     """
+    X_CW, camera = view
     rows, _ = make_rows(packed, camera)
     capacity, count = 1024, 0
     ends, depths = np.empty((capacity, 4)), np.empty((capacity, 2))
     labels = np.empty((capacity, 4), dtype=np.int64)
     u, v, facings, points = rows.u, rows.v, rows.facings, packed.points
     chosen = np.empty(packed.edges.shape[1], dtype=np.uint32)
-    for node in range(X_CN.shape[0]):
+    X_CN = np.empty((X_WN.shape[0], 3, 4))
+    for node in range(X_WN.shape[0]):
         if not selected[node]:
             continue
-        project(packed, node, X_CN, camera, u, v)
-        find_facings(packed, node, X_CN, camera, facings)
         X, ball = X_CN[node], packed.balls[node]
+        multiply(X_CW, X_WN[node], X)
+        place_surface(packed, node, X_CN, camera, u, v, facings)
         first, t0 = packed.starts[node, 0], packed.starts[node, 1]
         depth = X[2, 0] * ball[0] + X[2, 1] * ball[1] + X[2, 2] * ball[2] + X[2, 3]
         radius = 1.000001 * ball[3] * np.sqrt(X[2, 0] ** 2 + X[2, 1] ** 2 + X[2, 2] ** 2)
@@ -119,7 +124,7 @@ def find_segments(
 def find_crossings(
     segments: Segments, across: int, first: float, spacing: float, lines: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return where contour edges cross the lines of a raster, sorted along each line.
+    """Return where the lines of a raster enter and leave the union of the surfaces.
 
     An edge crosses lines from its upper (for columns: left) end, included, to its other end,
     excluded.
@@ -132,7 +137,8 @@ def find_crossings(
         lines: number of lines.
 
     Returns starts (lines + 1,) index of each line's first crossing, places (n,) of the crossings
-    along their lines [pixel], and indices (n,) of their edges.
+    along their lines [pixel], ascending and alternately entering and leaving, and indices (n,) of
+    their edges.
     """
     ends = segments.ends
     starts = np.zeros(lines + 1, dtype=np.int64)
@@ -185,46 +191,29 @@ def find_crossings(
             places[i], owners[i] = places[i - 1], owners[i - 1]
             i -= 1
         places[i], owners[i] = place, s
-    return starts, places, owners
-
-
-@compiled
-def find_line_spans(
-    segments: Segments,
-    across: int,
-    starts: np.ndarray,
-    places: np.ndarray,
-    owners: np.ndarray,
-    line: int,
-    spans: np.ndarray,
-) -> int:
-    """Write the covered spans of one line as index pairs of crossings; return the number of spans.
-
-    Args:
-        segments: the contour edges.
-        across: 0: the lines are rows; 1: columns.
-        starts, places, owners: the crossings, as ``find_crossings`` returns.
-        line: index of the line.
-        spans: (k, 2) output, indices of the crossings at which each span begins and ends.
-    """
-    found, winding, start = 0, 0, 0
-    # Gaps and overlaps up to this width [pixel] are rounding errors where surfaces touch.
-    tolerance = 1e-6
-    ends = segments.ends
-    for k in range(starts[line], starts[line + 1]):
-        s = owners[k]
-        if winding == 0:
-            start = k
-        # The weight holds for an edge towards later lines; otherwise its sign is opposite.
-        rising = ends[s, 1 - across] < ends[s, 3 - across]
-        winding += segments.weights[s] if rising else -segments.weights[s]
-        if winding == 0 and places[k] - places[start] > tolerance:
-            if found > 0 and places[start] - places[spans[found - 1, 1]] <= tolerance:
-                spans[found - 1, 1] = k
-            else:
-                spans[found, 0], spans[found, 1] = start, k
-                found += 1
-    return found
+    # Keep the crossings at which the winding number rises from zero or falls back to it, in place.
+    # Gaps and overlaps up to the tolerance [pixel] are rounding errors where surfaces touch.
+    n, tolerance = 0, 1e-6
+    for line in range(lines):
+        kept, winding, entry = n, 0, 0
+        for k in range(starts[line], used[line]):
+            s = owners[k]
+            if winding == 0:
+                entry = k
+            # The weight holds for an edge towards later lines; otherwise its sign is opposite.
+            rising = ends[s, 1 - across] < ends[s, 3 - across]
+            winding += segments.weights[s] if rising else -segments.weights[s]
+            if winding == 0 and places[k] - places[entry] > tolerance:
+                if n > kept and places[entry] - places[n - 1] <= tolerance:
+                    n -= 1
+                else:
+                    places[n], owners[n] = places[entry], owners[entry]
+                    n += 1
+                places[n], owners[n] = places[k], owners[k]
+                n += 1
+        starts[line] = kept
+    starts[lines] = n
+    return starts, places[:n], owners[:n]
 
 
 class ContourPoints(NamedTuple):
@@ -243,20 +232,19 @@ class ContourPoints(NamedTuple):
 
 @compiled
 def sample_contour(
-    packed: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray, spacing: float
+    packed: PackedOutlines,
+    X_WN: np.ndarray,
+    view: tuple[np.ndarray, np.ndarray],
+    spacing: float,
 ) -> ContourPoints:
     """Return points on the visible contour of the union of surfaces.
 
     Args:
-        packed: the surfaces of all nodes, each in its node's frame N.
-        X_CN: (nodes, 4, 4) poses of the nodes in the camera; rotations may be scaled uniformly for
-            a parallel camera.
-        camera: (8,) ``Camera.kernel_parameters()``. Triangles with a corner nearer than the near
-            plane are left out.
+        packed, X_WN, view: as of ``find_segments``.
         spacing: distance between sampled rows and between columns [pixel]; the first row and column
             are pixel centres.
     """
-    segments = find_segments(packed, X_CN, camera, np.ones(len(X_CN), dtype=np.bool_))
+    segments, camera = find_segments(packed, X_WN, view, np.ones(len(X_WN), np.bool_)), view[1]
     ends = segments.ends
     crossings = [(np.zeros(1, np.int64), np.zeros(1), np.zeros(1, np.int64)) for _ in range(0)]
     capacity = 0
@@ -267,16 +255,13 @@ def sample_contour(
     uv, normals, lengths = np.empty((capacity, 2)), np.empty((capacity, 2)), np.empty(capacity)
     nodes, p_N = np.empty(capacity, dtype=np.int64), np.empty((capacity, 3))
     clearances = np.empty((capacity, 2))
-    spans = np.empty((capacity // 2 + 1, 2), dtype=np.int64)
     count = 0
     for across in range(2):
         starts, places, owners = crossings[across]
         extent = camera[6 + across] - 0.5
         for line in range(len(starts) - 1):
-            found = find_line_spans(segments, across, starts, places, owners, line, spans)
-            for k in range(2 * found):
-                crossing = spans[k // 2, k % 2]
-                place, s = places[crossing], owners[crossing]
+            for k in range(starts[line], starts[line + 1]):
+                place, s, leaves = places[k], owners[k], (k - starts[line]) % 2
                 du, dv = ends[s, 2] - ends[s, 0], ends[s, 3] - ends[s, 1]
                 steep = abs(dv) >= abs(du)
                 if steep != (across == 0) or not -0.5 <= place <= extent:
@@ -285,9 +270,10 @@ def sample_contour(
                 n0, n1 = dv / size, -du / size
                 # Outward: backwards along the line where it enters, forwards where it leaves.
                 sign = 1.0 if (n0 if across == 0 else n1) > 0.0 else -1.0
-                sign = sign if k % 2 == 1 else -sign
+                sign = sign if leaves else -sign
                 normals[count, 0], normals[count, 1] = sign * n0, sign * n1
-                lengths[count] = spacing / abs(normals[count, across])
+                cosine = abs(normals[count, across])
+                lengths[count] = spacing / cosine
                 uv[count, across], uv[count, 1 - across] = place, line * spacing
                 fraction = (line * spacing - ends[s, 1 - across]) / (dv if across == 0 else du)
                 # Perspective-correct interpolation along the edge.
@@ -299,23 +285,21 @@ def sample_contour(
                         i, a
                     ] + fraction * packed.points[i, b]
                 nodes[count] = segments.nodes[s]
-                cosine = abs(normals[count, across])
-                clearances[count, 0] = cosine * (
-                    places[spans[k // 2, 1]] - places[spans[k // 2, 0]]
-                )
+                enters = k - leaves
+                clearances[count, 0] = cosine * (places[enters + 1] - places[enters])
                 clearances[count, 1] = np.inf
-                if k % 2 == 1 and k + 1 < 2 * found:
-                    clearances[count, 1] = cosine * (places[spans[k // 2 + 1, 0]] - place)
-                elif k % 2 == 0 and k > 0:
-                    clearances[count, 1] = cosine * (place - places[spans[k // 2 - 1, 1]])
+                if leaves and k + 1 < starts[line + 1]:
+                    clearances[count, 1] = cosine * (places[k + 1] - place)
+                elif not leaves and k > starts[line]:
+                    clearances[count, 1] = cosine * (place - places[k - 1])
                 count += 1
     return ContourPoints(
         uv[:count], normals[:count], lengths[:count], nodes[:count], p_N[:count], clearances[:count]
     )
 
 
-# Number of cells along each side of a face of the cube.
-_CELLS_PER_SIDE = 20
+CELLS_PER_SIDE = 20
+"""Number of cells along each side of a face of the cube."""
 
 
 class CelledOutline(NamedTuple):
@@ -353,7 +337,7 @@ def divide_outline(
             band.
     """
     rigid, skin = pack((outline,)), band or TriangleMesh.empty()
-    starts, edges = _find_cell_edges(rigid, _CELLS_PER_SIDE, spread)
+    starts, edges = _find_cell_edges(rigid, CELLS_PER_SIDE, spread)
     records = np.vstack([rigid.edges, rigid.sides]).T
     return CelledOutline(
         points=np.column_stack([outline.vertices, np.ones(len(outline.vertices))]),
@@ -365,22 +349,6 @@ def divide_outline(
         packed=mutable_copy(pack((outline, outline_of_triangles(skin.vertices, skin.triangles)))),
         bands=np.ascontiguousarray(np.zeros((0, 0, 3)) if bands is None else bands),
     )
-
-
-@compiled
-def find_cell(x: float, y: float, z: float) -> int:
-    """Return the index of the cell of direction (x, y, z), of any length but 0."""
-    ax, ay, az = abs(x), abs(y), abs(z)
-    if ax >= ay and ax >= az:
-        face, s, t = 0, y / x, z / x
-    elif ay >= az:
-        face, s, t = 1, x / y, z / y
-    else:
-        face, s, t = 2, x / z, y / z
-    half = 0.5 * _CELLS_PER_SIDE
-    column = min(int((s + 1.0) * half), _CELLS_PER_SIDE - 1)
-    row = min(int((t + 1.0) * half), _CELLS_PER_SIDE - 1)
-    return (face * _CELLS_PER_SIDE + row) * _CELLS_PER_SIDE + column
 
 
 def _find_cell_edges(

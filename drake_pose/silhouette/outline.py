@@ -239,22 +239,26 @@ def viewpoint_in_node(X: np.ndarray, camera: np.ndarray) -> tuple[float, float, 
 
 
 @compiled
-def project(
+def place_surface(
     packed: PackedOutlines,
     node: int,
     X_CN: np.ndarray,
     camera: np.ndarray,
     u: np.ndarray,
     v: np.ndarray,
+    facings: np.ndarray,
 ) -> None:
-    """Write the image coordinates u, v [pixel] of one surface's points, at any depth.
+    """Write where one surface's points lie in the image, and which sides of its triangles it shows.
 
     Args:
         packed: the surfaces of all nodes, each in its node's frame N.
         node: index of the surface.
         X_CN: (nodes, 3 or 4, 4) poses in the camera.
         camera: (8,) ``Camera.kernel_parameters()``.
-        u, v: (points,) output.
+        u, v: (points,) output: image coordinates [pixel], at any depth.
+        facings: (at least triangles + 1,) int8 output: +1 where a pinhole camera sees the triangle
+            counter-clockwise, -1 clockwise, 0 edge-on, and opposite for a parallel camera; 0 after
+            the last triangle: the facing of a missing second triangle.
     """
     fx, fy, cx, cy = camera[1], camera[2], camera[3], camera[4]
     begin, end = packed.starts[node, 0], packed.starts[node + 1, 0]
@@ -268,32 +272,13 @@ def project(
         for i in range(x.shape[0]):
             u[i] = a0 * x[i] + a1 * y[i] + a2 * z[i] + a3
             v[i] = b0 * x[i] + b1 * y[i] + b2 * z[i] + b3
-        return
-    d0, d1, d2, d3 = X[2, 0], X[2, 1], X[2, 2], X[2, 3]
-    for i in range(x.shape[0]):
-        inverse = 1.0 / (d0 * x[i] + d1 * y[i] + d2 * z[i] + d3)
-        u[i] = (a0 * x[i] + a1 * y[i] + a2 * z[i] + a3) * inverse + cx
-        v[i] = (b0 * x[i] + b1 * y[i] + b2 * z[i] + b3) * inverse + cy
-
-
-@compiled
-def find_facings(
-    packed: PackedOutlines, node: int, X_CN: np.ndarray, camera: np.ndarray, facings: np.ndarray
-) -> None:
-    """Write which side of each triangle of one surface the camera sees: +1, 0 (edge-on) or -1.
-
-    The sign is +1 where a pinhole camera sees the triangle counter-clockwise; for a parallel camera
-    it is the opposite.
-
-    Args:
-        packed: the surfaces of all nodes, each in its node's frame N.
-        node: index of the surface.
-        X_CN: (nodes, 3 or 4, 4) poses in the camera.
-        camera: (8,) ``Camera.kernel_parameters()``.
-        facings: (at least triangles + 1,) int8 output, with 0 after the last triangle: the facing
-            of a missing second triangle.
-    """
-    e0, e1, e2, w = viewpoint_in_node(X_CN[node], camera)
+    else:
+        d0, d1, d2, d3 = X[2, 0], X[2, 1], X[2, 2], X[2, 3]
+        for i in range(x.shape[0]):
+            inverse = 1.0 / (d0 * x[i] + d1 * y[i] + d2 * z[i] + d3)
+            u[i] = (a0 * x[i] + a1 * y[i] + a2 * z[i] + a3) * inverse + cx
+            v[i] = (b0 * x[i] + b1 * y[i] + b2 * z[i] + b3) * inverse + cy
+    e0, e1, e2, w = viewpoint_in_node(X, camera)
     begin, end = packed.starts[node, 1], packed.starts[node + 1, 1]
     n0, n1 = packed.planes[0, begin:end], packed.planes[1, begin:end]
     n2, offset = packed.planes[2, begin:end], packed.planes[3, begin:end]

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_pose.compiled import compiled
-from drake_pose.silhouette.outline import PackedOutlines, bend, clip_triangle, find_facings, project
+from drake_pose.silhouette.outline import PackedOutlines, bend, clip_triangle, place_surface
 
 SHIFT, BIAS = 3, 4
 """A crossing is stored as 8 * pixel + weight + BIAS; a weight is an integer from -2 to 2."""
@@ -31,7 +31,7 @@ class Rows(NamedTuple):
     # u, v: (points,) image coordinates of one surface's points [pixel].
     u: np.ndarray
     v: np.ndarray
-    facings: np.ndarray  # (triangles + 1,) int8 output of ``find_facings``.
+    facings: np.ndarray  # (triangles + 1,) int8 output of ``place_surface``.
     counts: np.ndarray  # (height,) int32 number of crossings of each row.
     # (3,) int64 first row touched, row after the last, and whether a row overflowed.
     row_range: np.ndarray
@@ -181,11 +181,10 @@ def add_surface(
             return
         cut = depth - radius < camera[5]
     u, v, facings, edges = rows.u, rows.v, rows.facings, packed.edges
-    project(packed, node, X_CN, camera, u, v)
-    find_facings(packed, node, X_CN, camera, facings)
+    place_surface(packed, node, X_CN, camera, u, v, facings)
+    width, height, counts, row_range = camera[6], camera[7], rows.counts, rows.row_range
     if cut:
         _clip_near(packed, node, X_CN, camera, crossings, rows)
-    width, height, counts, row_range = camera[6], camera[7], rows.counts, rows.row_range
     ordinary_end = packed.ordinary_ends[node]
     for e in range(packed.starts[node, 2], ordinary_end):
         weight = int(facings[edges[2, e]]) - int(facings[edges[3, e]])
@@ -395,11 +394,23 @@ def paint_labels(
     bounds = np.array([height, 0, width, 0])
     rows, crossings = make_rows(packed, camera)
     for node in range(X_CN.shape[0]):
+        label = labels[node]
         crossings = fill_rows(packed, node, node + 1, X_CN, camera, crossings, rows)
         for row in range(rows.row_range[0], rows.row_range[1]):
             for k in range(find_spans(row, crossings, rows.counts, rows.changes, rows.spans)):
-                a, b = rows.spans[k, 0], rows.spans[k, 1]
-                _paint_span(image, row, a, b, labels[node], empty, sums, bounds)
+                a, b, contested = rows.spans[k, 0], rows.spans[k, 1], False
+                for column in range(a, b):
+                    before = image[row, column]
+                    differs = (before != empty) & (before != label)
+                    image[row, column] = np.int16(-1 - label) if differs else label
+                    contested |= differs
+                if not contested:
+                    continue
+                bounds[0], bounds[1] = min(bounds[0], row), max(bounds[1], row + 1)
+                for column in range(a, b):
+                    if image[row, column] < 0:
+                        sums[(row >> _TILE) + 1, (column >> _TILE) + 1] = 1
+                        bounds[2], bounds[3] = min(bounds[2], column), max(bounds[3], column + 1)
     if bounds[0] >= bounds[1]:
         return
     for i in range(1, sums.shape[0]):
@@ -413,9 +424,9 @@ def paint_labels(
     for i in range(depths.shape[0]):
         for j in range(depths.shape[1]):
             depths[i, j] = -np.inf if image[top + i, left + j] < 0 else np.inf
-    contested = (sums, bounds, depths)
+    tiles = (sums, bounds, depths)
     for node in range(X_CN.shape[0]):
-        _draw_node(packed, node, labels[node], closed[node], X_CN, camera, image, contested, rows)
+        _draw_node(packed, node, labels[node], closed[node], X_CN, camera, image, tiles, rows)
     for row in range(bounds[0], bounds[1]):
         for column in range(bounds[2], bounds[3]):
             if image[row, column] < 0:  # No triangle covers the pixel, because of rounding.
@@ -423,58 +434,11 @@ def paint_labels(
 
 
 @compiled
-def _paint_span(
-    image: np.ndarray,
-    row: int,
-    a: int,
-    b: int,
-    label: int,
-    empty: int,
-    tiles: np.ndarray,
-    bounds: np.ndarray,
-) -> None:
-    """Write a label to the pixels [a, b) of a row, and mark the tiles of contested pixels.
-
-    A pixel that has another label already is contested and gets -1 - label.
-
-    Args:
-        image: (H, W) int16, changed in place.
-        empty: label of pixels without a surface.
-        tiles: the entry (row of tiles + 1, column of tiles + 1) of a contested tile is set to 1.
-        bounds: (4,) first row, row after the last, first column and column after the last of all
-            contested pixels, extended by this span's.
-    """
-    contested = False
-    for column in range(a, b):
-        before = image[row, column]
-        differs = (before != empty) & (before != label)
-        image[row, column] = np.int16(-1 - label) if differs else np.int16(label)
-        contested |= differs
-    if not contested:
-        return
-    while image[row, a] >= 0:
-        a += 1
-    while image[row, b - 1] >= 0:
-        b -= 1
-    for column in range(a, b):
-        if image[row, column] < 0:
-            tiles[(row >> _TILE) + 1, (column >> _TILE) + 1] = 1
-    bounds[0], bounds[1] = min(bounds[0], row), max(bounds[1], row + 1)
-    bounds[2], bounds[3] = min(bounds[2], a), max(bounds[3], b)
-
-
-@compiled
 def _draw_node(
-    packed: PackedOutlines,
-    node: int,
-    label: int,
-    closed: bool,
-    X_CN: np.ndarray,
-    camera: np.ndarray,
-    image: np.ndarray,
-    contested: tuple[np.ndarray, np.ndarray, np.ndarray],
+    packed: PackedOutlines, node: int, label: int, closed: bool, X_CN: np.ndarray,
+    camera: np.ndarray, image: np.ndarray, contested: tuple[np.ndarray, np.ndarray, np.ndarray],
     rows: Rows,
-) -> None:
+) -> None:  # fmt: skip
     """Draw the label of one surface at the contested pixels where it is the nearest so far.
 
     Args:
@@ -482,12 +446,12 @@ def _draw_node(
         label: the surface's label.
         closed: whether it is closed with outward normals; then only front faces are drawn.
         image: (H, W) int16, changed in place.
-        contested: number of contested tiles above and left of each tile corner, the bounds of
-            ``_paint_span``, and nearness of the surface drawn so far at each pixel in the bounds.
+        contested: number of contested tiles above and left of each tile corner, bounds (4,) of the
+            contested pixels, and nearness of the surface drawn so far at each pixel in the bounds.
     """
-    u, v, facings, X, sums = rows.u, rows.v, rows.facings, X_CN[node], contested[0]
-    project(packed, node, X_CN, camera, u, v)
-    find_facings(packed, node, X_CN, camera, facings)
+    u, v, facings, X = rows.u, rows.v, rows.facings, X_CN[node]
+    sums, bounds, depths = contested
+    place_surface(packed, node, X_CN, camera, u, v, facings)
     begin = packed.starts[node, 0]
     count = packed.starts[node + 1, 0] - begin
     x, y, z = packed.points[0, begin:], packed.points[1, begin:], packed.points[2, begin:]
@@ -526,60 +490,45 @@ def _draw_node(
         else:
             size = clip_triangle(packed, node, t, X_CN, camera, corners)
         for k in range(2, size):
-            _draw_triangle(corners, k - 1, k, label, image, contested[1], contested[2])
-
-
-@compiled(inline="always")
-def _draw_triangle(
-    p: np.ndarray,
-    b: int,
-    c: int,
-    label: int,
-    image: np.ndarray,
-    bounds: np.ndarray,
-    depths: np.ndarray,
-) -> None:
-    """Draw the triangle of the points 0, b, c of ``p`` at pixels where it is nearer than before.
-
-    Args:
-        p: (n, 3) points u, v [pixel] and nearness, 1 / depth [1/m] or, for a parallel camera,
-            -depth [m].
-        b, c: indices of the second and third point.
-        label, image: the label to write, and the (H, W) int16 image that gets it.
-        bounds: (4,) first row, row after the last, first and last column + 1 of contested pixels.
-        depths: float32 nearness drawn so far in the bounds, updated; inf: not contested.
-    """
-    # Nearness increases towards the camera and is linear in the image: 1 / z, or -z (parallel).
-    ua, va, da = p[0, 0], p[0, 1], p[0, 2]
-    ub, vb, db = p[b, 0], p[b, 1], p[b, 2]
-    uc, vc, dc = p[c, 0], p[c, 1], p[c, 2]
-    top, bottom = max(min(va, vb, vc), float(bounds[0])), min(max(va, vb, vc), bounds[1] - 0.5)
-    left, right = max(min(ua, ub, uc), float(bounds[2])), min(max(ua, ub, uc), bounds[3] - 0.5)
-    twice_area = (ub - ua) * (vc - va) - (uc - ua) * (vb - va)
-    if top <= bottom and left <= right and twice_area != 0.0:
-        along_u = ((db - da) * (vc - va) - (dc - da) * (vb - va)) / twice_area
-        along_v = ((dc - da) * (ub - ua) - (db - da) * (uc - ua)) / twice_area
-        at_origin = da - ua * along_u - va * along_v
-        nearest, farthest = max(da, db, dc), min(da, db, dc)
-        # Sort corners downwards, so that common edges of neighbours cross rows at equal places.
-        if va > vb:
-            ua, va, ub, vb = ub, vb, ua, va
-        if vb > vc:
-            ub, vb, uc, vc = uc, vc, ub, vb
-        if va > vb:
-            ua, va, ub, vb = ub, vb, ua, va
-        slope_long = (uc - ua) / (vc - va)
-        slope_upper, slope_lower = (ub - ua) / (vb - va), (uc - ub) / (vc - vb)
-        for row in range(math.ceil(top), min(math.ceil(vc), bounds[1])):
-            long = ua + (row - va) * slope_long
-            short = ua + (row - va) * slope_upper if row < vb else ub + (row - vb) * slope_lower
-            start = max(math.ceil(min(long, short)), bounds[2])
-            stop = min(math.ceil(max(long, short)), bounds[3])
-            at_row = at_origin + row * along_v
-            i, first = row - bounds[0], bounds[2]
-            for column in range(start, stop):
-                # Clamp, because the plane of a sliver is steep and amplifies rounding.
-                depth = np.float32(min(max(at_row + column * along_u, farthest), nearest))
-                if depth > depths[i, column - first]:
-                    depths[i, column - first] = depth
-                    image[row, column] = label
+            # Nearness is linear in the image: 1 / z, or -z (parallel).
+            ua, va, da = corners[0, 0], corners[0, 1], corners[0, 2]
+            ub, vb, db = corners[k - 1, 0], corners[k - 1, 1], corners[k - 1, 2]
+            uc, vc, dc = corners[k, 0], corners[k, 1], corners[k, 2]
+            v_first, v_last = (
+                max(min(va, vb, vc), float(bounds[0])),
+                min(max(va, vb, vc), bounds[1] - 0.5),
+            )
+            u_first, u_last = (
+                max(min(ua, ub, uc), float(bounds[2])),
+                min(max(ua, ub, uc), bounds[3] - 0.5),
+            )
+            twice_area = (ub - ua) * (vc - va) - (uc - ua) * (vb - va)
+            if v_first <= v_last and u_first <= u_last and twice_area != 0.0:
+                along_u = ((db - da) * (vc - va) - (dc - da) * (vb - va)) / twice_area
+                along_v = ((dc - da) * (ub - ua) - (db - da) * (uc - ua)) / twice_area
+                at_origin = da - ua * along_u - va * along_v
+                nearest, farthest = max(da, db, dc), min(da, db, dc)
+                # Sort corners downwards, so that common edges cross rows at equal places.
+                if va > vb:
+                    ua, va, ub, vb = ub, vb, ua, va
+                if vb > vc:
+                    ub, vb, uc, vc = uc, vc, ub, vb
+                if va > vb:
+                    ua, va, ub, vb = ub, vb, ua, va
+                slope_long = (uc - ua) / (vc - va)
+                slope_upper, slope_lower = (ub - ua) / (vb - va), (uc - ub) / (vc - vb)
+                for row in range(math.ceil(v_first), min(math.ceil(vc), bounds[1])):
+                    long = ua + (row - va) * slope_long
+                    short = (
+                        ua + (row - va) * slope_upper if row < vb else ub + (row - vb) * slope_lower
+                    )
+                    start = max(math.ceil(min(long, short)), bounds[2])
+                    stop = min(math.ceil(max(long, short)), bounds[3])
+                    at_row = at_origin + row * along_v
+                    i = row - bounds[0]
+                    for column in range(start, stop):
+                        # Clamp, because the plane of a sliver is steep and amplifies rounding.
+                        depth = np.float32(min(max(at_row + column * along_u, farthest), nearest))
+                        if depth > depths[i, column - bounds[2]]:
+                            depths[i, column - bounds[2]] = depth
+                            image[row, column] = label

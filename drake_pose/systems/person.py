@@ -27,7 +27,7 @@ from drake_pose.person.date.walking import (
     stance_of,
 )
 from drake_pose.person.figures import keep_views
-from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
+from drake_pose.person.pose_tracker import PersonBelief, PersonPoseTracker
 from drake_pose.person.views import (
     EDGE_POINTS,
     FrameViews,
@@ -69,8 +69,8 @@ class PersonTracker(MemorySystem):
             is not connected, each update has new pictures.
 
     Output ports:
-        estimated_positions (nq): NaN until the person is found, while lost, and while fewer than
-            two cameras see the person [rad or m].
+        estimated_positions (nq): NaN until the person is found, while another pose explains the
+            pictures as well, and while fewer than two cameras see the person [rad or m].
         last_positions (nq): the last known ones, initially the model's default [rad or m].
         body_poses: poses of all bodies at ``last_positions``, in the plant's order.
         inlier_ratio (1): fraction of the contours that fits; 0 if no person is visible.
@@ -104,7 +104,7 @@ class PersonTracker(MemorySystem):
         cameras = camera_tuple(cameras)
         require_distinct_cameras(cameras, 2, "a person is tracked by two or more different cameras")
         require_period("tracker", period)
-        self._tracker, self._cameras = tracker, cameras
+        self._tracker, self._cameras, self._period = tracker, cameras, period
         self._with_deviations, self._watch_frames = with_deviations, watch_frames
         self._views = self.add_camera_inputs({c.name: f"silhouette_{c.name}" for c in cameras})
         self.add_input("time", 1)
@@ -121,14 +121,10 @@ class PersonTracker(MemorySystem):
         }
         if with_deviations:
             outputs["deviations"] = unknown
-        # usual_ratio: 0 before a person is found; watched: number of frames in which others are
-        # still looked for; elapsed: time between the last two frames [s].
-        scalars = ("usual_ratio", "troubled_frames", "watched", "elapsed")
-        inner = {
-            "values": values,
-            "step": np.zeros(len(values)),
-            **{name: np.zeros(1) for name in scalars},
-        }
+        # usual_misfit: 0 before a person is found. watched: number of frames in which others are
+        # still looked for.
+        scalars = {name: np.zeros(1) for name in (*_SCALARS, "watched")}
+        inner = {"values": values, "step": np.zeros(len(values)), **scalars}
         self.declare_vectors(outputs | inner, outputs, period)
         last = self.GetOutputPort("last_positions")
         self.add_output(
@@ -138,13 +134,13 @@ class PersonTracker(MemorySystem):
             {self.all_state_ticket()},
         )
 
-    def known_person(self, context: Context) -> TrackState | None:
-        """Return the person's state in a context, tracked or lost; None before one was found."""
-        return _person(self.vectors(context), 0.0)
+    def known_person(self, context: Context) -> PersonBelief | None:
+        """Return the belief in a context, tracked or lost; None before a person was found."""
+        return _belief(self.vectors(context))
 
-    def set_person(self, context: Context, person: TrackState) -> None:
-        """Set the tracked person's state; the next pictures are expected within a period."""
-        fresh = {"watched": np.zeros(1), "time": np.full(1, np.nan), "elapsed": np.zeros(1)}
+    def set_person(self, context: Context, person: PersonBelief) -> None:
+        """Set the belief; the next pictures are expected within a period."""
+        fresh = {"watched": np.zeros(1), "time": np.full(1, np.nan)}
         state = context.get_mutable_discrete_state()
         self.set_vectors(state, self._packed(person) | fresh)
 
@@ -156,8 +152,10 @@ class PersonTracker(MemorySystem):
             time = float(stamp[0])
             if np.isnan(time) or time == before:
                 return {}
-        elapsed = 0.0 if np.isnan(before) else time - before
-        last = _person(known, elapsed)
+        last = _belief(known)
+        if last is not None:
+            frames = 1.0 if np.isnan(before) else abs(time - before) / self._period
+            last = self._tracker.predict(last, frames)
         views = self._views(context)
         cameras = [camera for camera in self._cameras if camera.name in views]
         separated = _SeparatedViews(FrameViews(cameras, list(views.values())))
@@ -171,7 +169,8 @@ class PersonTracker(MemorySystem):
         if self._with_deviations:
             changed["deviations"] = np.full(len(known["last_positions"]), np.nan)
         if found is None and last is not None:
-            found = TrackState(last.values, np.zeros(len(last.step)), 0.0, last.usual_ratio)
+            found = self._tracker.start(known["values"])
+            found = replace(found, inlier_ratio=0.0, usual_misfit=last.usual_misfit)
         if found is None:
             return changed
         clean = separated.views.without(separated.merged)
@@ -181,32 +180,26 @@ class PersonTracker(MemorySystem):
             sums = clean.compare(fit, fit.body.place(found.values), step).sums
             found = replace(found, inlier_ratio=inlier_ratio_of(sums))
         watched = self._watch_frames if separated.others else max(known["watched"][0] - 1.0, 0.0)
-        changed |= {"watched": np.array([watched]), "elapsed": np.array([elapsed])}
-        changed |= self._packed(found)
+        changed |= {"watched": np.array([watched])} | self._packed(found)
         if not found.is_lost:
             changed["last_positions"] = self._tracker.positions(found.values)
             if self._with_deviations:
                 changed["deviations"] = self._tracker.deviations(found.values, separated.views)
         return changed
 
-    def _packed(self, person: TrackState) -> dict[str, Array]:
-        """Return a person's state as state vectors by name."""
+    def _packed(self, person: PersonBelief) -> dict[str, Array]:
+        """Return a belief as state vectors by name."""
         q = self._tracker.positions(person.values)
-        numbers = {
-            "inlier_ratio": person.inlier_ratio,
-            "usual_ratio": person.usual_ratio,
-            "troubled_frames": person.troubled_frames,
-        }
         return {
             "estimated_positions": np.full(len(q), np.nan) if person.is_lost else q,
             "values": person.values,
             "step": person.step,
-            **{name: np.array([float(number)]) for name, number in numbers.items()},
+            **{name: np.array([float(getattr(person, name))]) for name in _SCALARS},
         }
 
     def _follow(
-        self, last: TrackState | None, separated: "_SeparatedViews", is_watching: bool
-    ) -> "tuple[TrackState | None, _SeparatedViews]":
+        self, last: PersonBelief | None, separated: "_SeparatedViews", is_watching: bool
+    ) -> "tuple[PersonBelief | None, _SeparatedViews]":
         """Return the person's next state, and the views without other persons.
 
         Others are cut out if there is no last state, while tracking is in trouble, and if
@@ -225,11 +218,11 @@ class PersonTracker(MemorySystem):
                 return self._follow_one(last, single.views), single
         return found, separated
 
-    def _follow_one(self, last: TrackState | None, seen: FrameViews) -> TrackState | None:
+    def _follow_one(self, last: PersonBelief | None, seen: FrameViews) -> PersonBelief | None:
         """Return the person's next state in ``seen``; None: no person, or fewer than two views."""
-        return self._tracker.follow(last, seen) if len(seen.showing) >= 2 else None
+        return self._tracker.update(last, seen) if len(seen.showing) >= 2 else None
 
-    def _without_others(self, seen: FrameViews, last: TrackState | None) -> "_SeparatedViews":
+    def _without_others(self, seen: FrameViews, last: PersonBelief | None) -> "_SeparatedViews":
         """Return the views ``seen`` without other persons than the one in the last state.
 
         If ``last`` is None, the tracker chooses the person. Cameras in which the person and another
@@ -252,23 +245,21 @@ class _SeparatedViews(NamedTuple):
     merged: tuple[str, ...] = ()
 
 
-def _person(known: Mapping[str, Array], elapsed: float, longest: float = 3.0) -> TrackState | None:
-    """Return the person's state from state vectors; None if no person was found yet.
+# Scalar fields of a belief that are state vectors; the first one is an output port as well.
+_SCALARS = (
+    "inlier_ratio", "misfit", "usual_misfit", "troubled_frames", "evidence", "judged",
+)  # fmt: skip
 
-    ``known``: state vectors of a PersonTracker by name. ``elapsed``: time since the last frame [s],
-    to which the motion is scaled; 0: not scaled. ``longest``: the motion is scaled by at most this
-    number of frames.
-    """
-    inlier_ratio, usual_ratio, troubled_frames, period = (
-        float(known[name][0])
-        for name in ("inlier_ratio", "usual_ratio", "troubled_frames", "elapsed")
-    )
-    if not usual_ratio:
+
+def _belief(known: Mapping[str, Array]) -> PersonBelief | None:
+    """Return the belief in a PersonTracker's state vectors by name; None: no person was found."""
+    numbers = {name: float(known[name][0]) for name in _SCALARS}
+    troubled, judged = int(numbers.pop("troubled_frames")), int(numbers.pop("judged"))
+    if not numbers["usual_misfit"]:
         return None
-    # Skipped frames extend the motion.
-    frames = min(elapsed / period, longest) if period > 0 and elapsed > 0 else 1.0
-    step = frames * known["step"]
-    return TrackState(known["values"], step, inlier_ratio, usual_ratio, int(troubled_frames))
+    return PersonBelief(
+        known["values"], known["step"], **numbers, troubled_frames=troubled, judged=judged
+    )
 
 
 class SilhouetteSensor(PersonRegion):

@@ -16,7 +16,7 @@ from drake_pose.fit.background import (
     window_around,
 )
 from drake_pose.fit.colours import COLOURS, Colour
-from drake_pose.fit.explain_kernel import Explained, explain
+from drake_pose.fit.explain_kernel import Explained, explain_poses
 from drake_pose.silhouette.outline import pack
 from drake_pose.silhouette.scoring import draw_mask
 from tests.registration.episodes import painted_episode
@@ -28,7 +28,7 @@ def episode(tmp_path_factory):
 
 
 def draw_masks(episode, X_CW):
-    """Return (f, H, W) masks of the body, and the surfaces and poses for ``explain``."""
+    """Return (f, H, W) masks of the body, and the surfaces and poses for ``explain_poses``."""
     outlines = episode.body.coarse
     poses = [X_CW @ episode.body.kinematics.poses(values) for values in episode.values]
     masks = np.array([draw_mask(outlines, X, episode.camera) for X in poses])
@@ -40,9 +40,8 @@ def test_explain_sums_log_likelihoods_over_pixels(episode):
     sums = backgrounds.sums
     masks, (packed, X_CN) = draw_masks(episode, episode.camera.X_CW)
     is_static = np.zeros(X_CN.shape[1], bool)
-    totals, tiles = explain(
-        packed, X_CN, is_static, episode.camera.kernel_parameters(), sums, 20.0, 4
-    )
+    parameters, here = episode.camera.kernel_parameters(), np.eye(4)[None, :3]
+    (totals,), tiles = explain_poses(packed, here, X_CN, is_static, parameters, sums, 20.0, 4)
     covered = np.moveaxis(masks, 0, -1)
     each = sums.visible + np.where(covered[..., None], sums.covered, 0.0).sum(axis=2)
     gain = each.max(axis=-1) - sums.uncovered
@@ -61,7 +60,8 @@ def test_outline_pixels_have_uncovered_neighbours(episode):
     parameters = episode.camera.kernel_parameters()
     for is_static in (False, True):
         stands = np.full(X_CN.shape[1], is_static)
-        totals, _ = explain(packed, X_CN, stands, parameters, sums, 1.0, 0)
+        here = np.eye(4)[None, :3]
+        (totals,), _ = explain_poses(packed, here, X_CN, stands, parameters, sums, 1.0, 0)
         inner = np.pad(masks, ((0, 0), (1, 1), (1, 1)), mode="edge")
         left, right = inner[:, 1:-1, :-2], inner[:, 1:-1, 2:]
         above, below = inner[:, :-2, 1:-1], inner[:, 2:, 1:-1]

@@ -12,7 +12,7 @@ from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walking import make_motion
 from drake_pose.person.pose_tracker import NOISE, PersonPoseTracker
-from drake_pose.person.search import EXACT, LENIENT, crowding_weights
+from drake_pose.person.search import LENIENT, crowding_weights
 from drake_pose.person.views import FrameViews, see_silhouette
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.person.persons_in_view import posed, see
@@ -31,6 +31,9 @@ class World:
         """The views of all cameras but the first `left_out`."""
         views = [see_silhouette(mask, 4.0) for mask in see(self.person, self.ring, [q])[0].values()]
         return FrameViews(self.cameras[left_out:], views[left_out:])
+
+    def follow(self, belief, frame):
+        return self.tracker.update(self.tracker.predict(belief), frame)
 
     def off(self, values, q):
         """The largest error of a joint centre [mm]."""
@@ -68,11 +71,11 @@ class TestTracker:
 
     def test_person_is_found_and_tracked_although_a_camera_drops_out(self, world):
         q = world.pose(**WALKING)
-        state = world.tracker.follow(None, world.frame(q))
+        state = world.tracker.update(None, world.frame(q))
         assert world.off(state.values, q) < 40.0
         for k in range(1, 6):
             q = world.pose(**{name: (1 - 0.2 * k) * a for name, a in WALKING.items()}, head_y=5 * k)
-            state = world.tracker.follow(state, world.frame(q, left_out=int(k >= 3)))
+            state = world.follow(state, world.frame(q, left_out=int(k >= 3)))
             assert world.off(state.values, q) < 30.0, k
 
     @pytest.mark.parametrize("frame", [30, 54], ids=["legs exchanged", "turned about"])
@@ -83,7 +86,7 @@ class TestTracker:
         masks = [LabelRenderer(person, camera).mask(q) for camera in ring.values()]
         tracker = PersonPoseTracker(ContourFit(person.pose_tree(), noise=NOISE), LENIENT)
         seen = FrameViews([*ring.values()], [see_silhouette(mask, 4.0) for mask in masks])
-        assert joint_error(tracker, tracker.follow(None, seen).values, q) < 30.0
+        assert joint_error(tracker, tracker.update(None, seen).values, q) < 30.0
 
     def test_perturbed_track_recovers_without_a_registered_pose(self, world):
         q = world.pose(**WALKING, head_y=-70)
@@ -91,13 +94,13 @@ class TestTracker:
         wrong = state.values + np.random.default_rng(5).normal(0.0, 0.7, len(state.values))
         state, frame = replace(state, values=np.clip(wrong, fit.lower, fit.upper)), world.frame(q)
         for _ in range(15):
-            state = world.tracker.follow(state, frame)
+            state = world.follow(state, frame)
         assert world.off(state.values, q) < 25.0
 
     def test_stretched_arms_are_not_bent_the_wrong_way(self, world):
         # A stretched arm, slightly bent backwards and twisted, has almost the same silhouette.
         q = world.pose(left_upper_arm_z=80.0, right_upper_arm_z=-80.0)
-        state = world.tracker.follow(None, world.frame(q))
+        state = world.tracker.update(None, world.frame(q))
         assert world.off(state.values, q) < 25.0
 
     def test_lost_arm_is_searched_again(self, world):
@@ -105,24 +108,53 @@ class TestTracker:
         state = world.tracker.start(world.tracker.values(world.pose(**WALKING)))
         frame = world.frame(lifted)
         for _ in range(4):
-            state = world.tracker.follow(state, frame)
+            state = world.follow(state, frame)
         assert world.off(state.values, lifted) < 25.0
 
     def test_empty_silhouettes(self, world):
         empty = see_silhouette(np.zeros((240, 320), dtype=bool), 4.0)
         frame = FrameViews(world.cameras, [empty] * len(world.cameras))
-        assert world.tracker.follow(None, frame) is None
+        assert world.tracker.update(None, frame) is None
         values = world.tracker.values(world.pose())
-        state = world.tracker.follow(world.tracker.start(values), frame)
+        state = world.follow(world.tracker.start(values), frame)
         assert state.inlier_ratio == 0.0
         np.testing.assert_allclose(state.values, values, atol=1e-6)
 
-    def test_all_headings_are_tried_and_the_first_ones_are_spread(self):
-        tried = [EXACT.headings_of(k) for k in range(4)]
-        assert sorted(turn for turns in tried for turn in turns) == list(range(12))
-        assert tried[0] == [0, 4, 8]
-        assert tried[1] == [2, 6, 10]
-        assert EXACT.headings_of(4) == tried[0]
+    def test_turned_about_start_is_judged_before_it_is_used(self, world):
+        q = world.pose(**WALKING)
+        turned = world.tracker.values(q)
+        turned[world.tracker.plan.heading] += np.pi
+        state, frame = world.tracker.start(turned), world.frame(q)
+        assert state.is_lost
+        state = world.follow(state, frame)
+        assert (world.off(state.values, q) < 25.0, state.is_lost) == (True, False)
+
+    @pytest.mark.parametrize("hidden", ["left", "bottom"])
+    def test_person_is_found_again_within_two_frames_of_full_view(self, world, hidden):
+        """Half of every silhouette is missing at first, as if it were not there."""
+        q = world.pose(**WALKING)
+        masks = see(world.person, world.ring, [q])[0].values()
+        halves = []
+        for mask in masks:
+            middle = int(np.flatnonzero(mask.any(axis=0 if hidden == "left" else 1)).mean())
+            half = mask.copy()
+            half[:, :middle] &= hidden != "left"
+            half[middle:] &= hidden != "bottom"
+            halves.append(see_silhouette(half, 4.0))
+        state, frame = None, FrameViews(world.cameras, halves)
+        for _ in range(5):
+            state = world.follow(state, frame) if state else world.tracker.update(None, frame)
+        for _ in range(2):
+            state = world.follow(state, world.frame(q))
+        assert (world.off(state.values, q) < 25.0, state.is_lost) == (True, False)
+
+    def test_motion_fades_away(self, world):
+        start = world.tracker.start(world.tracker.values(world.pose()))
+        moving = replace(start, step=np.ones(len(start.values)))
+        moved = [world.tracker.predict(moving, n).values[0] for n in (1.0, 2.0, 50.0)]
+        assert 0.5 < moved[0] < moved[1] < moved[2] < 2.0
+        twice = world.tracker.predict(world.tracker.predict(moving))
+        np.testing.assert_allclose(twice.values[0], moved[1])
 
 
 class TestPlan:
@@ -158,7 +190,7 @@ def test_stills_of_a_motion_are_not_mistaken_for_similar_poses(person):
     tracker = PersonPoseTracker(fit, LENIENT)
     for q in make_motion(load_skeleton(person), 240, 0).q[::8]:
         views = [see_silhouette(renderer.mask(q), 4.0) for renderer in renderers]
-        found = tracker.follow(None, FrameViews(cameras, views))
+        found = tracker.update(None, FrameViews(cameras, views))
         assert joint_error(tracker, found.values, q) < 60.0
 
 

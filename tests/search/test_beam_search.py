@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -109,9 +110,9 @@ def test_time_limit_returns_a_pose_and_is_reported(maker):
         (BeamSearchSettings, {"stages": ()}),
         (BeamSearchSettings, {"research_hypotheses": -1}),
         (BeamSearchSettings, {"time_limit": -1.0}),
-        (Stage, {"hypotheses": 0}),
-        (Stage, {"hypotheses": 1, "outside_fraction": -0.1}),
-        (Stage, {"hypotheses": 1, "outside_weight": 0}),
+        (partial(Stage, 0, 0.3, 5), {}),
+        (partial(Stage, 1, -0.1, 5), {}),
+        (partial(Stage, 1, 0.3, 0), {}),
         (ExaminationSettings, {"tolerance": -1.0}),
         (ExaminationSettings, {"proof_poses": 0}),
         (ExaminationSettings, {"time_limit": -1.0}),

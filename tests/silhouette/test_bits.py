@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from drake_pose.body import TriangleMesh
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.silhouette.bit_kernel import (
-    NEAREST_STRIDE,
     draw_bits,
     draw_discs,
     make_bit_view,
@@ -189,22 +188,3 @@ def test_discs_contain_the_surface(camera):
         drawn = draw_mask([outline], X[None], camera)
         disc = read_bits(view, view.inside, run, words)
         assert not (drawn & mask & ~disc).any()
-
-
-def test_nearest_outside_pixel_is_within_two_percent():
-    mask = np.zeros((70, 90), dtype=bool)
-    mask[:50, 20:71] = True
-    mask[20:23, 30:35] = False
-    camera = picture_cameras()[0]
-    view = make_bit_view(mask, camera.kernel_parameters(), camera.X_CW, 0)
-    top, left, _, _ = view.window
-    inside = np.argwhere(view.nearest >= 0)
-    place = view.nearest[tuple(inside.T)]
-    found = np.stack([place // NEAREST_STRIDE, place % NEAREST_STRIDE], axis=1)
-    assert not mask[tuple(found.T)].any()
-    rows, columns = (inside + np.array([top, left])).T
-    assert len(inside) == mask.sum()
-    assert mask[rows, columns].all()
-    distances = np.linalg.norm(found - np.stack([rows, columns], axis=1), axis=1)
-    exact = distance_transform_edt(mask)[rows, columns]
-    assert np.all((distances >= exact - 1e-9) & (distances <= 1.02 * exact))

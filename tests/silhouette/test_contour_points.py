@@ -16,8 +16,8 @@ CAMERAS = [
 
 
 def find_contour_points(outlines, X_CN, camera, spacing=1.0):
-    parameters = camera.kernel_parameters()
-    return sample_contour(pack(tuple(outlines)), np.ascontiguousarray(X_CN), parameters, spacing)
+    view = np.eye(4), camera.kernel_parameters()
+    return sample_contour(pack(tuple(outlines)), np.ascontiguousarray(X_CN), view, spacing)
 
 
 def covered(meshes, X_CN, camera, uv):

@@ -1,5 +1,7 @@
 """The silhouette capture's diagram, compared with plain functions frame by frame."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -56,11 +58,11 @@ def test_diagram_equals_the_plain_functions(studio, cameras, backgrounds, tracke
             see_silhouette(person_region(shot, backgrounds[name]), edge_spacing(cameras[name]))
             for name, shot in shots.items()
         ]
-        state = tracker.follow(state, FrameViews(list(cameras.values()), views))
+        state = tracker.update(tracker.predict(state), FrameViews(list(cameras.values()), views))
         positions = tracker.positions(state.values)
         np.testing.assert_array_equal(run["estimated_positions"], positions)
         known = capture.estimator.known_person(own)
-        for name in ("inlier_ratio", "usual_ratio", "troubled_frames", "step"):
+        for name in ("inlier_ratio", "usual_misfit", "troubled_frames", "step"):
             np.testing.assert_array_equal(getattr(known, name), getattr(state, name))
     elbow = studio.model.position_index("left_upper_arm_z")
     assert np.degrees(positions[elbow] - q[elbow]) == pytest.approx(0.0, abs=3.0)
@@ -71,10 +73,10 @@ def test_a_person_set_as_lost_has_no_estimated_positions(cameras, backgrounds, t
     context = capture.diagram.CreateDefaultContext()
     own = capture.estimator.GetMyMutableContextFromRoot(context)
     estimated = capture.diagram.GetOutputPort("estimated_positions")
-    state = tracker.start(tracker.values(path[1]))
+    state = tracker.start(tracker.values(path[1]), is_known=True)
     capture.estimator.set_person(own, state)
     np.testing.assert_allclose(estimated.Eval(context), path[1])
-    lost = type(state)(state.values, state.step, 0.1, state.usual_ratio)
+    lost = replace(tracker.start(state.values), inlier_ratio=0.1)
     capture.estimator.set_person(own, lost)
     assert np.isnan(estimated.Eval(context)).all()
     assert capture.estimator.known_person(own).inlier_ratio == 0.1

@@ -25,23 +25,18 @@ def shape():
     return load_model(SHAPE, check=False)
 
 
-def stretches(model):
-    return [i for i, name in enumerate(model.position_names) if name.endswith("_stretch")]
-
-
-def same_angles(person, shape, q, lengths):
-    """The shape model's positions at the plain model's q."""
+def same_angles(person, shape, q):
+    """The shape model's positions at the plain model's q, its own at zero."""
     whole = np.zeros(len(shape.position_names))
     for name, value in zip(person.position_names, q, strict=True):
         whole[shape.position_index(name)] = value
-    whole[stretches(shape)] = lengths
     return whole
 
 
 def random_pose(model, rng):
     q = rng.uniform(model.lower, model.upper)
     q[:3] = 0.0
-    q[stretches(model)] = 0.0
+    q[[name.endswith("_stretch") for name in model.position_names]] = 0.0
     return q
 
 
@@ -114,13 +109,29 @@ def test_shape_model_at_zero_is_the_plain_person(person, shape):
     pictures = Silhouettes(person), Silhouettes(shape)
     for _ in range(6):
         q = random_pose(person, rng)
-        whole = same_angles(person, shape, q, np.zeros(len(stretches(shape))))
+        whole = same_angles(person, shape, q)
         for name, point in marks(person, q).items():
             np.testing.assert_allclose(marks(shape, whole)[name], point, atol=1e-6)
         towards = rng.normal(size=3) * [1, 1, 0.3]
         view = (towards, np.array([0, 0, -0.6]), 2.6)
         masks = [pictures[0].mask(q, *view), pictures[1].mask(whole, *view)]
         assert np.count_nonzero(masks[0] != masks[1]) <= 0.002 * np.count_nonzero(masks[0])
+
+
+def test_joints_of_the_shape_model_are_mirrored_and_turn_the_right_way(shape):
+    rest = marks(shape, np.zeros(len(shape.position_names)))
+
+    def moved(name, degrees, landmark):
+        q = np.zeros(len(shape.position_names))
+        q[shape.position_index(name)] = np.radians(degrees)
+        return np.asarray(marks(shape, q)[landmark] - rest[landmark])
+
+    assert moved("waist_x", -40, "left_hip")[0] > 0.1  # forward: the spine bends forward
+    assert moved("waist_x", -40, "left_shoulder") == pytest.approx(0.0)
+    for side, sign in zip(SIDES, (1, -1), strict=True):
+        assert moved(f"{side}clavicle_z", 20 * sign, f"{side}shoulder")[2] > 0.04  # shrugged
+        assert moved(f"{side}clavicle_y", -20 * sign, f"{side}shoulder")[0] > 0.03  # forward
+        assert moved(f"{side}hand_z", 60, f"{side}wrist") == pytest.approx(0.0)
 
 
 def test_shape_joints_change_the_lengths_by_their_values(shape):

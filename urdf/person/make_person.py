@@ -35,6 +35,15 @@ LIMBS: dict[str, tuple[str, Limits]] = {
     "shin": ("thigh", (("x", 0, 150),)),
     "foot": ("shin", ()),
 }
+# Joints of person_shape.urdf alone, on the left side.
+WAIST: Limits = (("y", -45, 45), ("z", -35, 35), ("x", -60, 30))
+CLAVICLE: Limits = (("z", -10, 20), ("y", -20, 20))
+WELDED: dict[str, Limits] = {
+    "hand": (("z", -80, 70), ("x", -20, 30)),
+    "foot": (("x", -20, 50),),
+}
+WAIST_HEIGHT = 0.6  # of the waist under the neck's base, as a fraction of the way to the hips
+STERNUM = (0.02, 0.0, 0.0)  # left clavicle's inner end from the neck's base [m]
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 DOWN = (0.0, -1.0, 0.0)
 # Shape joints of person_shape.urdf: largest deviation of each length from the average [m].
@@ -218,8 +227,12 @@ def urdf_text(figure: "Figure", name: str, links: dict[str, str], stretchable: b
         if not (stretchable and part in STRETCHES):
             return joint_chain(chain) + links[link]
         axis = mirrored_if_right(figure.axis(part), link)
-        joint = slide(f"{link}_stretch", link, f"{link}_end", axis, part)
-        return joint_chain(chain) + links[link] + joint.text() + links[f"{link}_end"]
+        own = [slide(f"{link}_stretch", link, f"{link}_end", axis, part)]
+        if part == "trunk":
+            down = WAIST_HEIGHT * figure.offset("trunk", "thigh")[1] * np.array(AXES["y"])
+            waist = turns("waist", link, "waist_link", WAIST, down)
+            own = [*waist, moved(own[0], parent="waist_link", xyz=-down)]
+        return joint_chain(chain) + links[link] + joint_chain(own) + links[f"{link}_end"]
 
     chain = turns("neck_base", "head", "trunk", NECK_BASE, figure.offset("head", "chest"))
     if stretchable:
@@ -242,8 +255,10 @@ def limb_joints(
     offset = mirrored_if_right(figure.offset(parent, part), link)
     if stretchable and parent in STRETCHES and part != "upper_arm":
         before = f"{before}_end"
+    if stretchable:
+        axes = axes or WELDED[part]
     if side == "right_":
-        axes = tuple((a, low, high) if a == "x" else (a, -high, -low) for a, low, high in axes)
+        axes = mirrored(axes)
     if not axes:
         return [Joint(f"{link}_weld", before, link, xyz=offset)]
     chain = turns(link, before, link, axes, offset)
@@ -251,7 +266,17 @@ def limb_joints(
     if stretchable and place is not None:
         outwards = tuple(mirrored_if_right(np.array(AXES["x"]), link))
         chain = slide_before(chain, f"{side}{place}_stretch", outwards, place)
+    if stretchable and part == "upper_arm":
+        inner = mirrored_if_right(np.array(STERNUM), link)
+        turning, bare = mirrored(CLAVICLE) if side == "right_" else CLAVICLE, f"{side}clavicle_link"
+        clavicle = turns(f"{side}clavicle", before, bare, turning, inner)
+        chain = [*clavicle, moved(chain[0], parent=bare, xyz=offset - inner), *chain[1:]]
     return chain
+
+
+def mirrored(axes: Limits) -> Limits:
+    """Return axes with their limits, mirrored from the left to the right side."""
+    return tuple((a, low, high) if a == "x" else (a, -high, -low) for a, low, high in axes)
 
 
 def turns(

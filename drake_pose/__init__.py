@@ -30,7 +30,7 @@ if TYPE_CHECKING:
         RegistrationSettings,
     )
     from drake_pose.filtering.contour_tracker import TrackingSettings
-    from drake_pose.filtering.inequalities import from_bounds
+    from drake_pose.filtering.inequalities import from_bounds, model_inequalities
     from drake_pose.filtering.motion import constant_velocity
     from drake_pose.filtering.state import Belief, StateLayout
     from drake_pose.filtering.truncated_filter import FilterSettings, TruncatedFilter
@@ -64,7 +64,7 @@ _NAMES = {
     "files.overlay": "paint_agreement",
     "files.settings": "AuditSettings EstimateSettings MaskSettings RegistrationSettings",
     "filtering.contour_tracker": "TrackingSettings",
-    "filtering.inequalities": "from_bounds",
+    "filtering.inequalities": "from_bounds model_inequalities",
     "filtering.motion": "constant_velocity",
     "filtering.state": "Belief StateLayout",
     "filtering.truncated_filter": "FilterSettings TruncatedFilter",

@@ -170,8 +170,8 @@ def make_measurement(
     """Return a checked measurement.
 
     ``model``: the observation that predicts y. ``y``: (m,) NaN where occluded. ``variances``: noise
-    variances (m,) or covariance (m, m), finite where y is; None: the model's. Raises SettingsError:
-    a wrong shape, an infinite number, or a variance of a finite measurement that is not positive.
+    variances (m,) or covariance (m, m), NaN where nothing is measured; None: the model's. Raises
+    SettingsError: a wrong shape, an infinite number, or a variance that is not positive.
     """
     m = len(model.names)
     for values, shapes in ((y, [(m,)]), (variances, [(m,), (m, m)])):
@@ -192,6 +192,7 @@ def make_measurement(
     if variances is None:
         return Measurement(model, np.asarray(y, dtype=np.float64), own)
     noise = variances if np.ndim(variances) == 2 else np.diag(variances)
+    y = np.where(np.isnan(np.diag(noise)), np.nan, y)
     bad = np.flatnonzero(np.isfinite(y) & ~(np.diag(noise) > 0))
     if len(bad):
         raise SettingsError(f"the variance of measurement '{model.names[bad[0]]}' must be positive")

@@ -197,10 +197,10 @@ class ImmutableValue:
 class BeliefSystem(PortedSystem, Generic[T]):
     """A system whose state is an abstract belief, replaced by an unrestricted periodic update."""
 
-    def declare_belief(self, initial: T, period: float) -> None:
-        """Declare the belief with its initial value, and its update every ``period`` [s]."""
+    def declare_belief(self, initial: T, period: float, offset: float = 0.0) -> None:
+        """Declare the belief and its initial value; it is updated at offset + k period [s]."""
         self._belief = self.DeclareAbstractState(AbstractValue.Make(initial))
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, offset, self._update)
         self.DeclareForcedUnrestrictedUpdateEvent(self._update)
 
     def add_belief_output(

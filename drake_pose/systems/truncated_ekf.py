@@ -74,10 +74,10 @@ class TruncatedEkf(BeliefSystem[_EkfState]):
     restarts from ``reset_state``, if this is finite, with the covariance of ``start``.
 
     Input ports:
-        measurement (m): NaN where occluded; if all are NaN, or the port is not connected, the
-            update only predicts.
-        measurement_covariance (m x m, row by row): noise covariance of this measurement, finite
-            where the measurement is; the observation model's if not connected.
+        measurement (m): NaN where nothing is measured; if all are NaN, or the port is not
+            connected, the update only predicts.
+        measurement_covariance (m x m, row by row): noise covariance of this measurement, NaN where
+            nothing is measured; the observation model's if not connected.
         reset_state (n): state to restart from, for example a matcher's.
         restart (1): not 0: restart.
 
@@ -103,6 +103,9 @@ class TruncatedEkf(BeliefSystem[_EkfState]):
             are per step. None: the motion's.
         patience: number of consecutive unlikely measurements after which the track is lost.
         loss_probability: p-value below which a measurement is unlikely.
+        offset: time of the first update [s]. Drake updates all systems with a state at once, so
+            that a measurement by one of them, for example a ``SilhouetteTracker``, is a period old
+            unless the filter is updated shortly after it.
 
     Raises:
         SettingsError: an argument has the wrong type, the start does not fit the filter, the period
@@ -117,6 +120,7 @@ class TruncatedEkf(BeliefSystem[_EkfState]):
         period: float | None = None,
         patience: int = 3,
         loss_probability: float = 1e-6,
+        offset: float = 0.0,
     ) -> None:
         super().__init__()
         if not isinstance(belief_filter, TruncatedFilter):
@@ -140,7 +144,7 @@ class TruncatedEkf(BeliefSystem[_EkfState]):
         self.add_input("measurement_covariance", self._measured**2)
         self.add_input("reset_state", n)
         self.add_input("restart", 1)
-        self.declare_belief(_EkfState(belief_filter.start(self._start)), period)
+        self.declare_belief(_EkfState(belief_filter.start(self._start)), period, offset)
         rows = belief_filter.inequalities.rows
 
         def filled(size: int, read: Callable[[Hypothesis], Any], empty: float) -> Any:

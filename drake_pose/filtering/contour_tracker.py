@@ -224,6 +224,21 @@ class ContourTracker:
             state = self._widened(observation, evidence, prediction, state, measurement, lost_parts)
         return Track(state, measurement, bool(lost_parts.any()), colours)
 
+    def delayed(self, track: Track) -> Track:
+        """Return the track after a frame whose pictures may be late by up to a period.
+
+        The belief is widened by what the motion of a period moves the measurement.
+        """
+        measured, belief = track.measurement, track.state.best
+        if measured is None:
+            return track
+        count = len(self.observation.layout.moving)
+        moved = np.zeros(len(belief.mean))
+        moved[:count] = belief.mean[count : 2 * count]
+        shift = belief.covariance @ (measured.H.T @ (measured.H @ moved))
+        wide = Belief(belief.mean, belief.covariance + np.outer(shift, shift))
+        return replace(track, state=replace(self.filter.start(wide), step=track.state.step))
+
     def _fit(
         self, observation: ContourObservation, evidence: ContourEvidence, prediction: FilterState
     ) -> tuple[FilterState, ContourMeasurement | None]:

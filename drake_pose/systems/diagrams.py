@@ -4,7 +4,6 @@ A diagram connects simulated cameras or recorded masks to an estimator, Meshcat 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from pydrake.geometry import (
@@ -20,8 +19,8 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
-from pydrake.systems.primitives import LogVectorOutput, TrajectorySource, VectorLogSink
-from pydrake.systems.sensors import ImageLabel16I, RgbdSensor
+from pydrake.systems.primitives import TrajectorySource
+from pydrake.systems.sensors import ImageLabel16I
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_pose.arrays import Array
@@ -36,7 +35,7 @@ from drake_pose.registration.online_registration import (
 )
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import RegisteredCamera
-from drake_pose.search import PoseEstimate, PoseSearch
+from drake_pose.search import PoseSearch
 from drake_pose.silhouette.pictures.label_renderer import label_image_to_mask
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.bodies import add_meshcat_skin, add_posed_plant, add_skin
@@ -104,11 +103,14 @@ class CameraRegistration(BeliefSystem[OnlineState]):
         self._tree, camera = registration.body.tree, registration.camera
         self.add_input("label_image", ImageLabel16I(camera.width, camera.height))
         self.add_input("measured_positions", len(self._tree.model.position_names))
-        self.declare_belief(OnlineState(), period)
-        self.add_belief_output("X_WC", RigidTransform(), _X_WC)
-        self.add_belief_output("covariance", 36, self._covariance)
-        self.add_belief_output("status", 1, lambda known: [float(registration.status(known))])
-        self.add_belief_output("registration", len(REGISTRATION), _registration_numbers)
+        self.declare_belief(
+            OnlineState(),
+            period,
+            X_WC=(RigidTransform(), _X_WC),
+            covariance=(36, self._covariance),
+            status=(1, lambda known: [float(registration.status(known))]),
+            registration=(len(REGISTRATION), _registration_numbers),
+        )
 
     def registered_camera(self, context: Context) -> PinholeCamera | None:
         """Return the camera at its pose in the plant's world; None unless the status is 1."""
@@ -169,34 +171,6 @@ def _registration_numbers(known: OnlineState) -> list[float]:
 ESTIMATE_COLOUR = Rgba(0.0, 0.45, 0.70, 0.6)
 
 
-@dataclass(frozen=True)
-class MatchingDiagram:
-    """A diagram that estimates poses from silhouettes, and its parts."""
-
-    diagram: Diagram  # The diagram.
-    matcher: SilhouetteMatcher  # The system that estimates the poses.
-    # positions_log, error_log: logs of ``estimated_positions`` and ``error``, one sample a period.
-    positions_log: VectorLogSink
-    error_log: VectorLogSink
-
-    def estimate(self, context: Context) -> PoseEstimate | None:
-        """Return the last update's estimate, by the diagram's context; None: there is none."""
-        own = self.matcher.GetMyContextFromRoot(context)
-        estimate: PoseEstimate | None = self.matcher.GetOutputPort("pose_estimate").Eval(own)
-        return estimate
-
-    def was_tracked(self, context: Context) -> bool:
-        """Return whether the last update tracked without a search, by the diagram's context."""
-        own = self.matcher.GetMyContextFromRoot(context)
-        tracks = isinstance(self.matcher, SilhouetteTracker)
-        return tracks and bool(self.matcher.GetOutputPort("track").Eval(own)[0])
-
-    def with_intervals(self, context: Context) -> PoseEstimate:
-        """Return the SilhouetteTracker's pose with intervals, by the diagram's context."""
-        assert isinstance(self.matcher, SilhouetteTracker)
-        return self.matcher.with_intervals(self.matcher.GetMyContextFromRoot(context))
-
-
 def build_recorded_matching(
     scene: Scene,
     search: PoseSearch,
@@ -205,11 +179,12 @@ def build_recorded_matching(
     root_positions: Mapping[str, np.ndarray] | None = None,
     tracking: TrackingSettings | None = None,
     starts: Mapping[str, np.ndarray] | None = None,
-) -> MatchingDiagram:
-    """Build a diagram that estimates poses in recorded masks.
+) -> tuple[Diagram, SilhouetteMatcher]:
+    """Build a diagram that estimates poses in recorded masks; return it and its estimator.
 
-    It contains a MaskPlayer, a SilhouetteMatcher or SilhouetteTracker, and logs. Frame k is matched
-    at time k times the player's period.
+    It contains a MaskPlayer and a SilhouetteMatcher or SilhouetteTracker. Frame k is matched at
+    time k times the player's period. The tracker's search has no time limit, so that results are
+    repeatable.
 
     Args:
         scene: the recorded masks.
@@ -224,49 +199,53 @@ def build_recorded_matching(
             without a search, also after a loss. None: none are known.
     """
     player = MaskPlayer(scene, cameras, frames, positions=starts, root_positions=root_positions)
-    matcher = _matcher(search, cameras, player.period, tracking, player.color_cameras)
+    matcher = SilhouetteMatcher(search, cameras, player.period)
+    if tracking is not None:
+        matcher = SilhouetteTracker(
+            search, cameras, player.period, tracking=tracking, color_cameras=player.color_cameras,
+            search_time=None,
+        )  # fmt: skip
     builder = DiagramBuilder()
     builder.AddNamedSystem("mask_player", player)
     builder.AddNamedSystem("silhouette_matcher", matcher)
     connect_matching_ports(builder, player, matcher)
-    return _finish(builder, matcher, player.period)
+    return builder.Build(), matcher
 
 
-def build_simulated_matching(
-    search: PoseSearch,
+def build_simulation(
+    estimator: SilhouetteMatcher | CameraRegistration,
+    model: ParsedModel,
     cameras: Sequence[Camera],
     true_positions: Trajectory | np.ndarray,
-    period: float,
     meshcat: Meshcat | None = None,
-    tracking: TrackingSettings | None = None,
-) -> MatchingDiagram:
-    """Build a diagram that estimates the poses of a simulated body in rendered images.
+) -> Diagram:
+    """Build a diagram in which an estimator sees a simulated body in rendered images.
 
-    RgbdSensors see a body that moves on a trajectory. The estimate poses a second body, which the
-    sensors do not see.
+    RgbdSensors ``camera_<name>`` see a body that moves on a trajectory. A CameraRegistration gets
+    its true positions as the measured ones.
 
     Args:
-        search: the search for the poses of the body.
-        cameras: the cameras to simulate, matched together.
+        estimator: a matcher, a tracker or a registration.
+        model: the body.
+        cameras: the estimator's cameras; the registered camera is here at its true pose.
         true_positions: the true body's positions (nq,) [rad or m], constant or over time.
-        period: time between two images and updates [s].
-        meshcat: where to show both bodies; None: nowhere.
-        tracking: as in ``build_recorded_matching``.
+        meshcat: where to show the body, and a second one at a matcher's ``last_positions``, which
+            the sensors do not see; None: nowhere.
     """
     builder = DiagramBuilder()
-    model = search.tree.model
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
-    matcher = _matcher(search, cameras, period, tracking)
-    builder.AddNamedSystem("silhouette_matcher", matcher)
+    builder.AddNamedSystem("estimator", estimator)
     truth, images = add_simulated_cameras(builder, scene_graph, model, cameras, true_positions)
     for camera, image in zip(cameras, images, strict=True):
-        builder.Connect(image, matcher.GetInputPort(camera_port("label_image", camera, cameras)))
-    if meshcat is not None:
-        estimate = matcher.GetOutputPort("estimated_positions")
+        builder.Connect(image, estimator.GetInputPort(camera_port("label_image", camera, cameras)))
+    if isinstance(estimator, CameraRegistration):
+        builder.Connect(truth, estimator.GetInputPort("measured_positions"))
+    elif meshcat is not None:
+        estimate = estimator.GetOutputPort("last_positions")
         show_estimate(builder, scene_graph, model, estimate, meshcat, ESTIMATE_COLOUR)
         # After show_estimate, because its visualizer clears its part of Meshcat's tree.
         add_meshcat_skin(builder, meshcat, model, truth, "true")
-    return _finish(builder, matcher, period)
+    return builder.Build()
 
 
 def add_simulated_cameras(
@@ -330,29 +309,6 @@ def _depth_range(
     return float(everything.min()) - margin, float(everything.max()) + margin
 
 
-def _matcher(
-    search: PoseSearch,
-    cameras: Sequence[Camera],
-    period: float,
-    tracking: TrackingSettings | None,
-    color_cameras: Sequence[str] = (),
-) -> SilhouetteMatcher:
-    """Return a SilhouetteMatcher if ``tracking`` is None, else a SilhouetteTracker.
-
-    The tracker's search has no time limit, so that results are repeatable.
-
-    ``search``: finds poses without a prediction. ``cameras``: the cameras of the masks. ``period``:
-    time between two updates [s]. ``tracking``: the tracker's settings. ``color_cameras``: names of
-    the cameras whose pictures the tracker uses.
-    """
-    if tracking is None:
-        return SilhouetteMatcher(search, cameras, period)
-    # Recordings and simulations need no time limit; without one the result is repeatable.
-    return SilhouetteTracker(
-        search, cameras, period, tracking=tracking, color_cameras=color_cameras, search_time=None
-    )
-
-
 def show_estimate(
     builder: DiagramBuilder,
     scene_graph: SceneGraph,
@@ -388,51 +344,3 @@ def show_estimate(
                 scene_graph.AssignRole(source, geometry, properties, RoleAssign.kReplace)
     MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
     add_meshcat_skin(builder, meshcat, model, positions, "estimated", colour)
-
-
-def _finish(builder: DiagramBuilder, matcher: SilhouetteMatcher, period: float) -> MatchingDiagram:
-    """Log a matcher's outputs each ``period`` [s], and build."""
-    # A log samples before the update at the same time: sample k + 1 has the estimate of frame k.
-    positions_log = LogVectorOutput(
-        matcher.GetOutputPort("estimated_positions"), builder, publish_period=period
-    )
-    error_log = LogVectorOutput(matcher.GetOutputPort("error"), builder, publish_period=period)
-    return MatchingDiagram(builder.Build(), matcher, positions_log, error_log)
-
-
-@dataclass(frozen=True)
-class RegistrationDiagram:
-    """A diagram that registers a simulated camera, and its parts."""
-
-    diagram: Diagram  # The diagram.
-    registration: CameraRegistration  # The system that finds the camera's pose.
-    sensor: RgbdSensor  # The simulated camera; ``sensor.SetX_PB(context, X_WC)`` moves it.
-    status_log: VectorLogSink  # Log of ``status``, one sample a period.
-
-
-def build_simulated_registration(
-    registration: OnlineRegistration,
-    camera: PinholeCamera,
-    true_positions: Trajectory | np.ndarray,
-    period: float,
-) -> RegistrationDiagram:
-    """Build a diagram that registers a simulated camera; its pose is not an input.
-
-    Args:
-        registration: the method, with the body, and the camera with its intrinsics.
-        camera: the simulated camera, at its true pose.
-        true_positions: the body's positions (nq,) [rad or m], constant or over time, measured
-            without error.
-        period: time between two images and updates [s].
-    """
-    builder = DiagramBuilder()
-    scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
-    system = builder.AddNamedSystem("camera_registration", CameraRegistration(registration, period))
-    model = registration.body.tree.model
-    truth, images = add_simulated_cameras(builder, scene_graph, model, [camera], true_positions)
-    builder.Connect(images[0], system.GetInputPort("label_image"))
-    builder.Connect(truth, system.GetInputPort("measured_positions"))
-    status_log = LogVectorOutput(system.GetOutputPort("status"), builder, publish_period=period)
-    diagram = builder.Build()
-    sensor = diagram.GetSubsystemByName(f"camera_{camera.name}")
-    return RegistrationDiagram(diagram, system, sensor, status_log)

@@ -5,8 +5,10 @@
 """
 
 import math
+import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -98,7 +100,26 @@ class StagedDiagram(Generic[T]):
 
 
 class PortedSystem(LeafSystem):
-    """A LeafSystem that declares ports from model values; an int n is a vector of size n."""
+    """A LeafSystem that declares ports from model values; an int n is a vector of size n.
+
+    Each port has a getter, named as a MultibodyPlant's: ``get_<name>_input_port()`` or
+    ``get_<name>_output_port()``.
+    """
+
+    def __getattr__(self, name: str) -> Any:
+        """Return the getter of a port; raise AttributeError for any other name."""
+        found = re.fullmatch("get_(.+)_(input|output)_port", name)
+        if found and getattr(self, f"Has{found[2].title()}Port")(found[1]):
+            return partial(getattr(self, f"Get{found[2].title()}Port"), found[1])
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+    def __dir__(self) -> list[str]:
+        """Return the names of all attributes, the ports' getters included."""
+        kinds = {"input": self.num_input_ports(), "output": self.num_output_ports()}
+        return sorted([*super().__dir__(), *(
+            f"get_{getattr(self, f'get_{kind}_port')(index).get_name()}_{kind}_port"
+            for kind, count in kinds.items() for index in range(count)
+        )])  # fmt: skip
 
     def add_input(self, name: str, model_value: Any) -> InputPort:
         """Declare an input port for values as ``model_value``, or for vectors of this size."""
@@ -175,6 +196,23 @@ class PortedSystem(LeafSystem):
 
         return eval_inputs
 
+    def add_images(
+        self,
+        kind: str,
+        image: Callable[[int, int], Any],
+        cameras: Sequence[Camera],
+        names: Collection[str] | None = None,
+    ) -> Callable[[Context], dict[str, Any]]:
+        """Declare a port for the image of each camera, or of those in ``names``; return as above.
+
+        ``kind``: see ``camera_port``. ``image``: makes an image of a width and a height.
+        """
+        chosen = {one.name: one for one in cameras if names is None or one.name in names}
+        return self.add_camera_inputs(
+            {name: camera_port(kind, one, cameras) for name, one in chosen.items()},
+            lambda name: image(chosen[name].width, chosen[name].height),
+        )
+
     def add_parameter(self, initial: Any) -> Callable[[Context], Any]:
         """Declare the next abstract parameter; return a function that reads it from a context."""
         index = self.DeclareAbstractParameter(AbstractValue.Make(initial))
@@ -197,11 +235,22 @@ class ImmutableValue:
 class BeliefSystem(PortedSystem, Generic[T]):
     """A system whose state is an abstract belief, replaced by an unrestricted periodic update."""
 
-    def declare_belief(self, initial: T, period: float, offset: float = 0.0) -> None:
-        """Declare the belief and its initial value; it is updated at offset + k period [s]."""
+    def declare_belief(
+        self,
+        initial: T,
+        period: float,
+        offset: float = 0.0,
+        **outputs: tuple[Any, Callable[[T], Any]],
+    ) -> None:
+        """Declare the belief and its initial value; it is updated at offset + k period [s].
+
+        ``outputs``: model value and ``read`` of ``add_belief_output``, by name of the port.
+        """
         self._belief = self.DeclareAbstractState(AbstractValue.Make(initial))
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, offset, self._update)
         self.DeclareForcedUnrestrictedUpdateEvent(self._update)
+        for name, (model_value, read) in outputs.items():
+            self.add_belief_output(name, model_value, read)
 
     def add_belief_output(
         self, name: str, model_value: Any, read: Callable[[T], Any]

@@ -1,7 +1,8 @@
 """The matcher and the tracker as Drake systems: label images in, estimated positions out."""
 
+import zlib
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,34 +10,50 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
-from drake_pose.arrays import Array
+from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.camera.models import Camera, camera_tuple
 from drake_pose.errors import SettingsError, require_at_least, require_known
 from drake_pose.filtering.contour_tracker import MatchAndTrack, TrackerState, TrackingSettings
-from drake_pose.search import TRACKED, PoseEstimate, PoseSearch, View
+from drake_pose.fit.judge import LEVEL
+from drake_pose.search import TRACKED, PoseEstimate, PoseSearch, RobustSettings, View
 from drake_pose.silhouette.pictures.label_renderer import label_image_to_mask
 from drake_pose.systems.bodies import body_poses
 from drake_pose.systems.ports import (
     BeliefSystem,
     ImmutableValue,
-    camera_port,
     require_distinct_cameras,
     require_period,
     require_time_forward,
 )
 
-STATISTICS = ("found", "J", "E_total", "first_E_total", "runs", "outside_limit", "seconds")
+STATISTICS = (
+    "found", "J", "E_total", "first_E_total", "runs", "outside_limit", "seconds", "stale",
+)  # fmt: skip
 """Names of the elements of the output port ``statistics``."""
+
+MODE_LIMIT = 4
+"""Largest number of modes in ``mode_positions``."""
+
+
+class _Shown(NamedTuple):
+    """What is known of a camera's pictures."""
+
+    checksum: int  # Of the last picture.
+    age: int = 0  # Number of updates since it changed; negative: of changes in a row.
+    # Largest age at which another camera's picture changed; 0 again after many changes in a row.
+    held: int = 0
 
 
 @dataclass(frozen=True, eq=False)
 class MatcherState(ImmutableValue):
     """The state of a SilhouetteMatcher."""
 
-    q: Array  # (nq,) positions of the last pose found.
+    q: Array  # (nq,) positions of the last pose found or predicted.
     X_WB: Array  # (4, 4) pose of its base.
-    estimate: PoseEstimate | None  # Estimate of the last update; None: no camera saw the body.
-    memory: Any  # A subclass's own state; None: it has none.
+    estimate: PoseEstimate | None = None  # Of the last update; None: no camera saw the body.
+    memory: Any = None  # A subclass's own state; None: it has none.
+    shown: Mapping[str, _Shown] = field(default_factory=dict)  # By name of the camera.
+    stale: Collection[str] = ()  # Names of the cameras whose picture was not used.
 
 
 class SilhouetteMatcher(BeliefSystem[MatcherState]):
@@ -46,12 +63,18 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
 
         name: SilhouetteMatcher
         input_ports: [label_image, root_position (optional)]
-        output_ports: [estimated_positions, error, base_pose, body_poses, statistics,
-          proved_optimal, determined, lower, upper, mode_positions, pose_estimate]
+        output_ports: [estimated_positions, covariance, last_positions, E_total, base_pose,
+          body_poses, statistics, proved_optimal, determined, lower, upper, mode_positions,
+          pose_estimate]
 
-    A periodic update searches for the pose; output ports read the result. Before the first update,
-    and if no pose is found, the estimated positions are the last ones (initially the model's
-    default) and the error is infinite.
+    A periodic update searches for the pose; output ports read the result. ``estimated_positions``
+    and ``covariance`` are a measurement, as a ``TruncatedEkf`` takes it: NaN for what the pictures
+    of the last update do not show. To draw a body, use ``last_positions`` or ``body_poses``.
+
+    A picture that stays the same while another camera's changes is stale: it is not used until it
+    changes, nor for as long as it was held before while no picture changes. A camera that held a
+    picture has an unknown delay of up to a period: its new pictures are used only without newer
+    ones.
 
     Input ports:
         label_image (ImageLabel16I): ``label_image_<camera>`` with several cameras. A camera whose
@@ -59,11 +82,15 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
         root_position (3): known position of the root in the world [m].
 
     Output ports:
-        estimated_positions (nq): in the plant's order [rad or m].
-        error (1): E_total, the differing area as a fraction of the masks' area.
+        estimated_positions (nq): in the plant's order [rad or m]; NaN if no pose was found, and for
+            positions that are not determined.
+        covariance (nq x nq, row by row): of the estimated positions; NaN where they are, and if the
+            search does not examine its result. It is diagonal, from ``lower`` and ``upper``.
+        last_positions (nq): all positions of the last pose found, initially the model's default.
+        E_total (1): the differing area as a fraction of the masks' area; infinite without a pose.
         base_pose (RigidTransform): pose X_WB of the plant's world.
         body_poses: poses of all bodies in the scene's world, as a plant's port of that name.
-        statistics (7): see ``STATISTICS``.
+        statistics (8): see ``STATISTICS``; ``stale`` is the number of stale pictures.
         proved_optimal (1): 1 if it is proved that no pose of the searched grid fits better.
         determined (nq): 1 for a position that the silhouettes determine, else 0.
         lower, upper (nq): ends of each position's interval, or of the range found [rad or m].
@@ -91,13 +118,16 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
     _first_memory: Any = None
     """Initial value of ``MatcherState.memory``."""
 
+    _follows = False
+    """Whether the motion of the body is known, so that late pictures can be used."""
+
     def __init__(
         self,
         search: PoseSearch,
         cameras: Sequence[Camera] | Mapping[str, Camera],
         period: float,
         labels: Collection[int] | None = None,
-        mode_limit: int = 4,
+        mode_limit: int = MODE_LIMIT,
     ) -> None:
         super().__init__()
         if not hasattr(search, "match"):
@@ -113,29 +143,24 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
         self._search, self._cameras, self._mode_limit = search, cameras, mode_limit
         labels = search.tree.model.labels if labels is None else labels
         self._labels = self.add_parameter(None if labels is None else frozenset(labels))
-        known = {camera.name: camera for camera in cameras}
-        self._images = self.add_camera_inputs(
-            {one.name: camera_port("label_image", one, cameras) for one in cameras},
-            lambda name: ImageLabel16I(known[name].width, known[name].height),
-        )
+        self._images = self.add_images("label_image", ImageLabel16I, cameras)
         self.add_input("root_position", 3)
         q = search.tree.model.default_positions
-        self.declare_belief(MatcherState(q, np.eye(4), None, self._first_memory), period)
         plant, nq = search.tree.model.plant, len(q)
-        self.add_belief_output("estimated_positions", nq, lambda known: known.q)
-        self.add_belief_output("error", 1, lambda known: _statistics(known.estimate)[2:3])
-        self.add_belief_output(
-            "statistics", len(STATISTICS), lambda known: _statistics(known.estimate)
+        self.declare_belief(
+            MatcherState(q, np.eye(4), memory=self._first_memory),
+            period,
+            estimated_positions=(nq, lambda known: np.where(self._shows(known), known.q, np.nan)),
+            covariance=(nq * nq, self._shown_covariance),
+            last_positions=(nq, lambda known: known.q),
+            E_total=(1, lambda known: _statistics(known)[2:3]),
+            statistics=(len(STATISTICS), _statistics),
+            base_pose=(RigidTransform(), lambda known: RigidTransform(known.X_WB)),
+            body_poses=([RigidTransform()], lambda known: body_poses(plant, known.q, known.X_WB)),
+            pose_estimate=(None, lambda known: known.estimate),
         )
-        self.add_belief_output(
-            "base_pose", RigidTransform(), lambda known: RigidTransform(known.X_WB)
-        )
-        self.add_belief_output(
-            "body_poses", [RigidTransform()], lambda known: body_poses(plant, known.q, known.X_WB)
-        )
-        self.add_belief_output("pose_estimate", None, lambda known: known.estimate)
         sizes = {"proved_optimal": 1, "determined": nq, "lower": nq, "upper": nq}
-        for name, size in (sizes | {"mode_positions": self._mode_limit * nq}).items():
+        for name, size in (sizes | {"mode_positions": mode_limit * nq}).items():
 
             def read(known: MatcherState, name: str = name, size: int = size) -> Array:
                 return self._pose_set_values(known.estimate).get(name, np.full(size, np.nan))
@@ -146,32 +171,84 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
         """Return the state after matching the context's images, given the last state."""
         images, labels = self._images(context), self._labels(context)
         masks = {name: label_image_to_mask(image, labels) for name, image in images.items()}
-        seen = {name: mask for name, mask in masks.items() if mask.any()}
-        views = [View(one, seen[one.name]) for one in self._cameras if one.name in seen]
-        estimate, memory, is_shown = self._find(context, last.memory, views)
-        if estimate is None or not is_shown:
-            return MatcherState(last.q, last.X_WB, estimate, memory)
-        return MatcherState(estimate.q, estimate.X_WB, estimate, memory)
+        masks = {name: mask for name, mask in masks.items() if mask.any()}
+        pictures = self._pictures(context)
+        shown, stale, late = _compare(pictures | masks, last.shown)
+        if not self._follows and late < shown.keys() - stale:
+            stale |= late
+        views = [
+            View(one, masks[one.name])
+            for one in self._cameras
+            if one.name in masks and one.name not in stale
+        ]
+        pictures = {name: one for name, one in pictures.items() if name not in stale}
+        estimate, memory, is_shown = self._find(context, last.memory, views, pictures, late)
+        q, X_WB = last.q, last.X_WB
+        if estimate is not None and is_shown:
+            q, X_WB = estimate.q, estimate.X_WB
+        return MatcherState(q, X_WB, estimate, memory, shown, stale)
+
+    def was_tracked(self, context: Context) -> bool:
+        """Return whether the last update tracked without a search."""
+        return False
+
+    def with_intervals(self, context: Context) -> PoseEstimate:
+        """Return the pose of the last update with intervals, at the cost of an update if tracked.
+
+        There must be one.
+        """
+        estimate = self.belief(context).estimate
+        assert estimate is not None, "nothing was matched"
+        return estimate
+
+    def _pictures(self, context: Context) -> dict[str, Picture]:
+        """Return the pictures (H, W, 4) in a context, by name of the camera."""
+        return {}
 
     def _find(
-        self, context: Context, memory: Any, views: Sequence[View]
+        self,
+        context: Context,
+        memory: Any,
+        views: Sequence[View],
+        pictures: Mapping[str, Picture],
+        late: Collection[str],
     ) -> tuple[PoseEstimate | None, Any, bool]:
-        """Return the pose that the views show, None without any; next memory; whether to show it.
+        """Return the pose that is seen, None without evidence; next memory; whether to show it.
 
         ``memory``: ``MatcherState.memory`` of the last update. ``views``: the cameras that see the
-        body, with its mask.
+        body, with its mask. ``pictures``: ``_pictures``. ``late``: names of the cameras whose
+        picture may be late by up to a period.
         """
         if not views:
             return None, memory, False
         found = self._search.match(views, self.eval_input(context, "root_position"))
         return found, memory, found.found
 
+    def _shows(self, known: MatcherState) -> Mask:
+        """Return whether the last update's pictures determine each position (nq,)."""
+        estimate = known.estimate
+        if estimate is None or not estimate.found or estimate.pose_set is None:
+            return np.full(len(known.q), estimate is not None and estimate.found)
+        return np.asarray(estimate.pose_set.position_intervals(self._search.tree)[0] == 1.0)
+
+    def _shown_covariance(self, known: MatcherState) -> Array:
+        """Return the output ``covariance``, NaN where no position is estimated."""
+        shown = self._shows(known)
+        covariance = np.where(shown & shown[:, None], self._covariance(known), np.nan)
+        return covariance.ravel()
+
+    def _covariance(self, known: MatcherState) -> Array:
+        """Return the covariance (nq, nq) of the positions, NaN if unknown."""
+        nothing = np.full(len(known.q), np.nan)
+        values = self._pose_set_values(known.estimate)
+        ends = [np.abs(values.get(name, nothing) - known.q) for name in ("lower", "upper")]
+        return np.diag(np.square(np.max(ends, axis=0) / RobustSettings().significance))
+
     def _pose_set_values(self, estimate: PoseEstimate | None) -> dict[str, Array]:
         """Return the outputs from an estimate's pose set, by name of the port; {} without one."""
         if estimate is None or not estimate.found or estimate.pose_set is None:
             return {}
-        names = self._search.tree.model.position_names
-        modes = np.full((self._mode_limit, len(names)), np.nan)
+        modes = np.full((self._mode_limit, len(estimate.q)), np.nan)
         found = [mode.q for mode in estimate.pose_set.modes[: self._mode_limit]]
         modes[: len(found)] = found
         determined, lower, upper = estimate.pose_set.position_intervals(self._search.tree)
@@ -184,15 +261,39 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
         }
 
 
-def _statistics(estimate: PoseEstimate | None) -> Array:
-    """Return the elements of STATISTICS (7,): differences are infinite without a pose."""
-    values = np.zeros(len(STATISTICS))
+def _compare(
+    evidence: Mapping[str, Picture | Mask], last: Mapping[str, _Shown]
+) -> tuple[dict[str, _Shown], set[str], set[str]]:
+    """Return what is known of the pictures ``evidence``, and the names of stale and of late ones.
+
+    The mappings are by name of the camera; ``last``: what was known before this update. A picture
+    is late if it is new, but was held before: its time is unknown.
+    """
+    now = {name: _Shown(zlib.crc32(one.tobytes())) for name, one in evidence.items()}
+    same = {k for k, one in now.items() if k in last and last[k].checksum == one.checksum}
+    is_moving, stale, late = len(same) < len(now), set[str](), set[str]()
+    for name, one in now.items():
+        _, age, held = last.get(name, one)
+        age = max(age, 0) + 1 if name in same else min(age, 0) - 1
+        held = max(held, age) if is_moving else held
+        if age > 0 and (is_moving or age <= held):
+            stale.add(name)
+        elif age < 0 < held:
+            late.add(name)
+        now[name] = one._replace(age=age, held=held if -age * LEVEL < 1.0 else 0)
+    return {**last, **now}, stale, late
+
+
+def _statistics(known: MatcherState) -> Array:
+    """Return the elements of STATISTICS (8,): differences are infinite without a pose."""
+    values, estimate = np.zeros(len(STATISTICS)), known.estimate
     values[1:4] = np.inf
     if estimate is not None:
         limit = max(estimate.outside_limit, default=0.0)
-        values[4:] = estimate.runs, limit, estimate.seconds
+        values[4:7] = estimate.runs, limit, estimate.seconds
         if estimate.found:
             values[:4] = 1.0, estimate.J, estimate.E_total, estimate.first_E_total
+    values[-1] = len(known.stale)
     return values
 
 
@@ -216,13 +317,13 @@ class SilhouetteTracker(SilhouetteMatcher):
         name: SilhouetteTracker
         input_ports: [label_image, root_position (optional), measured_positions (optional),
           first_positions (optional), color_image (of color_cameras)]
-        output_ports: [estimated_positions, error, base_pose, body_poses, statistics,
-          proved_optimal, determined, lower, upper, mode_positions, pose_estimate,
-          position_deviations, estimated_state, track]
+        output_ports: [estimated_positions, covariance, last_positions, E_total, base_pose,
+          body_poses, statistics, proved_optimal, determined, lower, upper, mode_positions,
+          pose_estimate, position_deviations, estimated_state, track]
 
     A periodic update tracks or searches for the pose; output ports read the result. Ports and
     arguments are those of ``SilhouetteMatcher``, which it can replace in a diagram, and those
-    below. All state is in the context.
+    below. All state is in the context. Delays of up to a period widen the track along its motion.
 
     Input ports:
         color_image (ImageRgba8U): ``color_image_<camera>`` with several cameras; for the cameras in
@@ -235,17 +336,21 @@ class SilhouetteTracker(SilhouetteMatcher):
         first_positions (nq): approximate positions in the first image; ignored later.
 
     Output ports:
-        position_deviations (nq): standard deviation of each position [rad or m]; NaN for positions
-            that are not tracked (fixed, or solved from the root's pose). Without evidence, or if no
-            pose explains the masks because the body is occluded, positions are predicted and their
-            deviations grow. At most a tenth of the silhouettes' area may be occluded in a tracked
-            frame.
-        estimated_state (nq + nv): the estimated positions, then the plant's velocities [rad/s or
-            m/s]; velocities are NaN without a track and where ``position_deviations`` are. The
-            filter's rates decay with the time constant ``tracking.memory``: in steady motion at 30
-            Hz they are a fifth too small with the default of 0.15 s, and right with 5 s.
+        estimated_positions (nq): NaN while the pose is only predicted, and for positions that the
+            pictures of the last update alone do not determine (hidden links).
+        covariance (nq x nq, row by row): the track's; NaN where the estimated positions are.
+        last_positions (nq): found or predicted, never NaN.
+        position_deviations (nq): standard deviation of each of the last positions [rad or m]; NaN
+            for positions that are not tracked (fixed, or solved from the root's pose). Without
+            evidence, or if no pose explains the masks because the body is occluded, positions are
+            predicted and their deviations grow. At most a tenth of the silhouettes' area may be
+            occluded in a tracked frame.
+        estimated_state (nq + nv): the last positions, then the plant's velocities [rad/s or m/s];
+            velocities are NaN without a track and where ``position_deviations`` are. The filter's
+            rates decay with the time constant ``tracking.memory``: in steady motion at 30 Hz they
+            are a fifth too small with the default of 0.15 s, and right with 5 s.
         track (3): see ``TRACK``. ``tracked`` is 1 if the last pose was tracked, 0 if it was
-            searched or only predicted (``error`` is infinite then). ``matches`` is the number of
+            searched or only predicted (``E_total`` is infinite then). ``matches`` is the number of
             searches. ``distance`` is the robust root mean square distance of the body's contour
             from the edges [pixel].
 
@@ -261,6 +366,7 @@ class SilhouetteTracker(SilhouetteMatcher):
     """
 
     _first_memory = _Memory(TrackerState(), (0.0, 0.0, 0.0), -np.inf)
+    _follows = True
 
     def __init__(
         self,
@@ -271,46 +377,53 @@ class SilhouetteTracker(SilhouetteMatcher):
         tracking: TrackingSettings | None = None,
         color_cameras: Collection[str] = (),
         search_time: float | None = 5.0,
+        mode_limit: int = MODE_LIMIT,
     ) -> None:
-        super().__init__(search, cameras, period, labels)
-        cameras, self._search_time = self._cameras, search_time
+        super().__init__(search, cameras, period, labels, mode_limit)
+        cameras = camera_tuple(cameras)
         tracking = tracking or TrackingSettings()
+        self._search_time = search_time
+        # One for each TrackingSettings used, because several contexts may differ in them.
         follower = MatchAndTrack(search, cameras, period, tracking, search_time)
         self._tracking, self._followers = self.add_parameter(tracking), {tracking: follower}
         self._period, self._layout = period, follower.tracker.filter.layout
-        model = search.tree.model
+        model, moving = search.tree.model, follower.tracker.observation.layout.moving
         nq = len(model.position_names)
-        # Elements of the filter's state that are positions; the others are the root's.
-        self._moving, self._still = (
-            [name for name in some if name in model.position_names]
-            for some in (self._layout.moving, self._layout.constant)
-        )
+        # (nq, m) positions by the moving elements of the filter's state; the root's move none.
+        self._moves = np.array([[float(a == b) for b in moving] for a in model.position_names])
+        for coupled, leader, multiplier, _ in search.tree.followers:
+            self._moves[coupled] = multiplier * self._moves[leader]
+        # (m,) half of the limits' span, or of a turn; huge for the root's elements.
+        spans = dict(zip(model.position_names, 0.5 * (model.upper - model.lower), strict=True))
+        self._widest = np.array([spans.get(name, 1e4) for name in moving])
         self.add_input("measured_positions", nq)
         self.add_input("first_positions", nq)
-        known = {camera.name: camera for camera in cameras}
-        require_known("camera", color_cameras, known, "color_cameras")
-        self._colours = self.add_camera_inputs(
-            {
-                one.name: camera_port("color_image", one, cameras)
-                for one in cameras
-                if one.name in color_cameras
-            },
-            lambda name: ImageRgba8U(known[name].width, known[name].height),
+        require_known("camera", color_cameras, [one.name for one in cameras], "color_cameras")
+        self._colours = self.add_images("color_image", ImageRgba8U, cameras, color_cameras)
+        self.add_belief_output(
+            "position_deviations", nq, lambda known: np.sqrt(np.diag(self._covariance(known)))
         )
-        self.add_belief_output("position_deviations", nq, self._deviations)
         self.add_belief_output("estimated_state", model.plant.num_multibody_states(), self._state)
         self.add_belief_output("track", len(TRACK), lambda known: known.memory.track)
 
+    def _pictures(self, context: Context) -> dict[str, Picture]:
+        """Return the pictures (H, W, 4) in a context, by name of the camera."""
+        # Views of the images' writable data, as compiled kernels require.
+        images = self._colours(context)
+        return {name: one.mutable_data for name, one in images.items() if one.size()}
+
     def _find(
-        self, context: Context, memory: _Memory, views: Sequence[View]
+        self,
+        context: Context,
+        memory: _Memory,
+        views: Sequence[View],
+        pictures: Mapping[str, Picture],
+        late: Collection[str],
     ) -> tuple[PoseEstimate | None, _Memory, bool]:
         """Return the tracked or searched pose, None before any evidence; next memory; as above.
 
         A track predicts a pose that is not found.
         """
-        # Views of the images' writable data, as compiled kernels require.
-        images = self._colours(context)
-        pictures = {name: one.mutable_data for name, one in images.items() if one.size()}
         last, root_position = memory.tracker_state, self.eval_input(context, "root_position")
         if not views and not pictures and last.track is None:
             return None, memory, False
@@ -320,6 +433,8 @@ class SilhouetteTracker(SilhouetteMatcher):
         start = next((q for q in starts if q is not None and np.isfinite(q).all()), None)
         follower = self._follower(self._tracking(context))
         now, result = follower.next(last, views, root_position, pictures, start)
+        if late and now.track is not None:
+            now = replace(now, track=follower.tracker.delayed(now.track))
         is_tracked = result.stopped_by == TRACKED and now.matches == last.matches
         measurement = None if now.track is None else now.track.measurement
         distance = np.nan if measurement is None else measurement.distance
@@ -327,12 +442,17 @@ class SilhouetteTracker(SilhouetteMatcher):
         is_shown = result.found or now.track is not None
         return result, _Memory(now, track, context.get_time()), is_shown
 
+    def was_tracked(self, context: Context) -> bool:
+        """Return whether the last update tracked without a search."""
+        return bool(self.belief(context).memory.track[0])
+
     def with_intervals(self, context: Context) -> PoseEstimate:
-        """Return the last tracked pose with intervals, at the cost of an update."""
-        known = self.belief(context)
-        assert known.estimate is not None, "nothing was tracked"
-        follower = self._follower(self._tracking(context))
-        return follower.with_intervals(known.memory.tracker_state, known.estimate)
+        """Return the pose of the last update with intervals, at the cost of an update."""
+        estimate, follower = (
+            super().with_intervals(context),
+            self._follower(self._tracking(context)),
+        )
+        return follower.with_intervals(self.belief(context).memory.tracker_state, estimate)
 
     def _follower(self, tracking: TrackingSettings) -> MatchAndTrack:
         """Return the ``MatchAndTrack`` for a context's settings, created on first use."""
@@ -348,31 +468,35 @@ class SilhouetteTracker(SilhouetteMatcher):
             self._followers[tracking] = made
         return self._followers[tracking]
 
-    def _deviations(self, known: MatcherState) -> Array:
-        """Return the output ``position_deviations`` (nq,)."""
-        deviations, track = np.full(len(known.q), np.nan), known.memory.tracker_state.track
-        if track is not None:
-            seen = [*self._moving, *self._still]
-            found = track.state.best.deviations()[self._layout.indices(seen)]
-            deviations[self._indices(seen)] = found
-            for follower, leader, multiplier, _ in self._search.tree.followers:
-                deviations[follower] = abs(multiplier) * deviations[leader]
-        return deviations
+    def _shows(self, known: MatcherState) -> Mask:
+        """Return whether the last update's pictures determine each position (nq,)."""
+        shows, track = super()._shows(known), known.memory.tracker_state.track
+        if track is None or track.measurement is None or not known.memory.track[0]:
+            return shows
+        # Their information alone, in place of the prediction beside limits.
+        slopes = track.measurement.H[:, : self._moves.shape[1]]
+        alone = np.linalg.inv(slopes.T @ slopes + np.diag(1.0 / self._widest**2))
+        width = 2.0 * RobustSettings().significance * np.sqrt(np.diag(alone))
+        undetermined = self._moves[:, width > self._widest].any(axis=1)
+        return np.asarray(shows & self._moves.any(axis=1) & ~undetermined)
+
+    def _covariance(self, known: MatcherState) -> Array:
+        """Return the covariance (nq, nq) of the last positions, NaN if they are not tracked."""
+        moves, track = self._moves, known.memory.tracker_state.track
+        if track is None:
+            return np.full((len(moves), len(moves)), np.nan)
+        own = np.arange(moves.shape[1])
+        covariance = moves @ track.state.best.covariance[np.ix_(own, own)] @ moves.T
+        covariance[~moves.any(axis=1)] = np.nan
+        return covariance
 
     def _state(self, known: MatcherState) -> Array:
         """Return the output ``estimated_state`` (nq + nv,): q, then velocities."""
-        plant = self._search.tree.model.plant
-        qdot, track = np.full(len(known.q), np.nan), known.memory.tracker_state.track
+        plant, track = self._search.tree.model.plant, known.memory.tracker_state.track
+        qdot, count = np.full(len(known.q), np.nan), self._moves.shape[1]
         if track is not None:
-            rates = self._layout.indices([f"rate_{name}" for name in self._moving])
-            qdot[self._indices(self._still)] = 0.0
-            qdot[self._indices(self._moving)] = track.state.best.mean[rates] / self._period
-            for follower, leader, multiplier, _ in self._search.tree.followers:
-                qdot[follower] = multiplier * qdot[leader]
+            rates = self._moves @ track.state.best.mean[count : 2 * count] / self._period
+            qdot = np.where(self._moves.any(axis=1), rates, np.nan)
         plant_context = plant.CreateDefaultContext()
         plant.SetPositions(plant_context, known.q)
         return np.concatenate([known.q, plant.MapQDotToVelocity(plant_context, qdot)])
-
-    def _indices(self, names: Sequence[str]) -> list[int]:
-        """Return the indices in q of named positions."""
-        return [self._search.tree.model.position_index(name) for name in names]

@@ -1,4 +1,4 @@
-"""Forced updates equal periodic ones."""
+"""Forced updates equal periodic ones, and each port has a getter."""
 
 import numpy as np
 import pytest
@@ -31,9 +31,13 @@ class Abstract(BeliefSystem[int]):
 @pytest.mark.parametrize("make", [Counter, Abstract])
 def test_forced_updates_equal_periodic_ones(make):
     system = make()
+    assert {"get_step_input_port", "get_count_output_port"} <= {*dir(system)}
+    assert system.get_count_output_port().get_name() == "count"
+    with pytest.raises(AttributeError, match="get_count_input_port"):
+        system.get_count_input_port()
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
-    system.GetInputPort("step").FixValue(context, [2.0])
+    system.get_step_input_port().FixValue(context, [2.0])
     simulator.AdvanceTo(0.6)
     count = system.GetOutputPort("count")
     assert count.Eval(context) == [4.0]

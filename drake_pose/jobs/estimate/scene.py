@@ -134,20 +134,20 @@ def estimate_frames(
     follows = bool(inputs.scene.images or inputs.starts or inputs.known)
     played = inputs.frames[max(len(inputs.known) - 1, 0) :] if follows else left
     rate_hz = inputs.scene.frame_rate_hz or USUAL_RATE_HZ
-    matching = build_recorded_matching(
+    diagram, matcher = build_recorded_matching(
         replace(inputs.scene, frame_rate_hz=rate_hz), search, tuple(inputs.scene.cameras.values()),
         played, inputs.root_positions, tracking=inputs.tracking(), starts=inputs.starts,
     )  # fmt: skip
-    simulator = Simulator(matching.diagram)
+    simulator = Simulator(diagram)
+    context = matcher.GetMyContextFromRoot(simulator.get_context())
     for index, frame in enumerate(played):
         # The frame is matched at index / rate_hz; half a period later its output is up to date.
         simulator.AdvanceTo((index + 0.5) / rate_hz)
         if frame in left:
-            context = simulator.get_context()
-            pose = matching.estimate(context)
+            pose = matcher.belief(context).estimate
             if pose is None:
                 raise SettingsError(f"frame '{frame}': the matcher got no picture")
-            was_tracked = matching.was_tracked(context)
+            was_tracked = matcher.was_tracked(context)
             if pose.found and pose.pose_set is None and isinstance(search, MultiStartSearch):
                 before = track_start if was_tracked else None
                 if views := _views(inputs.scene, frame):
@@ -155,7 +155,7 @@ def estimate_frames(
                     pose = search.with_intervals(pose, views, place, before)
                 else:
                     # Without masks, the intervals come from the fitted contours.
-                    own = matching.with_intervals(context) if was_tracked else pose
+                    own = matcher.with_intervals(context) if was_tracked else pose
                     pose = own.widened(before)
             track_start = track_start if was_tracked else pose
             yield frame, pose

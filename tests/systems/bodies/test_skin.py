@@ -12,7 +12,8 @@ from drake_pose.camera.models import ParallelCamera
 from drake_pose.search import PaperSearch, PaperSearchSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.systems.bodies import MeshcatSkin, add_meshcat_skin
-from drake_pose.systems.diagrams import build_simulated_matching
+from drake_pose.systems.diagrams import build_simulation
+from drake_pose.systems.silhouette_matcher import SilhouetteMatcher
 from tests.body.models import load_limb
 
 X_WC = np.array([[0, 0, -1, 4.0], [1, 0, 0, 0], [0, -1, 0, 0.1], [0, 0, 0, 1.0]])
@@ -72,18 +73,17 @@ def test_a_simulated_camera_sees_the_skin(limb):
     )
     truth = np.array([0.6, -1.2, 0.6, 0.0, -0.6])
     meshcat = Meshcat(MeshcatParams(host="localhost", port=0))
-    built = build_simulated_matching(search, [CAMERA], truth, 0.1, meshcat)
-    simulator = Simulator(built.diagram)
+    matcher = SilhouetteMatcher(search, [CAMERA], 0.1)
+    simulator = Simulator(build_simulation(matcher, limb, [CAMERA], truth, meshcat))
     simulator.AdvanceTo(0.15)
     context = simulator.get_context()
-    sensor = built.diagram.GetSubsystemByName("camera_front")
+    sensor = simulator.get_system().GetSubsystemByName("camera_front")
     image = sensor.label_image_output_port().Eval(sensor.GetMyContextFromRoot(context))
     reference = LabelRenderer(limb, CAMERA).segments(truth)
     seen = image.data[..., 0]
     assert np.count_nonzero((seen < 32000) != (reference >= 0)) <= 3
     assert set(np.unique(seen[seen < 32000])) <= set(np.unique(reference))
-    matcher = built.matcher
-    error = matcher.GetOutputPort("error").Eval(matcher.GetMyContextFromRoot(context))[0]
+    error = matcher.GetOutputPort("E_total").Eval(matcher.GetMyContextFromRoot(context))[0]
     assert error < 0.01
     for name in ("true", "estimated"):
         for child in ("lower", "hand"):

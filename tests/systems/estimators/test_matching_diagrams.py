@@ -19,7 +19,7 @@ from drake_pose.search import (
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer, mask_to_label_image
 from drake_pose.silhouette.pictures.scenes import load_scene
 from drake_pose.systems.cameras import MaskPlayer
-from drake_pose.systems.diagrams import build_recorded_matching, build_simulated_matching
+from drake_pose.systems.diagrams import build_recorded_matching, build_simulation
 from drake_pose.systems.silhouette_matcher import STATISTICS, SilhouetteMatcher, SilhouetteTracker
 from tests.jobs.scenes import write_masks
 from tests.search.bodies import box_link, front_camera, joint, load_body, swinging_chain
@@ -48,17 +48,15 @@ def test_poses_rendered_by_drake_are_found(chain, camera):
     trajectory = PiecewisePolynomial.ZeroOrderHold(
         PERIOD * np.arange(4) - 0.01, np.vstack([TRUTH, TRUTH[-1:]]).T
     )
-    built = build_simulated_matching(search_for(chain), [camera], trajectory, PERIOD)
-    simulator = Simulator(built.diagram)
-    simulator.AdvanceTo(3 * PERIOD + 0.01)
-    context = simulator.get_context()
-    log = built.positions_log.FindLog(context)
-    # The log samples before each update: the first sample is the default pose.
-    np.testing.assert_allclose(log.sample_times()[:4], PERIOD * np.arange(4))
-    np.testing.assert_allclose(log.data().T[1:4], TRUTH, atol=1e-9)
-    errors = built.error_log.FindLog(context).data()[0]
-    assert np.isinf(errors[0])
-    assert (errors[1:4] < 0.02).all()
+    matcher = SilhouetteMatcher(search_for(chain), [camera], PERIOD)
+    simulator = Simulator(build_simulation(matcher, chain, [camera], trajectory))
+    run = Bench(matcher, matcher.GetMyContextFromRoot(simulator.get_context()))
+    assert np.isinf(run["E_total"])
+    assert np.isnan(run["estimated_positions"]).all()
+    for k, truth in enumerate(TRUTH):
+        simulator.AdvanceTo((k + 0.5) * PERIOD)
+        np.testing.assert_allclose(run["estimated_positions"], truth, atol=1e-9)
+        assert run["E_total"] < 0.02
 
 
 def test_one_camera_of_two_is_enough(chain):
@@ -75,10 +73,11 @@ def test_without_a_pose_the_last_estimate_is_kept_and_reported(chain):
     blot = np.zeros((100, 100), dtype=bool)
     blot[:2, :2] = True
     run.update(label_image=mask_to_label_image(blot))
-    np.testing.assert_array_equal(run["estimated_positions"], chain.default_positions)
+    assert np.isnan([*run["estimated_positions"], *run["covariance"]]).all()
+    np.testing.assert_array_equal(run["last_positions"], chain.default_positions)
     statistics = dict(zip(STATISTICS, run["statistics"], strict=True))
     assert (statistics["found"], statistics["runs"]) == (0, 1)
-    assert np.isinf(run["error"]).all()
+    assert np.isinf(run["E_total"]).all()
 
 
 def test_labels_select_the_body(chain):
@@ -120,10 +119,10 @@ def test_recorded_masks_with_a_root_position_for_each_frame(tmp_path):
     tree = model.pose_tree(root_position=np.zeros(3))
     search = PaperSearch(tree, PaperSearchSettings(interval=0.5, outside_limit=5.0))
     roots = {f"{k:04d}": pose[:3] for k, pose in enumerate(poses)}
-    built = build_recorded_matching(scene, search, [camera], root_positions=roots)
-    simulator = Simulator(built.diagram)
+    diagram, matcher = build_recorded_matching(scene, search, [camera], root_positions=roots)
+    simulator = Simulator(diagram)
     simulator.Initialize()
-    run = Bench(built.matcher, built.matcher.GetMyContextFromRoot(simulator.get_context()))
+    run = Bench(matcher, matcher.GetMyContextFromRoot(simulator.get_context()))
     for k, pose in enumerate(poses):
         simulator.AdvanceTo(k / 30 + 1e-4)
         np.testing.assert_allclose(run["estimated_positions"], pose, atol=1e-9)
@@ -169,6 +168,7 @@ def test_pose_sets_are_output(tmp_path):
     np.testing.assert_allclose(np.sort(run["mode_positions"][:2]), [-0.5, 0.5], atol=1e-9)
     assert np.isnan(run["mode_positions"][2])
     assert run["determined"] == 0.0
+    assert np.isnan(run["estimated_positions"])
     np.testing.assert_allclose([run["lower"][0], run["upper"][0]], [-0.5, 0.5], atol=1e-9)
     # NaN without a body in the image, and if the search does not examine its result.
     run.update(label_image=mask_to_label_image(0 * mask > 0))

@@ -66,7 +66,7 @@ def test_a_plant_and_its_sensor_suffice(tmp_path, system):
     simulator.get_system().ExecuteForcedEvents(simulator.get_mutable_context())
     own = matcher.GetMyContextFromRoot(simulator.get_context())
     # The wall has a label too, and fills the image.
-    assert matcher.GetOutputPort("error").Eval(own)[0] < 0.02
+    assert matcher.GetOutputPort("E_total").Eval(own)[0] < 0.02
     found = matcher.GetOutputPort("estimated_positions").Eval(own)
     np.testing.assert_allclose(found, TRUTH, atol=math.radians(1.0))
 

@@ -15,8 +15,8 @@ from drake_pose.silhouette.pictures.label_renderer import (
     mask_to_label_image,
 )
 from drake_pose.systems.cameras import SilhouetteCamera, picture_to_colour_image
-from drake_pose.systems.diagrams import build_simulated_matching
-from drake_pose.systems.silhouette_matcher import TRACK, SilhouetteTracker
+from drake_pose.systems.diagrams import build_simulation
+from drake_pose.systems.silhouette_matcher import TRACK, SilhouetteTracker, _compare
 from tests.search.arms import arm_cameras, gripper
 from tests.search.bodies import front_camera
 from tests.systems.bench import Bench
@@ -83,9 +83,9 @@ def test_contexts_have_their_own_labels_and_settings(body, search):
                 data[:40] = np.where(data[:40] != EMPTY, 7, data[:40])
             for run in (varied, plain):
                 run.update(label_image=image)
-        for port in ("estimated_positions", "position_deviations", "track"):
+        for port in ("last_positions", "covariance", "track"):
             np.testing.assert_allclose(varied[port], plain[port], atol=1e-12)
-        ends.append(varied["estimated_positions"])
+        ends.append(varied["last_positions"])
     assert np.abs(ends[0] - ends[1]).max() > 1e-3
     wrong = Bench(system)
     wrong.context.get_mutable_abstract_parameter(1).set_value(TrackingSettings(root_moves=True))
@@ -127,8 +127,29 @@ def test_measured_positions_that_do_not_fit_the_masks_are_rejected(body, search)
     run, truth = Bench(SilhouetteTracker(search, [CAMERA], PERIOD)), motion()[0]
     image = mask_to_label_image(LabelRenderer(body, CAMERA).mask(truth))
     run.update(label_image=image, measured_positions=truth + 1.5)
-    assert run["error"][0] < 0.1
+    assert run["E_total"][0] < 0.1
     assert run["track"][TRACK.index("matches")] == 1
+
+
+@pytest.mark.parametrize(
+    ("moves", "stale", "late"),
+    [
+        # Whether the picture of "a" and of "b" changes in each update, and what is said of "b".
+        ("ab ab ab", "...", "..."),
+        ("ab - - ab", "....", "...."),  # The robot stands still.
+        ("ab a a ab a", ".xx.x", "...x."),
+        ("ab a a ab - - - -", ".xx.xx..", "...x...."),  # It stops while a picture may be held.
+        ("ab a " + "ab " * 101, ".x" + 101 * ".", ".." + 100 * "x" + "."),  # Held long ago.
+    ],
+)
+def test_pictures_that_are_held_are_stale_and_their_next_ones_late(moves, stale, late):
+    pictures, shown = {name: np.zeros((2, 3), np.uint8) for name in "ab"}, {}
+    for k, moving in enumerate(moves.split()):
+        for name in moving.strip("-"):
+            pictures[name] = pictures[name] + 1
+        shown, *found = _compare(pictures, shown)
+        expected = [said[k] == "x" for said in (stale, late)]
+        assert [("b" in one) for one in found] == expected, k
 
 
 def test_an_unknown_color_camera_is_refused_by_name(search):
@@ -144,19 +165,14 @@ def test_mimic_joints_are_tracked_together(tmp_path):
     search = PaperSearch(model.pose_tree(), PaperSearchSettings(interval=math.radians(10)))
     breaks = PERIOD * (np.arange(len(truth) + 1) - 0.3)
     path = PiecewisePolynomial.ZeroOrderHold(breaks, np.vstack([truth, truth[-1:]]).T)
-    built = build_simulated_matching(
-        search, arm_cameras(), path, PERIOD, tracking=TrackingSettings()
-    )
-    simulator = Simulator(built.diagram)
-    root, rows = simulator.get_mutable_context(), []
+    tracker = SilhouetteTracker(search, arm_cameras(), PERIOD)
+    simulator = Simulator(build_simulation(tracker, model, arm_cameras(), path))
+    own, rows = Bench(tracker, tracker.GetMyContextFromRoot(simulator.get_context())), []
     for k in range(len(truth)):
         simulator.AdvanceTo((k + 0.5) * PERIOD)
-        own = Bench(built.matcher, built.matcher.GetMyContextFromRoot(root))
         rows.append([own["estimated_positions"], own["position_deviations"]])
-        was_tracked = own["track"][TRACK.index("tracked")] == 1.0
-        assert k == 0 or was_tracked
-        assert built.was_tracked(root) == was_tracked
-        np.testing.assert_array_equal(built.estimate(root).q, own["estimated_positions"])
+        assert k == 0 or own["track"][TRACK.index("tracked")] == 1.0
+        np.testing.assert_array_equal(own["pose_estimate"].q, own["estimated_positions"])
     found, deviations = np.swapaxes(rows, 0, 1)
     errors = found - truth
     np.testing.assert_array_equal(errors[:, 2], errors[:, 3])

@@ -4,6 +4,7 @@ The shape of a URDF model is changed in its text: links are hidden, scaled and s
 """
 
 import copy
+import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -33,6 +34,7 @@ from drake_pose.body.parsed_model import (
     ParsedModel,
     SkinBand,
     describe_positions,
+    follower_warnings,
     link_names,
     load_skin,
 )
@@ -83,12 +85,18 @@ class ArticulatedModel(ParsedModel):
                 rotates freely.
             held: values [rad or m] of positions that are not searched, by name.
 
+        Warns (UserWarning) of slides without limits, which keep their default values, and of
+        joints whose limits leave one value.
+
         Raises:
             UnknownNameError: the root link or a held position does not exist.
             ModelError: the root has no visual geometry, or the model's joints allow no pose tree.
             SettingsError: a position or value is missing, not finite, or outside the joint limits.
         """
-        return build_pose_tree(self, root, root_position, root_rotation, held)
+        tree = build_pose_tree(self, root, root_position, root_rotation, held)
+        for text in tree.warnings:
+            warnings.warn(f"{self.path}: {text}", stacklevel=2)
+        return tree
 
     @classmethod
     def from_plant(
@@ -107,6 +115,9 @@ class ArticulatedModel(ParsedModel):
         later. ``scene_graph``: the SceneGraph that holds the plant's geometry. ``model_instances``:
         the instances whose bodies are drawn; None: all.
 
+        Warns (UserWarning) of limits that are not as they are written, and of default positions
+        that do not follow others as mimics say; ``pose_tree`` warns of slides without limits.
+
         Raises ModelError: the plant is not finalized or not registered, no chosen body has visual
         geometry, or its joints or geometry cannot be used.
         """
@@ -122,8 +133,13 @@ class ArticulatedModel(ParsedModel):
         path = Path(name)
         with _model_errors(path):
             positions, remarks = describe_positions(plant, {}, name)
+            q, spans = plant.GetDefaultPositions(), positions["upper"] - positions["lower"]
+            names, couplings = positions["position_names"], positions["couplings"]
+            remarks += follower_warnings(names, couplings, q, spans)
         meshes = _visual_meshes(path, plant, scene_graph, bodies)
         labelled = [labelled_meshes(plant, scene_graph, plant.get_body(body)) for body in bodies]
+        for remark in summarise_warnings(remarks):
+            warnings.warn(f"{name}: {remark}", stacklevel=2)
         return cls(
             path=path,
             name=plant.GetModelInstanceName(chosen[-1]),

@@ -292,6 +292,23 @@ def _intersect_limits(
     return warnings
 
 
+def follower_warnings(
+    names: Sequence[str], followers: Sequence[Coupling], q: Array, spans: Array, slack: float = 0.1
+) -> list[str]:
+    """Return a warning for each position in q (nq,) that does not follow its leader (<mimic>).
+
+    ``names``: the position names. ``spans``: (nq,) upper minus lower limits [rad or m]. ``slack``:
+    tolerance, the smaller of this [rad or m] and this fraction of the span.
+    """
+    return [
+        f"joint '{names[follower]}' is written to follow joint '{names[leader]}' (<mimic>: "
+        f"{multiplier:g} x {offset:+g}), but the positions given do not: the body is posed by the "
+        "<mimic>; correct the positions, or remove the <mimic>"
+        for follower, leader, multiplier, offset in followers
+        if abs(q[follower] - multiplier * q[leader] - offset) > slack * min(1.0, spans[follower])
+    ]
+
+
 def _search_limits(
     joint: Joint, index: int, name: str, default: float, given: tuple[float, float] | None
 ) -> tuple[float, float, bool, str]:

@@ -12,6 +12,7 @@ then inverted.
 
 import itertools
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -24,7 +25,7 @@ from drake_pose.arrays import Array
 from drake_pose.body.link_graph import JointMap, PlantKinematics, chain_transforms
 from drake_pose.body.meshes import TriangleMesh
 from drake_pose.body.node_skin import NodeSkin
-from drake_pose.body.parsed_model import ParsedModel, covers_full_turn, one_turn
+from drake_pose.body.parsed_model import ParsedModel, covers_full_turn, follower_warnings, one_turn
 from drake_pose.body.plant_source import Coupling
 from drake_pose.body.root import BasePose, RootRotation, even_rotations
 from drake_pose.errors import SettingsError, require_known
@@ -144,6 +145,7 @@ class PoseTree:
         followers: couplings of the positions that follow searched positions.
         root: name of the root node; "world" if the plant's own roots are kept.
         placements: how each node is placed in its parent.
+        assumed: names of slides without limits that keep their default values.
         _base: how the plant takes up the pose of the tree's root.
         _rebuild: returns the tree with the root's origin at a position (3,) in the world [m]; None:
             the tree was not made by ``pose_tree``.
@@ -157,6 +159,7 @@ class PoseTree:
     followers: tuple[Coupling, ...]
     root: str
     placements: tuple[NodePlacement, ...] = field(repr=False)
+    assumed: tuple[str, ...]
     _base: BasePose = field(repr=False)
     _rebuild: "Callable[[Array], PoseTree] | None" = field(default=None, repr=False)
 
@@ -168,6 +171,25 @@ class PoseTree:
     def __post_init__(self) -> None:
         """Make ``held`` read-only."""
         object.__setattr__(self, "held", MappingProxyType(dict(self.held)))
+
+    @property
+    def warnings(self) -> list[str]:
+        """Warnings of positions that have no limits, or a single value between them."""
+        model = self.model
+        immobile = [
+            model.position_names[position]
+            for node in self.nodes
+            for position in node.positions
+            if model.lower[position] == model.upper[position]
+        ]
+        texts = {
+            "these joints have no limits: they place the object in the world and keep their "
+            "default values; a root position moves it, and a lower and an upper limit let them be "
+            "searched": self.assumed,
+            "the limits of these joints leave one value (widen them if they move), so they never "
+            "move": immobile,
+        }
+        return [f"{text}: {', '.join(names)}" for text, names in texts.items() if names]
 
     @property
     def turns_root_freely(self) -> bool:
@@ -365,10 +387,17 @@ class PoseTree:
     def values_from_positions(self, q: Array, X_WB: Array | None = None) -> list[Array]:
         """Return each node's values (k_i,) at the plant's q (nq,); inverse of ``positions_from``.
 
+        Warn (UserWarning) of positions that do not follow others as the model's mimics say.
+
         ``X_WB``: (4, 4) pose of the plant's world frame, used for roots with a RootRotation only;
         None: the identity.
         """
         q = np.asarray(q, dtype=np.float64)
+        model = self.model
+        spans = model.upper - model.lower
+        broken = follower_warnings(model.position_names, self.followers, q, spans)
+        if broken:
+            warnings.warn(broken[0], stacklevel=2)
         values = []
         for node, placement in zip(self.nodes, self.placements, strict=True):
             if placement.rotation is None:

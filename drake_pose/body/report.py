@@ -1,7 +1,7 @@
 """The report on a model file behind ``drake-pose check FILE``: its parts, warnings and errors."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -80,13 +80,8 @@ def describe_model(
     return ModelReport(path, model.name, tuple(nodes), model_warnings(model, tree), ())
 
 
-def model_warnings(
-    model: ArticulatedModel, tree: PoseTree, given: Iterable[str] = ()
-) -> tuple[str, ...]:
-    """Return the warnings about a model and its pose tree, at most ten of each kind.
-
-    ``given``: names of positions that the user holds; no warning names them as held by default.
-    """
+def model_warnings(model: ArticulatedModel, tree: PoseTree) -> tuple[str, ...]:
+    """Return the warnings about a model and its pose tree, at most ten of each kind."""
     warnings = list(model.warnings)
     constraints = model.plant.num_constraints() - len(model.couplings)
     if constraints:
@@ -110,17 +105,7 @@ def model_warnings(
             "their links to estimate them: " + ", ".join(tree.unobserved_positions)
         )
     warnings += _size_warnings(model, tree)
-    slides = [
-        model.position_names[position]
-        for position, value in tree.held.items()
-        if np.isinf(model.upper[position] - model.lower[position])
-        and value == model.default_positions[position]
-    ]
-    if slides := [name for name in slides if name not in set(given)]:
-        warnings.append(
-            "these joints have no limits: they place the object in the world and keep their "
-            "default values; a root position moves it: " + ", ".join(slides)
-        )
+    warnings += tree.warnings
     leaky = [
         f"'{node.name}'"
         for node in tree.nodes
@@ -135,7 +120,7 @@ def model_warnings(
 
 
 def _size_warnings(model: ArticulatedModel, tree: PoseTree, largest: float = 50.0) -> list[str]:
-    """Return warnings about implausible sizes and about joints with a single possible value.
+    """Return warnings about an implausible size.
 
     ``largest``: plausible extent of the body in its default pose [m]; the smallest is 1 / largest.
     """
@@ -149,17 +134,6 @@ def _size_warnings(model: ArticulatedModel, tree: PoseTree, largest: float = 50.
         warnings.append(
             f"the body is {size:.3g} m long from end to end; check that its lengths and the scale "
             "of its meshes are in metres"
-        )
-    immobile = [
-        model.position_names[position]
-        for node in tree.nodes
-        for position in node.positions
-        if model.lower[position] == model.upper[position]
-    ]
-    if immobile:
-        warnings.append(
-            "the limits of these joints leave one value (widen them if they move), so they never "
-            f"move: {', '.join(immobile)}"
         )
     return warnings
 

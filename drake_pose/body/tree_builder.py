@@ -317,6 +317,7 @@ def _plant_rooted(
             "its position"
         )
     held = {slide: float(model.default_positions[slide]) for slide in placing} | held
+    solved: dict[int, float] = {}
     X_WB = np.eye(4)
     tops = [index for index, branch in enumerate(branches) if branch.parent < 0]
     if position is not None:
@@ -327,14 +328,18 @@ def _plant_rooted(
         top = branches[tops[0]]
         slides = [model.position_kinds[index] == "length" for index in top.positions[:3]]
         if slides == [True] * 3 and all(s.position_count == 1 for s in top.steps[:3]):
-            held = {**held, **_solve_translations(model, top, position)}
+            solved = _solve_translations(model, top, position)
         else:
             body = graph.groups[top.group].body
             X_WB[:3, 3] = position - PlantKinematics(model).pose(body)[:3, 3]
     X_WA = X_WB @ PlantKinematics(model).pose(graph.groups[0].body)
     roots: Roots = dict.fromkeys(tops, (X_WA, None))
     name = graph.groups[0].name
-    return _assemble(model, graph, branches, roots, BasePose("constant", X_WB), held, name)
+    base, assumed = (
+        BasePose("constant", X_WB),
+        tuple(slide for slide in free if slide not in solved),
+    )
+    return _assemble(model, graph, branches, roots, base, held | solved, name, assumed)
 
 
 def _solve_translations(model: ParsedModel, top: Branch, p_WN: Array) -> dict[int, float]:
@@ -428,13 +433,14 @@ def _assemble(
     base: BasePose,
     held: dict[int, float],
     root: str,
+    assumed: Sequence[int] = (),
 ) -> PoseTree:
     """Return the pose tree with one node for each branch, in their order.
 
     ``branches``: branches of ``graph``, parents before children. ``roots``: pose and rotation of
     the branches without parents. ``base``: how the plant takes up the pose of the tree's root.
     ``held``: values of held positions [rad or m], by index in q. ``root``: name of the root node,
-    for ``PoseTree.root``.
+    for ``PoseTree.root``. ``assumed``: indices in q, for ``PoseTree.assumed``.
 
     Raises ModelError: a searched length has no limits, or the links of a skin band are no
     neighbours.
@@ -481,6 +487,7 @@ def _assemble(
         followers=followers,
         root=root,
         placements=tuple(placements),
+        assumed=tuple(model.position_names[index] for index in assumed),
         _base=base,
     )
 

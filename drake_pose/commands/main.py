@@ -8,6 +8,7 @@ import os
 import re
 import signal
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import NoReturn
@@ -114,6 +115,8 @@ def main(words: Sequence[str] | None = None) -> None:
     for ending in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(ending) is signal.SIG_DFL:
             signal.signal(ending, signal.default_int_handler)
+    # Results name these joints themselves.
+    warnings.filterwarnings("ignore", ".*(have no limits: they place|joints leave one value)")
     with messages_for("command line"):
         _run(words)
 

@@ -228,7 +228,9 @@ def record_pose_set(pose_set: PoseSet | None, tree: PoseTree) -> dict[str, Any]:
         for joint, value in zip((*joints, *mimic_joints(tree, joints)), values, strict=True):
             unit = 1.0 if kinds.get(joint.name) == "length" else math.degrees(1.0)
             shown = None if value is None else unit * value
-            estimates[joint.name] = _entry(joint.determined, joint.low, joint.high, unit, shown)
+            if joint.name not in tree.assumed:
+                ends = joint.determined, joint.low, joint.high
+                estimates[joint.name] = _entry(*ends, unit, shown)
         return estimates
 
     modes = [

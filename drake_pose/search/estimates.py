@@ -175,9 +175,11 @@ class PoseSet:
         return tuple(joint.determined for joint in self.joints)
 
     def position_intervals(self, tree: PoseTree) -> np.ndarray:
-        """Return (3, nq) ``determined``, ``low``, ``high`` of q; NaN: it is not in the tree."""
+        """Return (3, nq) ``determined``, ``low``, ``high`` of q; NaN: it is not searched."""
         joints = (*self.joints, *mimic_joints(tree, self.joints))
         known = {joint.name: (joint.determined, joint.low, joint.high) for joint in joints}
+        for name in tree.assumed:
+            known.pop(name, None)
         names = tree.model.position_names
         return np.array([known.get(name, (np.nan,) * 3) for name in names], dtype=float).T
 

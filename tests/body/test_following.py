@@ -69,6 +69,9 @@ def test_node_poses_of_coupled_joints_match_the_plant(tmp_path, root):
         for node, X_WN in zip(tree.nodes, kinematics.poses(values), strict=True):
             np.testing.assert_allclose(X_WN, X_WB @ poses[node.name], atol=1e-9)
         back = kinematics.flatten(tree.values_from_positions(q, X_WB))
+        broken = q + 0.1 * (np.array(model.position_names) == "bend")
+        with pytest.warns(UserWarning, match=r"joint 'bend' is .* joint 'lead' \(<mimic>: -0.5"):
+            tree.values_from_positions(broken, X_WB)
         np.testing.assert_allclose(kinematics.poses(back), kinematics.poses(values), atol=1e-9)
 
 

@@ -7,7 +7,9 @@ from scipy.spatial.transform import Rotation
 from drake_pose.body import BASE_JOINTS, TARGET_POSITIONS, RootRotation, TriangleMesh, load_model
 from drake_pose.body.pose_tree import axis_samples, product_grid
 from drake_pose.body.root import even_rotations
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
+from drake_pose.search.estimates import PoseSet, joint_estimates
 from tests.body.models import (
     FLOATING_URDF,
     JOINTED_BASE_URDF,
@@ -116,10 +118,17 @@ def test_unlimited_slides_place_the_only_object(tmp_path):
     slides = [model.position_index("x"), model.position_index("z")]
     moved = model.pose_tree(root_position=(1.0, -2.0, 3.0))
     turned = model.pose_tree("arm", root_position=(0.0, 0.0, 0.0))
-    for tree in (model.pose_tree(), moved, turned):
+    with pytest.warns(UserWarning, match=r"no limits.* a lower and an upper limit .*: x, z"):
+        own = model.pose_tree()
+    for tree in (own, moved, turned):
         assert largest_difference_from_drake(model, tree) < 1e-9
-    for tree in (model.pose_tree(), moved):
+    for tree in (own, moved):
         assert dict(tree.held) == dict.fromkeys(slides, 0.0)
+    kinematics = TreeKinematics(own)
+    ends = kinematics.lower, kinematics.upper, kinematics.lower == kinematics.upper
+    found = PoseSet((), joint_estimates(kinematics, *ends), 0.0, True, 1).position_intervals(own)
+    assert np.isnan(found[:, slides]).all()
+    assert model.pose_tree(held={"x": 0.0, "z": 0.1}).warnings == []
     X_WN = moved.node_poses(moved.default_values())
     np.testing.assert_allclose(X_WN[0, :3, 3], (1.0, -2.0, 3.0), atol=1e-12)
 

@@ -366,7 +366,7 @@ def read_inputs(
         X_WN = tree.node_poses(values)
         for camera in scene.cameras.values():
             require_visible(search.sampled.outlines, camera.X_CW @ X_WN, camera)
-    of_model = model_warnings(model, search.tree, settings.hold)
+    of_model = model_warnings(model, search.tree)
     warnings = (*scene_as_used.warnings, *of_truth, *of_model)
     return EstimateInputs(
         scene_as_used, model, frames, tracked, search, truth, warnings, centres, starts

@@ -59,6 +59,36 @@ class View:
                 "mask that shows the body"
             )
 
+    def cut(self, straight: float = 0.8, shortest: int = 8) -> "View":
+        """Return the view without the empty parts of its picture beyond straight cuts of its mask.
+
+        Where a mask ends at a line along the picture's rows or columns, it may be cut by a crop, or
+        by what stands before the body; behind the line the picture then tells nothing. Without a
+        cut this view itself is returned.
+
+        ``straight``: a mask's last row or column is a cut if it has at least this fraction of the
+        pixels of the next one; between that of a round end, .71, and that of two edges across the
+        line, 1. ``shortest``: least number of its pixels.
+        """
+        kept, first = [], []
+        for lines in (self.mask, self.mask.T):
+            sums = np.count_nonzero(lines, axis=1)
+            filled = np.flatnonzero(sums)
+            ends = [0, len(sums)]
+            for k, (end, inward) in enumerate(((filled[0], 1), (filled[-1], -1))):
+                inner = sums[end + inward] if len(filled) > 1 else np.inf
+                if sums[end] >= max(shortest, straight * inner):
+                    ends[k] = int(end) + k
+            kept.append(slice(*ends))
+            first.append(ends[0])
+        mask = np.ascontiguousarray(self.mask[tuple(kept)])
+        if mask.shape == self.mask.shape:
+            return self
+        height, width = mask.shape
+        x, y = self.camera.center_x - first[1], self.camera.center_y - first[0]
+        camera = replace(self.camera, width=width, height=height, center_x=x, center_y=y)
+        return View(camera, mask)
+
 
 def require_views(views: Sequence[View]) -> None:
     """Raise a SettingsError if there are no views, or a single View in place of a sequence."""

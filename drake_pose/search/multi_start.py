@@ -151,11 +151,30 @@ class MultiStartSearch:
         if self._time_limit is not None:
             warm_up()
         start = time.perf_counter()
-        body, fit, clean = self._fit(views, root_position)
         deadline = np.inf if self._time_limit is None else start + self._time_limit
-        run = _MultiStartRun(self, body, fit, clean, views, root_position, deadline)
-        result = run.search(self.settings.rounds if self._alternatives else 0, self._alternatives)
+        result, cut = self._search(views, root_position, deadline), [one.cut() for one in views]
+        length = RefinementProblem(self.exact.body, views).border_length
+        # A pose that ends where a mask is cut is one of several, unless all pixels agree with it.
+        in_time = result.stopped_by == "end" and cut != list(views)
+        if in_time and result.J > self.exact.settings.misfit * length:
+            known = [self._kinematics.flatten(result.node_values)]
+            result = self._search(cut, root_position, deadline, known)
         return replace(result, seconds=time.perf_counter() - start)
+
+    def _search(
+        self,
+        views: Sequence[View],
+        root_position: np.ndarray | None,
+        deadline: float,
+        known: Sequence[np.ndarray] = (),
+    ) -> PoseEstimate:
+        """Return the best pose found until ``deadline`` (perf_counter); as ``match``.
+
+        ``known``: values (m,) of further starts.
+        """
+        body, fit, clean = self._fit(views, root_position)
+        run = _MultiStartRun(self, body, fit, clean, views, root_position, deadline, known)
+        return run.search(self.settings.rounds if self._alternatives else 0, self._alternatives)
 
     def with_intervals(
         self,
@@ -205,6 +224,7 @@ class _MultiStartRun:
     ``fit``: the robust fit to the clean views. ``clean``: the views without specks. ``views``: the
     views as they were given; J is computed from these. ``root_position``: (3,) the root's position
     [m]; None: that of the tree. ``deadline``: time.perf_counter() at which the search ends [s].
+    ``known``: values (m,) of further starts.
     """
 
     def __init__(
@@ -216,7 +236,9 @@ class _MultiStartRun:
         views: Sequence[View],
         root_position: np.ndarray | None,
         deadline: float,
+        known: Sequence[np.ndarray],
     ) -> None:
+        self._known = known
         self._search, self._body, self._fit, self._kinematics = search, body, fit, fit.kinematics
         self._root_position, self._deadline, self._stopped_by = root_position, deadline, "end"
         self._problem = self._clean = RefinementProblem(search.exact.body, views)
@@ -242,7 +264,8 @@ class _MultiStartRun:
         starts = self._coarse.choose_distinct(
             self._coarse.find(), settings.starts, settings.separation
         )
-        pool = refine_best(self._fit, self._values(starts), self._passes, self._proceed)
+        first = [*self._values(starts), *self._known]
+        pool = refine_best(self._fit, first, self._passes, self._proceed)
         first_J = self._J(pool[0].values)
         searched = self._looks_exact(pool[0].values)
         if searched:

@@ -20,6 +20,7 @@ from drake_pose.search import (
     covariance_pose_set,
 )
 from tests.search.arms import crane, views_of
+from tests.search.bodies import front_camera
 
 TURN = 2.0 * math.pi
 CAMERA = ParallelCamera("front", 6, 4, 10.0, 3.0, 2.0, np.eye(4))
@@ -55,6 +56,30 @@ def model(tmp_path_factory):
 @pytest.fixture(scope="module")
 def tree(model):
     return model.pose_tree()
+
+
+def test_masks_are_cut_at_straight_lines_alone():
+    y, x = np.mgrid[:200, :200]
+    camera = front_camera(200)
+    disc = (x - 90) ** 2 + (y - 100) ** 2 < 50**2
+    box = (abs(x + 0.3 * y - 110) < 40) & (abs(y - 0.3 * x - 50) < 60)
+    for mask in (disc, box, disc | box):
+        assert View(camera, mask).cut().mask.shape == (200, 200)
+        # Half of the picture is empty; what is seen of the body stays where it is.
+        for side, shape in (
+            (np.s_[:, 110:], (200, 110)),
+            (np.s_[:, :70], (200, 130)),
+            (np.s_[:120], (80, 200)),
+        ):
+            half = mask.copy()
+            half[side] = False
+            cut = View(camera, half).cut()
+            assert cut.mask.shape == shape
+            assert cut.mask.sum() == half.sum()
+            p_W = np.array([[0.1, 0.2, 0.3]])
+            gone = np.array([200, 200]) - shape[::-1]
+            moved = camera.project(p_W)[0] - cut.camera.project(p_W)[0]
+            assert moved == pytest.approx(gone[None] * (side in (np.s_[:, :70], np.s_[:120])))
 
 
 @pytest.mark.parametrize("around", [0.0, TURN, -2.0 * TURN])

@@ -207,6 +207,21 @@ def test_a_body_cut_off_by_the_image_border_is_found(tree, search, pose):
     assert worst_place(tree, result, pose) < 0.02
 
 
+def test_what_a_straight_cut_may_hide_is_no_evidence(tree, search):
+    camera, held = arm_cameras()[0], []
+    for seed, side in enumerate(4 * [np.s_[:, 160:], np.s_[:, :160]]):
+        values = draw_pose(tree, np.random.default_rng(900 + seed))
+        whole = draw_view(tree, values, camera).mask
+        mask = whole.copy()
+        mask[side] = False  # A crop, or what stands before half of the arm.
+        if np.count_nonzero(mask) > 0.15 * np.count_nonzero(whole):
+            joints = search.match([View(camera, mask)]).pose_set.joints
+            told = zip(joints, values, strict=True)
+            held += [one.holds(value) for one, value in told if one.determined]
+    assert len(held) > 12
+    assert np.mean(held) >= 0.9
+
+
 def test_salt_noise_does_not_spoil_the_pose(tree, search, pose):
     generator = np.random.default_rng(8)
     views = clean_views(tree, pose)

@@ -7,17 +7,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from pydrake.geometry import (
-    IllustrationProperties,
     Meshcat,
     MeshcatVisualizer,
+    MeshcatVisualizerParams,
     RenderEngineVtkParams,
-    Rgba,
-    Role,
-    RoleAssign,
     SceneGraph,
 )
 from pydrake.math import RigidTransform
-from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import TrajectorySource
 from pydrake.systems.sensors import ImageLabel16I
@@ -168,9 +164,6 @@ def _registration_numbers(known: OnlineState) -> list[float]:
     return [len(known.keyframes), known.outlier_count, known.moves, iou]
 
 
-ESTIMATE_COLOUR = Rgba(0.0, 0.45, 0.70, 0.6)
-
-
 def build_recorded_matching(
     scene: Scene,
     search: PoseSearch,
@@ -229,8 +222,8 @@ def build_simulation(
         model: the body.
         cameras: the estimator's cameras; the registered camera is here at its true pose.
         true_positions: the true body's positions (nq,) [rad or m], constant or over time.
-        meshcat: where to show the body, and a second one at a matcher's ``last_positions``, which
-            the sensors do not see; None: nowhere.
+        meshcat: where to show the body (path ``true``), and a second one at a matcher's
+            ``last_positions`` (``estimated``); None: nowhere.
     """
     builder = DiagramBuilder()
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
@@ -241,10 +234,17 @@ def build_simulation(
     if isinstance(estimator, CameraRegistration):
         builder.Connect(truth, estimator.GetInputPort("measured_positions"))
     elif meshcat is not None:
+        # Of its own SceneGraph, so that the sensors do not see it.
+        shown = builder.AddNamedSystem("estimate_scene_graph", SceneGraph())
         estimate = estimator.GetOutputPort("last_positions")
-        show_estimate(builder, scene_graph, model, estimate, meshcat, ESTIMATE_COLOUR)
-        # After show_estimate, because its visualizer clears its part of Meshcat's tree.
-        add_meshcat_skin(builder, meshcat, model, truth, "true")
+        add_posed_plant(builder, shown, model, estimate, "estimated_geometry_pose")
+        places = {"true": (scene_graph, truth), "estimated": (shown, estimate)}
+        for name, (scene, positions) in places.items():
+            parameters = MeshcatVisualizerParams(prefix=name)
+            MeshcatVisualizer.AddToBuilder(builder, scene, meshcat, parameters)
+            # After the visualizer, which clears its part of Meshcat's tree.
+            add_meshcat_skin(builder, meshcat, model, positions, name, prefix=name)
+        meshcat.SetProperty("estimated", "modulated_opacity", 0.6)
     return builder.Build()
 
 
@@ -273,16 +273,14 @@ def add_simulated_cameras(
     add_posed_plant(builder, scene_graph, model, truth, "true_geometry_pose", "true")
     labels = {name: label for label, name in enumerate(model.link_names)}
     add_skin(builder, scene_graph, model, truth, labels)
-    ranges = {}
-    for camera in cameras:
-        nearest, farthest = _depth_range(camera, model, true_positions)
-        if isinstance(camera, PinholeCamera):
-            # Drake warns of farther planes, which are not needed behind the body.
-            nearest, farthest = camera.near, max(60.0, farthest)
-        ranges[camera.name] = nearest, farthest
-    sensors = add_sensors(
-        builder, scene_graph, {one.name: one for one in cameras}, ranges, RenderEngineVtkParams()
-    )
+    # Pinhole cameras see to 1 km; the depths of parallel ones must be tight.
+    ranges = {
+        one.name: _depth_range(one, model, true_positions)
+        for one in cameras
+        if not isinstance(one, PinholeCamera)
+    }
+    named = {one.name: one for one in cameras}
+    sensors = add_sensors(builder, scene_graph, named, ranges, RenderEngineVtkParams())
     return truth, [sensor.label_image_output_port() for sensor in sensors.values()]
 
 
@@ -293,54 +291,15 @@ def _depth_range(
 
     Both have a margin of 0.5 m and a tenth of the range, because the body is sampled at 100 times.
     """
-    start, end = true_positions.start_time(), true_positions.end_time()
+    tree, depths = build_pose_tree(model), []
     # A constant trajectory has infinite times.
-    times = np.linspace(start, end, 100) if np.isfinite([start, end]).all() else np.zeros(1)
-    tree = build_pose_tree(model)
-    depths = []
-    for time in times:
+    ends = np.array([true_positions.start_time(), true_positions.end_time()])
+    start, end = np.where(np.isfinite(ends), ends, 0.0).tolist()
+    for time in np.linspace(start, end, 100):
         values = tree.values_from_positions(true_positions.value(time).ravel())
         for node, taken, X_WN in zip(tree.nodes, values, tree.node_poses(values), strict=True):
             p_N = node.surface(taken).vertices
             depths.append(camera.project(p_N @ X_WN[:3, :3].T + X_WN[:3, 3])[1])
-    everything = np.concatenate(depths)
-    # The body may leave the range between the sampled times.
-    margin = 0.5 + 0.1 * float(np.ptp(everything))
-    return float(everything.min()) - margin, float(everything.max()) + margin
-
-
-def show_estimate(
-    builder: DiagramBuilder,
-    scene_graph: SceneGraph,
-    model: ParsedModel,
-    positions: OutputPort,
-    meshcat: Meshcat,
-    colour: Rgba | None = None,
-) -> None:
-    """Show a SceneGraph in Meshcat, with a body at estimated positions that sensors do not see.
-
-    Args:
-        builder: the diagram that contains ``scene_graph``.
-        model: the body.
-        positions: port of the estimated positions (nq,) [rad or m].
-        meshcat: where to show them.
-        colour: colour of the body; None: its own colours.
-    """
-    plant = add_posed_plant(
-        builder, scene_graph, model, positions, "estimated_geometry_pose", "estimated"
-    )
-    source, inspector = plant.get_source_id(), scene_graph.model_inspector()
-    for index in range(plant.num_bodies()):
-        frame = plant.GetBodyFrameIdOrThrow(BodyIndex(index))
-        for geometry in inspector.GetGeometries(frame):
-            # The world's frame also carries other bodies' skin.
-            if not inspector.BelongsToSource(geometry, source):
-                continue
-            if inspector.GetPerceptionProperties(geometry) is not None:
-                scene_graph.RemoveRole(source, geometry, Role.kPerception)
-            if colour is not None and inspector.GetIllustrationProperties(geometry) is not None:
-                properties = IllustrationProperties()
-                properties.AddProperty("phong", "diffuse", colour)
-                scene_graph.AssignRole(source, geometry, properties, RoleAssign.kReplace)
-    MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
-    add_meshcat_skin(builder, meshcat, model, positions, "estimated", colour)
+    low, high = np.min(np.concatenate(depths)), np.max(np.concatenate(depths))
+    margin = 0.5 + 0.1 * (high - low)
+    return float(low - margin), float(high + margin)

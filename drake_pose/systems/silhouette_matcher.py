@@ -15,7 +15,7 @@ from drake_pose.camera.models import Camera, camera_tuple
 from drake_pose.errors import SettingsError, require_at_least, require_known
 from drake_pose.filtering.contour_tracker import MatchAndTrack, TrackerState, TrackingSettings
 from drake_pose.fit.judge import LEVEL
-from drake_pose.search import TRACKED, PoseEstimate, PoseSearch, RobustSettings, View
+from drake_pose.search import TRACKED, PoseEstimate, PoseSearch, PoseSet, RobustSettings, View
 from drake_pose.silhouette.pictures.label_renderer import label_image_to_mask
 from drake_pose.systems.bodies import body_poses
 from drake_pose.systems.ports import (
@@ -44,6 +44,15 @@ class _Shown(NamedTuple):
     held: int = 0
 
 
+class _Frame(NamedTuple):
+    """The evidence of an update."""
+
+    context: Context  # The system's context.
+    views: Sequence[View]  # The cameras that see the body, with its mask.
+    pictures: Mapping[str, Picture]  # (H, W, 4) by name of the camera.
+    late: Collection[str]  # Names of the cameras whose picture may be late by up to a period.
+
+
 @dataclass(frozen=True, eq=False)
 class MatcherState(ImmutableValue):
     """The state of a SilhouetteMatcher."""
@@ -54,6 +63,11 @@ class MatcherState(ImmutableValue):
     memory: Any = None  # A subclass's own state; None: it has none.
     shown: Mapping[str, _Shown] = field(default_factory=dict)  # By name of the camera.
     stale: Collection[str] = ()  # Names of the cameras whose picture was not used.
+
+    @property
+    def was_tracked(self) -> bool:
+        """Whether the pose was tracked without a search."""
+        return isinstance(self.memory, _Memory) and bool(self.memory.track[0])
 
 
 class SilhouetteMatcher(BeliefSystem[MatcherState]):
@@ -158,14 +172,12 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
             base_pose=(RigidTransform(), lambda known: RigidTransform(known.X_WB)),
             body_poses=([RigidTransform()], lambda known: body_poses(plant, known.q, known.X_WB)),
             pose_estimate=(None, lambda known: known.estimate),
+            proved_optimal=(1, _proved_optimal),
+            determined=(nq, lambda known: self._intervals(known)[0]),
+            lower=(nq, lambda known: self._intervals(known)[1]),
+            upper=(nq, lambda known: self._intervals(known)[2]),
+            mode_positions=(mode_limit * nq, self._mode_positions),
         )
-        sizes = {"proved_optimal": 1, "determined": nq, "lower": nq, "upper": nq}
-        for name, size in (sizes | {"mode_positions": mode_limit * nq}).items():
-
-            def read(known: MatcherState, name: str = name, size: int = size) -> Array:
-                return self._pose_set_values(known.estimate).get(name, np.full(size, np.nan))
-
-            self.add_belief_output(name, size, read)
 
     def next_belief(self, context: Context, last: MatcherState) -> MatcherState:
         """Return the state after matching the context's images, given the last state."""
@@ -174,23 +186,15 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
         masks = {name: mask for name, mask in masks.items() if mask.any()}
         pictures = self._pictures(context)
         shown, stale, late = _compare(pictures | masks, last.shown)
-        if not self._follows and late < shown.keys() - stale:
+        if not self._follows and late < {*pictures, *masks} - stale:
             stale |= late
-        views = [
-            View(one, masks[one.name])
-            for one in self._cameras
-            if one.name in masks and one.name not in stale
-        ]
+        names = [one for one in self._cameras if one.name in masks and one.name not in stale]
+        views = [View(one, masks[one.name]) for one in names]
         pictures = {name: one for name, one in pictures.items() if name not in stale}
-        estimate, memory, is_shown = self._find(context, last.memory, views, pictures, late)
-        q, X_WB = last.q, last.X_WB
-        if estimate is not None and is_shown:
-            q, X_WB = estimate.q, estimate.X_WB
-        return MatcherState(q, X_WB, estimate, memory, shown, stale)
-
-    def was_tracked(self, context: Context) -> bool:
-        """Return whether the last update tracked without a search."""
-        return False
+        frame = _Frame(context, views, pictures, late)
+        estimate, memory, is_shown = self._find(frame, last.memory)
+        pose = estimate if estimate is not None and is_shown else last
+        return MatcherState(pose.q, pose.X_WB, estimate, memory, shown, stale)
 
     def with_intervals(self, context: Context) -> PoseEstimate:
         """Return the pose of the last update with intervals, at the cost of an update if tracked.
@@ -205,31 +209,22 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
         """Return the pictures (H, W, 4) in a context, by name of the camera."""
         return {}
 
-    def _find(
-        self,
-        context: Context,
-        memory: Any,
-        views: Sequence[View],
-        pictures: Mapping[str, Picture],
-        late: Collection[str],
-    ) -> tuple[PoseEstimate | None, Any, bool]:
+    def _find(self, frame: _Frame, memory: Any) -> tuple[PoseEstimate | None, Any, bool]:
         """Return the pose that is seen, None without evidence; next memory; whether to show it.
 
-        ``memory``: ``MatcherState.memory`` of the last update. ``views``: the cameras that see the
-        body, with its mask. ``pictures``: ``_pictures``. ``late``: names of the cameras whose
-        picture may be late by up to a period.
+        ``memory``: ``MatcherState.memory`` of the last update.
         """
-        if not views:
+        if not frame.views:
             return None, memory, False
-        found = self._search.match(views, self.eval_input(context, "root_position"))
+        root_position = self.eval_input(frame.context, "root_position")
+        found = self._search.match(frame.views, root_position)
         return found, memory, found.found
 
     def _shows(self, known: MatcherState) -> Mask:
         """Return whether the last update's pictures determine each position (nq,)."""
-        estimate = known.estimate
-        if estimate is None or not estimate.found or estimate.pose_set is None:
-            return np.full(len(known.q), estimate is not None and estimate.found)
-        return np.asarray(estimate.pose_set.position_intervals(self._search.tree)[0] == 1.0)
+        if _pose_set(known) is not None:
+            return np.asarray(self._intervals(known)[0] == 1.0)
+        return np.full(len(known.q), known.estimate is not None and known.estimate.found)
 
     def _shown_covariance(self, known: MatcherState) -> Array:
         """Return the output ``covariance``, NaN where no position is estimated."""
@@ -239,26 +234,34 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
 
     def _covariance(self, known: MatcherState) -> Array:
         """Return the covariance (nq, nq) of the positions, NaN if unknown."""
-        nothing = np.full(len(known.q), np.nan)
-        values = self._pose_set_values(known.estimate)
-        ends = [np.abs(values.get(name, nothing) - known.q) for name in ("lower", "upper")]
-        return np.diag(np.square(np.max(ends, axis=0) / RobustSettings().significance))
+        widths = np.abs(self._intervals(known)[1:] - known.q).max(axis=0)
+        return np.diag(np.square(widths / RobustSettings().significance))
 
-    def _pose_set_values(self, estimate: PoseEstimate | None) -> dict[str, Array]:
-        """Return the outputs from an estimate's pose set, by name of the port; {} without one."""
-        if estimate is None or not estimate.found or estimate.pose_set is None:
-            return {}
-        modes = np.full((self._mode_limit, len(estimate.q)), np.nan)
-        found = [mode.q for mode in estimate.pose_set.modes[: self._mode_limit]]
-        modes[: len(found)] = found
-        determined, lower, upper = estimate.pose_set.position_intervals(self._search.tree)
-        return {
-            "proved_optimal": np.array([float(estimate.proved_optimal)]),
-            "determined": determined,
-            "lower": lower,
-            "upper": upper,
-            "mode_positions": modes.ravel(),
-        }
+    def _intervals(self, known: MatcherState) -> Array:
+        """Return the outputs ``determined``, ``lower`` and ``upper`` (3, nq)."""
+        found = _pose_set(known)
+        if found is None:
+            return np.full((3, len(known.q)), np.nan)
+        return found.position_intervals(self._search.tree)
+
+    def _mode_positions(self, known: MatcherState) -> Array:
+        """Return the output ``mode_positions``."""
+        found, modes = _pose_set(known), np.full((self._mode_limit, len(known.q)), np.nan)
+        for k, mode in enumerate(found.modes[: self._mode_limit] if found else ()):
+            modes[k] = mode.q
+        return modes.ravel()
+
+
+def _pose_set(known: MatcherState) -> PoseSet | None:
+    """Return the pose set of the last update; None: no pose was found, or not examined."""
+    estimate = known.estimate
+    return estimate.pose_set if estimate is not None and estimate.found else None
+
+
+def _proved_optimal(known: MatcherState) -> list[float]:
+    """Return the output ``proved_optimal`` (1,)."""
+    one = known.estimate
+    return [np.nan if one is None or _pose_set(known) is None else float(one.proved_optimal)]
 
 
 def _compare(
@@ -354,15 +357,13 @@ class SilhouetteTracker(SilhouetteMatcher):
             searches. ``distance`` is the robust root mean square distance of the body's contour
             from the edges [pixel].
 
-    ``tracking``: settings of the tracker; None: TrackingSettings(). They are abstract parameter 1
-    of the context, where all but ``root_moves`` and ``scale_unknown`` can be changed.
-    ``color_cameras``: names of the cameras that have a port for a colour image. ``search_time``:
-    time limit of a ``MultiStartSearch`` [s]; a search that reaches it is repeated in the next
-    updates. None: no limit.
+    ``tracking``: settings of the tracker; None: TrackingSettings(). ``color_cameras``: names of the
+    cameras that have a port for a colour image. ``search_time``: time limit of a
+    ``MultiStartSearch`` [s]; a search that reaches it is repeated in the next updates. None: no
+    limit.
 
-    Raises SettingsError: as for ``SilhouetteMatcher``. In a simulation: time runs backwards, or the
-    context's settings have another state; UnknownNameError: a name in ``color_cameras`` is no
-    camera's.
+    Raises SettingsError: as for ``SilhouetteMatcher``; in a simulation: time runs backwards.
+    UnknownNameError: a name in ``color_cameras`` is no camera's.
     """
 
     _first_memory = _Memory(TrackerState(), (0.0, 0.0, 0.0), -np.inf)
@@ -380,14 +381,9 @@ class SilhouetteTracker(SilhouetteMatcher):
         mode_limit: int = MODE_LIMIT,
     ) -> None:
         super().__init__(search, cameras, period, labels, mode_limit)
-        cameras = camera_tuple(cameras)
-        tracking = tracking or TrackingSettings()
-        self._search_time = search_time
-        # One for each TrackingSettings used, because several contexts may differ in them.
-        follower = MatchAndTrack(search, cameras, period, tracking, search_time)
-        self._tracking, self._followers = self.add_parameter(tracking), {tracking: follower}
-        self._period, self._layout = period, follower.tracker.filter.layout
-        model, moving = search.tree.model, follower.tracker.observation.layout.moving
+        cameras, self._period = camera_tuple(cameras), period
+        self._follower = MatchAndTrack(search, cameras, period, tracking, search_time)
+        model, moving = search.tree.model, self._follower.tracker.observation.layout.moving
         nq = len(model.position_names)
         # (nq, m) positions by the moving elements of the filter's state; the root's move none.
         self._moves = np.array([[float(a == b) for b in moving] for a in model.position_names])
@@ -412,18 +408,12 @@ class SilhouetteTracker(SilhouetteMatcher):
         images = self._colours(context)
         return {name: one.mutable_data for name, one in images.items() if one.size()}
 
-    def _find(
-        self,
-        context: Context,
-        memory: _Memory,
-        views: Sequence[View],
-        pictures: Mapping[str, Picture],
-        late: Collection[str],
-    ) -> tuple[PoseEstimate | None, _Memory, bool]:
+    def _find(self, frame: _Frame, memory: _Memory) -> tuple[PoseEstimate | None, _Memory, bool]:
         """Return the tracked or searched pose, None before any evidence; next memory; as above.
 
         A track predicts a pose that is not found.
         """
+        context, views, pictures, late = frame
         last, root_position = memory.tracker_state, self.eval_input(context, "root_position")
         if not views and not pictures and last.track is None:
             return None, memory, False
@@ -431,10 +421,9 @@ class SilhouetteTracker(SilhouetteMatcher):
         ports = ["measured_positions", *(["first_positions"] if last.track is None else [])]
         starts = (self.eval_input(context, port) for port in ports)
         start = next((q for q in starts if q is not None and np.isfinite(q).all()), None)
-        follower = self._follower(self._tracking(context))
-        now, result = follower.next(last, views, root_position, pictures, start)
+        now, result = self._follower.next(last, views, root_position, pictures, start)
         if late and now.track is not None:
-            now = replace(now, track=follower.tracker.delayed(now.track))
+            now = replace(now, track=self._follower.tracker.delayed(now.track))
         is_tracked = result.stopped_by == TRACKED and now.matches == last.matches
         measurement = None if now.track is None else now.track.measurement
         distance = np.nan if measurement is None else measurement.distance
@@ -442,36 +431,15 @@ class SilhouetteTracker(SilhouetteMatcher):
         is_shown = result.found or now.track is not None
         return result, _Memory(now, track, context.get_time()), is_shown
 
-    def was_tracked(self, context: Context) -> bool:
-        """Return whether the last update tracked without a search."""
-        return bool(self.belief(context).memory.track[0])
-
     def with_intervals(self, context: Context) -> PoseEstimate:
         """Return the pose of the last update with intervals, at the cost of an update."""
-        estimate, follower = (
-            super().with_intervals(context),
-            self._follower(self._tracking(context)),
-        )
-        return follower.with_intervals(self.belief(context).memory.tracker_state, estimate)
-
-    def _follower(self, tracking: TrackingSettings) -> MatchAndTrack:
-        """Return the ``MatchAndTrack`` for a context's settings, created on first use."""
-        if tracking not in self._followers:
-            made = MatchAndTrack(
-                self._search, self._cameras, self._period, tracking, self._search_time
-            )
-            if made.tracker.filter.layout.names != self._layout.names:
-                raise SettingsError(
-                    f"{self.get_name()}: root_moves and scale_unknown cannot be changed in a "
-                    "context, because the size of the state depends on them; create another system"
-                )
-            self._followers[tracking] = made
-        return self._followers[tracking]
+        state = self.belief(context).memory.tracker_state
+        return self._follower.with_intervals(state, super().with_intervals(context))
 
     def _shows(self, known: MatcherState) -> Mask:
         """Return whether the last update's pictures determine each position (nq,)."""
         shows, track = super()._shows(known), known.memory.tracker_state.track
-        if track is None or track.measurement is None or not known.memory.track[0]:
+        if track is None or track.measurement is None or not known.was_tracked:
             return shows
         # Their information alone, in place of the prediction beside limits.
         slopes = track.measurement.H[:, : self._moves.shape[1]]

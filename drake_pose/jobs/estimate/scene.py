@@ -147,7 +147,7 @@ def estimate_frames(
             pose = matcher.belief(context).estimate
             if pose is None:
                 raise SettingsError(f"frame '{frame}': the matcher got no picture")
-            was_tracked = matcher.was_tracked(context)
+            was_tracked = matcher.belief(context).was_tracked
             if pose.found and pose.pose_set is None and isinstance(search, MultiStartSearch):
                 before = track_start if was_tracked else None
                 if views := _views(inputs.scene, frame):

@@ -87,8 +87,7 @@ def test_a_simulated_camera_sees_the_skin(limb):
     assert error < 0.01
     for name in ("true", "estimated"):
         for child in ("lower", "hand"):
-            assert meshcat.HasPath(f"visualizer/{name}_skin/{child}")
-        assert meshcat.HasPath(f"visualizer/{name}")
+            assert meshcat.HasPath(f"{name}/{name}_skin/{child}")
 
 
 def test_models_without_skin_add_no_system(tmp_path):

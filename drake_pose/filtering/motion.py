@@ -11,9 +11,11 @@ from typing import Protocol
 
 import numpy as np
 from scipy.linalg import expm
+from scipy.special import ndtr
 
 from drake_pose.arrays import Array
 from drake_pose.errors import SettingsError
+from drake_pose.filtering.inequalities import Inequalities
 from drake_pose.filtering.state import (
     Belief,
     Function,
@@ -161,3 +163,22 @@ def step_from(motion: MotionModel, belief: Belief, over_belief: bool) -> Linear:
         no_angles = np.zeros(len(belief.mean), dtype=np.bool_)
         return linearise_over(motion.predict, belief, no_angles, function_without_jacobian(motion))
     return Linear(belief.mean, *motion.predict(belief.mean))
+
+
+def stopped_rates(belief: Belief, limits: Inequalities, moving: int) -> Array:
+    """Return the (n, n) covariance of rates that limits may have stopped or reversed.
+
+    What moves beyond a limit in a predicted belief has been stopped by it. How is not known, so
+    that all of the rate is in doubt, with the probability of this.
+
+    ``moving``: number of moving elements, whose rates follow them in the state.
+    """
+    noise, reach = np.zeros_like(belief.covariance), 5.0
+    for row, margin in zip(limits.phi, limits.margins(belief.mean), strict=True):
+        across = np.zeros_like(row)
+        across[moving : 2 * moving] = row[:moving]
+        deviation, size = math.sqrt(max(row @ belief.covariance @ row, 0.0)), across @ across
+        if size and margin < reach * deviation:
+            rate = float(across @ belief.mean) ** 2 + across @ belief.covariance @ across
+            noise += ndtr(-margin / deviation) * rate / size**2 * np.outer(across, across)
+    return noise

@@ -205,6 +205,14 @@ def make_belief(
     return belief
 
 
+def mix(weights: Array, beliefs: Sequence[Belief]) -> Belief:
+    """Return mean and covariance of a mixture of beliefs with weights (k,) that sum to 1."""
+    means = np.array([one.mean for one in beliefs])
+    mean = weights @ means
+    within = np.einsum("k,kij->ij", weights, np.array([one.covariance for one in beliefs]))
+    return Belief(mean, within + (weights[:, None] * (means - mean)).T @ (means - mean))
+
+
 Function = Callable[[Array], Array]
 """Maps x (n,) to values (m,)."""
 
@@ -220,6 +228,8 @@ class Linear(NamedTuple):
     slope: Array  # (m, n) derivative, or slope over a belief.
     # (m, m) covariance of the linearisation error; None: not estimated.
     remainder: Array | None = None
+    # (m, n, n) second derivatives along the columns of the belief's root; None: not estimated.
+    bends: Array | None = None
 
 
 def wrapped_difference(values: Array, expected: Array, is_angle: Mask) -> Array:
@@ -255,7 +265,9 @@ def linearise_over(
             more points then replace the Jacobians at the sigma points. None: use the Jacobians.
     """
     distance, root, n = np.sqrt(3.0), belief.root, len(belief.mean)
-    value, tangent = function(belief.mean)
+    tangent = np.zeros((len(is_angle), n))
+    value, tangent = function(belief.mean) if values is None else (values(belief.mean), tangent)
+    value = np.asarray(value, dtype=np.float64)
 
     def end_of(step: Array) -> tuple[Array, Array]:
         """Return the change of the values from the mean to mean + step, and the Jacobian there."""
@@ -268,23 +280,28 @@ def linearise_over(
     # Slopes (m, n) along the root's columns, shift of the mean (m,), second derivatives (m, n, n).
     S, mean_shift = (plus - minus).T / (2.0 * distance), (plus + minus).sum(axis=0) / 6.0
     C = np.zeros((len(value), n, n))
-    for i, ((_, plus_slope), (_, minus_slope)) in enumerate(zip(*ends, strict=True)):
-        C[:, i] = (plus_slope - minus_slope) @ root / (2.0 * distance)
-        if values is not None:
+    if values is None:
+        for i, ((_, one), (_, other)) in enumerate(zip(*ends, strict=True)):
+            C[:, i] = (one - other) @ root / (2.0 * distance)
+        C = 0.5 * (C + C.transpose(0, 2, 1))
+    else:
+        # Steps that change no value, such as those of rates, need no second derivatives.
+        moved = np.flatnonzero((plus != 0.0).any(axis=1) | (minus != 0.0).any(axis=1))
+        for i in moved.tolist():
             C[:, i, i] = (plus[i] + minus[i]) / 3.0
-            for j in range(i):
+            for j in moved[moved < i]:
                 both, _ = end_of(distance * (root[:, i] + root[:, j]))
                 C[:, i, j] = C[:, j, i] = (both - plus[i] - plus[j]) / 3.0
+    deviations = belief.deviations()
     is_finite = np.isfinite(S).all(axis=1) & np.isfinite(C).all(axis=(1, 2))
+    if values is not None and not (is_finite.all() and (deviations > 0.0).all()):
+        tangent = function(belief.mean)[1]
     S[~is_finite], mean_shift[~is_finite], C[~is_finite] = (tangent @ root)[~is_finite], 0.0, 0.0
     # Directions without variance keep the tangent.
-    deviations = belief.deviations()
     scale = np.where(deviations > 0, deviations, 1.0)
     correction = np.linalg.lstsq((root / scale[:, None]).T, (S - tangent @ root).T, rcond=1e-12)[0]
-    flat = (0.5 * (C + C.transpose(0, 2, 1))).reshape(len(C), -1)
-    return Linear(
-        belief.mean, value + mean_shift, tangent + correction.T / scale, 0.5 * flat @ flat.T
-    )
+    flat, slope = C.reshape(len(C), -1), tangent + correction.T / scale
+    return Linear(belief.mean, value + mean_shift, slope, 0.5 * flat @ flat.T, C)
 
 
 def numerical_jacobian(function: Function, x: Array, is_angle: Mask, size: float) -> Array:

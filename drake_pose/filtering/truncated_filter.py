@@ -13,11 +13,24 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from drake_pose.arrays import Array
+from drake_pose.arrays import Array, Indices
 from drake_pose.errors import SettingsError, require_at_least, require_choice
 from drake_pose.filtering.inequalities import Inequalities, inner_point
-from drake_pose.filtering.motion import LinearMotion, MotionModel, require_models, step_from
-from drake_pose.filtering.state import Belief, Linear, StateLayout, make_belief, require_jacobian
+from drake_pose.filtering.motion import (
+    LinearMotion,
+    MotionModel,
+    require_models,
+    step_from,
+    stopped_rates,
+)
+from drake_pose.filtering.state import (
+    Belief,
+    Linear,
+    StateLayout,
+    make_belief,
+    mix,
+    require_jacobian,
+)
 from drake_pose.filtering.truncated_normal import (
     Truncated,
     clip,
@@ -37,8 +50,13 @@ from drake_pose.filtering.update import (
     begin_repeated_view,
     make_measurement,
     next_view,
+    slices,
     update,
 )
+
+# Hypotheses lighter than the first are dropped; a merger that costs less than the second, a
+# Kullback-Leibler divergence, changes nothing that matters.
+_LIGHT, _SAME = 1e-6, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +83,21 @@ class Hypothesis:
         """Its weight, between 0 and 1."""
         return math.exp(self.log_weight)
 
+    def merged_with(self, lighter: "Hypothesis") -> "Hypothesis":
+        """Return this hypothesis with the moments and the weight of both."""
+        logs = np.array(
+            [[one.log_weight, one.log_evidence] for one in (self, lighter)], dtype=np.float64
+        )
+        total = np.logaddexp(*logs)
+        weight, evidence = np.exp(logs - total).T
+        return replace(
+            self,
+            belief=mix(weight, (self.belief, lighter.belief)),
+            free=mix(evidence, (self.free, lighter.free)),
+            log_weight=float(total[0]),
+            log_evidence=float(total[1]),
+        )
+
 
 @dataclass(frozen=True)
 class Rejection:
@@ -89,42 +122,57 @@ def normalise(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     ]
 
 
-def merge_duplicates(
-    hypotheses: Sequence[Hypothesis], distance: float, step: int
-) -> tuple[list[Hypothesis], list[Rejection]]:
-    """Merge hypotheses whose means are close, and return those kept and the rejections.
-
-    ``hypotheses``: sorted by weight, descending. Of two close ones the first is kept with the sum
-    of their weights. ``distance``: largest difference in any element at which two are the same
-    [standard deviations]. ``step``: number of the step, for the rejections.
-    """
-    kept: list[Hypothesis] = []
-    rejected = []
-    for candidate in hypotheses:
-        for place, other in enumerate(kept):
-            scale = np.maximum(other.belief.deviations(), 1e-12)
-            if np.abs((candidate.belief.mean - other.belief.mean) / scale).max() < distance:
-                both = float(np.logaddexp(other.log_weight, candidate.log_weight))
-                gain = both - other.log_weight
-                kept[place] = replace(
-                    other, log_weight=both, log_evidence=other.log_evidence + gain
-                )
-                rejected.append(Rejection(step, candidate, "twin"))
-                break
-        else:
-            kept.append(candidate)
-    return kept, rejected
-
-
-def prune(
+def reduce_mixture(
     hypotheses: Sequence[Hypothesis], cap: int, step: int
 ) -> tuple[list[Hypothesis], list[Rejection]]:
-    """Return at most ``cap`` hypotheses, the heaviest, and the rejections.
+    """Merge hypotheses until at most ``cap`` are left; return these and the rejections.
 
-    Weights that are kept sum to 1. ``step``: number of the step, for the rejections.
+    Those two are merged next whose merger changes the mixture least: the product of the lighter
+    weight and their difference, the Kullback-Leibler divergence by which Runnalls (2007) bounds the
+    change for equal weights. Moments and weights are preserved. Hypotheses with a difference below
+    ``_SAME`` are merged also below the cap. ``step``: number of the step, for the rejections: the
+    lighter one is a "twin" if they differ as little, else "cap".
     """
-    ordered = normalise(hypotheses)
-    return normalise(ordered[:cap]), [Rejection(step, h, "cap") for h in ordered[cap:]]
+    kept, rejected = normalise(hypotheses), []
+    means = np.array([one.belief.mean for one in kept])
+    covariances = np.array([one.belief.covariance for one in kept])
+    weights = np.array([max(one.weight, 1e-300) for one in kept])
+    scale = np.sqrt(np.einsum("kii->ki", covariances).max(axis=0))
+    scale[scale == 0.0] = 1.0
+
+    def log_determinants(blocks: Array) -> Array:
+        """Return the log determinants (k,) of covariances (k, n, n); singular ones have one."""
+        relative = blocks / np.outer(scale, scale) + 1e-12 * np.eye(len(scale))
+        return np.asarray(np.linalg.slogdet(relative)[1])
+
+    def differences(i: int, others: Indices) -> Array:
+        """Return the differences (k,) of hypothesis i from ``others`` (k,)."""
+        off = 0.5 * (means[others] - means[i])
+        both = 0.5 * (covariances[i] + covariances[others]) + off[:, :, None] * off[:, None, :]
+        return log_determinants(both) - 0.5 * (logs[i] + logs[others])
+
+    count = len(kept)
+    logs, apart = log_determinants(covariances), np.full((count, count), np.inf)
+    for i in range(count - 1):
+        apart[i, i + 1 :] = differences(i, np.arange(i + 1, count))
+    while count > 1:
+        cost = apart
+        if apart.min() >= _SAME:
+            lighter = np.minimum.outer(weights, weights)
+            cost = np.where(lighter > 0.0, apart, 1.0) * np.where(lighter > 0.0, lighter, np.inf)
+        i, j = (int(k) for k in np.unravel_index(np.argmin(cost), cost.shape))
+        if count <= cap and apart[i, j] >= _SAME:
+            break
+        heavy, light = (kept[k] for k in ((i, j) if weights[i] >= weights[j] else (j, i)))
+        rejected.append(Rejection(step, light, "twin" if apart[i, j] < _SAME else "cap"))
+        kept[i] = heavy.merged_with(light)
+        means[i], covariances[i] = kept[i].belief.mean, kept[i].belief.covariance
+        weights[i], weights[j], count = weights[i] + weights[j], 0.0, count - 1
+        logs[i] = log_determinants(covariances[i : i + 1])[0]
+        apart[j], apart[:, j], others = np.inf, np.inf, np.flatnonzero(weights)
+        others = others[others != i]
+        apart[np.minimum(i, others), np.maximum(i, others)] = differences(i, others)
+    return normalise([kept[i] for i in np.flatnonzero(weights)]), rejected
 
 
 Truncation = Literal["joint", "sequential", "clip", "none"]
@@ -153,11 +201,11 @@ class FilterSettings:
             to a sharp maximum of the posterior, and are overconfident where it is not sharp.
         persistence: correlation time of the linearisation error of a measurement, so that frames in
             this time do not average it away [s]; for "spread".
-        hypothesis_cap: largest number of hypotheses; 1: only the best.
+        hypothesis_cap: largest number of hypotheses; 1: only the best. With "spread" those are
+            split over which the measurement is too curved.
         novelty: p-value below which a measurement differs from the first of its static view and
             begins a new one, for example 1e-9; see ``views``. 0: each frame is a new view, as in
             the paper, and always with "sequential" and "clip".
-        twin_distance: hypotheses closer than this in all elements are merged [standard deviations].
         rough_iterations: largest number of linearisations for rough states, and smallest for
             mirrored hypotheses with "spread".
         rejected_below: a hypothesis with a smaller c_k (24) of any row is removed [standard
@@ -171,9 +219,8 @@ class FilterSettings:
     linearisation: Linearisation = "spread"
     iterations: int = 1
     persistence: float = 0.15
-    hypothesis_cap: int = 4
+    hypothesis_cap: int = 8
     novelty: float = 0.0
-    twin_distance: float = 0.3
     rough_iterations: int = 3
     rejected_below: float = -4.0
 
@@ -209,11 +256,14 @@ class FilterState:
     def overall(self) -> Belief:
         """Mean and covariance of the mixture of all hypotheses."""
         weights = np.array([one.weight for one in self.hypotheses])
-        means = np.array([one.belief.mean for one in self.hypotheses])
-        mean = weights @ means / weights.sum()
-        within = sum(one.weight * one.belief.covariance for one in self.hypotheses)
-        between = (weights[:, None] * (means - mean)).T @ (means - mean)
-        return Belief(mean, (within + between) / weights.sum())
+        return mix(weights / weights.sum(), [one.belief for one in self.hypotheses])
+
+    @property
+    def estimate(self) -> Belief:
+        """The best mean, and the covariance of its error over all hypotheses."""
+        mean, overall = self.best.mean, self.overall
+        off = mean - overall.mean
+        return Belief(mean, overall.covariance + np.outer(off, off))
 
 
 def _require_class(given: object, kind: type, subject: str) -> None:
@@ -324,9 +374,13 @@ class TruncatedFilter:
         for h in state.hypotheses:
             # Linearised inside the limits, also for the belief without limits.
             step = self._step(h.belief)
-            repeated = h.repeated.after_step(step, self._U) if h.repeated else None
-            free = repeated.state() if repeated else after_step(h.free, step, self._U)
-            belief = after_step(h.belief, step, self._U)
+            U = self._U
+            if self._remainder_weight and self._limits:
+                moving = len(self.layout.moving)
+                U = U + stopped_rates(after_step(h.belief, step, U), self.inequalities, moving)
+            repeated = h.repeated.after_step(step, U) if h.repeated else None
+            free = repeated.state() if repeated else after_step(h.free, step, U)
+            belief = after_step(h.belief, step, U)
             stepped.append(replace(h, belief=belief, free=free, repeated=repeated))
         return replace(state, hypotheses=tuple(stepped), rejections=())
 
@@ -384,17 +438,18 @@ class TruncatedFilter:
             branches = [
                 b for h in state.hypotheses for b in self._branches(h, measurement, step, numbers)
             ]
+            branches = self._split(branches, measurement)
         alive, rejected = self._reject(branches, step)
         finished = [
             self._finish(h, done.belief, done.truncated, done.log_likelihood) for h, done in alive
         ]
         leader = max(range(len(finished)), key=lambda i: finished[i].log_weight)
-        merged, twins = merge_duplicates(normalise(finished), self.settings.twin_distance, step)
-        kept, pruned = prune(merged, settings.hypothesis_cap, step)
+        if self._remainder_weight:
+            least = finished[leader].log_weight + math.log(_LIGHT)
+            finished = [one for one in finished if one.log_weight > least]
+        kept, merged = reduce_mixture(finished, settings.hypothesis_cap, step)
         best = alive[leader][1]
-        return FilterState(
-            step, tuple(kept), (*rejected, *twins, *pruned), best.distance, best.count, view
-        )
+        return FilterState(step, tuple(kept), (*rejected, *merged), best.distance, best.count, view)
 
     def _branches(
         self, hypothesis: Hypothesis, measurement: Measurement, step: int, numbers: Iterator[int]
@@ -407,7 +462,6 @@ class TruncatedFilter:
         Returns one branch for the hypothesis, then one for each mirrored state.
         """
         own = replace(hypothesis, repeated=None)
-        iterations = self.settings.iterations
         starts = [(own, own.belief.mean)]
         if self.settings.hypothesis_cap > 1:
             for start in measurement.model.mirrors(own.belief):
@@ -415,18 +469,51 @@ class TruncatedFilter:
         # A belief wide enough to include its mirrored state would mix the two, so that each is
         # linearised at its own start.
         alone = self._remainder_weight > 0 and len(starts) == 1
-        if self._remainder_weight > 0 and not alone:
-            iterations = max(iterations, self.settings.rough_iterations)
         return [
-            (
-                h,
-                update(
-                    h.free, measurement, iterations, None if alone else start, tempered=h is own,
-                    truncate=self._limits, sites=h.sites, remainder_weight=self._remainder_weight,
-                ),
-            )
+            (h, self._linearise(h, measurement, None if alone else start, h is own))
             for h, start in starts
-        ]  # fmt: skip
+        ]
+
+    def _linearise(
+        self, h: Hypothesis, measurement: Measurement, start: Array | None, tempered: bool = True
+    ) -> Updated:
+        """Update a predicted hypothesis, linearised at ``start``; None: over its belief."""
+        iterations, weight = self.settings.iterations, self._remainder_weight
+        if weight and start is not None:
+            iterations = max(iterations, self.settings.rough_iterations)
+        done = update(
+            h.free, measurement, iterations, start, tempered, self._limits, h.sites, weight
+        )
+        if start is None and done.bend > 1.0 and iterations < self.settings.rough_iterations:
+            iterations = self.settings.rough_iterations
+            return update(
+                h.free, measurement, iterations, None, True, self._limits, h.sites, weight
+            )
+        return done
+
+    def _split(self, branches: list[Branch], measurement: Measurement) -> list[Branch]:
+        """Split hypotheses over which the measurement is too curved for one normal distribution.
+
+        That is, the variance of the linearisation error exceeds that of the noise.
+        The heaviest is split first, into slices across the direction that matters most. They cover
+        all of it: also look-alikes that a linearisation at its mean would not find. (Alspach and
+        Sorenson's Gaussian sum filter, 1972, with as many parts as the measurement requires.)
+        """
+        cap, done = self.settings.hypothesis_cap, list(branches)
+        while cap > 1 and len(done) < 5 * cap:
+            logs = np.array([
+                h.log_evidence + one.log_likelihood + one.truncated.log_probability
+                for h, one in done
+            ])  # fmt: skip
+            curved = np.array([one.bend > 1.0 for _, one in done])
+            curved &= logs > logs.max() + math.log(_LIGHT)
+            if not curved.any():
+                break
+            h, wide = done.pop(int(np.argmax(np.where(curved, logs, -np.inf))))
+            for log_weight, part in slices(h.free, wide):
+                own = replace(h, free=part, log_evidence=h.log_evidence + log_weight)
+                done.append((own, self._linearise(own, measurement, None)))
+        return done
 
     def _repeat(self, hypothesis: Hypothesis, measurement: Measurement) -> Branch:
         """Update a predicted hypothesis by a measurement of another frame of its static view.

@@ -10,7 +10,7 @@ Static views: a filter that linearises anew in each frame of a static view becom
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Protocol
@@ -162,6 +162,10 @@ class Updated:
     # of freedom if the models are right.
     distance: float
     count: int  # Number of measurements used.
+    # Variance of the linearisation error relative to that of the noise, and the direction (n,)
+    # along which a narrower belief would reduce it most; 0 and None if it is not estimated.
+    bend: float = 0.0
+    direction: Array | None = None
 
 
 def make_measurement(
@@ -242,22 +246,25 @@ def update(
     # oscillate.
     good_fit, cooling, full_steps = 9.0, 6.0, 8
     settled = 0.01 if truncate is None else 0.3
+    bend, direction = 0.0, None
     if not np.isfinite(measurement.y).any():
         iterations, range_covariance = 1, None
     P, values = prediction.covariance, function_without_jacobian(measurement.model)
     for made in range(iterations):
         # Linearised at x, over the measurements that are visible there.
         model = measurement.model
-        _, h, H, remainder = (
-            linearise_over(model.predict, Belief(x, range_covariance), model.wraps, values)
-            if range_covariance is not None
-            else Linear(x, *model.predict(x))
+        spread = None if range_covariance is None else Belief(x, range_covariance)
+        _, h, H, remainder, bends = (
+            Linear(x, *model.predict(x))
+            if spread is None
+            else linearise_over(model.predict, spread, model.wraps, values)
         )
         rows = np.isfinite(measurement.y) & np.isfinite(h)
         count = int(np.count_nonzero(rows))
         residual = wrapped_difference(measurement.y[rows], h[rows], measurement.model.wraps[rows])
         H, R = H[rows], measurement.covariance[np.ix_(rows, rows)]
-        if remainder is not None:
+        if remainder is not None and spread is not None and bends is not None and count:
+            bend, direction = _find_bend(bends[rows], R, spread)
             R = R + remainder_weight * remainder[np.ix_(rows, rows)]
         innovation = residual + H @ (x - prediction.mean)
         if made == 0 and iterations > 1 and tempered and not remainder_weight:
@@ -290,7 +297,45 @@ def update(
             break
         x = x + (step if made < full_steps else 0.5 * step)
         temperature = max(1.0, temperature / cooling)
-    return Updated(belief, truncated, log_likelihood, distance, count)
+    return Updated(belief, truncated, log_likelihood, distance, count, bend, direction)
+
+
+def _find_bend(bends: Array, R: Array, spread: Belief) -> tuple[float, Array]:
+    """Return ``bend`` and ``direction`` of ``Updated``.
+
+    ``bends``: (m, n, n) of a function linearised over the belief ``spread``. ``R``: (m, m)
+    covariance of the noise.
+    """
+    m, n, _ = bends.shape
+    white = np.linalg.solve(np.linalg.cholesky(R), bends.reshape(m, -1)).reshape(m * n, n)
+    sizes, axes = np.linalg.eigh(white.T @ white)
+    # A function of the state that is 1 at one standard deviation along the axis, 0 along others.
+    direction = np.linalg.lstsq(spread.root.T, axes[:, -1], rcond=1e-9)[0]
+    return 0.5 * float(sizes.sum()), direction
+
+
+def slices(free: Belief, wide: Updated) -> Iterator[tuple[float, Belief]]:
+    """Yield parts of a belief before an update, with logarithms of their weights.
+
+    Their mixture is the belief. They are so narrow along the direction of ``wide``, the belief's
+    update, that the measurement is straight over each.
+    """
+    a = wide.direction
+    assert a is not None
+    across = free.covariance @ a
+    deviation = math.sqrt(a @ across)
+    # The error's variance grows with the fourth power of the width.
+    width = wide.bend**-0.25 * math.sqrt(a @ wide.truncated.covariance @ a) / deviation
+    width = min(width, 0.7)
+    spread = math.sqrt(1.0 - width**2)
+    # Normal densities 1.5 standard deviations apart add up to a flat one within 1 %.
+    count = math.ceil(2.5 * spread / (1.5 * width))
+    centers = 1.5 * width * np.arange(-count, count + 1)
+    logs = -0.5 * (centers / spread) ** 2
+    P = free.covariance - spread**2 * np.outer(across, across) / deviation**2
+    P = 0.5 * (P + P.T)
+    for center, log_weight in zip(centers, logs - np.logaddexp.reduce(logs), strict=True):
+        yield float(log_weight), Belief(free.mean + center / deviation * across, P)
 
 
 def next_view(

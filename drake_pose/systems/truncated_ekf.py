@@ -25,6 +25,7 @@ from drake_pose.filtering.hand_silhouette import HandMeasurement, HandSilhouette
 from drake_pose.filtering.motion import FunctionMotion, MotionModel
 from drake_pose.filtering.state import Belief, StateLayout, make_belief
 from drake_pose.filtering.truncated_filter import FilterState, Hypothesis, TruncatedFilter
+from drake_pose.fit.judge import LEVEL
 from drake_pose.silhouette.pictures.label_renderer import label_image_to_mask
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.cameras import MaskPlayer
@@ -83,7 +84,7 @@ class TruncatedEkf(BeliefSystem[_EkfState]):
 
     Output ports:
         estimated_state (n): mean of the heaviest hypothesis.
-        covariance (n x n, row by row): of the heaviest hypothesis.
+        covariance (n x n, row by row): of this state's error, over all hypotheses.
         overall_state (n): mean of the mixture of all hypotheses.
         overall_covariance (n x n): of this mixture.
         hypothesis_weights (cap): sorted, descending; 0 where there are fewer hypotheses.
@@ -119,7 +120,7 @@ class TruncatedEkf(BeliefSystem[_EkfState]):
         start: Belief,
         period: float | None = None,
         patience: int = 3,
-        loss_probability: float = 1e-6,
+        loss_probability: float = LEVEL,
         offset: float = 0.0,
     ) -> None:
         super().__init__()
@@ -169,7 +170,7 @@ class TruncatedEkf(BeliefSystem[_EkfState]):
 
         self.add_belief_output("estimated_state", n, lambda known: known.state.best.mean)
         self.add_belief_output(
-            "covariance", n * n, lambda known: known.state.best.covariance.ravel()
+            "covariance", n * n, lambda known: known.state.estimate.covariance.ravel()
         )
         self.add_belief_output("overall_state", n, lambda known: known.state.overall.mean)
         self.add_belief_output(

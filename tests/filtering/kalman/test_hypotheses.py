@@ -3,7 +3,12 @@ import pytest
 
 from drake_pose.filtering.hand import HAND_STATE
 from drake_pose.filtering.state import Belief, Linear
-from drake_pose.filtering.truncated_filter import Hypothesis, merge_duplicates, normalise
+from drake_pose.filtering.truncated_filter import (
+    FilterState,
+    Hypothesis,
+    normalise,
+    reduce_mixture,
+)
 from drake_pose.filtering.update import (
     RepeatedView,
     anchored_observation,
@@ -136,16 +141,17 @@ def test_normalised_weights_sum_to_one_and_keep_their_ratios(common):
     np.testing.assert_allclose(gains(found), -2.0)
 
 
-def test_close_hypotheses_merge_and_add_their_weights():
-    """Closer than the distance in all elements, in standard deviations of the heavier one."""
-    some = normalise([at(0.0, 0.0, 2.0), at(0.55, -1.0), at(0.65, -2.0), at(0.7, -3.0)])
-    kept, rejected = merge_duplicates(some, 0.3, 7)
-    assert [one.belief.mean[0] for one in kept] == [0.0, 0.65]
-    assert [(one.step, one.reason) for one in rejected] == [(7, "twin")] * 2
+def test_merged_hypotheses_keep_moments_and_weights():
+    """Those that are the same merge, then the lightest with what is nearest, down to the cap."""
+    some = [at(0.0, 0.0, 2.0), at(0.2, -1.0, 2.0), at(9.0, -2.0), at(5.0, -9.0), at(-3.0, -3.0)]
+    kept, rejected = reduce_mixture(some, 3, 7)
+    assert [(one.step, one.reason) for one in rejected] == [(7, "twin"), (7, "cap")]
+    assert [one.hypothesis.belief.mean[0] for one in rejected] == [0.2, 5.0]
+    before, after = (FilterState(0, tuple(each)).overall for each in (normalise(some), kept))
+    np.testing.assert_allclose(after.mean, before.mean)
+    np.testing.assert_allclose(after.covariance, before.covariance, atol=1e-12)
     assert sum(one.weight for one in kept) == pytest.approx(1.0)
-    assert kept[0].weight == pytest.approx(some[0].weight + some[1].weight)
     np.testing.assert_allclose(gains(kept), -2.0)
-    # Distances of 0.2 and 0.4 standard deviations, for any standard deviation.
-    small = normalise([at(0.0, 0.0, 1e-3), at(0.2e-3, -1.0, 1e-3), at(0.4e-3, -2.0, 1e-3)])
-    kept, _ = merge_duplicates(small, 0.3, 7)
-    assert [one.belief.mean[0] for one in kept] == [0.0, 0.4e-3]
+    # Differences are relative to the standard deviations.
+    small = [at(place, 0.0, 1e-3) for place in (0.0, 0.2e-3, 0.9e-3)]
+    assert len(reduce_mixture(small, 4, 7)[0]) == 2

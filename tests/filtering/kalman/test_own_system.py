@@ -154,6 +154,41 @@ def test_nees_is_one_for_linearisation_over_the_belief():
     assert means["tangent"] > means["spread"] + 0.1
 
 
+def test_a_ring_of_look_alikes_has_its_mixture():
+    """Only the distance of a point is measured: the posterior is a ring, cut by limits."""
+    layout = StateLayout((), ("x", "y"))
+    far = FunctionObservation(("distance",), 0.1, lambda x: np.array([np.hypot(*x)]))
+    still = LinearMotion(np.eye(2), np.zeros((2, 2)), 0.1)
+    start = Belief(np.array([0.4, 0.1]), np.diag([0.7, 0.7]) ** 2)
+    limits, settings = from_bounds(["x"], [-0.5], [2.0]), FilterSettings(hypothesis_cap=16)
+    f = TruncatedFilter(layout, far, limits, still, settings)
+    state = f.start(start)
+    grid = np.stack(np.meshgrid(np.linspace(-0.5, 2.0, 400), np.linspace(-2, 2, 640)), -1)
+    log = -0.5 * (((grid - start.mean) / 0.7) ** 2).sum(axis=-1)
+    for _ in range(3):
+        state = f.update(state, np.array([1.0]))
+        log -= 0.5 * ((np.hypot(*np.moveaxis(grid, -1, 0)) - 1.0) / 0.1) ** 2
+    density = (np.exp(log) / np.exp(log).sum())[..., None]
+    mean = (density * grid).sum(axis=(0, 1))
+    off = (grid - mean).reshape(-1, 2)
+    np.testing.assert_allclose(state.overall.mean, mean, atol=0.05)
+    expected = (density.reshape(-1, 1) * off).T @ off
+    np.testing.assert_allclose(state.overall.covariance, expected, atol=0.04)
+    estimate = state.estimate
+    off = estimate.mean - state.overall.mean
+    np.testing.assert_allclose(estimate.covariance - np.outer(off, off), state.overall.covariance)
+
+
+def test_limits_stop_rates():
+    """A joint that moves beyond its limit has been stopped; its rate is no longer known."""
+    f = make(rows=from_bounds(["angle"], [-0.2], [1.5]))
+    for angle, is_free in ((0.5, True), (1.49, False)):
+        before = f.start(Belief(np.array([angle, 3.0, 1.0]), np.diag([0.02, 0.1, 0.1]) ** 2))
+        after = f.predict(before).best
+        known = after.deviations()[1]
+        assert known < 0.5 if is_free else known == pytest.approx(3.0, rel=0.1)
+
+
 def test_defaults_beat_a_clipped_ekf_on_an_arm_of_unknown_lengths():
     """And stay inside the limits, in a few runs of the benchmark's arm."""
     ends, low = (1, 3), []

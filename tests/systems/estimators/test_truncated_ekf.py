@@ -54,13 +54,13 @@ def test_a_diagram_equals_the_filter(sequence):
         np.testing.assert_array_equal(logs["active_limits"][t], cut)
     assert max(counts[:17]) < counts[-1] == run.system.filter_state(run.context).view[1]
     covariance = run["covariance"].reshape(len(HAND_STATE), -1)
-    np.testing.assert_allclose(covariance, state.best.covariance)
+    np.testing.assert_allclose(covariance, state.estimate.covariance)
     weights = run["hypothesis_weights"]
     assert weights.sum() == pytest.approx(1.0)
-    states = run["hypothesis_states"].reshape(4, -1)
+    states = run["hypothesis_states"].reshape(8, -1)
     np.testing.assert_array_equal(np.isnan(states).all(axis=1), weights == 0)
     # The overall moments equal those of the mixture of the hypotheses.
-    covariances = run["hypothesis_covariances"].reshape(4, len(HAND_STATE), -1)
+    covariances = run["hypothesis_covariances"].reshape(8, len(HAND_STATE), -1)
     second = sum(
         weights[k] * (covariances[k] + np.outer(states[k], states[k]))
         for k in np.flatnonzero(weights)
@@ -71,7 +71,7 @@ def test_a_diagram_equals_the_filter(sequence):
     np.testing.assert_allclose(overall + np.outer(mean, mean), second, rtol=1e-6, atol=1e-9)
     assert logs["active_limits"].any()
     statistics = dict(zip(STATISTICS, run["statistics"], strict=True))
-    assert (statistics["step"], statistics["lost"]) == (len(rows), 0)
+    assert statistics["step"] == len(rows)
     assert statistics["distance"] == state.distance
     inside = f.inequalities.b - logs["estimated_state"] @ f.inequalities.phi.T
     assert inside.min() > -1e-9
@@ -155,7 +155,7 @@ def test_a_contexts_parameters_set_the_filter():
     run.update(0.3, measurement=rows[0] + 1.0)
     assert run["statistics"][STATISTICS.index("lost")] == 1
     for index, value, word in (
-        (0, FilterSettings(hypothesis_cap=9), "4 hypotheses"),
+        (0, FilterSettings(hypothesis_cap=9), "8 hypotheses"),
         (0, "joint", "not str"),
     ):
         run.context.get_mutable_abstract_parameter(index).set_value(value)

@@ -156,10 +156,8 @@ def reduce_mixture(
     for i in range(count - 1):
         apart[i, i + 1 :] = differences(i, np.arange(i + 1, count))
     while count > 1:
-        cost = apart
-        if apart.min() >= _SAME:
-            lighter = np.minimum.outer(weights, weights)
-            cost = np.where(lighter > 0.0, apart, 1.0) * np.where(lighter > 0.0, lighter, np.inf)
+        lighter = np.minimum.outer(weights, weights)
+        cost = apart if apart.min() < _SAME else apart * np.where(lighter > 0.0, lighter, np.inf)
         i, j = (int(k) for k in np.unravel_index(np.argmin(cost), cost.shape))
         if count <= cap and apart[i, j] >= _SAME:
             break

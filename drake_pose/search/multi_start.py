@@ -281,10 +281,14 @@ class _MultiStartRun:
         # Evaluations for the pose set, which come later, are not counted.
         steps = self._fit.evaluations
         if found is not None and found.J <= exactly:
-            if with_set:
+            fits = found.J <= exact.settings.misfit * problem.border_length
+            if with_set and fits:
                 found, pose_set = exact.modes(problem, found, tree)
             values = found.parameters[:-4]
             steps += found.steps
+            if with_set and not fits:
+                known = [FittedPose(values), *pool]
+                pose_set = RobustModes(self._fit, self._proceed).find(known, self._J)
         else:
             if found is not None:
                 by_pixels = self._kinematics.nearest_turns(found.parameters[:-4])

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import betainc, ndtri
 
 from drake_pose.arrays import Array, Floats, Mask, Picture
 from drake_pose.body import PlantKinematics, PoseTree
@@ -51,11 +52,12 @@ from drake_pose.fit.contour_fit import (
 )
 from drake_pose.fit.covariance import distances, error_unit, estimate_sizes, values_covariance
 from drake_pose.fit.evidence import NO_EDGE, find_edge_points
-from drake_pose.fit.kernel import REACH, Sum
+from drake_pose.fit.judge import LEVEL
+from drake_pose.fit.kernel import REACH, Sum, compare_contours
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import BodyParameters
 from drake_pose.fit.surfaces import MANY, simplify_rigid_parts
-from drake_pose.search import slide_root
+from drake_pose.search import JointEstimate, slide_root
 from drake_pose.silhouette.outline import PackedSurfaces, TreeSurfaces
 from drake_pose.silhouette.scoring import draw_packed
 
@@ -111,24 +113,27 @@ class ContourEvidence(NamedTuple):
 class ContourMeasurement(LinearObservation):
     """The measurement that a frame's contours give, linearised at one state.
 
-    The distances of hundreds of contour points are summed to normal equations. Their factorisation
-    gives one scalar measurement with variance 1 for each observable direction of the state.
+    Normal equations of hundreds of contour points are factorised into one scalar measurement with
+    variance 1 for each observable direction of the state.
     """
 
     y: Array  # (k,) measured values; the predicted value at ``at`` is 0.
-    inlier_ratio: float  # Fraction of the visible model contour with an edge nearby.
     distance: float  # Robustly weighted root mean square distance of contour and edges [pixel].
-    # (nodes,) the same by part, in pictures [pixel]; 0 where evidence is too weak.
-    part_distances: Array
+    length: float  # Mean length of the contours of body and masks [pixel].
+    # Whether no more of the contours of body and masks is unlikely than noise makes so, at LEVEL,
+    # most of the contour in pictures fits, and no part is hidden there.
+    is_explained: bool
+    # (cameras, nodes) parts of whose contour in a mask more is unlikely, or whose distance in
+    # pictures is.
+    hidden_parts: Mask
     compared: Comparison  # The comparison of the contours at ``at``.
 
 
 class ContourObservation:
     """The free values of a pose tree as a filter's state x (n,), measured by contours in cameras.
 
-    Masks and pictures give measurements of the state; pictures with ``fit.colours``.
-
-    A state holds the free values [rad or m], root shift and log scale, then the rates of all these.
+    Masks and pictures (with ``fit.colours``) give measurements of it. It holds the free values [rad
+    or m], root shift and log scale, then the rates of all these.
 
     Args:
         root_moves: whether the root's position in the world is part of the state.
@@ -137,9 +142,8 @@ class ContourObservation:
 
     Attributes:
         layout: the tree's free values, then ROOT_SHIFT and LOG_SCALE, and their rates.
-        prior: prior of the joints over the state's moving elements: the model's couplings file, and
-            for other limited joints a normal distribution with the mean and variance of a uniform
-            one between their limits.
+        prior: of the joints over the state's moving elements: the model's couplings file, and for
+            other limited joints normal with the mean and variance of uniform between the limits.
 
     Raises:
         SettingsError: there is no camera, the tree has no free value, or a scale is unknown and
@@ -268,13 +272,7 @@ class ContourObservation:
         """Return the root's position (3,) in the world at a state (n,), body unscaled [m]."""
         values, root = self._split(x)
         p_WR = self._root(values) + root[:3]
-        return p_WR if root[3] == 0.0 else slide_root(self._parallel(), p_WR, math.exp(-root[3]))
-
-    def _parallel(self) -> ParallelCamera:
-        """Return the camera whose scale is unknown."""
-        camera = self.cameras[0]
-        assert isinstance(camera, ParallelCamera)
-        return camera
+        return p_WR if root[3] == 0.0 else slide_root(self.cameras[0], p_WR, math.exp(-root[3]))
 
     def positions(self, x: Array) -> tuple[Array, Array]:
         """Return the plant's q (nq,) and X_WB (4, 4) at a state (n,), for the unscaled body.
@@ -302,14 +300,14 @@ class ContourObservation:
             X_BR = PlantKinematics(model).pose_at(link, q)
             p_WR = (X_BR if X_WB is None else X_WB @ X_BR)[:3, 3]
             if scale != 1.0:
-                p_WR = slide_root(self._parallel(), p_WR, scale)
+                p_WR = slide_root(self.cameras[0], p_WR, scale)
             root[:3] = p_WR - self._root(values)
         return self.state_of(np.r_[values, root])
 
     def turned(self, x: Array, rotation: Array) -> Array:
-        """Return the state x (n,) with the root rotated about its own origin.
+        """Return the state x (n,) with its root rotated by ``rotation`` (3, 3) in the world.
 
-        ``rotation``: (3, 3) in the world. Raises SettingsError: the root does not turn freely.
+        Raises SettingsError: the root does not turn freely.
         """
         placed = self.tree.placements[0]
         if placed.rotation is None or not self.tree.turns_root_freely:
@@ -419,7 +417,7 @@ class ContourObservation:
             x: (n,) the state in this frame.
             colours: the histograms before this frame.
             pose_is_known: whether the state is certain, so that the old histograms are discarded.
-            excluded_parts: (nodes,) parts whose histograms stay unchanged; None: none.
+            excluded_parts: (cameras, nodes) whose histograms stay unchanged; None: none.
 
         Raises SettingsError: a picture does not fit its camera.
         """
@@ -430,7 +428,7 @@ class ContourObservation:
         placed = self._body.place(self.parameters(x))
         known = update_histograms(placed, self.cameras, checked, colours, pose_is_known)
         if excluded_parts is not None:
-            known[:, excluded_parts] = colours[:, excluded_parts]
+            known[excluded_parts] = colours[excluded_parts]
         return known
 
     def measure(
@@ -450,9 +448,9 @@ class ContourObservation:
                 edges are searched in the whole reach.
             iteration: number of measurements of this frame made before; search lines in pictures
                 become finer with it.
-            excluded_parts: (nodes,) parts that are not measured in pictures; None: none.
+            excluded_parts: (cameras, nodes) parts that are not measured; None: none.
 
-        Returns the measurement; None if no edge is near the contour in any mask or picture.
+        Returns the measurement; None if no edge is near in any mask or picture.
         """
         width = CONTOUR.reach / REACH
         if distance is not None:
@@ -462,18 +460,16 @@ class ContourObservation:
             return None
         shown = np.array([picture is not None for picture in evidence.pictures])
         if excluded_parts is not None:
-            off = np.ix_(shown, excluded_parts)
-            found[0].A[off], found[0].b[off] = 0.0, 0.0
-        return self._compress(x, *found, part_distances(found[0].sums[shown]))
+            found[0].A[excluded_parts], found[0].b[excluded_parts] = 0.0, 0.0
+        return self._compress(x, *found, shown)
 
     def _compare(
         self, evidence: ContourEvidence, x: Array, width: float, iteration: int
     ) -> tuple[Comparison, float] | None:
-        """Compare the contours of the body at a state x (n,) with a frame.
+        """Compare the contours of the body at a state x (n,) with a frame; as of ``measure``.
 
-        ``width``: scale of the robust cost [pixel]. ``iteration``: number of measurements made
-        before. Returns the comparison, and the weighted RMS distance [pixel]; None: no edge is
-        near.
+        ``width``: scale of the robust cost [pixel]. Returns the comparison, and the weighted RMS
+        distance [pixel].
         """
         step = AnnealingStage(width, CONTOUR.spacing)
         placed = self._body.place(self.parameters(x))
@@ -493,17 +489,15 @@ class ContourObservation:
         return None if weight <= 0.0 else (compared, math.sqrt(squares / weight))
 
     def _compress(
-        self, x: Array, compared: Comparison, distance: float, parts: Array
+        self, x: Array, compared: Comparison, distance: float, shown: Mask
     ) -> ContourMeasurement:
         """Return a comparison at a state as at most n independent measurements of variance 1.
 
         ``x``: (n,) the state. ``compared``: the comparison of the contours there. ``distance``:
-        root mean square distance of the contours [pixel]. ``parts``:
-        ``ContourMeasurement.part_distances``.
+        their root mean square [pixel]. ``shown``: (cameras,) which have a picture and no mask.
         """
         H, g = normal_equations(compared, len(self._body.names))
-        index = self._parameter_index
-        scale = max(CONTOUR.deviation, distance)
+        index, scale = self._parameter_index, max(CONTOUR.deviation, distance)
         # Residuals are computed from both contours, so each gets half of the weight.
         weight = 0.5 / (scale**2 * CONTOUR.correlation)
         prior_curvature, prior_slope = self._prior_information
@@ -513,9 +507,11 @@ class ContourObservation:
         # Directions whose information is zero up to rounding are dropped.
         observable = size > max(float(size[-1]), 1e-300) * len(size) * np.finfo(np.float64).eps
         root, turns = np.sqrt(size[observable]), turns[:, observable]
+        far = part_distances(compared.sums[shown]) > ndtri(1.0 - LEVEL) * CONTOUR.deviation
+        lines = compared.sums[shown].sum(axis=(0, 1))
+        is_seen = not far.any() and 2.0 * lines[Sum.FITTING] >= lines[Sum.COMPARED]
         slope = np.zeros((len(root), len(self.layout)))
         slope[:, self._state_index] = root[:, None] * turns.T
-        contour = compared.sums[:, :-1].sum(axis=(0, 1))
         return ContourMeasurement(
             names=tuple(f"contour_{k}" for k in range(len(root))),
             variances=np.ones(len(root)),
@@ -524,19 +520,57 @@ class ContourObservation:
             y=-(turns.T @ slopes) / root,
             H=slope,
             at=x,
-            inlier_ratio=float(contour[Sum.FITTING] / max(contour[Sum.COMPARED], 1e-9)),
             distance=distance,
-            part_distances=parts,
+            length=0.5 * float(compared.sums[~shown, :, Sum.COMPARED].sum()),
+            is_explained=bool(is_seen and _is_noise(compared.sums[~shown].sum(axis=(0, 1)))),
+            hidden_parts=np.where(shown[:, None], far, ~_is_noise(compared.sums[:, :-1])),
             compared=compared,
         )
 
-    def covariance(self, measured: ContourMeasurement, area: float) -> Array:
+    def tile_costs(self, evidence: ContourEvidence, x: Array, side: float) -> tuple[Array, Array]:
+        """Return costs of masks at a state x (n,), and lengths of their edges, by image tile.
+
+        Both are (cameras, 64, 64) [pixel]; a cost is about the length of contour that does not fit.
+        ``evidence``: the frame. ``side``: of a tile [pixel]; indices are taken modulo 64.
+        """
+        step = AnnealingStage(CONTOUR.robust_width * CONTOUR.deviation, CONTOUR.spacing)
+        placed, views = self._body.place(self.parameters(x)), evidence.views
+        weights = camera_weights(views.cameras, placed, step, _PLAIN, 1.0)
+        surfaces = placed.packed, placed.X_WN
+        costs = compare_contours(*surfaces, *views, weights, 64, side, False)[3]
+        edges, lengths = views.evidence, np.zeros_like(costs)
+        camera = np.searchsorted(edges.starts, np.arange(len(edges.uv)), "right") - 1
+        column, row = (edges.uv // side).astype(np.intp).T % 64
+        np.add.at(lengths, (camera, row, column), edges.lengths)
+        return np.asarray(costs) / step.scale**2, lengths
+
+    def spread(
+        self, joints: Sequence[JointEstimate], values: Array, is_hidden: bool
+    ) -> Array | None:
+        """Return (n,) standard deviations of the state in what a search left undetermined.
+
+        They are those of uniform distributions over its intervals, about the pose. None: all values
+        are determined.
+
+        ``joints``: of the tree's m values. ``values``: (m,) the pose [rad or m]. ``is_hidden``:
+        whether intervals are the limits, as parts may be hidden.
+        """
+        low, high = np.array([[one.low, one.high] for one in joints]).T
+        if is_hidden:
+            low, high = self._kinematics.local_limits(values)
+        third = ((high - values) ** 3 - (low - values) ** 3) / np.maximum(3.0 * (high - low), 1e-12)
+        third[[one.determined for one in joints]] = 0.0
+        spread = self.state_of(np.r_[np.sqrt(third), self._known_shift, 0.0])
+        return spread if spread.any() else None
+
+    def covariance(
+        self, measured: ContourMeasurement, area: float, spread: Array | None = None
+    ) -> Array:
         """Return the covariance (m, m) of the tree's values from one frame's measurement alone.
 
-        It is 0 for values that are not free. Errors of surfaces, masks and cameras are correlated,
-        see ``fit.covariance``.
+        It is 0 for values that are not free; errors are correlated, see ``fit.covariance``.
 
-        ``measured``: the measurement. ``area``: total area of all silhouettes [pixel].
+        ``area``: of all silhouettes [pixel]. ``spread``: (n,) further deviations of the state.
         """
         unit = error_unit(math.sqrt(area / len(self.cameras)))
         index, size = self._parameter_index, len(self._body.names)
@@ -549,4 +583,18 @@ class ContourObservation:
         covariance[np.ix_(index, index)] = values_covariance(
             errors, sizes, np.arange(len(index)), is_angle
         )
+        if spread is not None:
+            covariance[index, index] += spread[self._state_index] ** 2
         return covariance[:count, :count]
+
+
+def _is_noise(sums: Array) -> Mask:
+    """Return (...) whether noise explains what does not fit of contours, ``sums`` (..., 6).
+
+    Of pieces as long as errors are correlated, a fraction LEVEL is off by the robust width.
+    """
+    length, off = sums[..., Sum.COMPARED], sums[..., Sum.COMPARED] - sums[..., Sum.FITTING]
+    pieces, off = np.rint(length / CONTOUR.correlation), np.floor(off / CONTOUR.correlation)
+    # The binomial distribution's upper tail.
+    tail = betainc(np.maximum(off, 1.0), np.maximum(pieces - off, 0.0) + 1.0, LEVEL)
+    return np.asarray((off < 1.0) | (tail > LEVEL))

@@ -1,21 +1,29 @@
-"""Tracking of a pose tree by its contour, with a search where that fails.
+"""Tracking of a pose tree by its contour, with a search where that does not explain what is seen.
 
-``ContourTracker`` feeds the contours of masks and pictures to a ``TruncatedFilter``;
-``MatchAndTrack`` begins a track by a search, and searches again after a loss.
+A ``Tracker`` feeds the contours of masks and pictures to a ``TruncatedFilter``. It has no level of
+errors of its own. Masks are *explained* if no more of the contours is unlikely than noise makes so.
+Where they are not, it searches: a pose from the search replaces the track if it explains the frame
+better at ``judge.LEVEL``, and unless the motion excludes it or it is the only one that explains the
+frame. Otherwise a better pose that the motion excludes shows that the body is hidden: the track is
+predicted.
 """
 
 import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
+from scipy.special import chdtri, ndtri
 
 from drake_pose.arrays import Array, Floats, Mask, Picture
 from drake_pose.body import PoseTree
 from drake_pose.camera.models import Camera
 from drake_pose.errors import require_positive
 from drake_pose.filtering.contour_observation import (
+    CONTOUR,
     LOG_SCALE,
     ContourEvidence,
     ContourMeasurement,
@@ -26,9 +34,10 @@ from drake_pose.filtering.state import Belief
 from drake_pose.filtering.truncated_filter import FilterSettings, FilterState, TruncatedFilter
 from drake_pose.filtering.update import LinearObservation
 from drake_pose.fit.colours import LINES, search_line_step
+from drake_pose.fit.covariance import vuong_statistic
+from drake_pose.fit.judge import LEVEL
 from drake_pose.search import (
     TRACKED,
-    UNEXPLAINED,
     MultiStartSearch,
     PoseEstimate,
     PoseSearch,
@@ -40,34 +49,24 @@ from drake_pose.silhouette.pictures.masks import count_edge_pixels
 
 @dataclass(frozen=True)
 class TrackingSettings:
-    """Settings of a ``ContourTracker`` and of ``MatchAndTrack``.
+    """Settings of a ``Tracker``.
 
     Args:
         angle_acceleration: standard deviation of the acceleration of joint angles [rad/s^2].
         length_acceleration: of the root's position and of sliding joints [m/s^2].
         log_scale_acceleration: of the log scale, if unknown [1/s^2].
         memory: time constant of the decay of rates [s]; occluded limbs come to rest.
-        rounds: largest number of contour comparisons in a frame.
+        rounds: largest number of comparisons of contours with masks in a frame.
         root_moves: whether the root's position in the world is estimated.
         scale_unknown: whether the scale of the one parallel camera is estimated, and may drift.
         rest_time: time constant with which unobserved joints return to their prior (the middle of
             their limits, or that of a couplings file) [s]. It also decides which way joints bend
             where the silhouette is the same for both. None: no prior.
         standstill: a frame's iteration ends when the pose changes by less [rad, m].
-        first_rounds: factor on ``rounds`` in the first two frames with masks, when rates are
-            unknown.
-        start_angle, start_length, start_log_scale: standard deviations at the start of angles
-            [rad], of the root's position and other lengths [m], and of the log scale.
-        lost_distance: a track is lost if the distance of its contour from the edges is larger
-            [pixel].
-        lost_inlier_ratio: a track is lost if a smaller fraction of its contour has an edge nearby.
-        lost_colour_distance: a part is lost if the distance of its contour in pictures is larger
-            [pixel]. Search lines are so short that even wrong poses have small distances. The
-            colours of a lost part are not learned.
-        patience: time for which a track without explanation is predicted before the best pose of a
-            search replaces it, however bad [s].
-        search_pause: time between two searches meanwhile [s].
-        retries: number of frames in which a search that reached its time limit is repeated.
+        start_angle, start_length, start_log_scale: standard deviations of a search's pose, in
+            angles [rad], the root's position and other lengths [m], and the log scale.
+        search_pause: time between two searches in masks that are not explained, unless other masks
+            come [s]. It doubles while the search finds nothing better than the track.
 
     Raises:
         SettingsError: a number is not positive.
@@ -77,21 +76,15 @@ class TrackingSettings:
     length_acceleration: float = 5.0
     log_scale_acceleration: float = 0.1
     memory: float = 0.15
-    rounds: int = 4
+    rounds: int = 16
     root_moves: bool = False
     scale_unknown: bool = False
     rest_time: float | None = None
     standstill: float = 1e-3
-    first_rounds: int = 4
     start_angle: float = 0.2
     start_length: float = 0.03
     start_log_scale: float = 0.1
-    lost_distance: float = 12.0
-    lost_inlier_ratio: float = 0.6
-    lost_colour_distance: float = 1.5
-    patience: float = 1.0
-    search_pause: float = 0.2
-    retries: int = 5
+    search_pause: float = 0.5
 
     def __post_init__(self) -> None:
         require_positive(**{k: one for k, one in vars(self).items() if not isinstance(one, bool)})
@@ -99,40 +92,123 @@ class TrackingSettings:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """The state of a ``ContourTracker`` after a frame.
+    """A track after a frame.
 
     Attributes:
         state: belief of the pose tree's state.
         measurement: of the contour at the final state; None: no edge was near the contour.
-        lost: whether the contour is too far from the edges, or that of a part in pictures, or no
-            edge was near it in a frame with evidence. A frame without evidence keeps the value.
+        lost: whether noise does not explain the contours, or the distance of a part in pictures,
+            or no edge was near in a frame with evidence. A frame without evidence keeps the value.
         colours: colour histograms of the body; None before the first picture.
+        noise: least distance of an explained frame so far, see ``ContourMeasurement`` [pixel].
+        pose: in the frame, with J and area; None: it was not judged.
     """
 
     state: FilterState
     measurement: ContourMeasurement | None
     lost: bool
     colours: Floats | None = None
+    noise: float = math.inf
+    pose: PoseEstimate | None = None
 
 
-class ContourTracker:
-    """Tracks a pose tree's state from frame to frame, inside its limits.
+Tiles = tuple[float, Array, Array]
+"""Side of a tile [pixel], and costs and lengths of edges in tiles (cameras, 64, 64) of a frame, see
+``ContourObservation.tile_costs``."""
 
-    ``observation``: the body and the cameras. ``period``: time between two frames [s].
-    ``settings``: None: TrackingSettings().
 
-    Raises SettingsError: the period is not positive.
+@dataclass(frozen=True, eq=False)
+class TrackerState:
+    """The state of a ``Tracker`` after a frame.
+
+    Attributes:
+        track: the track; None before the first pose.
+        spread: (n,) standard deviations of the state that the last search left to poses that look
+            the same, or that the masks' defects leave [rad or m].
+        matches: number of searches so far.
+        is_kept: whether the track is the best known pose, not a prediction through masks that a
+            pose which the motion excludes explains better.
+        doubt: what was seen in the last search's frame; None: the masks were explained since.
+        wait, waited: number of frames until the search is repeated, and since the last one.
+    """
+
+    track: Track | None = None
+    spread: Array | None = None
+    matches: int = 0
+    is_kept: bool = True
+    doubt: Tiles | None = None
+    wait: int = 0
+    waited: int = 0
+
+    @cached_property
+    def belief(self) -> Belief | None:
+        """The track's mean (n,) and covariance (n, n), with ``spread``; None without a track."""
+        if self.track is None or self.spread is None:
+            return None if self.track is None else self.track.state.best
+        best = self.track.state.best
+        return Belief(best.mean, best.covariance + np.diag(self.spread**2))
+
+
+class _Seen(NamedTuple):
+    """A frame as a tracker compares it."""
+
+    observation: ContourObservation  # The body with its root where it is known to be.
+    masks: Sequence[Mask | None]  # For each camera (H, W) or None.
+    # For each camera (H, W, 3 or 4) or None; None: no pictures.
+    pictures: Sequence[Picture | None] | None
+    evidence: ContourEvidence  # Without colours.
+    views: Sequence[View]  # The cameras that have a mask, with it.
+    root_position: Array | None  # (3,) of the root in the world [m]; None: as in the tree.
+    begin: float  # Time at which the processing of the frame started [s].
+
+    @property
+    def is_bare(self) -> bool:
+        """Whether there is neither a mask nor a picture."""
+        return all(one is None for one in (*self.masks, *(self.pictures or ())))
+
+
+class Tracker:
+    """Tracks a pose tree from frame to frame, inside its limits, and searches where that fails.
+
+    All state is in a ``TrackerState``.
+
+    Args:
+        tree: the body.
+        cameras: all cameras of the sequence.
+        period: time between two frames [s].
+        settings: None: TrackingSettings().
+        search: finds poses where the track does not explain the masks; None: there is none.
+        search_time: time limit of a ``MultiStartSearch`` [s]; None: the search's own. A search that
+            reaches it is repeated if its pose does not explain the masks.
+
+    Attributes:
+        observation: the body and the cameras.
+        filter: the filter of the body's state.
+
+    Raises:
+        SettingsError: there is no camera, the period is not positive, or the tree has no free
+            value.
     """
 
     def __init__(
         self,
-        observation: ContourObservation,
+        tree: PoseTree,
+        cameras: Sequence[Camera],
         period: float,
         settings: TrackingSettings | None = None,
+        search: PoseSearch | None = None,
+        search_time: float | None = None,
     ) -> None:
         require_positive(period=period)
-        self.observation, self.settings = observation, settings or TrackingSettings()
-        layout = observation.layout
+        own = self.settings = settings or TrackingSettings()
+        if search_time is not None and isinstance(search, MultiStartSearch):
+            search = search.with_time_limit(search_time)
+        self._search, self._period = search, period
+        prior_weight = 0.0 if own.rest_time is None else period / own.rest_time
+        self.observation = ContourObservation(
+            tree, cameras, own.root_moves, own.scale_unknown, prior_weight
+        )
+        layout = self.observation.layout
         scale = {name: period**2 * self.acceleration(name) for name in layout.moving}
         size, none = len(layout), np.zeros(0)
         # Each frame has its own observation model.
@@ -140,16 +216,15 @@ class ContourTracker:
         self.filter = TruncatedFilter(
             layout,
             nothing,
-            observation.inequalities(),
+            self.observation.inequalities(),
             LinearMotion(
-                layout.transition(math.exp(-period / self.settings.memory)),
-                layout.process_noise(scale),
-                None,
+                layout.transition(math.exp(-period / own.memory)), layout.process_noise(scale), None
             ),
             # Measurements of different frames are not comparable, so there are no static views.
             FilterSettings(hypothesis_cap=1, linearisation="tangent", iterations=20),
         )
-        self._period = period
+        kinds = (own.start_log_scale, own.start_angle, own.start_length)
+        self._start_deviations = np.array([self._of_kind(name, *kinds) for name in layout.moving])
 
     def acceleration(self, name: str) -> float:
         """Return the standard deviation of an element's acceleration [unit/s^2]."""
@@ -170,59 +245,12 @@ class ContourTracker:
         # Standard deviation of a rate [unit/step] that accelerates during ``memory``.
         picked_up = self.settings.memory * self._period
         rates = [picked_up * self.acceleration(name) for name in moving]
-        settings = self.settings
-        kinds = (settings.start_log_scale, settings.start_angle, settings.start_length)
-        deviations = [*(self._of_kind(name, *kinds) for name in moving), *rates]
-        belief = Belief(x, np.diag(np.square(deviations)))
-        return Track(self.filter.start(belief), None, False)
+        deviations = np.r_[self._start_deviations, rates]
+        return Track(self.filter.start(Belief(x, np.diag(deviations**2))), None, False)
 
-    def follow(
-        self,
-        track: Track,
-        masks: Sequence[Mask | None],
-        first: bool = False,
-        root_position: Array | None = None,
-        pictures: Sequence[Picture | None] | None = None,
-    ) -> Track:
-        """Return the track after the next frame.
-
-        Args:
-            track: after the last frame, or ``start``.
-            masks: for each camera (H, W) or None.
-            first: whether ``track`` was started in this very frame, so that it is not predicted.
-            root_position: (3,) known position of the root in the world [m]; None: as in the tree.
-            pictures: for each camera (H, W, 3 or 4) or None; None: no pictures. The colours along
-                the contour are used for cameras without a mask; they are learned from each frame,
-                at first at the start.
-
-        Raises SettingsError: the number or size of masks or pictures does not fit the cameras.
-        """
-        observation = self.observation
-        if root_position is not None:
-            observation = observation.with_root_position(root_position)
-        prediction = track.state if first else self.filter.predict(track.state)
-        colours = track.colours
-        if pictures is not None and colours is None:
-            colours = observation.uninformed_histograms()
-            if all(mask is None for mask in masks):
-                colours = observation.update_histograms(
-                    pictures, prediction.best.mean, colours, True
-                )
-        evidence = observation.gather_evidence(masks, pictures, colours)
-        state, measurement = self._fit(observation, evidence, prediction)
-        if measurement is None:
-            shown = any(one is not None for one in (*masks, *(pictures or ())))
-            return Track(state, None, track.lost or shown, colours)
-        whole = measurement.distance > self.settings.lost_distance
-        whole |= measurement.inlier_ratio < self.settings.lost_inlier_ratio
-        lost_parts = (measurement.part_distances > self.settings.lost_colour_distance) | whole
-        if pictures is not None and colours is not None and not lost_parts.all():
-            colours = observation.update_histograms(
-                pictures, state.best.mean, colours, excluded_parts=lost_parts
-            )
-        if evidence.has_pictures and lost_parts.any():
-            state = self._widened(observation, evidence, prediction, state, measurement, lost_parts)
-        return Track(state, measurement, bool(lost_parts.any()), colours)
+    def predict(self, track: Track) -> Track:
+        """Return the track one period later, without evidence."""
+        return replace(track, state=self.filter.predict(track.state), measurement=None)
 
     def delayed(self, track: Track) -> Track:
         """Return the track after a frame whose pictures may be late by up to a period.
@@ -239,146 +267,110 @@ class ContourTracker:
         wide = Belief(belief.mean, belief.covariance + np.outer(shift, shift))
         return replace(track, state=replace(self.filter.start(wide), step=track.state.step))
 
-    def _fit(
-        self, observation: ContourObservation, evidence: ContourEvidence, prediction: FilterState
-    ) -> tuple[FilterState, ContourMeasurement | None]:
-        """Return state and measurement in a frame after ``prediction``; None: no edge is near."""
-        moving, state = len(observation.layout.moving), prediction
-        measurement = observation.measure(evidence, state.best.mean)
-        rounds = self.settings.rounds
-        if prediction.step <= 1 and not evidence.has_pictures:
-            rounds *= self.settings.first_rounds
-        for k in range(rounds):
-            if measurement is None:
-                break
-            before = state.best.mean
-            state = self.filter.update(prediction, measurement.y, measurement)
-            still = (
-                k > 0
-                and np.abs((state.best.mean - before)[:moving]).max() < self.settings.standstill
-            )
-            # With masks the last comparison is made at the final state. With pictures the number of
-            # comparisons is limited, and the finest search lines must have been reached.
-            if evidence.has_pictures:
-                is_finest = search_line_step(k) == LINES.steps[-1]
-                still = k + 1 == rounds or (still and is_finest)
-            if still:
-                break
-            measurement = observation.measure(
-                evidence, state.best.mean, measurement.distance, k + 1
-            )
-        return state, measurement
+    def follow(
+        self,
+        track: Track,
+        masks: Sequence[Mask | None],
+        first: bool = False,
+        pictures: Sequence[Picture | None] | None = None,
+    ) -> Track:
+        """Return the track after the next frame, without a search.
 
-    def _widened(
+        Args:
+            track: after the last frame, or ``start``.
+            masks: for each camera (H, W) or None.
+            first: whether ``track`` was started in this very frame, so that it is not predicted.
+            pictures: for each camera (H, W, 3 or 4) or None; None: no pictures. The colours along
+                the contour are used for cameras without a mask; they are learned from each frame,
+                at first at the start.
+
+        Raises SettingsError: the number or size of masks or pictures does not fit the cameras.
+        """
+        evidence = self.observation.gather_evidence(masks, pictures)
+        return self._follow(
+            track, _Seen(self.observation, masks, pictures, evidence, (), None, 0.0), first
+        )
+
+    def _follow(self, track: Track, seen: _Seen, first: bool) -> Track:
+        """Return the track after a frame; the arguments are of ``follow``."""
+        observation, pictures = seen.observation, seen.pictures
+        prediction = track.state if first else self.filter.predict(track.state)
+        colours = track.colours
+        if pictures is not None and colours is None:
+            colours = observation.uninformed_histograms()
+            if all(mask is None for mask in seen.masks):
+                colours = observation.update_histograms(
+                    pictures, prediction.best.mean, colours, True
+                )
+        evidence = seen.evidence._replace(colours=colours)
+        state, measurement = self._fit(observation, evidence, prediction)
+        if measurement is None:
+            return Track(state, None, track.lost or not seen.is_bare, colours, track.noise)
+        if measurement.distance > max(track.noise, CONTOUR.deviation):
+            # Noise does not grow.
+            judged = observation.measure(evidence, state.best.mean, track.noise, len(LINES.steps))
+            measurement = measurement if judged is None else judged
+        found = Track(state, measurement, not measurement.is_explained, colours, track.noise)
+        if not found.lost:
+            found = replace(found, noise=min(track.noise, measurement.distance))
+        elif evidence.has_pictures or self._search is not None:
+            state, remaining = self._fit(observation, evidence, prediction, found)
+            # If most parts are hidden in pictures, search lines are unreliable.
+            few = evidence.has_pictures and measurement.hidden_parts.mean() > 0.5
+            if remaining is None or few:
+                state, remaining = prediction, measurement
+            elif evidence.has_pictures:
+                # The shift that hidden parts cause is added to the covariance.
+                moved = found.state.best.mean - state.best.mean
+                wide = state.best.covariance + np.outer(moved, moved)
+                started = self.filter.start(Belief(found.state.best.mean, wide))
+                state = replace(started, step=state.step)
+            found = replace(found, state=state, measurement=remaining)
+        if pictures is not None and colours is not None:
+            shown = np.array([mask is None for mask in seen.masks])
+            hidden = measurement.hidden_parts & shown[:, None]
+            colours = observation.update_histograms(
+                pictures, found.state.best.mean, colours, excluded_parts=hidden
+            )
+        return replace(found, colours=colours)
+
+    def _fit(
         self,
         observation: ContourObservation,
         evidence: ContourEvidence,
         prediction: FilterState,
-        state: FilterState,
-        measurement: ContourMeasurement,
-        lost_parts: Mask,
-    ) -> FilterState:
-        """Return ``state`` with the uncertainty it has without the lost parts' measurements.
+        found: Track | None = None,
+    ) -> tuple[FilterState, ContourMeasurement | None]:
+        """Return state and measurement in a frame after ``prediction``; None: no edge is near.
 
-        ``state`` and ``measurement`` are those of ``_fit`` from ``prediction``; ``lost_parts`` is
-        (nodes,). The shift that lost parts cause is added to the covariance. If more than half of
-        the parts are lost, return the prediction: their search lines are unreliable.
+        ``found``: what was found with all parts; those that are not seen are left out.
         """
-        found, remaining = state.best.mean, None
-        if 2 * np.count_nonzero(lost_parts) > len(lost_parts):
-            return prediction
-        if not lost_parts.all():
-            rounds = self.settings.rounds
-            remaining = observation.measure(
-                evidence, found, measurement.distance, rounds, lost_parts
+        moving, state, at = len(observation.layout.moving), prediction, 0
+        distance, hidden = None, None
+        if found is not None and found.measurement is not None:
+            state, at = found.state, len(LINES.steps)
+            distance, hidden = found.measurement.distance, found.measurement.hidden_parts
+        measurement = observation.measure(evidence, state.best.mean, distance, at, hidden)
+        # With pictures the number of comparisons is limited, and the finest search lines must have
+        # been reached. With masks the last comparison is made at the final state.
+        last = at + (len(LINES.steps) if evidence.has_pictures else self.settings.rounds - 1)
+        while measurement is not None:
+            before, at = state.best.mean, at + 1
+            state = self.filter.update(prediction, measurement.y, measurement)
+            change = np.abs((state.best.mean - before)[:moving]).max()
+            still = at > 1 and change < self.settings.standstill
+            if evidence.has_pictures:
+                still &= search_line_step(at - 1) == LINES.steps[-1]
+            if still or (evidence.has_pictures and at > last):
+                break
+            measurement = observation.measure(
+                evidence, state.best.mean, measurement.distance, at, hidden
             )
-        expected = prediction
-        if remaining is not None:
-            expected = self.filter.update(prediction, remaining.y, remaining)
-        moved = found - expected.best.mean
-        belief = Belief(found, expected.best.covariance + np.outer(moved, moved))
-        return replace(self.filter.start(belief), step=state.step)
+            if at > last:
+                break
+        return state, measurement
 
-
-@dataclass(frozen=True, eq=False)
-class TrackerState:
-    """The state of ``MatchAndTrack`` after a frame."""
-
-    track: Track | None = None  # The contour track; None before the first pose.
-    reference: float = 0.0  # E_total after the last match; a track with a much larger one is lost.
-    matches: int = 0  # Number of searches so far.
-    # Number of consecutive frames, up to this one, that no pose explains; the track is predicted
-    # through them.
-    unexplained: int = 0
-    # Number of following frames in which the search is repeated because it reached its time limit.
-    retries: int = 0
-
-
-def make_tracker(
-    tree: PoseTree, cameras: Sequence[Camera], period: float, settings: TrackingSettings
-) -> ContourTracker:
-    """Return a tracker of a pose tree's contour; ``period``: time between two frames [s].
-
-    Raises SettingsError: there is no camera, the period is not positive, or the tree has no free
-    value.
-    """
-    prior_weight = 0.0 if settings.rest_time is None else period / settings.rest_time
-    observation = ContourObservation(
-        tree, cameras, settings.root_moves, settings.scale_unknown, prior_weight
-    )
-    return ContourTracker(observation, period, settings)
-
-
-@dataclass(frozen=True, eq=False)
-class _GivenFrame:
-    """The evidence of a frame."""
-
-    views: Sequence[View]  # The cameras that have a mask, with it; for the search.
-    # (3,) the root's known position in the world [m]; None: as in the tree.
-    root_position: Array | None
-    observation: ContourObservation  # The body with its root there.
-    masks: list[Mask | None]  # For each camera (H, W) or None.
-    # For each camera (H, W, 3 or 4) or None; None: no pictures.
-    pictures: list[Picture | None] | None
-    begin: float  # Time at which the processing of the frame started [s].
-
-
-class MatchAndTrack:
-    """Tracks a body from frame to frame, and searches for it where tracking fails.
-
-    A frame that no pose explains, because the body is hidden or there is no evidence, leaves the
-    track predicted: its standard deviations grow, and the frame's pose is not found. A pose from
-    the search replaces the prediction only if it explains the masks about as well as earlier poses
-    did, or after ``TrackingSettings.patience``.
-
-    Args:
-        search: used in the first frame and when the track is lost; it has the pose tree.
-        cameras: all cameras of the sequence.
-        period: time between two frames [s].
-        settings: None: TrackingSettings().
-        search_time: time limit of a ``MultiStartSearch`` [s]; None: the search's own. A search that
-            reaches it is repeated in the next frames.
-
-    Raises:
-        SettingsError: there is no camera, the period is not positive, or the tree has no free
-            value.
-    """
-
-    def __init__(
-        self,
-        search: PoseSearch,
-        cameras: Sequence[Camera],
-        period: float,
-        settings: TrackingSettings | None = None,
-        search_time: float | None = None,
-    ) -> None:
-        self.settings, self._period = settings or TrackingSettings(), period
-        if search_time is not None and isinstance(search, MultiStartSearch):
-            search = search.with_time_limit(search_time)
-        self._search = search
-        self.tracker = make_tracker(search.tree, cameras, period, self.settings)
-
-    def next(
+    def update(
         self,
         last: TrackerState,
         views: Sequence[View],
@@ -386,7 +378,7 @@ class MatchAndTrack:
         pictures: Mapping[str, Picture] | None = None,
         start: Array | None = None,
     ) -> tuple[TrackerState, PoseEstimate]:
-        """Process the next frame.
+        """Return the state after the next frame, and the pose.
 
         Args:
             last: the state after the previous frame; TrackerState() before the first.
@@ -395,202 +387,212 @@ class MatchAndTrack:
             pictures: pictures (H, W, 3 or 4) by name of the camera; the colours along the contour
                 are used for cameras without a mask. None: no pictures.
             start: (nq,) approximate positions in this frame, if known; the search is then used only
-                if the masks do not fit them.
+                if the masks do not fit them, and its pose only if it explains the masks.
 
         Returns:
-            The new state, and the pose. ``stopped_by`` is TRACKED if the pose was tracked. If no
-                pose explains the masks, or there is no evidence, ``found`` is false and the pose is
-                the prediction, or ``start`` if given. A track lost in pictures without masks is
-                continued with ``found`` false until its contour fits again.
+            The new state, and the pose. ``stopped_by`` is TRACKED if the pose was tracked. If a
+                pose that the motion excludes explains the masks better, or there is no evidence,
+                ``found`` is false and the pose is the prediction, or ``start`` if given. A track
+                lost in pictures without masks is continued with ``found`` false until its contour
+                fits again.
 
         Raises SettingsError: masks or pictures do not fit the cameras.
         """
-        begin, observation = time.perf_counter(), self.tracker.observation
-        names = [camera.name for camera in observation.cameras]
-        given = {view.camera.name: view.mask for view in views}
+        begin, own, before = time.perf_counter(), self.observation, last.track
         if root_position is not None:
-            observation = observation.with_root_position(root_position)
-        masks = [given.get(name) for name in names]
+            own = own.with_root_position(root_position)
+        names, given = [one.name for one in own.cameras], {one.camera.name: one for one in views}
+        masks = [given[name].mask if name in given else None for name in names]
         shown = [pictures.get(name) for name in names] if pictures else None
-        frame = _GivenFrame(views, root_position, observation, masks, shown, begin)
-        tracked: tuple[Track, PoseEstimate] | None = None
-        if last.track is not None:
-            track = self._follow(last.track, frame, False)
-            tracked = track, self._result(track, frame)
-            if not self._is_lost(*tracked, last.reference, frame):
-                if last.retries and views:
-                    return self._match(last, tracked, frame, None)
-                return TrackerState(track, last.reference, last.matches), tracked[1]
-        if start is not None:
-            started = self._begin(start, last, frame)
-            if started[1].found or not views:
-                return started
-        if not views:
-            if tracked is None:
-                default = self._search.tree.model.default_positions
-                nowhere = self.tracker.observation.state(default)
-                result = self._result(self.tracker.start(nowhere), frame)
-                return last, replace(result, found=False)
-            # With unexplained = 0 the next frame with evidence is searched at once.
-            return replace(last, track=tracked[0], unexplained=0), replace(tracked[1], found=False)
-        return self._match(last, tracked, frame, start)
+        evidence = own.gather_evidence(masks, shown)
+        seen = _Seen(own, masks, shown, evidence, views, root_position, begin)
+        track = None if before is None else self._judged(self._follow(before, seen, False), seen)
+        spread, begun = last.spread, None
+        if start is not None and (track is None or track.lost or seen.is_bare):
+            begun, spread = self._start_near(own.state(start), before), None
+            track = self._judged(self._follow(begun, seen, True), seen)
+        # Whether the last search saw defective masks, and could not tell poses apart in them.
+        is_open = last.doubt is not None and spread is not None
+        if track is not None and not (track.lost or seen.is_bare or (views and is_open)):
+            return TrackerState(track, spread, last.matches), self._pose(track)
+        if views:
+            return self._search_again(replace(last, track=track), before, begun, seen)
+        if track is None:
+            nowhere = self._judged(self.start(own.state(own.tree.model.default_positions)), seen)
+            return last, self._pose(nowhere, False)
+        # The next masks are searched at once if they are not explained.
+        return replace(last, track=track, waited=last.wait), self._pose(track, False)
 
     def with_intervals(self, state: TrackerState, pose: PoseEstimate) -> PoseEstimate:
         """Return a tracked pose with the joints' intervals from this frame's contours alone.
 
-        ``state`` and ``pose`` are what ``next`` returned for the frame. Without a measurement the
+        ``state`` and ``pose`` are what ``update`` returned for the frame. Without a measurement the
         pose is returned unchanged.
         """
-        track = state.track
+        track, own = state.track, self.observation
         if track is None or track.measurement is None:
             return pose
-        observation = self.tracker.observation
-        own = observation.covariance(track.measurement, pose.area)
-        pictures = len(observation.cameras)
-        return replace(pose, pose_set=covariance_pose_set(self._search.tree, pose, own, pictures))
+        covariance = own.covariance(track.measurement, pose.area, state.spread)
+        found = covariance_pose_set(own.tree, pose, covariance, len(own.cameras))
+        return replace(pose, pose_set=found)
 
-    def _match(
-        self,
-        last: TrackerState,
-        tracked: tuple[Track, PoseEstimate] | None,
-        frame: _GivenFrame,
-        start: Array | None,
+    def _search_again(
+        self, state: TrackerState, before: Track | None, begun: Track | None, seen: _Seen
     ) -> tuple[TrackerState, PoseEstimate]:
-        """Return the better of the tracked pose, if any, and the search's, and the state after it.
+        """Return state and pose in masks that the track does not explain, or that end a doubt.
 
-        If neither explains the masks, return the given start or the prediction, as not found.
-
-        ``last``: the state after the previous frame. ``tracked``: the track and its pose in this
-        frame; None: there was no track. ``start``: (nq,) approximate positions in this frame; None:
-        unknown.
+        ``state``: the last state, with the track in this frame; None: there was none. ``before``:
+        the track in the last frame. ``begun``: as it starts at positions that are known, or None.
         """
-        settings, last_track = self.settings, last.track
-        unexplained = last.unexplained + 1
-        pause = max(1, round(settings.search_pause / self._period))
-        found, matches = [] if tracked is None else [tracked], last.matches
-        retries = max(0, last.retries - 1)
-        if last_track is None or last.retries or unexplained % pause == 1 % pause:
-            matches += 1
-            matched = self._search.match(frame.views, frame.root_position)
-            found += self._search_candidates(matched, last_track, frame)
-            if matched.stopped_by != "time_limit":
-                retries = 0
-            elif not last.retries:
-                retries = settings.retries
-            if not found and last_track is None and start is None:
-                return TrackerState(None, 0.0, matches, 0, retries), matched
-        limit = self._limit(last.reference)
-        explained = [one for one in found if last_track is None or one[1].E_total <= limit]
-        if not explained and unexplained * self._period > settings.patience:
-            explained = found
-        if start is not None and (last_track is None or not explained):
-            # Measured positions are kept if no pose explains the masks.
-            explained = [one for one in found if one[1].E_total <= self._limit(0.0)]
-        if explained:
-            track, result = min(explained, key=lambda pair: pair[1].E_total)
-            return TrackerState(track, result.E_total, matches, 0, retries), result
-        if start is not None:
-            track = self.tracker.start(self._state(start, last, frame))
-        else:
-            assert last_track is not None
-            none = [None] * len(frame.masks)
-            track = self.tracker.follow(last_track, none, False, frame.root_position)
-        result = replace(self._result(track, frame), found=False)
-        return TrackerState(track, last.reference, matches, unexplained, retries), result
-
-    def _search_candidates(
-        self, matched: PoseEstimate, last: Track | None, frame: _GivenFrame
-    ) -> list[tuple[Track, PoseEstimate]]:
-        """Return the pose of a search, tracked in its frame and as it is; empty if not found.
-
-        ``matched``: the search's pose. ``last``: the track before this frame, whose turns the
-        angles take; None: there is none.
-        """
+        worse, doubt, track, now = ndtri(1.0 - LEVEL), state.doubt, state.track, None
+        expected = begun
+        if track is not None:
+            now = self._tiles(track, seen, doubt)
+            if begun is None and before is not None:
+                expected = self.predict(before)
+            if track.lost and doubt is not None and state.waited + 1 < state.wait:
+                # Costs that rise and edges that come are other masks.
+                changes = (vuong_statistic(*both) for both in zip(now[1:], doubt[1:], strict=True))
+                if max(changes) <= worse:
+                    state = replace(state, waited=state.waited + 1)
+                    return self._kept(state, expected, seen)
+        assert self._search is not None
+        matched = self._search.match(seen.views, seen.root_position)
+        pause = round(self.settings.search_pause / self._period)
+        wait = max(1, pause, 2 * state.wait)
+        known = replace(
+            state, matches=state.matches + 1, is_kept=True, doubt=now, wait=wait, waited=0
+        )
         if not matched.found:
-            return []
-        x = frame.observation.state(matched.q, matched.X_WB, matched.scale)
-        if last is not None:
-            # A search does not know the number of full turns of an angle.
-            x = frame.observation.unwrapped(x, last.state.best.mean)
-            node_values = frame.observation.node_values(x)
-            turns = [
-                2.0 * np.pi * np.round((now - then) / (2.0 * np.pi))
-                for now, then in zip(node_values, matched.node_values, strict=True)
-            ]
-            matched = matched.turned(self._search.tree, turns)
-        first = self.tracker.start(x)
-        refined = self._follow(first, frame, True)
-        # The pose was refined from the search's, so that the search's pose set still applies.
-        tracked = replace(self._result(refined, frame), pose_set=matched.pose_set)
-        # The unrefined pose may fit better; it keeps the colours learned in this frame.
-        return [(refined, tracked), (replace(first, colours=refined.colours), matched)]
+            if track is None:
+                return TrackerState(matches=known.matches), matched
+            return self._kept(known, expected, seen)
+        other, spread = self._candidate(matched, before, seen)
+        others = self._tiles(other, seen, now)
+        if track is not None and now is not None:
+            if vuong_statistic(now[1], others[1]) <= worse:
+                if not track.lost:
+                    known = TrackerState(track, spread, known.matches)
+                return self._kept(known, expected, seen)
+            assert expected is not None
+            if not self._is_possible(other, matched, expected.state.best, state.spread):
+                return self._kept(replace(known, is_kept=False), expected, seen)
+        if not other.lost:
+            return TrackerState(other, spread, known.matches), self._pose(other)
+        if spread is not None and state.spread is not None:
+            # What look the same in one frame with defects may look different in the next.
+            spread = np.maximum(spread, state.spread)
+        return replace(known, track=other, spread=spread, doubt=others), self._pose(other)
 
-    def _begin(
-        self, start: Array, last: TrackerState, frame: _GivenFrame
+    def _kept(
+        self, state: TrackerState, expected: Track | None, seen: _Seen
     ) -> tuple[TrackerState, PoseEstimate]:
-        """Return the state and pose of a track that starts at positions ``start`` (nq,).
+        """Return a state and its pose; what was ``expected`` in place of a track not kept."""
+        track = state.track
+        if not state.is_kept and expected is not None:
+            track = self._judged(expected, seen)
+        assert track is not None
+        return replace(state, track=track), self._pose(track, state.is_kept)
 
-        ``last``: the state after the previous frame. The pose is not ``found`` if it is lost.
+    def _tiles(self, track: Track, seen: _Seen, last: Tiles | None) -> Tiles:
+        """Return the tiles of a frame with a track, as large as those of ``last``."""
+        # The errors of tiles are regarded as independent, as in ``ViewsFit.tile_costs``.
+        areas = [np.count_nonzero(view.mask) for view in seen.views]
+        side = last[0] if last else max(1.0, 0.2 * math.sqrt(float(np.mean(areas))))
+        x = track.state.best.mean
+        return side, *seen.observation.tile_costs(seen.evidence, x, side)
+
+    def _start_near(self, x: Array, last: Track | None) -> Track:
+        """Return the track that starts at x (n,), with angles in the last track's turns."""
+        if last is not None:
+            x = self.observation.unwrapped(x, last.state.best.mean)
+        return self.start(x)
+
+    def _candidate(
+        self, matched: PoseEstimate, last: Track | None, seen: _Seen
+    ) -> tuple[Track, Array | None]:
+        """Return a search's pose, tracked in its frame or as it is if that fits better.
+
+        ``matched``: the search's pose, which is found. ``last``: the track before this frame; None:
+        there is none. Returns the track, and ``TrackerState.spread``.
         """
-        track = self._follow(self.tracker.start(self._state(start, last, frame)), frame, True)
-        result = self._result(track, frame)
-        reference = result.E_total if frame.views else UNEXPLAINED
-        found = not self._is_lost(track, result, reference, frame)
-        return TrackerState(track, reference, last.matches), replace(result, found=found)
+        own = seen.observation
+        start = self._start_near(own.state(matched.q, matched.X_WB, matched.scale), last)
+        x = start.state.best.mean
+        # A search does not know the number of full turns of an angle.
+        turns = [
+            2.0 * np.pi * np.round((now - then) / (2.0 * np.pi))
+            for now, then in zip(own.node_values(x), matched.node_values, strict=True)
+        ]
+        matched = matched.turned(own.tree, turns)
+        best = self._judged(self._follow(start, seen, True), seen)
+        # The pose was refined from the search's, so that the search's pose set still applies.
+        pose = replace(self._pose(best), pose_set=matched.pose_set)
+        if matched.E_total < pose.E_total:
+            measured, pose = own.measure(seen.evidence, x), matched
+            lost = measured is None or not measured.is_explained
+            # The unrefined pose keeps the colours learned in this frame.
+            best = self._judged(
+                replace(start, measurement=measured, lost=lost, colours=best.colours), seen
+            )
+        known, spread = matched.pose_set, None
+        if known is not None and (best.lost or known.mode_count > 1):
+            spread = own.spread(known.joints, np.concatenate(matched.node_values), best.lost)
+        return replace(best, pose=pose), spread
 
-    def _state(self, start: Array, last: TrackerState, frame: _GivenFrame) -> Array:
-        """Return the state (n,) at positions ``start`` (nq,), angles in the last track's turns."""
-        x = frame.observation.state(start)
-        if last.track is None:
-            return x
-        return frame.observation.unwrapped(x, last.track.state.best.mean)
-
-    def _follow(self, track: Track, frame: _GivenFrame, first: bool) -> Track:
-        """Return the track after a frame; ``first``: it begins in this frame."""
-        return self.tracker.follow(track, frame.masks, first, frame.root_position, frame.pictures)
-
-    def _is_lost(
-        self, track: Track, result: PoseEstimate, reference: float, frame: _GivenFrame
+    def _is_possible(
+        self, other: Track, matched: PoseEstimate, expected: Belief, spread: Array | None
     ) -> bool:
-        """Return whether evidence is missing, the track left the contour, or E_total is high.
+        """Return whether a search's pose may replace a track that was ``expected`` elsewhere.
 
-        ``reference``: E_total after the last match.
+        The motion does not exclude it, at LEVEL, or it explains the frame, and the joints that
+        moved too far are determined. ``spread``: of the track.
         """
-        explains = not frame.views or result.E_total <= self._limit(reference)
-        is_bare = all(one is None for one in (*frame.masks, *(frame.pictures or ())))
-        return is_bare or track.lost or not explains
+        count = len(self._start_deviations)
+        off = (other.state.best.mean - expected.mean)[:count]
+        wide = self._start_deviations**2 + (0.0 if spread is None else spread[:count] ** 2)
+        C = expected.covariance[:count, :count] + np.diag(wide)
+        if off @ np.linalg.solve(C, off) <= chdtri(count, LEVEL):
+            return True
+        if other.lost or matched.pose_set is None:
+            return not other.lost
+        near = np.abs(off) <= ndtri(1.0 - 0.5 * LEVEL) * np.sqrt(np.diag(C))
+        values = np.concatenate(matched.node_values)
+        unknown = self.observation.spread(matched.pose_set.joints, values, True)
+        return unknown is None or bool(np.all(near | (unknown[:count] == 0.0)))
 
-    @staticmethod
-    def _limit(reference: float) -> float:
-        """Return the largest E_total of a pose that explains the masks, given ``reference``."""
-        return min(1.5 * reference + 0.1, UNEXPLAINED)
+    def _judged(self, track: Track, seen: _Seen) -> Track:
+        """Return a track in a frame with its pose.
 
-    def _difference(self, track: Track, frame: _GivenFrame) -> tuple[float, float]:
-        """Return the area where body and evidence differ, and the silhouettes' area [pixel].
-
-        With masks these are areas of pixels. With pictures alone the first is the length of the
-        body's contours times their distance from edges (infinite without a measurement), and the
-        second the area of the drawn body.
+        It is also lost if body and masks differ in more than noise of their edges makes so, at
+        LEVEL: pieces of contour as long as errors are correlated are off by |r|, r normal.
         """
-        observation, x = frame.observation, track.state.best.mean
-        if frame.views:
-            return observation.difference(x, [(view.camera, view.mask) for view in frame.views])
-        J, area = 0.0, 0.0
-        if track.measurement is None:
-            return math.inf, 1.0
-        for camera in observation.cameras:
-            drawn = observation.draw(x, camera)
-            area += int(np.count_nonzero(drawn))
-            J += count_edge_pixels(drawn) * track.measurement.distance
-        return J, max(area, 1.0)
-
-    def _result(self, track: Track, frame: _GivenFrame) -> PoseEstimate:
-        """Return a track's pose as an estimate that is ``found``, with J and area in a frame."""
-        observation, x = frame.observation, track.state.best.mean
-        q, X_WB = observation.positions(x)
-        J, area = self._difference(track, frame)
-        return PoseEstimate(
-            found=True, q=q, X_WB=X_WB, node_values=observation.node_values(x), J=float(J),
-            area=float(area), stopped_by=TRACKED, seconds=time.perf_counter() - frame.begin,
-            root_position=observation.root_position(x), scale=observation.scale(x),
+        own, x, measured = seen.observation, track.state.best.mean, track.measurement
+        J, area = math.inf, 0.0
+        if seen.views:
+            J, area = own.difference(x, [(view.camera, view.mask) for view in seen.views])
+        elif measured is not None:
+            # Pictures alone: the contours' length times their distance from edges.
+            drawn = [own.draw(x, camera) for camera in own.cameras]
+            J = sum(map(count_edge_pixels, drawn)) * measured.distance
+            area = sum(map(np.count_nonzero, drawn))
+        q, X_WB = own.positions(x)
+        pose = PoseEstimate(
+            found=True, q=q, X_WB=X_WB, node_values=own.node_values(x), J=float(J),
+            area=max(float(area), 1.0), stopped_by=TRACKED,
+            seconds=time.perf_counter() - seen.begin, root_position=own.root_position(x),
+            scale=own.scale(x),
         )  # fmt: skip
+        is_noise = True
+        if measured is not None and seen.views:
+            mean, scatter = math.sqrt(2.0 / math.pi), math.sqrt(1.0 - 2.0 / math.pi)
+            pieces = measured.length / CONTOUR.correlation
+            most = mean * pieces + ndtri(1.0 - LEVEL) * scatter * math.sqrt(pieces)
+            off = J / (CONTOUR.correlation * max(CONTOUR.deviation, measured.distance))
+            is_noise = pose.explained and off <= most
+        return replace(track, lost=track.lost or not is_noise, pose=pose)
+
+    def _pose(self, track: Track, found: bool = True) -> PoseEstimate:
+        """Return the pose of a judged track; ``found``: whether it is reliable."""
+        assert track.pose is not None
+        return replace(track.pose, found=found)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from drake_pose.arrays import Array, Indices, Mask
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.filtering.contour_observation import ContourObservation
-from drake_pose.filtering.contour_tracker import ContourTracker, Track
+from drake_pose.filtering.contour_tracker import Track, Tracker
 from drake_pose.fit.contour_fit import Noise
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
@@ -101,7 +101,7 @@ def tilted(observation: ContourObservation, x: Array, tilt: Sequence[float]) -> 
 
 
 def find_start(
-    tracker: ContourTracker, x: Array, masks: Sequence[Sequence[Mask | None]]
+    tracker: Tracker, x: Array, masks: Sequence[Sequence[Mask | None]]
 ) -> list[TrackedStart]:
     """Return tracked starts for a sequence fit, sorted by cost, ascending.
 
@@ -181,7 +181,7 @@ class FittedSequence:
 
 
 def fit_sequence(
-    tracker: ContourTracker, masks: Sequence[Mask], starts: Sequence[Sequence[Array]], period: float
+    tracker: Tracker, masks: Sequence[Mask], starts: Sequence[Sequence[Array]], period: float
 ) -> list[FittedSequence]:
     """Return the explanations of one camera's masks, sorted by cost, ascending.
 

@@ -126,7 +126,7 @@ def scale_camera(camera: ParallelCamera, scale: float) -> ParallelCamera:
     return dataclasses.replace(camera, pixels_per_metre=scale * camera.pixels_per_metre)
 
 
-def slide_root(camera: ParallelCamera, p_WR: np.ndarray, factor: float) -> np.ndarray:
+def slide_root(camera: Camera, p_WR: np.ndarray, factor: float) -> np.ndarray:
     """Return a root position (3,) [m] with its distance from a parallel camera's axis multiplied.
 
     A camera whose scale is divided by the same factor sees the root at the same place.

@@ -13,7 +13,7 @@ from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.camera.models import Camera, camera_tuple
 from drake_pose.errors import SettingsError, require_at_least, require_known
-from drake_pose.filtering.contour_tracker import MatchAndTrack, TrackerState, TrackingSettings
+from drake_pose.filtering.contour_tracker import Tracker, TrackerState, TrackingSettings
 from drake_pose.fit.judge import LEVEL
 from drake_pose.search import TRACKED, PoseEstimate, PoseSearch, PoseSet, RobustSettings, View
 from drake_pose.silhouette.pictures.label_renderer import label_image_to_mask
@@ -307,7 +307,7 @@ TRACK = ("tracked", "matches", "distance")
 class _Memory(NamedTuple):
     """The state of a SilhouetteTracker."""
 
-    tracker_state: TrackerState  # State of the ``MatchAndTrack``.
+    tracker_state: TrackerState  # State of the ``Tracker``.
     track: tuple[float, float, float]  # Elements of TRACK.
     time: float  # Time of the last update [s].
 
@@ -344,10 +344,10 @@ class SilhouetteTracker(SilhouetteMatcher):
         covariance (nq x nq, row by row): the track's; NaN where the estimated positions are.
         last_positions (nq): found or predicted, never NaN.
         position_deviations (nq): standard deviation of each of the last positions [rad or m]; NaN
-            for positions that are not tracked (fixed, or solved from the root's pose). Without
-            evidence, or if no pose explains the masks because the body is occluded, positions are
-            predicted and their deviations grow. At most a tenth of the silhouettes' area may be
-            occluded in a tracked frame.
+            for positions that are not tracked (fixed, or solved from the root's pose). Positions of
+            parts that are not seen are predicted, and their deviations grow. Joints that a search
+            did not determine in masks with defects have the deviations of their limits, until masks
+            come that noise of their edges explains; the body is then searched again.
         estimated_state (nq + nv): the last positions, then the plant's velocities [rad/s or m/s];
             velocities are NaN without a track and where ``position_deviations`` are. The filter's
             rates decay with the time constant ``tracking.memory``: in steady motion at 30 Hz they
@@ -382,8 +382,8 @@ class SilhouetteTracker(SilhouetteMatcher):
     ) -> None:
         super().__init__(search, cameras, period, labels, mode_limit)
         cameras, self._period = camera_tuple(cameras), period
-        self._follower = MatchAndTrack(search, cameras, period, tracking, search_time)
-        model, moving = search.tree.model, self._follower.tracker.observation.layout.moving
+        self._follower = Tracker(search.tree, cameras, period, tracking, search, search_time)
+        model, moving = search.tree.model, self._follower.observation.layout.moving
         nq = len(model.position_names)
         # (nq, m) positions by the moving elements of the filter's state; the root's move none.
         self._moves = np.array([[float(a == b) for b in moving] for a in model.position_names])
@@ -421,9 +421,9 @@ class SilhouetteTracker(SilhouetteMatcher):
         ports = ["measured_positions", *(["first_positions"] if last.track is None else [])]
         starts = (self.eval_input(context, port) for port in ports)
         start = next((q for q in starts if q is not None and np.isfinite(q).all()), None)
-        now, result = self._follower.next(last, views, root_position, pictures, start)
+        now, result = self._follower.update(last, views, root_position, pictures, start)
         if late and now.track is not None:
-            now = replace(now, track=self._follower.tracker.delayed(now.track))
+            now = replace(now, track=self._follower.delayed(now.track))
         is_tracked = result.stopped_by == TRACKED and now.matches == last.matches
         measurement = None if now.track is None else now.track.measurement
         distance = np.nan if measurement is None else measurement.distance
@@ -438,23 +438,25 @@ class SilhouetteTracker(SilhouetteMatcher):
 
     def _shows(self, known: MatcherState) -> Mask:
         """Return whether the last update's pictures determine each position (nq,)."""
-        shows, track = super()._shows(known), known.memory.tracker_state.track
+        shows, state = super()._shows(known), known.memory.tracker_state
+        track = state.track
         if track is None or track.measurement is None or not known.was_tracked:
             return shows
         # Their information alone, in place of the prediction beside limits.
         slopes = track.measurement.H[:, : self._moves.shape[1]]
         alone = np.linalg.inv(slopes.T @ slopes + np.diag(1.0 / self._widest**2))
-        width = 2.0 * RobustSettings().significance * np.sqrt(np.diag(alone))
+        spread = 0.0 if state.spread is None else state.spread[: len(alone)]
+        width = 2.0 * RobustSettings().significance * np.sqrt(np.diag(alone) + spread**2)
         undetermined = self._moves[:, width > self._widest].any(axis=1)
         return np.asarray(shows & self._moves.any(axis=1) & ~undetermined)
 
     def _covariance(self, known: MatcherState) -> Array:
         """Return the covariance (nq, nq) of the last positions, NaN if they are not tracked."""
-        moves, track = self._moves, known.memory.tracker_state.track
-        if track is None:
+        moves, belief = self._moves, known.memory.tracker_state.belief
+        if belief is None:
             return np.full((len(moves), len(moves)), np.nan)
         own = np.arange(moves.shape[1])
-        covariance = moves @ track.state.best.covariance[np.ix_(own, own)] @ moves.T
+        covariance = moves @ belief.covariance[np.ix_(own, own)] @ moves.T
         covariance[~moves.any(axis=1)] = np.nan
         return covariance
 

@@ -19,7 +19,7 @@ from drake_pose.files.records import user_units
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.writer import OnStage
 from drake_pose.filtering.contour_observation import ContourObservation
-from drake_pose.filtering.contour_tracker import ContourTracker, TrackingSettings, make_tracker
+from drake_pose.filtering.contour_tracker import Tracker, TrackingSettings
 from drake_pose.filtering.sequence_fit import (
     SEQUENCE,
     TrackedStart,
@@ -151,7 +151,7 @@ class _BodyFit:
         )  # fmt: skip
         return inputs, self._more, shapes
 
-    def _fit(self, tracker: ContourTracker, starts: Sequence[TrackedStart]) -> _Fitted | None:
+    def _fit(self, tracker: Tracker, starts: Sequence[TrackedStart]) -> _Fitted | None:
         """Fit shape and poses to the sequence; return None if the mean E_total is not reduced.
 
         The result is the best fit; its estimates have the others as alternative poses.
@@ -251,9 +251,9 @@ class _BodyFit:
         self._more["unseen"] = hidden
         return other, better
 
-    def _tracker(self, search: RootPlacementSearch) -> ContourTracker:
+    def _tracker(self, search: RootPlacementSearch) -> Tracker:
         """Return a tracker of the body of a search in the only camera."""
-        return make_tracker(search.tree, [self._camera], self._period, self._tracking)
+        return Tracker(search.tree, [self._camera], self._period, self._tracking)
 
     def _estimate_of(
         self, observation: ContourObservation, x: np.ndarray, frame: int

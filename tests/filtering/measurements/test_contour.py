@@ -39,7 +39,7 @@ def test_measurements_lead_to_the_pose_that_drake_rendered(body):
     np.testing.assert_allclose(q, truth, atol=np.radians(2.5))
     np.testing.assert_allclose(X_WB, np.eye(4), atol=1e-9)
     assert measured.distance < 0.6
-    assert measured.inlier_ratio > 0.95
+    assert measured.is_explained
     drawn = observation.draw(x, camera)
     assert np.count_nonzero(drawn != masks[0]) < 0.02 * np.count_nonzero(masks[0])
 

@@ -11,8 +11,7 @@ from drake_pose.camera.models import circle_of_cameras
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.contour_observation import ContourObservation
 from drake_pose.filtering.contour_tracker import (
-    ContourTracker,
-    MatchAndTrack,
+    Tracker,
     TrackerState,
     TrackingSettings,
 )
@@ -78,11 +77,11 @@ def test_a_drifting_scale_is_tracked_and_found_again_after_a_cut(tree):
     second[:, layout.index("root_shift_y")] += 0.5
     masks, answers = drawn(tree, camera, [*first, *second])
     search = KnownPoses(tree, answers)
-    follower, tracker_state = MatchAndTrack(search, [camera], PERIOD, SETTINGS), TrackerState()
+    follower, tracker_state = Tracker(tree, [camera], PERIOD, SETTINGS, search), TrackerState()
     scales, errors, kinds = [], [], []
     for frame, mask in enumerate(masks):
         search.frame = frame
-        tracker_state, result = follower.next(tracker_state, [View(camera, mask)])
+        tracker_state, result = follower.update(tracker_state, [View(camera, mask)])
         scales.append(result.scale / answers[frame][2])
         errors.append(np.degrees(np.abs(result.q - answers[frame][0])).max())
         kinds.append(result.stopped_by)
@@ -104,7 +103,8 @@ def test_unobserved_joints_move_to_the_middle_of_their_limits(tree):
         (x,) = moving_states(tree, camera, 1, np.random.default_rng(3))
         mask = observation.draw(x, camera)
         # The left arm is removed from the mask.
-        tracker = ContourTracker(observation, PERIOD, SETTINGS)
+        settings = replace(SETTINGS, rest_time=PERIOD / rest if rest else None)
+        tracker = Tracker(tree, [camera], PERIOD, settings)
         empty = np.zeros_like(mask)
         empty[:, : mask.shape[1] // 2 + 6] = mask[:, : mask.shape[1] // 2 + 6]
         track = tracker.start(x)
@@ -132,7 +132,7 @@ def fitted(tree):
     states = moving_states(tree, camera, FRAMES, generator)
     masks, _ = drawn(tree, camera, states)
     observation = ContourObservation(tree, [camera], True, True, prior_weight=0.1)
-    tracker = ContourTracker(observation, PERIOD, AT_REST)
+    tracker = Tracker(tree, [camera], PERIOD, AT_REST)
     # Each start has a constant error, and two of them converge to the same fit.
     starts = []
     for off in ([0.15, -0.12, 0.1], [-0.1, 0.1, 0.12], [0.0, 2.6, 0.0]):
@@ -209,7 +209,7 @@ def test_the_true_start_is_tracked_and_not_worse_than_the_given_one(observation)
     masks = [[observation.draw(x, camera)] for x in truth]
     given = truth[0].copy()
     given[:moving] += 0.05
-    tracker = ContourTracker(observation, PERIOD, SETTINGS)
+    tracker = Tracker(observation.tree, [camera], PERIOD, SETTINGS)
     found = find_start(tracker, given, masks)
     assert [one.cost for one in found] == sorted(one.cost for one in found)
     assert len(found[0].states) == len(found[0].errors) == 12

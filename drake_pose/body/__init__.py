@@ -19,6 +19,7 @@ from drake_pose.body.model import (
     TARGET_POSITIONS,
     ArticulatedModel,
     load_model,
+    require_registered,
     reshaped,
 )
 from drake_pose.body.model_files import bundled_model, package_folder

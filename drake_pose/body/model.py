@@ -62,6 +62,17 @@ Vectors = Mapping[str, Sequence[float]]
 ElementTree.register_namespace("drake", "http://drake.mit.edu")
 
 
+def require_registered(plant: MultibodyPlant, scene_graph: SceneGraph) -> str:
+    """Return the plant's name; ModelError unless it is finalized and has the SceneGraph."""
+    name = plant.get_name() or "the plant"
+    if not plant.is_finalized():
+        raise ModelError(f"{name} is not finalized: call plant.Finalize() first")
+    source_id = plant.get_source_id()
+    if source_id is None or not scene_graph.model_inspector().SourceIsRegistered(source_id):
+        raise ModelError(f"{name} is not registered with the given SceneGraph")
+    return name
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class ArticulatedModel(ParsedModel):
     """An immutable object with the attributes of ``ParsedModel``, and methods that build trees."""
@@ -121,12 +132,7 @@ class ArticulatedModel(ParsedModel):
         Raises ModelError: the plant is not finalized or not registered, no chosen body has visual
         geometry, or its joints or geometry cannot be used.
         """
-        name = plant.get_name() or "the plant"
-        if not isinstance(plant, MultibodyPlant) or not plant.is_finalized():
-            raise ModelError(f"{name} is not finalized: call plant.Finalize() first")
-        source_id = plant.get_source_id()
-        if source_id is None or not scene_graph.model_inspector().SourceIsRegistered(source_id):
-            raise ModelError(f"{name} is not registered with the given SceneGraph")
+        name = require_registered(plant, scene_graph)
         all_instances = [ModelInstanceIndex(k) for k in range(1, plant.num_model_instances())]
         chosen = all_instances if model_instances is None else list(model_instances)
         bodies = [body for instance in chosen for body in plant.GetBodyIndices(instance)]

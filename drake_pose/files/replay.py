@@ -9,7 +9,6 @@ from pydrake.geometry import (
     Mesh,
     Meshcat,
     MeshcatParams,
-    MeshcatVisualizer,
     Rgba,
     Role,
     SceneGraph,
@@ -23,7 +22,7 @@ from drake_pose.body import ArticulatedModel
 from drake_pose.body.meshes import shape_mesh, write_obj
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.fit.surfaces import reduce_meshes
-from drake_pose.systems.bodies import add_meshcat_skin, add_posed_plant, body_poses
+from drake_pose.systems.bodies import add_posed_plant, body_poses, show_in_meshcat
 
 _BODY_PATH, _MEASURED_PATH = "visualizer", "measured"
 
@@ -59,13 +58,11 @@ def make_replay(
     builder = DiagramBuilder()
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
     source = builder.AddNamedSystem("positions", ConstantVectorSource(positions[0]))
-    plant = add_posed_plant(builder, scene_graph, model, source.get_output_port(), "geometry_pose")
+    plant = add_posed_plant(builder, scene_graph, model, source.get_output_port())
     _lighten(scene_graph, plant.get_source_id(), most_triangles)
-    MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
-    add_meshcat_skin(
-        builder, meshcat, model, source.get_output_port(), "body", prefix=_BODY_PATH,
-        is_recorded=True,
-    )  # fmt: skip
+    show_in_meshcat(
+        builder, scene_graph, meshcat, model, source.get_output_port(), _BODY_PATH, is_recorded=True
+    )
     own = [*model.link_meshes.values()]
     ghosts = [] if measured is None else reduce_meshes(own, most_triangles // 2)
     for link, mesh in zip(model.link_meshes, ghosts, strict=False):

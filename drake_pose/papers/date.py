@@ -576,7 +576,7 @@ def draw_walk(model: ArticulatedModel, q: Array, pose: Array, rest: Array) -> Pi
     builder = DiagramBuilder()
     scene_graph = add_garden(builder, X_RP)
     positions = builder.AddSystem(ConstantVectorSource(q)).get_output_port()
-    add_posed_plant(builder, scene_graph, model, positions, "geometry_pose")
+    add_posed_plant(builder, scene_graph, model, positions)
     X_RC = X_RP.GetAsMatrix4() @ look_at(*view_from_behind(pose))
     camera = PinholeCamera("view", 480, 360, 384.0, 384.0, 240.0, 180.0, X_RC)
     sky = RenderEngineVtkParams(default_clear_color=np.array([0.65, 0.78, 0.94]))

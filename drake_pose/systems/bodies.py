@@ -4,7 +4,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from drake import lcmt_robot_state
-from pydrake.geometry import GeometryConfigurationVector, Meshcat, Rgba, SceneGraph
+from pydrake.geometry import (
+    GeometryConfigurationVector,
+    Meshcat,
+    MeshcatVisualizer,
+    MeshcatVisualizerParams,
+    Rgba,
+    SceneGraph,
+)
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem, OutputPort
@@ -33,8 +40,8 @@ def add_posed_plant(
     scene_graph: SceneGraph,
     model: ParsedModel,
     positions: OutputPort,
-    name: str,
     prefix: str = "",
+    skin_labels: Mapping[str, int] | None = None,
 ) -> MultibodyPlant:
     """Add a body without dynamics that is posed by an output port; return its finalized plant.
 
@@ -43,20 +50,32 @@ def add_posed_plant(
         scene_graph: a system of the diagram, to which the body's geometry is added.
         model: the body.
         positions: port of the positions (nq,) in the plant's order [rad or m].
-        name: name of the MultibodyPositionToGeometryPose that is added.
-        prefix: prefix of the body's name in the SceneGraph.
+        prefix: prefix of the names of the body and of the systems that are added.
+        skin_labels: render label of each link, by name, which its skin takes; Drake's own are the
+            links' body indices. None: sensors do not see the skin.
     """
     plant = MultibodyPlant(0.0)
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     model.add_to(plant, scene_graph, prefix=prefix)
     plant.Finalize()
-    poser = builder.AddNamedSystem(
-        name, MultibodyPositionToGeometryPose(plant, input_multibody_state=False)
-    )
+    poser = MultibodyPositionToGeometryPose(plant, input_multibody_state=False)
+    builder.AddNamedSystem(f"{prefix}_geometry_pose", poser)
     builder.Connect(positions, poser.get_input_port())
     builder.Connect(
         poser.get_output_port(), scene_graph.get_source_pose_port(plant.get_source_id())
     )
+    if skin_labels is not None and model.skin:
+        skin = DeformableSkin(ModelSkin(model), scene_graph, skin_labels, f"{prefix}_skin")
+        bender = builder.AddNamedSystem(f"{prefix}_skin_poser", PortedSystem())
+        q = bender.add_input("positions", plant.num_positions())
+        bender.add_output(
+            "configuration",
+            GeometryConfigurationVector(),
+            lambda context: skin.configuration(skin.skin.vertices(q.Eval(context))),
+        )
+        builder.Connect(positions, bender.get_input_port())
+        configured = scene_graph.get_source_configuration_port(skin.source)
+        builder.Connect(bender.get_output_port(), configured)
     return plant
 
 
@@ -82,7 +101,6 @@ class MeshcatSkin(LeafSystem):
         skin: the skin bands.
         position_count: nq.
         path: Meshcat path of the skin.
-        colour: colour of all bands; None: the bands' own colours.
         is_recorded: whether a Meshcat recording must show the motion. Meshcat records the motion of
             objects but not of vertices, so that each new shape becomes an object that is visible
             until the next one.
@@ -94,15 +112,12 @@ class MeshcatSkin(LeafSystem):
         skin: ModelSkin,
         position_count: int,
         path: str,
-        colour: Rgba | None = None,
         *,
         is_recorded: bool = False,
     ) -> None:
         super().__init__()
         self._meshcat, self._path = meshcat, path
-        self._skin, self._colour = skin, colour
-        self._recorded = is_recorded
-        self._shapes = 0
+        self._skin, self._recorded, self._shapes = skin, is_recorded, 0
         self._drawn: np.ndarray | None = None
         self._positions = self.DeclareVectorInputPort("positions", position_count)
         self.DeclarePeriodicPublishEvent(MESHCAT_PERIOD, 0.0, self._draw)
@@ -128,75 +143,42 @@ class MeshcatSkin(LeafSystem):
                 f"{path}/{band.child}",
                 np.asfortranarray(vertices.T),
                 np.asfortranarray(band.mesh.triangles.T),
-                self._colour or Rgba(*band.colour, 1.0),
+                Rgba(*band.colour, 1.0),
             )
         self._drawn = positions
         self._shapes += 1
         return EventStatus.Succeeded()
 
 
-def add_skin(
+def show_in_meshcat(
     builder: DiagramBuilder,
     scene_graph: SceneGraph,
-    model: ParsedModel,
-    positions: OutputPort,
-    labels: Mapping[str, int] | None = None,
-) -> None:
-    """Add a model's skin to a SceneGraph, so that sensors see it; do nothing if it has none.
-
-    Args:
-        builder: the diagram to which the system is added.
-        scene_graph: a system of the diagram, which contains the body's rigid parts.
-        positions: port of the positions (nq,) in the model's order [rad or m].
-        labels: render label of each link, by name, which its skin takes; Drake's own are the links'
-            body indices. None: none.
-    """
-    if not model.skin:
-        return
-    deformable = DeformableSkin(ModelSkin(model), scene_graph, labels or {}, "true_skin")
-    poser = builder.AddNamedSystem("true_skin_poser", PortedSystem())
-    q = poser.add_input("positions", model.plant.num_positions())
-    poser.add_output(
-        "configuration",
-        GeometryConfigurationVector(),
-        lambda context: deformable.configuration(deformable.skin.vertices(q.Eval(context))),
-    )
-    builder.Connect(positions, poser.get_input_port())
-    builder.Connect(
-        poser.get_output_port(), scene_graph.get_source_configuration_port(deformable.source)
-    )
-
-
-def add_meshcat_skin(
-    builder: DiagramBuilder,
     meshcat: Meshcat,
     model: ParsedModel,
     positions: OutputPort,
-    name: str,
-    colour: Rgba | None = None,
+    prefix: str,
     *,
-    prefix: str = "visualizer",
     is_recorded: bool = False,
 ) -> None:
-    """Show a model's skin in Meshcat; do nothing if it has none.
+    """Show a SceneGraph in Meshcat, with the skin of its one model.
 
     Args:
-        builder: the diagram to which the system is added.
-        positions: port of the positions (nq,) in the model's order [rad or m].
-        name: name of the skin in Meshcat, and with ``_meshcat_skin`` of the new system.
-        colour, is_recorded: as in MeshcatSkin.
-        prefix: Meshcat path under which it is drawn: that of the MeshcatVisualizer.
+        builder: the diagram that contains ``scene_graph``.
+        meshcat: where to draw.
+        model: the body.
+        positions: port of its positions (nq,) in the model's order [rad or m].
+        prefix: Meshcat path; the skin is in ``<prefix>/skin``.
+        is_recorded: as in MeshcatSkin.
     """
-    if not model.skin:
-        return
-    drawer = builder.AddNamedSystem(
-        f"{name}_meshcat_skin",
-        MeshcatSkin(
-            meshcat, ModelSkin(model), model.plant.num_positions(), f"{prefix}/{name}_skin", colour,
-            is_recorded=is_recorded,
-        ),
-    )  # fmt: skip
-    builder.Connect(positions, drawer.get_input_port())
+    parameters = MeshcatVisualizerParams(prefix=prefix)
+    MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, parameters)
+    # After the visualizer, which clears its part of Meshcat's tree.
+    if model.skin:
+        skin = ModelSkin(model)
+        count = model.plant.num_positions()
+        drawer = MeshcatSkin(meshcat, skin, count, f"{prefix}/skin", is_recorded=is_recorded)
+        builder.AddNamedSystem(f"{prefix}_meshcat_skin", drawer)
+        builder.Connect(positions, drawer.get_input_port())
 
 
 def held_positions(q: Array, period: float) -> Trajectory:

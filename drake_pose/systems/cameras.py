@@ -21,7 +21,7 @@ from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U, RgbdSensor
 from pydrake.trajectories import Trajectory
 
 from drake_pose.arrays import Array, Mask, Picture
-from drake_pose.body import ParsedModel, captured_warnings, labelled_meshes
+from drake_pose.body import ParsedModel, captured_warnings, labelled_meshes, require_registered
 from drake_pose.camera.exchange import camera_from_drake, camera_to_drake
 from drake_pose.camera.models import Camera, PinholeCamera, camera_tuple
 from drake_pose.errors import CameraError, ModelError, UnknownNameError
@@ -233,7 +233,7 @@ def build_camera_rig(
         builder.ExportInput(source.get_input_port(), "positions")
     else:
         source = builder.AddNamedSystem("true_positions", TrajectorySource(true_positions))
-    add_posed_plant(builder, scene_graph, model, source.get_output_port(), "geometry_pose")
+    add_posed_plant(builder, scene_graph, model, source.get_output_port())
     # Within the range of 16-bit depth images in millimetres, which is 65 m.
     ranges = {name: (camera.near, 60.0) for name, camera in cameras.items()}
     parameters = RenderEngineVtkParams(default_clear_color=np.array([0.55, 0.58, 0.62]))
@@ -379,12 +379,8 @@ class SilhouetteCamera(PortedSystem):
         parent: RigidBody | None = None,
     ) -> None:
         super().__init__()
-        if not plant.is_finalized():
-            raise ModelError("a SilhouetteCamera needs a plant that is finalized")
+        require_registered(plant, scene_graph)
         inspector = scene_graph.model_inspector()
-        source = plant.get_source_id()
-        if source is None or not inspector.SourceIsRegistered(source):
-            raise ModelError("the plant is not registered with the SceneGraph that was given")
         deformable = [
             inspector.GetName(geometry)
             for geometry in inspector.GetAllDeformableGeometryIds()

@@ -8,8 +8,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from pydrake.geometry import (
     Meshcat,
-    MeshcatVisualizer,
-    MeshcatVisualizerParams,
     RenderEngineVtkParams,
     SceneGraph,
 )
@@ -34,7 +32,7 @@ from drake_pose.registration.register import RegisteredCamera
 from drake_pose.search import PoseSearch
 from drake_pose.silhouette.pictures.label_renderer import label_image_to_mask
 from drake_pose.silhouette.pictures.scenes import Scene
-from drake_pose.systems.bodies import add_meshcat_skin, add_posed_plant, add_skin
+from drake_pose.systems.bodies import add_posed_plant, show_in_meshcat
 from drake_pose.systems.cameras import MaskPlayer, add_sensors
 from drake_pose.systems.ports import (
     BeliefSystem,
@@ -237,13 +235,9 @@ def build_simulation(
         # Of its own SceneGraph, so that the sensors do not see it.
         shown = builder.AddNamedSystem("estimate_scene_graph", SceneGraph())
         estimate = estimator.GetOutputPort("last_positions")
-        add_posed_plant(builder, shown, model, estimate, "estimated_geometry_pose")
-        places = {"true": (scene_graph, truth), "estimated": (shown, estimate)}
-        for name, (scene, positions) in places.items():
-            parameters = MeshcatVisualizerParams(prefix=name)
-            MeshcatVisualizer.AddToBuilder(builder, scene, meshcat, parameters)
-            # After the visualizer, which clears its part of Meshcat's tree.
-            add_meshcat_skin(builder, meshcat, model, positions, name, prefix=name)
+        add_posed_plant(builder, shown, model, estimate, "estimated")
+        show_in_meshcat(builder, scene_graph, meshcat, model, truth, "true")
+        show_in_meshcat(builder, shown, meshcat, model, estimate, "estimated")
         meshcat.SetProperty("estimated", "modulated_opacity", 0.6)
     return builder.Build()
 
@@ -270,9 +264,8 @@ def add_simulated_cameras(
         true_positions = PiecewisePolynomial(true_positions.reshape(-1, 1))
     source = builder.AddNamedSystem("true_positions", TrajectorySource(true_positions))
     truth = source.get_output_port()
-    add_posed_plant(builder, scene_graph, model, truth, "true_geometry_pose", "true")
     labels = {name: label for label, name in enumerate(model.link_names)}
-    add_skin(builder, scene_graph, model, truth, labels)
+    add_posed_plant(builder, scene_graph, model, truth, "true", labels)
     # Pinhole cameras see to 1 km; the depths of parallel ones must be tight.
     ranges = {
         one.name: _depth_range(one, model, true_positions)

@@ -4,14 +4,12 @@ import numpy as np
 import pytest
 from pydrake.geometry import Meshcat, MeshcatParams, Rgba
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_pose.body import ModelSkin
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.search import PaperSearch, PaperSearchSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.systems.bodies import MeshcatSkin, add_meshcat_skin
+from drake_pose.systems.bodies import MeshcatSkin
 from drake_pose.systems.diagrams import build_simulation
 from drake_pose.systems.silhouette_matcher import SilhouetteMatcher
 from tests.body.models import load_limb
@@ -87,12 +85,4 @@ def test_a_simulated_camera_sees_the_skin(limb):
     assert error < 0.01
     for name in ("true", "estimated"):
         for child in ("lower", "hand"):
-            assert meshcat.HasPath(f"{name}/{name}_skin/{child}")
-
-
-def test_models_without_skin_add_no_system(tmp_path):
-    plain = load_limb(tmp_path, "")
-    builder = DiagramBuilder()
-    source = builder.AddSystem(ConstantVectorSource(np.zeros(5)))
-    add_meshcat_skin(builder, _Recorder(), plain, source.get_output_port(), "plain")
-    assert len(builder.GetSystems()) == 1
+            assert meshcat.HasPath(f"{name}/skin/{child}")

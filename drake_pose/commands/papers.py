@@ -101,7 +101,7 @@ def shimada(
     *,
     runs: Annotated[int | None, within(1)] = None,
     seed: Seed = 0,
-    truncation: Literal["sequential", "joint", "clip", "none"] | None = None,
+    truncation: Literal["sequential", "joint", "none"] | None = None,
     iterations: Annotated[int | None, within(1)] = None,
     hypotheses: bool = False,
     pictures: bool = False,

@@ -33,7 +33,6 @@ from drake_pose.filtering.state import (
 )
 from drake_pose.filtering.truncated_normal import (
     Truncated,
-    clip,
     merge_rows,
     truncate_joint,
     truncate_sequential,
@@ -173,7 +172,7 @@ def reduce_mixture(
     return normalise([kept[i] for i in np.flatnonzero(weights)]), rejected
 
 
-Truncation = Literal["joint", "sequential", "clip", "none"]
+Truncation = Literal["joint", "sequential", "none"]
 Linearisation = Literal["spread", "tangent"]
 Branch = tuple[Hypothesis, Updated]
 """A hypothesis before an update, and its belief after it."""
@@ -191,8 +190,7 @@ class FilterSettings:
     the hand of Shimada et al.
 
     Args:
-        truncation: "joint" (all rows at once), "sequential" (the paper's), "clip" (only the mean is
-            moved inside) or "none".
+        truncation: "joint" (all rows at once), "sequential" (the paper's) or "none".
         linearisation: "spread" (over the belief, with the remainder's covariance as noise; see
             ``linearise_over``) or "tangent" (at one point, the paper's).
         iterations: largest number of linearisations of an update; 1 in the paper. More come closer
@@ -203,7 +201,7 @@ class FilterSettings:
             split over which the measurement is too curved.
         novelty: p-value below which a measurement differs from the first of its static view and
             begins a new one, for example 1e-9; see ``views``. 0: each frame is a new view, as in
-            the paper, and always with "sequential" and "clip".
+            the paper, and always with "sequential".
         rough_iterations: largest number of linearisations for rough states, and smallest for
             mirrored hypotheses with "spread".
         rejected_below: a hypothesis with a smaller c_k (24) of any row is removed [standard
@@ -321,7 +319,7 @@ class TruncatedFilter:
         _require_class(settings, FilterSettings, "a filter's settings are")
         self.settings = settings
         # Offsets of a static view cannot be kept if the truncated belief is fed back.
-        feeds_back = settings.truncation in ("sequential", "clip")
+        feeds_back = settings.truncation == "sequential"
         self.novelty = 0.0 if feeds_back else settings.novelty
         self._remainder_weight = 0.0
         if settings.linearisation == "spread":
@@ -594,6 +592,4 @@ class TruncatedFilter:
         """Truncate a belief by the limits in the settings' way; ``sites`` (S, 2) start "joint"."""
         if self.settings.truncation == "sequential":
             return truncate_sequential(belief, self.inequalities)
-        if self.settings.truncation == "clip":
-            return clip(belief, self.inequalities)
         return truncate_joint(belief, self._rows, start=sites)

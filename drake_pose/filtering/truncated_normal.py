@@ -419,27 +419,6 @@ def truncate_joint(
     return Truncated(q, covariance_from(factor), c, active, log_probability, sites)
 
 
-def clip(belief: Belief, inequalities: Inequalities) -> Truncated:
-    """Move a belief's mean to a nearby point inside the rows; the covariance stays unchanged.
-
-    A baseline for comparison. The mean is projected in the metric of the covariance onto the most
-    violated row, until no row is violated or 100 projections are made. ``active`` are the rows that
-    were violated.
-
-    Raises SettingsError: as for ``truncate_sequential``.
-    """
-    c, q = _margins(belief, inequalities), belief.mean
-    for _ in range(100):
-        margins = inequalities.margins(q)
-        worst = int(np.argmin(margins)) if len(inequalities) else -1
-        if worst < 0 or margins[worst] >= -1e-12:
-            break
-        row = inequalities.phi[worst]
-        gain = belief.covariance @ row
-        q = q + gain * margins[worst] / float(row @ gain)
-    return Truncated(q, belief.covariance, c, c < 0, 0.0)
-
-
 def untruncated(belief: Belief) -> Truncated:
     """Return a belief as the result of a truncation without rows."""
     nothing = np.zeros(0)

@@ -26,7 +26,6 @@ from drake_pose.filtering.state import (
     Belief,
     Function,
     Linear,
-    factor_of,
     function_without_jacobian,
     linearise_over,
     numerical_jacobian,
@@ -368,26 +367,6 @@ def next_view(
     return (y, 1) if is_new else (reference, count + 1)
 
 
-def measure_curvature(model: ObservationModel, belief: Belief) -> Array:
-    """Return the mean squares (m,) of the linearisation error of a model's measurements.
-
-    The model is linearised at the mean of ``belief``, over which the mean is taken. By second
-    differences along the columns of the covariance's root.
-    """
-    h, H = model.predict(belief.mean)
-    used = np.flatnonzero(np.abs(H).sum(axis=0) > 0)
-    root = factor_of(belief.covariance[np.ix_(used, used)])
-    total = np.zeros(len(h))
-    for column in root.T:
-        step = np.zeros_like(belief.mean)
-        step[used] = column
-        ends = [model.predict(belief.mean + sign * step)[0] for sign in (1.0, -1.0)]
-        bend = 0.5 * sum(wrapped_difference(end, h, model.wraps) for end in ends)
-        # E[(b z^2)^2] = 3 b^2 for a standard normal z.
-        total += 3.0 * np.nan_to_num(bend) ** 2
-    return total
-
-
 def after_step(belief: Belief, step: Linear, U: Array) -> Belief:
     """Return a belief after one step of a motion, with process noise covariance U (n, n): (6).
 
@@ -425,15 +404,20 @@ class RepeatedView:
 def begin_repeated_view(
     model: ObservationModel, free: Belief, state: Belief, tangent: Array
 ) -> RepeatedView:
-    """Return a view at its second frame; the offsets have mean 0 and the curvature as variance.
+    """Return a view at its second frame; the offsets have mean 0.
 
     Args:
         model: the observation of both frames.
         free: the prediction for the second frame, without limits.
-        state: belief whose covariance is the range over which the curvature is measured.
+        state: belief whose covariance is the range over which the mean squares of the linearisation
+            error are taken; these are the offsets' variances.
         tangent: (n,) state at which the first frame was linearised.
     """
-    curvature = measure_curvature(model, Belief(tangent, state.covariance))
+    over = linearise_over(model.predict, Belief(tangent, state.covariance), model.wraps)
+    assert over.remainder is not None
+    h, _ = model.predict(tangent)
+    shift = np.nan_to_num(wrapped_difference(over.value, h, model.wraps))
+    curvature = shift**2 + np.diag(over.remainder)
     n, m = len(tangent), len(curvature)
     P = np.zeros((n + m, n + m))
     P[:n, :n] = free.covariance

@@ -290,7 +290,7 @@ def run_frames(
 def experiment_settings(truncation: str = "joint", iterations: int = 20) -> FilterSettings:
     """Return the hand filter's settings with at most some iterated tangents; 1 in the paper.
 
-    ``truncation``: "joint", "sequential", "clip" or "none". Raises SettingsError: another.
+    ``truncation``: "joint", "sequential" or "none". Raises SettingsError: another.
     """
     return FilterSettings(
         truncation=cast(Truncation, truncation),

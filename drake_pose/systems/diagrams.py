@@ -238,7 +238,7 @@ def build_simulation(
         add_posed_plant(builder, shown, model, estimate, "estimated")
         show_in_meshcat(builder, scene_graph, meshcat, model, truth, "true")
         show_in_meshcat(builder, shown, meshcat, model, estimate, "estimated")
-        meshcat.SetProperty("estimated", "modulated_opacity", 0.6)
+        meshcat.SetProperty("estimated", "modulated_opacity", 0.5)
     return builder.Build()
 
 

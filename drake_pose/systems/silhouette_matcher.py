@@ -389,9 +389,9 @@ class SilhouetteTracker(SilhouetteMatcher):
         self._moves = np.array([[float(a == b) for b in moving] for a in model.position_names])
         for coupled, leader, multiplier, _ in search.tree.followers:
             self._moves[coupled] = multiplier * self._moves[leader]
-        # (m,) half of the limits' span, or of a turn; huge for the root's elements.
+        # (m,) half of the limits' span, or of a turn; 1 m for the root's elements.
         spans = dict(zip(model.position_names, 0.5 * (model.upper - model.lower), strict=True))
-        self._widest = np.array([spans.get(name, 1e4) for name in moving])
+        self._widest = np.array([spans.get(name, 1.0) for name in moving])
         self.add_input("measured_positions", nq)
         self.add_input("first_positions", nq)
         require_known("camera", color_cameras, [one.name for one in cameras], "color_cameras")

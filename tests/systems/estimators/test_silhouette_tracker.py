@@ -59,6 +59,13 @@ def test_velocities_and_body_poses_equal_the_plants(body, search):
     seen = Bench(SilhouetteCamera(body.plant, body.scene_graph, CAMERA)).give(body_poses=poses)
     mask = label_image_to_mask(seen["label_image"])
     assert np.count_nonzero(mask != renderer.mask(found)) <= 0.002 * mask.sum()
+    # A measurement for a filter: NaN while the pose is only predicted.
+    sure = run["position_deviations"]
+    np.testing.assert_allclose(np.diag(run["covariance"].reshape(3, 3)), sure**2)
+    run.update(label_image=mask_to_label_image(0 * mask > 0))
+    assert np.isnan([*run["estimated_positions"], *run["covariance"]]).all()
+    np.testing.assert_array_equal(run["estimated_state"][:3], run["last_positions"])
+    assert (run["position_deviations"] > sure).all()
 
 
 def test_contexts_have_their_own_labels(body, search):

@@ -173,12 +173,11 @@ def stopped_rates(belief: Belief, limits: Inequalities, moving: int) -> Array:
 
     ``moving``: number of moving elements, whose rates follow them in the state.
     """
-    noise, reach = np.zeros_like(belief.covariance), 5.0
-    for row, margin in zip(limits.phi, limits.margins(belief.mean), strict=True):
-        across = np.zeros_like(row)
-        across[moving : 2 * moving] = row[:moving]
-        deviation, size = math.sqrt(max(row @ belief.covariance @ row, 0.0)), across @ across
-        if size and margin < reach * deviation:
-            rate = float(across @ belief.mean) ** 2 + across @ belief.covariance @ across
-            noise += ndtr(-margin / deviation) * rate / size**2 * np.outer(across, across)
-    return noise
+    P, margins = belief.covariance, limits.margins(belief.mean)
+    across = np.zeros_like(limits.phi)
+    across[:, moving : 2 * moving] = limits.phi[:, :moving]
+    of_place, of_rate = (np.einsum("ki,ij,kj->k", one, P, one) for one in (limits.phi, across))
+    deviation = np.sqrt(np.maximum(of_place, np.finfo(np.float64).tiny))
+    size = np.maximum((across**2).sum(axis=1), np.finfo(np.float64).eps)
+    weight = ndtr(-margins / deviation) * ((across @ belief.mean) ** 2 + of_rate) / size**2
+    return np.asarray((weight[:, None] * across).T @ across)

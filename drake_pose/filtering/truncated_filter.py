@@ -135,7 +135,7 @@ def reduce_mixture(
     kept, rejected = normalise(hypotheses), []
     means = np.array([one.belief.mean for one in kept])
     covariances = np.array([one.belief.covariance for one in kept])
-    weights = np.array([max(one.weight, 1e-300) for one in kept])
+    weights = np.maximum([one.weight for one in kept], np.finfo(np.float64).tiny)
     scale = np.sqrt(np.einsum("kii->ki", covariances).max(axis=0))
     scale[scale == 0.0] = 1.0
 

@@ -309,7 +309,7 @@ def _find_bend(bends: Array, R: Array, spread: Belief) -> tuple[float, Array]:
     white = np.linalg.solve(np.linalg.cholesky(R), bends.reshape(m, -1)).reshape(m * n, n)
     sizes, axes = np.linalg.eigh(white.T @ white)
     # A function of the state that is 1 at one standard deviation along the axis, 0 along others.
-    direction = np.linalg.lstsq(spread.root.T, axes[:, -1], rcond=1e-9)[0]
+    direction = np.linalg.lstsq(spread.root.T, axes[:, -1], rcond=None)[0]
     return 0.5 * float(sizes.sum()), direction
 
 
@@ -324,12 +324,12 @@ def slices(free: Belief, wide: Updated) -> Iterator[tuple[float, Belief]]:
     across = free.covariance @ a
     deviation = math.sqrt(a @ across)
     # The error's variance grows with the fourth power of the width.
-    width = wide.bend**-0.25 * math.sqrt(a @ wide.truncated.covariance @ a) / deviation
-    width = min(width, 0.7)
-    spread = math.sqrt(1.0 - width**2)
+    width = math.sqrt(a @ wide.truncated.covariance @ a / math.sqrt(wide.bend)) / deviation
+    width = min(max(width, 0.2), 0.7)
     # Normal densities 1.5 standard deviations apart add up to a flat one within 1 %.
-    count = math.ceil(2.5 * spread / (1.5 * width))
-    centers = 1.5 * width * np.arange(-count, count + 1)
+    spread, step = math.sqrt(1.0 - width**2), 1.5 * width
+    count = math.ceil(2.5 * spread / step)
+    centers = step * np.arange(-count, count + 1)
     logs = -0.5 * (centers / spread) ** 2
     P = free.covariance - spread**2 * np.outer(across, across) / deviation**2
     P = 0.5 * (P + P.T)

@@ -267,11 +267,7 @@ class _BeamRun:
             # No stage found a pose: search one without a limit on the area outside, with a single
             # hypothesis if the time is up.
             width = 1 if self._stopped_by else self._settings.stages[-1].hypotheses
-            store = PoseStore(self._body, self._bits)
-            whole = self._grow_all(store, store.start(), self._body.order, width, 2, limited=False)
-            if whole is not None:
-                best = int(np.argmin(self._score(store, whole)))
-                self._keep_if_better(store.samples(whole.poses[best]))
+            self._run_stage(Stage(width, np.inf, 2), limited=False)
         self._stopped_by = "exact" if self._is_matched else self._stopped_by or "end"
 
     @property
@@ -311,44 +307,39 @@ class _BeamRun:
         store: PoseStore,
         partial: PartialPoses,
         order: Sequence[int],
-        width: int,
-        outside_weight: int,
+        stage: Stage,
         limited: bool = True,
     ) -> PartialPoses | None:
-        """Place nodes one after another.
+        """Place the nodes of ``order`` one after another.
 
-        ``store``: the poses of nodes. ``partial``: the partial poses that are extended. ``order``:
-        the nodes, in the order in which they are placed. ``width``: beam width: greatest number of
-        partial poses kept after each node. ``outside_weight``: cost of a pixel outside, relative to
-        the gain of a newly covered one. ``limited``: whether the time limit ends the search.
+        ``store``: the poses of nodes. ``partial``: the partial poses that are extended. ``stage``:
+        whose beam width and weight hold. ``limited``: whether the time limit ends the search.
 
         Returns the partial poses with all nodes placed; None: none was left, or the time is up.
         """
         for node in order:
-            grown = grow(store, partial, node, width, outside_weight)
-            if grown is None or (limited and not self._proceed()):
+            grown = grow(store, partial, node, stage.hypotheses, stage.outside_weight)
+            self._runs += 1
+            if limited and time.perf_counter() >= self._deadline:
+                self._stopped_by = "time_limit"
+                return None
+            if grown is None:
                 return None
             partial = grown
         return partial
 
-    def _proceed(self) -> bool:
-        """Count one more placed node, and return whether there is time left."""
-        self._runs += 1
-        if time.perf_counter() >= self._deadline:
-            self._stopped_by = "time_limit"
-        return not self._stopped_by
-
-    def _run_stage(self, stage: Stage) -> None:
-        """Run one stage and keep its best pose."""
+    def _run_stage(self, stage: Stage, limited: bool = True) -> None:
+        """Run one stage and keep its best pose; ``limited``: whether the time limit ends it."""
         store = PoseStore(self._body, self._bits, stage.outside_fraction)
         order = self._body.limb_order if stage.limb_by_limb else self._body.order
-        whole = self._grow_all(store, store.start(), order, stage.hypotheses, stage.outside_weight)
+        whole = self._grow_all(store, store.start(), order, stage, limited)
         if whole is None:
             return
         Js = self._score(store, whole)
         best = int(np.argmin(Js))
         self._keep_if_better(store.samples(whole.poses[best]))
-        if self._settings.research_hypotheses and (self._collect or not self._is_matched):
+        again = limited and self._settings.research_hypotheses
+        if again and (self._collect or not self._is_matched):
             better = self._search_limbs_again(store, order, whole.poses[best], float(Js[best]))
             self._keep_if_better(store.samples(better))
 
@@ -374,13 +365,13 @@ class _BeamRun:
         ]
         limbs = limbs or [frozenset(one) for one in subtrees if 2 * len(one) <= len(nodes)][:1]
         choices = [*((limb,) for limb in limbs), *itertools.combinations(limbs, 2)]
-        unchanged, width = 0, self._settings.research_hypotheses
+        unchanged, stage = 0, Stage(self._settings.research_hypotheses, np.inf, 2)
         for choice in itertools.cycle(choices):
             again = frozenset().union(*choice)
             part = [node for node in order if node in again]
             # A limb placed last may cover silhouette that it had left to later nodes before.
             start = store.without(poses, again)
-            last = self._grow_all(store, start, part, width, 2)
+            last = self._grow_all(store, start, part, stage)
             if last is None:
                 break
             Js = self._score(store, last)

@@ -4,6 +4,7 @@
    the best of them. Masks may be damaged, and the model may fit only approximately.
 2. If the border of the best pose coincides with most of the masks' border, the masks may be exact:
    ``exact_search`` refines poses by pixels. A pose that leaves hardly a pixel wrong is the answer.
+   Where masks are known to be exact, this comes first.
 3. Otherwise alternative poses around the best ones are tried: limbs searched again, and
    ``self_motions``. If a wrong region as thick as a limb remains, the poses of a beam search are
    further starts.
@@ -256,25 +257,26 @@ class _MultiStartRun:
         ``rounds``: number of rounds of the search for alternative poses. ``with_set``: whether the
         pose set is computed.
         """
-        tree, exact, settings = self._kinematics.tree, self._search.exact, self._settings
-        problem, found, poses = self._problem, None, list[FittedPose]()
+        tree, exact = self._kinematics.tree, self._search.exact
+        problem, first_J = self._problem, None
+        pool, poses = list[FittedPose](), list[FittedPose]()
         exactly = exact.settings.exact * problem.border_length
-        # The coarse search is kept for ``_alternatives_to``.
-        self._coarse = CoarseSearch(self._body, self._clean.views, None if self._proceed() else 1)
-        starts = self._coarse.choose_distinct(
-            self._coarse.find(), settings.starts, settings.separation
-        )
-        first = [*self._values(starts), *self._known]
-        pool = refine_best(self._fit, first, self._passes, self._proceed)
-        first_J = self._J(pool[0].values)
-        searched = self._looks_exact(pool[0].values)
-        if searched:
-            found = exact.find(problem, self._root_position, self._deadline)
+
+        def find_exactly() -> ExactPose | None:
+            return exact.find(problem, self._root_position, self._deadline)
+
+        searched = self._search.exact_masks and self._clean is problem and self._proceed()
+        found = find_exactly() if searched else None
+        if found is None or found.J > exactly:
+            pool = self._start()
+            first_J = self._J(pool[0].values)
+            if not searched and self._looks_exact(pool[0].values):
+                searched, found = True, find_exactly()
         if found is None or found.J > exactly:
             poses = self._search_robustly(pool, rounds)
             looks_exact = self._looks_exact(poses[0].values)
             if looks_exact and not searched:
-                found = exact.find(problem, self._root_position, self._deadline)
+                found = find_exactly()
             if looks_exact and (found is None or found.J > exactly):
                 found = self._refine_by_pixels(found, poses[0].values)
         begin, pose_set = time.perf_counter(), None
@@ -287,7 +289,7 @@ class _MultiStartRun:
             values = found.parameters[:-4]
             steps += found.steps
             if with_set and not fits:
-                known = [FittedPose(values), *pool]
+                known = [FittedPose(values), *(pool or self._start())]
                 pose_set = RobustModes(self._fit, self._proceed).find(known, self._J)
         else:
             if found is not None:
@@ -302,6 +304,16 @@ class _MultiStartRun:
             stopped_by=self._stopped_by, runs=steps, first_J=first_J, interval_seconds=seconds,
             pose_set=pose_set,
         )  # fmt: skip
+
+    def _start(self) -> list[FittedPose]:
+        """Return poses of the coarse search, refined by all stages but the final, best first."""
+        settings, width = self._settings, None if self._proceed() else 1
+        # The coarse search is kept for ``_alternatives_to``.
+        self._coarse = CoarseSearch(self._body, self._clean.views, width)
+        coarse = self._coarse.find()
+        starts = self._coarse.choose_distinct(coarse, settings.starts, settings.separation)
+        values = [*self._values(starts), *self._known]
+        return refine_best(self._fit, values, self._passes, self._proceed)
 
     def _refine_by_pixels(self, found: ExactPose | None, values: np.ndarray) -> ExactPose | None:
         """Refine values (m,) by pixels, and return the better of the result and ``found``.

@@ -463,8 +463,8 @@ class NeighbourhoodSearch:
         same = settings.least_decrease * self.problem.border_length
         least = settings.least_error * self.problem.area
         last = np.inf if tries is None else int(self._tried.sum()) + tries
+        errors = self._errors_near(parameters, J)
         while J > enough and self._tried.sum() < last and time.perf_counter() < deadline:
-            errors = self._errors_near(parameters, J)
             # A part is tried again only if the error near it has changed since its last try.
             due = ((errors >= least) | everywhere) & (self._tried < rounds)
             due &= np.abs(errors - self._left_error) > np.maximum(
@@ -491,10 +491,7 @@ class NeighbourhoodSearch:
         ``parameters``: (m + 4,) the best pose, as in ``RefinementBody``. ``limit``: greatest J
         [pixel]. ``same``: poses are equal if no parameter differs by more [rad or m].
         """
-        problem, settings, J = self.problem, self._settings, float(self.problem.J(parameters))
-        # Until now reflections were tried at other poses, or not at all.
-        for k in range(len(self.search.parts), len(self._parts)):
-            self._try(parameters, J, k, False)
+        problem, settings = self.problem, self._settings
         known, kept = [parameters], []
         spare = settings.alternative_excess * problem.border_length
         everything = problem.body.freedom()

@@ -3,7 +3,7 @@
 An image without pixels (0 x 0) means that a camera has no picture.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
@@ -302,7 +302,7 @@ def cameras_from_drake(
     for name in names or ():
         if name not in found:
             raise UnknownNameError("camera", name, found, "the diagram")
-    plants = _systems_of(diagram, MultibodyPlant)
+    plants = list(_systems_of(diagram, MultibodyPlant))
     cameras = {}
     for name in found if names is None else names:
         sensor = found[name]
@@ -325,15 +325,13 @@ def cameras_from_drake(
     return cameras
 
 
-def _systems_of(diagram: Diagram | DiagramBuilder, kind: type[_System]) -> list[_System]:
-    """Return all systems of the type ``kind`` in a diagram, recursively."""
-    found: list[_System] = []
+def _systems_of(diagram: Diagram | DiagramBuilder, kind: type[_System]) -> Iterator[_System]:
+    """Yield all systems of the type ``kind`` in a diagram, recursively."""
     for system in diagram.GetSystems():
         if isinstance(system, kind):
-            found.append(system)
+            yield system
         elif isinstance(system, Diagram):
-            found += _systems_of(system, kind)
-    return found
+            yield from _systems_of(system, kind)
 
 
 class SilhouetteCamera(PortedSystem):

@@ -77,7 +77,7 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
 
         name: SilhouetteMatcher
         input_ports: [label_image, root_position (optional)]
-        output_ports: [estimated_positions, covariance, last_positions, E_total, base_pose,
+        output_ports: [estimated_positions, covariance, last_positions, E_total, error, base_pose,
           body_poses, statistics, proved_optimal, determined, lower, upper, mode_positions,
           pose_estimate]
 
@@ -102,6 +102,7 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
             search does not examine its result. It is diagonal, from ``lower`` and ``upper``.
         last_positions (nq): all positions of the last pose found, initially the model's default.
         E_total (1): the differing area as a fraction of the masks' area; infinite without a pose.
+        error (1): the same; diagrams of earlier versions connect it under this name.
         base_pose (RigidTransform): pose X_WB of the plant's world.
         body_poses: poses of all bodies in the scene's world, as a plant's port of that name.
         statistics (8): see ``STATISTICS``; ``stale`` is the number of stale pictures.
@@ -168,6 +169,7 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
             covariance=(nq * nq, self._shown_covariance),
             last_positions=(nq, lambda known: known.q),
             E_total=(1, lambda known: _statistics(known)[2:3]),
+            error=(1, lambda known: _statistics(known)[2:3]),
             statistics=(len(STATISTICS), _statistics),
             base_pose=(RigidTransform(), lambda known: RigidTransform(known.X_WB)),
             body_poses=([RigidTransform()], lambda known: body_poses(plant, known.q, known.X_WB)),
@@ -320,7 +322,7 @@ class SilhouetteTracker(SilhouetteMatcher):
         name: SilhouetteTracker
         input_ports: [label_image, root_position (optional), measured_positions (optional),
           first_positions (optional), color_image (of color_cameras)]
-        output_ports: [estimated_positions, covariance, last_positions, E_total, base_pose,
+        output_ports: [estimated_positions, covariance, last_positions, E_total, error, base_pose,
           body_poses, statistics, proved_optimal, determined, lower, upper, mode_positions,
           pose_estimate, position_deviations, estimated_state, track]
 

@@ -47,7 +47,7 @@ class BoundLimits:
     states: int = 40_000  # Greatest number of partial poses kept after each node.
     # Greatest number of pairs of a partial pose and a pose of the next node that are evaluated for
     # one node.
-    pairs: int = 1_000_000
+    pairs: int = 1_500_000
     poses: int = 1_000_000  # Number of drawn poses of nodes after which the search stops.
     # The search stops before the drawn poses and the areas that they reach take more than this, and
     # it keeps fewer partial poses if all would take more than a quarter of this [byte]. Temporary

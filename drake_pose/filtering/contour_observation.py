@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import betainc, ndtri
+from scipy.special import ndtri
 
 from drake_pose.arrays import Array, Floats, Mask, Picture
 from drake_pose.body import PlantKinematics, PoseTree
@@ -52,7 +52,7 @@ from drake_pose.fit.contour_fit import (
 )
 from drake_pose.fit.covariance import distances, error_unit, estimate_sizes, values_covariance
 from drake_pose.fit.evidence import NO_EDGE, find_edge_points
-from drake_pose.fit.judge import LEVEL
+from drake_pose.fit.judge import LEVEL, is_noise
 from drake_pose.fit.kernel import REACH, Sum, compare_contours
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import BodyParameters
@@ -239,10 +239,17 @@ class ContourObservation:
             parts.append(load_couplings(file, model.position_names).restricted_to(names))
         return warn_if_unlimited(stack(parts, names), str(model.path))
 
-    def with_root_position(self, root_position: Array) -> "ContourObservation":
-        """Return a copy whose root is at another known position (3,) in the world [m]."""
+    def seen_by(
+        self, cameras: Sequence[Camera], root_position: Array | None
+    ) -> "ContourObservation":
+        """Return a copy whose cameras see other parts of the same pictures.
+
+        ``root_position``: (3,) known position of the root in the world [m]; None: as in the tree.
+        """
         other = copy.copy(self)
-        other._known_shift = np.asarray(root_position, dtype=np.float64) - self._root(self._values)
+        other.cameras = tuple(cameras)
+        if root_position is not None:
+            other._known_shift = np.asarray(root_position, np.float64) - self._root(self._values)
         return other
 
     def _root(self, values: Array) -> Array:
@@ -375,11 +382,9 @@ class ContourObservation:
     ) -> ContourEvidence:
         """Return the evidence of a frame; edge points are found once for all its measurements.
 
-        ``masks``: for each of ``cameras`` (H, W) or None. ``pictures``: for each camera (H, W, 3 or
-        4) or None; used for cameras without a mask. None: no pictures. ``colours``: colour
-        histograms of the body; None: pictures are not used.
-
-        Raises SettingsError: the number or size of masks or pictures does not fit the cameras.
+        ``masks``, ``pictures``: for each of ``cameras`` (H, W), (H, W, 3 or 4) or None; pictures
+        are used for cameras without a mask. ``colours``: colour histograms of the body; None:
+        pictures are not used. Raises SettingsError: masks or pictures do not fit the cameras.
         """
         pictures = [None] * len(masks) if pictures is None else pictures
         for kind, given in (("masks", masks), ("pictures", pictures)):
@@ -412,14 +417,10 @@ class ContourObservation:
     ) -> Floats:
         """Return the body's colour histograms updated by a frame.
 
-        Args:
-            pictures: for each camera (H, W, 3 or 4) or None.
-            x: (n,) the state in this frame.
-            colours: the histograms before this frame.
-            pose_is_known: whether the state is certain, so that the old histograms are discarded.
-            excluded_parts: (cameras, nodes) whose histograms stay unchanged; None: none.
-
-        Raises SettingsError: a picture does not fit its camera.
+        ``pictures``: for each camera (H, W, 3 or 4) or None. ``x``: (n,) the state in this frame.
+        ``colours``: before it. ``pose_is_known``: whether the state is certain, so that the old
+        histograms are discarded. ``excluded_parts``: (cameras, nodes) that stay unchanged. Raises
+        SettingsError: a picture does not fit its camera.
         """
         checked = [
             None if picture is None else check_picture(camera, picture)
@@ -509,6 +510,9 @@ class ContourObservation:
         root, turns = np.sqrt(size[observable]), turns[:, observable]
         far = part_distances(compared.sums[shown]) > ndtri(1.0 - LEVEL) * CONTOUR.deviation
         lines = compared.sums[shown].sum(axis=(0, 1))
+        length = compared.sums[..., Sum.COMPARED]
+        off = length - compared.sums[..., Sum.FITTING]
+        masked = length[~shown].sum(), off[~shown].sum()
         is_seen = not far.any() and 2.0 * lines[Sum.FITTING] >= lines[Sum.COMPARED]
         slope = np.zeros((len(root), len(self.layout)))
         slope[:, self._state_index] = root[:, None] * turns.T
@@ -522,8 +526,10 @@ class ContourObservation:
             at=x,
             distance=distance,
             length=0.5 * float(compared.sums[~shown, :, Sum.COMPARED].sum()),
-            is_explained=bool(is_seen and _is_noise(compared.sums[~shown].sum(axis=(0, 1)))),
-            hidden_parts=np.where(shown[:, None], far, ~_is_noise(compared.sums[:, :-1])),
+            is_explained=bool(is_seen and is_noise(*masked, CONTOUR.correlation)),
+            hidden_parts=np.where(
+                shown[:, None], far, ~is_noise(length, off, CONTOUR.correlation)[:, :-1]
+            ),
             compared=compared,
         )
 
@@ -586,15 +592,3 @@ class ContourObservation:
         if spread is not None:
             covariance[index, index] += spread[self._state_index] ** 2
         return covariance[:count, :count]
-
-
-def _is_noise(sums: Array) -> Mask:
-    """Return (...) whether noise explains what does not fit of contours, ``sums`` (..., 6).
-
-    Of pieces as long as errors are correlated, a fraction LEVEL is off by the robust width.
-    """
-    length, off = sums[..., Sum.COMPARED], sums[..., Sum.COMPARED] - sums[..., Sum.FITTING]
-    pieces, off = np.rint(length / CONTOUR.correlation), np.floor(off / CONTOUR.correlation)
-    # The binomial distribution's upper tail.
-    tail = betainc(np.maximum(off, 1.0), np.maximum(pieces - off, 0.0) + 1.0, LEVEL)
-    return np.asarray((off < 1.0) | (tail > LEVEL))

@@ -1,11 +1,9 @@
 """Tracking of a pose tree by its contour, with a search where that does not explain what is seen.
 
-A ``Tracker`` feeds the contours of masks and pictures to a ``TruncatedFilter``. It has no level of
-errors of its own. Masks are *explained* if no more of the contours is unlikely than noise makes so.
-Where they are not, it searches: a pose from the search replaces the track if it explains the frame
-better at ``judge.LEVEL``, and unless the motion excludes it or it is the only one that explains the
-frame. Otherwise a better pose that the motion excludes shows that the body is hidden: the track is
-predicted.
+Masks are *explained* if noise explains all that does not fit. Where they are not, a ``Tracker``
+searches: a pose from the search replaces the track if it explains the frame better at
+``judge.LEVEL``, unless the motion excludes it and it is not the only one that explains the frame.
+A better pose that the motion excludes shows that the body is hidden: the track is predicted.
 """
 
 import math
@@ -35,7 +33,7 @@ from drake_pose.filtering.truncated_filter import FilterSettings, FilterState, T
 from drake_pose.filtering.update import LinearObservation
 from drake_pose.fit.colours import LINES, search_line_step
 from drake_pose.fit.covariance import vuong_statistic
-from drake_pose.fit.judge import LEVEL
+from drake_pose.fit.judge import LEVEL, largest_difference
 from drake_pose.search import (
     TRACKED,
     MultiStartSearch,
@@ -111,10 +109,15 @@ class Track:
     noise: float = math.inf
     pose: PoseEstimate | None = None
 
+    def pose_if(self, found: bool) -> PoseEstimate:
+        """Return the pose; ``found``: whether it is reliable."""
+        assert self.pose is not None
+        return replace(self.pose, found=found)
 
-Tiles = tuple[float, Array, Array]
-"""Side of a tile [pixel], and costs and lengths of edges in tiles (cameras, 64, 64) of a frame, see
-``ContourObservation.tile_costs``."""
+
+Tiles = tuple[int, float, Array, Array]
+"""Of a frame: number of cut masks; side of a tile [pixel]; costs and lengths of edges in tiles
+(cameras, 64, 64), see ``ContourObservation.tile_costs``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,8 +126,7 @@ class TrackerState:
 
     Attributes:
         track: the track; None before the first pose.
-        spread: (n,) standard deviations of the state that the last search left to poses that look
-            the same, or that the masks' defects leave [rad or m].
+        spread: (n,) further standard deviations of what the last search left open [rad or m].
         matches: number of searches so far.
         is_kept: whether the track is the best known pose, not a prediction through masks that a
             pose which the motion excludes explains better.
@@ -143,9 +145,9 @@ class TrackerState:
     @cached_property
     def belief(self) -> Belief | None:
         """The track's mean (n,) and covariance (n, n), with ``spread``; None without a track."""
-        if self.track is None or self.spread is None:
-            return None if self.track is None else self.track.state.best
-        best = self.track.state.best
+        best = None if self.track is None else self.track.state.best
+        if best is None or self.spread is None:
+            return best
         return Belief(best.mean, best.covariance + np.diag(self.spread**2))
 
 
@@ -154,12 +156,22 @@ class _Seen(NamedTuple):
 
     observation: ContourObservation  # The body with its root where it is known to be.
     masks: Sequence[Mask | None]  # For each camera (H, W) or None.
-    # For each camera (H, W, 3 or 4) or None; None: no pictures.
-    pictures: Sequence[Picture | None] | None
+    pictures: Sequence[Picture | None] | None  # Likewise (H, W, 3 or 4); None: no pictures.
     evidence: ContourEvidence  # Without colours.
-    views: Sequence[View]  # The cameras that have a mask, with it.
+    views: Sequence[View]  # The cameras that have a mask, with it; of cut masks what they show.
+    whole: Sequence[View]  # The same, as given.
     root_position: Array | None  # (3,) of the root in the world [m]; None: as in the tree.
     begin: float  # Time at which the processing of the frame started [s].
+
+    @property
+    def cuts(self) -> int:
+        """Number of masks that are cut."""
+        return sum(one.cut() is not one for one in self.whole)
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether only what straight cuts of masks left is compared."""
+        return self.views is not self.whole
 
     @property
     def is_bare(self) -> bool:
@@ -184,10 +196,10 @@ class Tracker:
     Attributes:
         observation: the body and the cameras.
         filter: the filter of the body's state.
+        accelerations: (m,) standard deviation of each moving element's acceleration [unit/s^2].
 
     Raises:
-        SettingsError: there is no camera, the period is not positive, or the tree has no free
-            value.
+        SettingsError: there is no camera, the period is not positive, or no value is free.
     """
 
     def __init__(
@@ -208,8 +220,14 @@ class Tracker:
         self.observation = ContourObservation(
             tree, cameras, own.root_moves, own.scale_unknown, prior_weight
         )
-        layout = self.observation.layout
-        scale = {name: period**2 * self.acceleration(name) for name in layout.moving}
+        layout, is_angle = self.observation.layout, self.observation.is_angle
+        kinds = [0 if one == LOG_SCALE else 1 + is_angle(one) for one in layout.moving]
+        accelerations = own.log_scale_acceleration, own.length_acceleration, own.angle_acceleration
+        self.accelerations = np.array(accelerations)[kinds]
+        starts = np.array([own.start_log_scale, own.start_length, own.start_angle])[kinds]
+        # Standard deviation of a rate [unit/step] that accelerates during ``memory``.
+        self._start_deviations = np.r_[starts, own.memory * period * self.accelerations]
+        scale = dict(zip(layout.moving, period**2 * self.accelerations, strict=True))
         size, none = len(layout), np.zeros(0)
         # Each frame has its own observation model.
         nothing = LinearObservation((), none, none > 0, np.zeros(size), none, np.zeros((0, size)))
@@ -223,40 +241,18 @@ class Tracker:
             # Measurements of different frames are not comparable, so there are no static views.
             FilterSettings(hypothesis_cap=1, linearisation="tangent", iterations=20),
         )
-        kinds = (own.start_log_scale, own.start_angle, own.start_length)
-        self._start_deviations = np.array([self._of_kind(name, *kinds) for name in layout.moving])
-
-    def acceleration(self, name: str) -> float:
-        """Return the standard deviation of an element's acceleration [unit/s^2]."""
-        own = self.settings
-        return self._of_kind(
-            name, own.log_scale_acceleration, own.angle_acceleration, own.length_acceleration
-        )
-
-    def _of_kind(self, name: str, log_scale: float, angle: float, length: float) -> float:
-        """Return ``log_scale``, ``angle`` or ``length``, whichever the element ``name`` is."""
-        if name == LOG_SCALE:
-            return log_scale
-        return angle if self.observation.is_angle(name) else length
 
     def start(self, x: Array) -> Track:
         """Return the track that starts at the mean x (n,), truncated by the limits."""
-        moving = self.observation.layout.moving
-        # Standard deviation of a rate [unit/step] that accelerates during ``memory``.
-        picked_up = self.settings.memory * self._period
-        rates = [picked_up * self.acceleration(name) for name in moving]
-        deviations = np.r_[self._start_deviations, rates]
-        return Track(self.filter.start(Belief(x, np.diag(deviations**2))), None, False)
+        covariance = np.diag(self._start_deviations**2)
+        return Track(self.filter.start(Belief(x, covariance)), None, False)
 
     def predict(self, track: Track) -> Track:
         """Return the track one period later, without evidence."""
         return replace(track, state=self.filter.predict(track.state), measurement=None)
 
     def delayed(self, track: Track) -> Track:
-        """Return the track after a frame whose pictures may be late by up to a period.
-
-        The belief is widened by what the motion of a period moves the measurement.
-        """
+        """Return the track widened by what a period moves the measurement: pictures may be late."""
         measured, belief = track.measurement, track.state.best
         if measured is None:
             return track
@@ -276,19 +272,14 @@ class Tracker:
     ) -> Track:
         """Return the track after the next frame, without a search.
 
-        Args:
-            track: after the last frame, or ``start``.
-            masks: for each camera (H, W) or None.
-            first: whether ``track`` was started in this very frame, so that it is not predicted.
-            pictures: for each camera (H, W, 3 or 4) or None; None: no pictures. The colours along
-                the contour are used for cameras without a mask; they are learned from each frame,
-                at first at the start.
-
-        Raises SettingsError: the number or size of masks or pictures does not fit the cameras.
+        ``track``: after the last frame, or ``start``. ``masks``: for each camera (H, W) or None.
+        ``first``: whether the track was started in this very frame. ``pictures``: for each camera
+        (H, W, 3 or 4) or None; colours along the contour are used for cameras without a mask, and
+        learned from each frame. Raises SettingsError: masks or pictures do not fit the cameras.
         """
         evidence = self.observation.gather_evidence(masks, pictures)
         return self._follow(
-            track, _Seen(self.observation, masks, pictures, evidence, (), None, 0.0), first
+            track, _Seen(self.observation, masks, pictures, evidence, (), (), None, 0.0), first
         )
 
     def _follow(self, track: Track, seen: _Seen, first: bool) -> Track:
@@ -382,52 +373,49 @@ class Tracker:
 
         Args:
             last: the state after the previous frame; TrackerState() before the first.
-            views: the cameras' masks; may be empty if there are pictures.
+            views: the cameras' masks; may be empty.
             root_position: (3,) known position of the root in the world [m]; None: as in the tree.
-            pictures: pictures (H, W, 3 or 4) by name of the camera; the colours along the contour
-                are used for cameras without a mask. None: no pictures.
+            pictures: (H, W, 3 or 4) by name of the camera, of cameras without a mask; None: none.
             start: (nq,) approximate positions in this frame, if known; the search is then used only
                 if the masks do not fit them, and its pose only if it explains the masks.
 
         Returns:
             The new state, and the pose. ``stopped_by`` is TRACKED if the pose was tracked. If a
                 pose that the motion excludes explains the masks better, or there is no evidence,
-                ``found`` is false and the pose is the prediction, or ``start`` if given. A track
-                lost in pictures without masks is continued with ``found`` false until its contour
-                fits again.
+                ``found`` is false and the pose is the prediction, or ``start`` if given. In
+                pictures ``found`` is false until the contour fits again.
 
         Raises SettingsError: masks or pictures do not fit the cameras.
         """
-        begin, own, before = time.perf_counter(), self.observation, last.track
-        if root_position is not None:
-            own = own.with_root_position(root_position)
-        names, given = [one.name for one in own.cameras], {one.camera.name: one for one in views}
-        masks = [given[name].mask if name in given else None for name in names]
-        shown = [pictures.get(name) for name in names] if pictures else None
-        evidence = own.gather_evidence(masks, shown)
-        seen = _Seen(own, masks, shown, evidence, views, root_position, begin)
-        track = None if before is None else self._judged(self._follow(before, seen, False), seen)
-        spread, begun = last.spread, None
+        before, spread, begun, track = last.track, last.spread, None, None
+        seen = self._see(views, views, pictures, root_position)
+        sights, own = [seen], seen.observation
+        if before is not None:
+            track, _ = self._look(before, sights, False)
+        # Whether the last search saw defective or cut masks, in which poses look alike.
+        is_open = last.doubt is not None and last.spread is not None
+        if (track is None or track.lost) and seen.cuts:
+            sights.append(self._see([one.cut() for one in views], views, pictures, root_position))
+            if before is not None:
+                track, seen = self._look(before, sights[1:], False)
         if start is not None and (track is None or track.lost or seen.is_bare):
             begun, spread = self._start_near(own.state(start), before), None
-            track = self._judged(self._follow(begun, seen, True), seen)
-        # Whether the last search saw defective masks, and could not tell poses apart in them.
-        is_open = last.doubt is not None and spread is not None
-        if track is not None and not (track.lost or seen.is_bare or (views and is_open)):
-            return TrackerState(track, spread, last.matches), self._pose(track)
+            track, seen = self._look(begun, sights, True)
+        is_open &= begun is None and bool(views)
+        if track is not None and not (track.lost or seen.is_bare or is_open):
+            return TrackerState(track, spread, last.matches), track.pose_if(True)
         if views:
-            return self._search_again(replace(last, track=track), before, begun, seen)
+            return self._search_again(replace(last, track=track), before, begun, sights)
         if track is None:
-            nowhere = self._judged(self.start(own.state(own.tree.model.default_positions)), seen)
-            return last, self._pose(nowhere, False)
+            nowhere = self.start(own.state(own.tree.model.default_positions))
+            return last, self._judged(nowhere, seen).pose_if(False)
         # The next masks are searched at once if they are not explained.
-        return replace(last, track=track, waited=last.wait), self._pose(track, False)
+        return replace(last, track=track, waited=last.wait), track.pose_if(False)
 
     def with_intervals(self, state: TrackerState, pose: PoseEstimate) -> PoseEstimate:
         """Return a tracked pose with the joints' intervals from this frame's contours alone.
 
-        ``state`` and ``pose`` are what ``update`` returned for the frame. Without a measurement the
-        pose is returned unchanged.
+        ``state`` and ``pose``: of ``update``. Without a measurement the pose is as it was.
         """
         track, own = state.track, self.observation
         if track is None or track.measurement is None:
@@ -437,52 +425,52 @@ class Tracker:
         return replace(pose, pose_set=found)
 
     def _search_again(
-        self, state: TrackerState, before: Track | None, begun: Track | None, seen: _Seen
+        self, state: TrackerState, before: Track | None, begun: Track | None, sights: list[_Seen]
     ) -> tuple[TrackerState, PoseEstimate]:
         """Return state and pose in masks that the track does not explain, or that end a doubt.
 
-        ``state``: the last state, with the track in this frame; None: there was none. ``before``:
-        the track in the last frame. ``begun``: as it starts at positions that are known, or None.
+        ``state``: the last state, with the track in this frame. ``before``: that in the last frame.
+        ``begun``: as it starts at known positions. ``sights``: the frame, whole and cut.
         """
         worse, doubt, track, now = ndtri(1.0 - LEVEL), state.doubt, state.track, None
-        expected = begun
+        expected, seen, cuts = begun, sights[-1], sights[0].cuts
         if track is not None:
             now = self._tiles(track, seen, doubt)
             if begun is None and before is not None:
                 expected = self.predict(before)
-            if track.lost and doubt is not None and state.waited + 1 < state.wait:
-                # Costs that rise and edges that come are other masks.
-                changes = (vuong_statistic(*both) for both in zip(now[1:], doubt[1:], strict=True))
-                if max(changes) <= worse:
+            if doubt is not None and cuts >= doubt[0] + (not track.lost and not cuts):
+                # Costs that rise, and edges that come, are other masks.
+                rise, come = (vuong_statistic(*k) for k in ((now[2], doubt[2]), (now[3], doubt[3])))
+                fall = -rise if state.spread is not None or not state.is_kept else 0.0
+                if max(rise, come, fall) <= worse and state.waited + 1 < state.wait:
                     state = replace(state, waited=state.waited + 1)
                     return self._kept(state, expected, seen)
         assert self._search is not None
-        matched = self._search.match(seen.views, seen.root_position)
+        matched = self._search.match(seen.whole, seen.root_position)
         pause = round(self.settings.search_pause / self._period)
-        wait = max(1, pause, 2 * state.wait)
-        known = replace(
-            state, matches=state.matches + 1, is_kept=True, doubt=now, wait=wait, waited=0
-        )
+        # Searches are as rare as they were fruitless.
+        wait = max(1, pause, 2 * state.wait if state.waited + 1 >= state.wait else 0)
+        known = TrackerState(track, state.spread, state.matches + 1, True, now, wait)
         if not matched.found:
             if track is None:
                 return TrackerState(matches=known.matches), matched
             return self._kept(known, expected, seen)
-        other, spread = self._candidate(matched, before, seen)
+        other, spread = self._candidate(matched, before, sights)
         others = self._tiles(other, seen, now)
         if track is not None and now is not None:
-            if vuong_statistic(now[1], others[1]) <= worse:
-                if not track.lost:
+            if vuong_statistic(now[2], others[2]) <= worse:
+                if not (track.lost or cuts):
                     known = TrackerState(track, spread, known.matches)
                 return self._kept(known, expected, seen)
             assert expected is not None
             if not self._is_possible(other, matched, expected.state.best, state.spread):
                 return self._kept(replace(known, is_kept=False), expected, seen)
-        if not other.lost:
-            return TrackerState(other, spread, known.matches), self._pose(other)
+        if not (other.lost or (cuts and spread is not None)):
+            return TrackerState(other, spread, known.matches), other.pose_if(True)
         if spread is not None and state.spread is not None:
             # What look the same in one frame with defects may look different in the next.
             spread = np.maximum(spread, state.spread)
-        return replace(known, track=other, spread=spread, doubt=others), self._pose(other)
+        return replace(known, track=other, spread=spread, doubt=others), other.pose_if(True)
 
     def _kept(
         self, state: TrackerState, expected: Track | None, seen: _Seen
@@ -492,15 +480,13 @@ class Tracker:
         if not state.is_kept and expected is not None:
             track = self._judged(expected, seen)
         assert track is not None
-        return replace(state, track=track), self._pose(track, state.is_kept)
+        return replace(state, track=track), track.pose_if(state.is_kept)
 
     def _tiles(self, track: Track, seen: _Seen, last: Tiles | None) -> Tiles:
         """Return the tiles of a frame with a track, as large as those of ``last``."""
-        # The errors of tiles are regarded as independent, as in ``ViewsFit.tile_costs``.
-        areas = [np.count_nonzero(view.mask) for view in seen.views]
-        side = last[0] if last else max(1.0, 0.2 * math.sqrt(float(np.mean(areas))))
-        x = track.state.best.mean
-        return side, *seen.observation.tile_costs(seen.evidence, x, side)
+        area = float(np.mean([np.count_nonzero(view.mask) for view in seen.views]))
+        side, x = last[1] if last else max(1.0, 0.2 * math.sqrt(area)), track.state.best.mean
+        return seen.cuts, side, *seen.observation.tile_costs(seen.evidence, x, side)
 
     def _start_near(self, x: Array, last: Track | None) -> Track:
         """Return the track that starts at x (n,), with angles in the last track's turns."""
@@ -509,14 +495,13 @@ class Tracker:
         return self.start(x)
 
     def _candidate(
-        self, matched: PoseEstimate, last: Track | None, seen: _Seen
+        self, matched: PoseEstimate, last: Track | None, sights: list[_Seen]
     ) -> tuple[Track, Array | None]:
         """Return a search's pose, tracked in its frame or as it is if that fits better.
 
-        ``matched``: the search's pose, which is found. ``last``: the track before this frame; None:
-        there is none. Returns the track, and ``TrackerState.spread``.
+        ``last``: as ``before`` of ``_search_again``. Returns track, and ``TrackerState.spread``.
         """
-        own = seen.observation
+        own = sights[0].observation
         start = self._start_near(own.state(matched.q, matched.X_WB, matched.scale), last)
         x = start.state.best.mean
         # A search does not know the number of full turns of an angle.
@@ -525,19 +510,20 @@ class Tracker:
             for now, then in zip(own.node_values(x), matched.node_values, strict=True)
         ]
         matched = matched.turned(own.tree, turns)
-        best = self._judged(self._follow(start, seen, True), seen)
+        best, seen = self._look(start, sights, True)
         # The pose was refined from the search's, so that the search's pose set still applies.
-        pose = replace(self._pose(best), pose_set=matched.pose_set)
+        pose = replace(best.pose_if(True), pose_set=matched.pose_set)
         if matched.E_total < pose.E_total:
-            measured, pose = own.measure(seen.evidence, x), matched
+            measured, pose = seen.observation.measure(seen.evidence, x), matched
             lost = measured is None or not measured.is_explained
             # The unrefined pose keeps the colours learned in this frame.
             best = self._judged(
                 replace(start, measurement=measured, lost=lost, colours=best.colours), seen
             )
         known, spread = matched.pose_set, None
-        if known is not None and (best.lost or known.mode_count > 1):
-            spread = own.spread(known.joints, np.concatenate(matched.node_values), best.lost)
+        hides = best.lost or seen.is_cut
+        if known is not None and (hides or seen.cuts or known.mode_count > 1):
+            spread = own.spread(known.joints, np.concatenate(matched.node_values), hides)
         return replace(best, pose=pose), spread
 
     def _is_possible(
@@ -545,13 +531,12 @@ class Tracker:
     ) -> bool:
         """Return whether a search's pose may replace a track that was ``expected`` elsewhere.
 
-        The motion does not exclude it, at LEVEL, or it explains the frame, and the joints that
-        moved too far are determined. ``spread``: of the track.
+        The motion does not exclude it, or it alone explains the frame. ``spread``: of the track.
         """
-        count = len(self._start_deviations)
+        count = len(self.accelerations)
         off = (other.state.best.mean - expected.mean)[:count]
-        wide = self._start_deviations**2 + (0.0 if spread is None else spread[:count] ** 2)
-        C = expected.covariance[:count, :count] + np.diag(wide)
+        wide = self._start_deviations**2 + (0.0 if spread is None else spread**2)
+        C = (expected.covariance + np.diag(wide))[:count, :count]
         if off @ np.linalg.solve(C, off) <= chdtri(count, LEVEL):
             return True
         if other.lost or matched.pose_set is None:
@@ -561,11 +546,35 @@ class Tracker:
         unknown = self.observation.spread(matched.pose_set.joints, values, True)
         return unknown is None or bool(np.all(near | (unknown[:count] == 0.0)))
 
+    def _look(self, track: Track, sights: list[_Seen], first: bool) -> tuple[Track, _Seen]:
+        """Return a track after a frame as it explains the first or next of ``sights``, and that."""
+        for seen in sights:
+            found = self._judged(self._follow(track, seen, first), seen)
+            if not found.lost:
+                break
+        return found, seen
+
+    def _see(
+        self,
+        views: Sequence[View],
+        whole: Sequence[View],
+        pictures: Mapping[str, Picture] | None,
+        root_position: Array | None,
+    ) -> _Seen:
+        """Return a frame as it is compared; the arguments are of ``update`` and ``_Seen``."""
+        begin, given = time.perf_counter(), {one.camera.name: one for one in views}
+        seen = [given.get(one.name, one) for one in self.observation.cameras]
+        masks = [one.mask if isinstance(one, View) else None for one in seen]
+        cameras = [one.camera if isinstance(one, View) else one for one in seen]
+        shown = [pictures.get(one.name) for one in cameras] if pictures else None
+        own = self.observation.seen_by(cameras, root_position)
+        evidence = own.gather_evidence(masks, shown)
+        return _Seen(own, masks, shown, evidence, views, whole, root_position, begin)
+
     def _judged(self, track: Track, seen: _Seen) -> Track:
         """Return a track in a frame with its pose.
 
-        It is also lost if body and masks differ in more than noise of their edges makes so, at
-        LEVEL: pieces of contour as long as errors are correlated are off by |r|, r normal.
+        It is also lost if body and masks differ in more than noise of their edges explains.
         """
         own, x, measured = seen.observation, track.state.best.mean, track.measurement
         J, area = math.inf, 0.0
@@ -585,14 +594,7 @@ class Tracker:
         )  # fmt: skip
         is_noise = True
         if measured is not None and seen.views:
-            mean, scatter = math.sqrt(2.0 / math.pi), math.sqrt(1.0 - 2.0 / math.pi)
-            pieces = measured.length / CONTOUR.correlation
-            most = mean * pieces + ndtri(1.0 - LEVEL) * scatter * math.sqrt(pieces)
-            off = J / (CONTOUR.correlation * max(CONTOUR.deviation, measured.distance))
-            is_noise = pose.explained and off <= most
+            deviation = max(CONTOUR.deviation, measured.distance)
+            most = largest_difference(measured.length, deviation, CONTOUR.correlation)
+            is_noise = pose.explained and J <= most
         return replace(track, lost=track.lost or not is_noise, pose=pose)
-
-    def _pose(self, track: Track, found: bool = True) -> PoseEstimate:
-        """Return the pose of a judged track; ``found``: whether it is reliable."""
-        assert track.pose is not None
-        return replace(track.pose, found=found)

@@ -210,8 +210,7 @@ def fit_sequence(
         rounds = SEQUENCE.rounds[-1:] if last else SEQUENCE.rounds
         joints, rest_time = observation.prior, tracker.settings.rest_time
         information = (0.0 if rest_time is None else time_step / rest_time) / joints.deviation**2
-        names = observation.layout.moving
-        accelerations = np.array([tracker.acceleration(name) for name in names]) * time_step**2
+        accelerations = tracker.accelerations * time_step**2
         prior = sequence_prior(len(frames), (joints.phi, joints.mean, information), accelerations)
         used = [edges[k] for k in frames.tolist()]
         limits = _limits(observation)

@@ -10,6 +10,7 @@ from math import factorial, perm
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import betainc, ndtri
 
 from drake_pose.arrays import Array, Floats, Mask
 
@@ -129,6 +130,31 @@ def correlation_length(rows: Array) -> int:
         if scale * float((off[lag:] * off[:-lag]).sum()) < variance / np.e:
             return lag
     return max(1, len(rows))
+
+
+def is_noise(length: Array | float, off: Array | float, correlation: float) -> Mask:
+    """Return whether no more of contours is farther off than noise is with probability LEVEL.
+
+    Pieces of contour as long as ``correlation`` are independent, so that the number of those that
+    are off has a binomial distribution.
+
+    ``length``: of contours, scalar or (...). ``off``: of what is farther off [any unit].
+    """
+    pieces, beyond = np.rint(length / correlation), np.floor(np.asarray(off) / correlation)
+    tail = betainc(np.maximum(beyond, 1.0), np.maximum(pieces - beyond, 0.0) + 1.0, LEVEL)
+    return np.asarray((beyond < 1.0) | (tail > LEVEL))
+
+
+def largest_difference(length: float, deviation: float, correlation: float) -> float:
+    """Return the area [pixel^2] between two contours that noise exceeds with probability LEVEL.
+
+    ``length``, ``deviation``, ``correlation``: of a contour and its noise [pixel].
+    """
+    pieces = length / correlation
+    # Mean and standard deviation of |r|, r normal.
+    mean, scatter = np.sqrt(2.0 / np.pi), np.sqrt(1.0 - 2.0 / np.pi)
+    most = mean * pieces + ndtri(1.0 - LEVEL) * scatter * np.sqrt(pieces)
+    return float(correlation * deviation * most)
 
 
 def opposite_side(X_CW: Array, middle: Array) -> Array:

@@ -7,6 +7,8 @@ from drake_pose.fit.judge import (
     LEVEL,
     correlation_length,
     depth_twin,
+    is_noise,
+    largest_difference,
     paired_evidence,
     paired_gains,
 )
@@ -82,3 +84,13 @@ def test_a_twin_shows_a_plane_set_alike_from_the_other_side():
     assert np.abs(uv[0] - uv[1]).mean() < 0.01 * np.ptp(uv[0], axis=0).mean()
     # What is near in one is far in the other.
     assert np.corrcoef(places[0][:, 2], places[1][:, 2])[0, 1] < -0.99
+
+
+def test_noise_of_contours_is_seldom_taken_for_a_difference():
+    rng = np.random.default_rng(4)
+    r = np.abs(rng.normal(size=(4000, 60)))
+    off = 12.0 * (r > 2.576).sum(axis=1)
+    assert np.mean(~is_noise(720.0, off, 12.0)) <= LEVEL
+    areas = 12.0 * 0.7 * r.sum(axis=1)
+    assert 0.3 * LEVEL < np.mean(areas > largest_difference(720.0, 0.7, 12.0)) < 2.0 * LEVEL
+    assert not is_noise(720.0, 72.0, 12.0)

@@ -54,7 +54,7 @@ def test_known_and_estimated_root_positions_agree(body):
     at_home = moves.draw(x, camera)
     x[moves.layout.indices(ROOT_SHIFT)] = shift
     np.testing.assert_allclose(moves.root_position(x), there)
-    seen = held.with_root_position(there).draw(held.state(q), camera)
+    seen = held.seen_by(held.cameras, there).draw(held.state(q), camera)
     assert not np.array_equal(seen, at_home)
     np.testing.assert_array_equal(moves.draw(x, camera), seen)
     found, _ = descend(moves, moves.gather_evidence([seen]), moves.state(q), steps=8)

@@ -77,10 +77,7 @@ class MultiStartSettings:
     separation: float = 0.13
     rounds: int = 2  # Rounds of the search for alternative poses,
     explored: int = 3  # number of poses around which alternatives are searched in a round,
-    alternatives: int = 6  # and number of alternatives of each pose that are fitted,
-    flipped: int = 3  # besides this number of flipped poses.
-    # In several views a round ends if no alternative costs less than this fraction of the best.
-    improvement: float = 0.98
+    alternatives: int = 6  # and number of flipped and of other alternatives that are fitted.
     # Radius of a disc as thick as a limb, in one and in several views.
     limb_radii: tuple[float, float] = (0.03, 0.04)
     beam_starts: int = 10  # If a wrong region holds such a disc: number of poses of a beam search,
@@ -391,7 +388,7 @@ class _MultiStartRun:
                 others = self._alternatives_to(pose.values)
                 found += others
                 least = min((one.cost for one in others), default=math.inf)
-                if self._several and least > settings.improvement * pool[0].cost:
+                if self._several and least >= pool[0].cost:
                     break
             pool = distinct([*pool, *found], self._survivors, self._kinematics.covers_full_turn)
         return pool
@@ -448,10 +445,12 @@ class _MultiStartRun:
         tried += itertools.chain.from_iterable(map_ordered(search_again, limbs))
         stage = COARSE_STAGES[-1]
         best: list[FittedPose] = []
-        for group, count in ((flipped, settings.flipped), (tried, settings.alternatives)):
+        for group in (flipped, tried):
             costs = map_ordered(lambda one: self._fit.cost(one, stage), group)
             scored = [FittedPose(*pair) for pair in zip(group, costs, strict=True)]
-            best += distinct(scored, count, kinematics.covers_full_turn, 0.5 * settings.interval)
+            best += distinct(
+                scored, settings.alternatives, kinematics.covers_full_turn, 0.5 * settings.interval
+            )
         starts = [one.values for one in best]
         if self._several:
             return refine_best(self._fit, starts, settings.alternative_passes, self._proceed)

@@ -24,6 +24,7 @@ from drake_pose.search.refinement import (
     RefinementProblem,
     descend,
 )
+from drake_pose.search.self_motions import flips
 from drake_pose.search.views_fit import FittedPose, RobustSettings, describe_modes
 
 
@@ -164,6 +165,10 @@ class ExactSearch:
         ``reached``: from ``find`` or ``refine``. ``tree``: with its root where the body is.
         """
         settings, others = self.settings, []
+        flipped = flips(self.body.kinematics, reached.parameters[:-4])
+        reached.neighbourhood.consider(
+            [np.r_[one.values, reached.parameters[-4:]] for one in flipped], reached.J
+        )
         while True:
             limit = reached.J + NeighbourhoodSettings.noise * problem.border_length
             others = reached.neighbourhood.others(reached.parameters, limit, settings.same)

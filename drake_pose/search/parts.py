@@ -485,6 +485,13 @@ class NeighbourhoodSearch:
             self._left_error[chosen] = errors[chosen]
         return parameters, J
 
+    def consider(self, poses: Sequence[np.ndarray], J: float) -> None:
+        """Store poses (m + 4,) that come near to ``J`` [pixel] as alternatives."""
+        everything = self.problem.body.freedom()
+        most = J + self._settings.first_excess * self.problem.border_length
+        tried = [(float(self.problem.J(pose)), pose[everything.columns]) for pose in poses]
+        self._others += [(cost, everything, values) for cost, values in tried if cost <= most]
+
     def others(self, parameters: np.ndarray, limit: float, same: float) -> list[np.ndarray]:
         """Return alternative poses with J up to a limit, refined to the end, best first.
 

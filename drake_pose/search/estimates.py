@@ -316,12 +316,21 @@ class PoseEstimate:
         if first is None or before is None or self.pose_set is None or before.mode_count < 2:
             return self
         values = np.concatenate(self.node_values) - np.concatenate(first.node_values)
+        found = self.united(first, values)
+        assert found.pose_set is not None
+        return replace(found, pose_set=replace(found.pose_set, mode_count=before.mode_count))
+
+    def united(self, other: "PoseEstimate", moved: np.ndarray | float = 0.0) -> "PoseEstimate":
+        """Return this pose with joint intervals that hold another's, shifted by ``moved`` (m,)."""
+        if self.pose_set is None or other.pose_set is None:
+            return self
+        pairs = zip(self.pose_set.joints, other.pose_set.joints, strict=True)
+        changes = np.broadcast_to(moved, len(self.pose_set.joints))
         joints = tuple(
-            now.widened(then, float(moved))
-            for now, then, moved in zip(self.pose_set.joints, before.joints, values, strict=True)
+            now.widened(then, float(change))
+            for (now, then), change in zip(pairs, changes, strict=True)
         )
-        known = replace(self.pose_set, joints=joints, mode_count=before.mode_count)
-        return replace(self, pose_set=known)
+        return replace(self, pose_set=replace(self.pose_set, joints=joints))
 
     def turned(self, tree: PoseTree, turns: Sequence[np.ndarray]) -> "PoseEstimate":
         """Return the same pose with full turns added to its angles, their intervals and modes.

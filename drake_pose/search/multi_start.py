@@ -151,12 +151,18 @@ class MultiStartSearch:
         start = time.perf_counter()
         deadline = np.inf if self._time_limit is None else start + self._time_limit
         result, cut = self._search(views, root_position, deadline), [one.cut() for one in views]
+        misfit = self.exact.settings.misfit
         length = RefinementProblem(self.exact.body, views).border_length
         # A pose that ends where a mask is cut is one of several, unless all pixels agree with it.
         in_time = result.stopped_by == "end" and cut != list(views)
-        if in_time and result.J > self.exact.settings.misfit * length:
-            known = [self._kinematics.flatten(result.node_values)]
-            result = self._search(cut, root_position, deadline, known)
+        if in_time and result.J > misfit * length:
+            values = self._kinematics.flatten(result.node_values)
+            other = self._search(cut, root_position, deadline, [values])
+            seen = RefinementProblem(self.exact.body, cut)
+            J = float(seen.J(self.exact.body.parameters(result.node_values, root_position)))
+            noise = misfit * seen.border_length
+            is_better = other.J <= max(noise, J - noise)
+            result = other if is_better else result.united(other)
         return replace(result, seconds=time.perf_counter() - start)
 
     def _search(
@@ -280,7 +286,8 @@ class _MultiStartRun:
         # Evaluations for the pose set, which come later, are not counted.
         steps = self._fit.evaluations
         if found is not None and found.J <= exactly:
-            fits = found.J <= exact.settings.misfit * problem.border_length
+            fits = self._search.exact_masks
+            fits |= found.J <= exact.settings.misfit * problem.border_length
             if with_set and fits:
                 found, pose_set = exact.modes(problem, found, tree)
             values = found.parameters[:-4]

@@ -286,13 +286,12 @@ class _MultiStartRun:
         # Evaluations for the pose set, which come later, are not counted.
         steps = self._fit.evaluations
         if found is not None and found.J <= exactly:
-            fits = self._search.exact_masks
-            fits |= found.J <= exact.settings.misfit * problem.border_length
-            if with_set and fits:
+            if with_set:
                 found, pose_set = exact.modes(problem, found, tree)
             values = found.parameters[:-4]
             steps += found.steps
-            if with_set and not fits:
+            fits = found.J <= exact.settings.misfit * problem.border_length
+            if with_set and not (fits or self._search.exact_masks):
                 known = [FittedPose(values), *(pool or self._start())]
                 pose_set = RobustModes(self._fit, self._proceed).find(known, self._J)
         else:

@@ -395,7 +395,7 @@ class PoseTree:
         q = np.asarray(q, dtype=np.float64)
         model = self.model
         spans = model.upper - model.lower
-        broken = follower_warnings(model.position_names, self.followers, q, spans)
+        broken = follower_warnings(model.position_names, self.model.couplings, q, spans)
         if broken:
             warnings.warn(broken[0], stacklevel=2)
         values = []

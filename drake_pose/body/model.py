@@ -34,9 +34,9 @@ from drake_pose.body.parsed_model import (
     ParsedModel,
     SkinBand,
     describe_positions,
-    follower_warnings,
     link_names,
     load_skin,
+    mimic_warnings,
 )
 from drake_pose.body.parsing import ModelSource, check_in_child, summarise_warnings
 from drake_pose.body.plant_source import PlantSource
@@ -141,7 +141,7 @@ class ArticulatedModel(ParsedModel):
             positions, remarks = describe_positions(plant, {}, name)
             q, spans = plant.GetDefaultPositions(), positions["upper"] - positions["lower"]
             names, couplings = positions["position_names"], positions["couplings"]
-            remarks += follower_warnings(names, couplings, q, spans)
+            remarks += mimic_warnings(names, couplings, q, spans)
         meshes = _visual_meshes(path, plant, scene_graph, bodies)
         labelled = [labelled_meshes(plant, scene_graph, plant.get_body(body)) for body in bodies]
         for remark in summarise_warnings(remarks):

@@ -292,7 +292,7 @@ def _intersect_limits(
     return warnings
 
 
-def follower_warnings(
+def mimic_warnings(
     names: Sequence[str], followers: Sequence[Coupling], q: Array, spans: Array, slack: float = 0.1
 ) -> list[str]:
     """Return a warning for each position in q (nq,) that does not follow its leader (<mimic>).

@@ -25,7 +25,7 @@ from drake_pose.arrays import Array
 from drake_pose.body.link_graph import JointMap, PlantKinematics, chain_transforms
 from drake_pose.body.meshes import TriangleMesh
 from drake_pose.body.node_skin import NodeSkin
-from drake_pose.body.parsed_model import ParsedModel, covers_full_turn, follower_warnings, one_turn
+from drake_pose.body.parsed_model import ParsedModel, covers_full_turn, mimic_warnings, one_turn
 from drake_pose.body.plant_source import Coupling
 from drake_pose.body.root import BasePose, RootRotation, even_rotations
 from drake_pose.errors import SettingsError, require_known
@@ -395,7 +395,7 @@ class PoseTree:
         q = np.asarray(q, dtype=np.float64)
         model = self.model
         spans = model.upper - model.lower
-        broken = follower_warnings(model.position_names, self.model.couplings, q, spans)
+        broken = mimic_warnings(model.position_names, self.model.couplings, q, spans)
         if broken:
             warnings.warn(broken[0], stacklevel=2)
         values = []

@@ -335,10 +335,8 @@ def _plant_rooted(
     X_WA = X_WB @ PlantKinematics(model).pose(graph.groups[0].body)
     roots: Roots = dict.fromkeys(tops, (X_WA, None))
     name = graph.groups[0].name
-    base, assumed = (
-        BasePose("constant", X_WB),
-        tuple(slide for slide in free if slide not in solved),
-    )
+    base = BasePose("constant", X_WB)
+    assumed = tuple(slide for slide in free if slide not in solved)
     return _assemble(model, graph, branches, roots, base, held | solved, name, assumed)
 
 

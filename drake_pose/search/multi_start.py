@@ -150,19 +150,18 @@ class MultiStartSearch:
             warm_up()
         start = time.perf_counter()
         deadline = np.inf if self._time_limit is None else start + self._time_limit
-        result, cut = self._search(views, root_position, deadline), [one.cut() for one in views]
-        misfit = self.exact.settings.misfit
-        length = RefinementProblem(self.exact.body, views).border_length
+        result = self._search(views, root_position, deadline)
+        cut, misfit = [one.cut() for one in views], self.exact.settings.misfit
         # A pose that ends where a mask is cut is one of several, unless all pixels agree with it.
-        in_time = result.stopped_by == "end" and cut != list(views)
-        if in_time and result.J > misfit * length:
-            values = self._kinematics.flatten(result.node_values)
-            other = self._search(cut, root_position, deadline, [values])
-            seen = RefinementProblem(self.exact.body, cut)
-            J = float(seen.J(self.exact.body.parameters(result.node_values, root_position)))
-            noise = misfit * seen.border_length
-            is_better = other.J <= max(noise, J - noise)
-            result = other if is_better else result.united(other)
+        if result.stopped_by == "end" and cut != list(views):
+            whole, seen = (RefinementProblem(self.exact.body, some) for some in (views, cut))
+            if result.J > misfit * whole.border_length:
+                values = self._kinematics.flatten(result.node_values)
+                other = self._search(cut, root_position, deadline, [values])
+                J = float(seen.J(self.exact.body.parameters(result.node_values, root_position)))
+                noise = misfit * seen.border_length
+                is_better = other.J <= max(noise, J - noise)
+                result = other if is_better else result.united(other)
         return replace(result, seconds=time.perf_counter() - start)
 
     def _search(

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.errors import MaskError
@@ -245,14 +246,6 @@ def _solve(
     return solution, noise[:, None, None] * np.linalg.inv(N), sides
 
 
-def block_covariance(blocks: Array) -> Array:
-    """Return (2 k, 2 k) with the blocks (k, 2, 2) on its diagonal and 0 elsewhere."""
-    count = len(blocks)
-    R = np.zeros((count, 2, count, 2))
-    R[np.arange(count), :, np.arange(count)] = blocks
-    return R.reshape(2 * count, 2 * count)
-
-
 class HandMeasurement(NamedTuple):
     """The measurement of a hand in a silhouette."""
 
@@ -401,7 +394,7 @@ class HandSilhouette:
         for k, gate in enumerate(gates):
             axes = match_axes(edge, self._rough(x), self._unit * gate, self.center)
             y, R = np.full(len(names), np.nan), np.diag(observation.variances)
-            y[lines], R[lines, lines] = axes.lines.ravel(), block_covariance(axes.line_covariances)
+            y[lines], R[lines, lines] = axes.lines.ravel(), block_diag(*axes.line_covariances)
             for rows, tip, covariance in zip(tips, axes.tips, axes.tip_covariances, strict=True):
                 y[rows], R[np.ix_(rows, rows)] = tip, covariance
             y[[names.index(name) for name in self._hand.hidden]] = np.nan

@@ -263,7 +263,12 @@ def update(
         residual = wrapped_difference(measurement.y[rows], h[rows], measurement.model.wraps[rows])
         H, R = H[rows], measurement.covariance[np.ix_(rows, rows)]
         if remainder is not None and spread is not None and bends is not None and count:
-            bend, direction = _find_bend(bends[rows], R, spread)
+            white = np.linalg.solve(np.linalg.cholesky(R), bends[rows].reshape(count, -1))
+            white = white.reshape(-1, len(x))
+            sizes, axes = np.linalg.eigh(white.T @ white)
+            # A function that is 1 at one standard deviation along the axis, 0 along others.
+            direction = np.linalg.lstsq(spread.root.T, axes[:, -1], rcond=None)[0]
+            bend = 0.5 * float(sizes.sum())
             R = R + remainder_weight * remainder[np.ix_(rows, rows)]
         innovation = residual + H @ (x - prediction.mean)
         if made == 0 and iterations > 1 and tempered and not remainder_weight:
@@ -297,20 +302,6 @@ def update(
         x = x + (step if made < full_steps else 0.5 * step)
         temperature = max(1.0, temperature / cooling)
     return Updated(belief, truncated, log_likelihood, distance, count, bend, direction)
-
-
-def _find_bend(bends: Array, R: Array, spread: Belief) -> tuple[float, Array]:
-    """Return ``bend`` and ``direction`` of ``Updated``.
-
-    ``bends``: (m, n, n) of a function linearised over the belief ``spread``. ``R``: (m, m)
-    covariance of the noise.
-    """
-    m, n, _ = bends.shape
-    white = np.linalg.solve(np.linalg.cholesky(R), bends.reshape(m, -1)).reshape(m * n, n)
-    sizes, axes = np.linalg.eigh(white.T @ white)
-    # A function of the state that is 1 at one standard deviation along the axis, 0 along others.
-    direction = np.linalg.lstsq(spread.root.T, axes[:, -1], rcond=None)[0]
-    return 0.5 * float(sizes.sum()), direction
 
 
 def slices(free: Belief, wide: Updated) -> Iterator[tuple[float, Belief]]:

@@ -93,16 +93,24 @@ class ExactSearch:
         up.
         """
         settings, length, reached = self.settings, problem.border_length, None
+        views, freedom = problem.views, self.body.freedom()
+        size = float(np.sqrt(problem.area / len(views)))
+        hopeless = max(settings.hopeless, settings.hopeless_fraction * size)
         for grid in self._grids:
             left = deadline - time.perf_counter()
             if left <= 0.0:
                 return None
-            views = problem.views
             starts = grid.best_poses(views, root_position, time_limit=left)
             poses = [self.body.parameters(start, root_position) for start in starts]
-            found = self._descend(problem, poses, deadline)
-            if found is None:
+            coarse = [descend(problem, pose, freedom, COARSE_PASSES) for pose in poses]
+            start = min((parameters for parameters, _, _ in coarse), key=problem.J)
+            first_J = float(problem.J(start))
+            if first_J > hopeless * length:
                 return None
+            found = self.refine(problem, start, deadline)
+            if first_J <= found.J:
+                found = found._replace(parameters=start, J=first_J)
+            found = found._replace(steps=found.steps + sum(steps for _, _, steps in coarse))
             reached = min((one for one in (reached, found) if one), key=lambda one: one.J)
             if reached.J <= settings.exact * length:
                 break
@@ -110,27 +118,6 @@ class ExactSearch:
             return None
         last, _ = reached.neighbourhood.improve(reached.parameters, 0.0, deadline, everywhere=True)
         return self._end(problem, reached, last)
-
-    def _descend(
-        self, problem: RefinementProblem, poses: Sequence[np.ndarray], deadline: float
-    ) -> ExactPose | None:
-        """Refine starts (m + 4,) by the coarse passes, and the best of them by ``refine``.
-
-        ``deadline``: time.perf_counter() at which the search ends [s]. Returns the refined pose;
-        None if J is hopelessly large after the coarse passes.
-        """
-        freedom, length = self.body.freedom(), problem.border_length
-        coarse = [descend(problem, pose, freedom, COARSE_PASSES) for pose in poses]
-        start = min((parameters for parameters, _, _ in coarse), key=problem.J)
-        first_J = float(problem.J(start))
-        size = float(np.sqrt(problem.area / len(problem.views)))
-        hopeless = max(self.settings.hopeless, self.settings.hopeless_fraction * size)
-        if first_J > hopeless * length:
-            return None
-        reached = self.refine(problem, start, deadline)
-        if first_J <= reached.J:
-            reached = reached._replace(parameters=start, J=first_J)
-        return reached._replace(steps=reached.steps + sum(steps for _, _, steps in coarse))
 
     def refine(self, problem: RefinementProblem, start: np.ndarray, deadline: float) -> ExactPose:
         """Refine ``start`` (m + 4,), and place parts anew until ``deadline`` (perf_counter)."""

@@ -185,21 +185,14 @@ class CameraRig:
         self.diagram.GetInputPort("positions").FixValue(context, q)
 
     def picture(self, context: Context, camera: str) -> Picture:
-        """Return the colour image (H, W, 3), red, green, blue, of the camera of this name.
+        """Return the colour image (H, W, 3), red, green, blue, of a camera, by its name.
 
-        ``context``: the diagram's.
-
-        Raises UnknownNameError: the rig has no such camera.
+        ``context``: the diagram's. Raises UnknownNameError: the rig has no such camera.
         """
         return colour_image_to_picture(self._port("color_image", camera).Eval(context))
 
     def mask(self, context: Context, camera: str) -> Mask:
-        """Return the body's silhouette (H, W) in the camera of this name.
-
-        ``context``: the diagram's.
-
-        Raises UnknownNameError: the rig has no such camera.
-        """
+        """Return the body's silhouette (H, W) in a camera; see ``picture``."""
         return label_image_to_mask(self._port("label_image", camera).Eval(context))
 
     def _port(self, kind: str, camera: str) -> OutputPort:

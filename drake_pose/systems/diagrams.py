@@ -6,11 +6,7 @@ A diagram connects simulated cameras or recorded masks to an estimator, Meshcat 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from pydrake.geometry import (
-    Meshcat,
-    RenderEngineVtkParams,
-    SceneGraph,
-)
+from pydrake.geometry import Meshcat, RenderEngineVtkParams, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import TrajectorySource
@@ -112,11 +108,7 @@ class CameraRegistration(BeliefSystem[OnlineState]):
         return None if valid is None else valid.camera
 
     def next_belief(self, context: Context, last: OnlineState) -> OnlineState:
-        """Return the state after the context's image and positions, given the last state.
-
-        Raises:
-            MaskError: the body's labels cover more than ``max_coverage`` of the image.
-        """
+        """Return the state after the context's image and positions; see the class for MaskError."""
         image = self.eval_input(context, "label_image")
         if image is None:
             return last

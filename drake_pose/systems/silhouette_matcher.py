@@ -44,15 +44,6 @@ class _Shown(NamedTuple):
     held: int = 0
 
 
-class _Frame(NamedTuple):
-    """The evidence of an update."""
-
-    context: Context  # The system's context.
-    views: Sequence[View]  # The cameras that see the body, with its mask.
-    pictures: Mapping[str, Picture]  # (H, W, 4) by name of the camera.
-    late: Collection[str]  # Names of the cameras whose picture may be late by up to a period.
-
-
 @dataclass(frozen=True, eq=False)
 class MatcherState(ImmutableValue):
     """The state of a SilhouetteMatcher."""
@@ -193,8 +184,7 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
         names = [one for one in self._cameras if one.name in masks and one.name not in stale]
         views = [View(one, masks[one.name]) for one in names]
         pictures = {name: one for name, one in pictures.items() if name not in stale}
-        frame = _Frame(context, views, pictures, late)
-        estimate, memory, is_shown = self._find(frame, last.memory)
+        estimate, memory, is_shown = self._find(context, views, pictures, late, last.memory)
         pose = estimate if estimate is not None and is_shown else last
         return MatcherState(pose.q, pose.X_WB, estimate, memory, shown, stale)
 
@@ -211,15 +201,19 @@ class SilhouetteMatcher(BeliefSystem[MatcherState]):
         """Return the pictures (H, W, 4) in a context, by name of the camera."""
         return {}
 
-    def _find(self, frame: _Frame, memory: Any) -> tuple[PoseEstimate | None, Any, bool]:
+    def _find(
+        self, context: Context, views: Sequence[View], pictures: Mapping[str, Picture],
+        late: Collection[str], memory: Any,
+    ) -> tuple[PoseEstimate | None, Any, bool]:  # fmt: skip
         """Return the pose that is seen, None without evidence; next memory; whether to show it.
 
-        ``memory``: ``MatcherState.memory`` of the last update.
+        ``views``: the cameras that see the body. ``pictures``: (H, W, 4) by name of the camera.
+        ``late``: names of the cameras whose picture may be late by up to a period. ``memory``:
+        ``MatcherState.memory`` of the last update.
         """
-        if not frame.views:
+        if not views:
             return None, memory, False
-        root_position = self.eval_input(frame.context, "root_position")
-        found = self._search.match(frame.views, root_position)
+        found = self._search.match(views, self.eval_input(context, "root_position"))
         return found, memory, found.found
 
     def _shows(self, known: MatcherState) -> Mask:
@@ -410,12 +404,14 @@ class SilhouetteTracker(SilhouetteMatcher):
         images = self._colours(context)
         return {name: one.mutable_data for name, one in images.items() if one.size()}
 
-    def _find(self, frame: _Frame, memory: _Memory) -> tuple[PoseEstimate | None, _Memory, bool]:
+    def _find(
+        self, context: Context, views: Sequence[View], pictures: Mapping[str, Picture],
+        late: Collection[str], memory: _Memory,
+    ) -> tuple[PoseEstimate | None, _Memory, bool]:  # fmt: skip
         """Return the tracked or searched pose, None before any evidence; next memory; as above.
 
         A track predicts a pose that is not found.
         """
-        context, views, pictures, late = frame
         last, root_position = memory.tracker_state, self.eval_input(context, "root_position")
         if not views and not pictures and last.track is None:
             return None, memory, False

@@ -301,10 +301,9 @@ def _period_of(motion: MotionModel, period: float | None) -> float:
 
     Raises SettingsError: no period is known, or the given one differs from the motion's.
     """
-    if period is None and motion.period is None:
-        raise SettingsError("the motion's rates are per step: give TruncatedEkf a period")
     step_period = period if motion.period is None else motion.period
-    assert step_period is not None
+    if step_period is None:
+        raise SettingsError("the motion's rates are per step: give TruncatedEkf a period")
     require_period("filter", step_period)
     if period is not None and period != step_period:
         raise SettingsError(f"the motion's period is {step_period:g} s, not {period:g} s")

@@ -1,3 +1,4 @@
+import json
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from drake_pose.camera.models import circle_of_cameras
 from drake_pose.errors import ModelError, SceneError, SettingsError
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.fit.contour_fit import ContourFit
-from drake_pose.jobs.estimate import person
+from drake_pose.jobs.estimate import inputs, person
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.person.capture import CheckedCapture, PersonCapture
 from drake_pose.person.figures import ViewFaults
@@ -40,24 +41,18 @@ class PersonScene:
         return [command, str(self.folder), "--model", model, "--out", str(out), "--no-replay"]
 
 
-def record_person(folder: Path, sequence: bool = True) -> PersonScene:
-    """Write a recording of a person who raises an arm."""
-    folder.mkdir(parents=True, exist_ok=True)
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A recording of a person who raises an arm; shared, do not change it."""
+    folder = tmp_path_factory.mktemp("person")
     person = load_model(bundled_model("person"), check=False)
     cameras = circle_of_cameras(4, size=(160, 120), face_camera=False)
     save_cameras(folder / "cameras.yaml", cameras)
-    rate = "frame_rate_hz: 30\n" if sequence else ""
-    (folder / "scene.yaml").write_text(f"sequence: {str(sequence).lower()}\n{rate}")
+    (folder / "scene.yaml").write_text("sequence: true\nframe_rate_hz: 30\n")
     arms = [(30.0 + 10.0 * k, -30.0) for k in range(FRAMES)]
     truth = np.array([posed(person, left_upper_arm_z=a, right_upper_arm_z=b) for a, b in arms])
     write_masks(folder, person, cameras.values(), truth)
     return PersonScene(folder, person, truth)
-
-
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory):
-    """A recording; shared, do not change it."""
-    return record_person(tmp_path_factory.mktemp("person") / "scene")
 
 
 @pytest.fixture
@@ -147,22 +142,20 @@ def test_an_equally_good_pose_is_written_and_named_in_a_warning(recording, known
     assert row["modes"] == "2"
 
 
-def test_capture_selects_cameras_and_frames_as_estimate_does(known, tmp_path, out):
-    scene = record_person(tmp_path / "scene", sequence=False)
-    some = ("--frame", "0:1", "--camera", "camera_0", "--camera", "camera_2", "--no-overlay")
-    _, summary = run_estimate(scene, out, *some)
-    assert list(summary["frames"]) == ["0000", "0001"]
-    assert set(summary["cameras"]) == {"camera_0", "camera_2"}
-    assert not (out / "positions.mot").exists()
-    assert len(read_rows(out / "joint_centres.csv")) == 2 * 14
-
-
-def test_capture_is_a_sequence_unless_the_scene_says_otherwise(own_recording, known, tmp_path):
+def test_capture_is_an_estimate_of_a_sequence_unless_the_scene_says_otherwise(
+    own_recording, known, tmp_path
+):
+    """It selects cameras and frames as an estimate does."""
     own_recording.folder.joinpath("scene.yaml").unlink()
+    some = ("--frame", "0:1", "--camera", "camera_0", "--camera", "camera_2", "--no-overlay")
     for said in ("motion", "stills"):
         out = tmp_path / said
-        run_to_end(*own_recording.estimate(out, "capture"), "--no-overlay")
+        run_to_end(*own_recording.estimate(out, "capture"), *some)
+        summary = json.loads((out / "summary.json").read_text())
+        assert list(summary["frames"]) == ["0000", "0001"]
+        assert set(summary["cameras"]) == {"camera_0", "camera_2"}
         assert (out / "positions.mot").exists() == (said == "motion")
+        assert len(read_rows(out / "joint_centres.csv")) == 2 * 14
         own_recording.folder.joinpath("scene.yaml").write_text("sequence: false\n")
 
 
@@ -173,8 +166,7 @@ def test_capture_uses_the_bundled_person(recording, out, monkeypatch):
         asked.update(options, model=model, settings=settings)
 
     monkeypatch.setattr("drake_pose.commands.estimate.estimate", note)
-    options = ["--out", out, "--no-overlay", "--frame", "1"]
-    run_to_end("capture", recording.folder, *options)
+    run_to_end("capture", recording.folder, "--out", out, "--no-overlay", "--frame", "1")
     assert asked["model"].name == "person_shape.urdf"
     assert asked["settings"] == EstimateSettings(method="person", frames=("1",))
     assert asked["overlay"] is False
@@ -204,25 +196,16 @@ def test_an_interrupted_capture_is_incomplete_and_resumes_without_loss(recording
 
 
 @pytest.mark.parametrize(
-    "settings",
+    "more",
     [
-        EstimateSettings(method="beam"),
-        EstimateSettings(cameras=("camera_0",)),
-        EstimateSettings(hold={"left_forearm_x": -20.0}),
-        EstimateSettings(root="left_foot", root_position=(0.0, 0.0, 0.0)),
+        {"method": "beam"}, {"cameras": ("camera_0",)}, {"hold": {"left_forearm_x": -20.0}},
+        {"root": "left_foot", "root_position": (0.0, 0.0, 0.0)},
     ],
-    ids=["method", "one camera", "hold", "root"],
-)
-def test_options_of_the_search_choose_the_search(recording, settings, monkeypatch):
-    class Searched(Exception):
-        """Replaces the search."""
-
-    def search(*_: object, **__: object) -> None:
-        raise Searched
-
-    monkeypatch.setattr("drake_pose.jobs.estimate.inputs.make_search", search)
-    with pytest.raises(Searched):
-        estimate_scene(recording.folder, recording.person.path, None, settings)
+)  # fmt: skip
+def test_options_of_the_search_choose_the_search(recording, more, monkeypatch):
+    monkeypatch.setattr(inputs, "make_search", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        estimate_scene(recording.folder, recording.person.path, settings=EstimateSettings(**more))
 
 
 def test_pictures_with_few_masks_are_refused(own_recording):

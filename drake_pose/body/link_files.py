@@ -97,7 +97,7 @@ def sanitise_urdf(path: Path, finder: FileFinder, warn: Warn) -> str:
     if not root.get("name"):
         root.set("name", path.stem)
     leave_out(root, _READ["urdf"], _IGNORED, warn)
-    refuse_macros(root)
+    refuse_macros(root, path)
     joints = _joints(root)
     ends = [[_end(joint, end) for end in ("parent", "child")] for joint in joints]
     links = [link.get("name") for link in root.iterfind("link")]
@@ -290,7 +290,7 @@ def sanitise_sdf(
     if "version" not in root.attrib:
         raise ModelError('its <sdf> has no version; write for example <sdf version="1.9">')
     leave_out(root, _READ["sdf"], _IGNORED, warn)
-    refuse_macros(root)
+    refuse_macros(root, path)
     for include in root.iter("include"):
         uri, name = _uri(include, "an <include> without a <uri>")
         found = finder.resolve(name, path, "included model")

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.multibody.parsing import PackageMap
 
+from drake_pose.body.plant_source import told_multiplier
 from drake_pose.errors import ModelError, require_known
 
 OLD_XACRO_ELEMENTS = ("macro", "include")
@@ -38,12 +39,9 @@ def read_xml(path: Path) -> ElementTree.Element:
         data = path.read_bytes()
     except OSError as error:
         raise ModelError(f"{path} cannot be read: {error.strerror}") from error
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = data.decode("iso-8859-1")
+    text = _decoded(data)
     blank_lines = text[: len(text) - len(text.lstrip())].count("\n")
-    text = re.sub(r"(?s)<!--.*?-->", lambda comment: "\n" * comment[0].count("\n"), text.lstrip())
+    text = _uncommented(text.lstrip())
     if "<!ENTITY" not in text:
         text = re.sub(r"&(?!(?:#\d+|#x[0-9a-fA-F]+|lt|gt|amp|quot|apos);)", "&amp;", text)
     builder = ElementTree.TreeBuilder()
@@ -63,6 +61,19 @@ def read_xml(path: Path) -> ElementTree.Element:
             f"{path} is not well-formed XML: {expat.ErrorString(error.code)}: {place}"
         ) from error
     return builder.close()
+
+
+def _decoded(data: bytes) -> str:
+    """Return a file's text; text that is not valid UTF-8 is read as Latin-1."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("iso-8859-1")
+
+
+def _uncommented(text: str) -> str:
+    """Return an XML file's text without comments, on the same lines."""
+    return re.sub(r"(?s)<!--.*?-->", lambda comment: "\n" * comment[0].count("\n"), text)
 
 
 def xml_text(root: ElementTree.Element) -> str:
@@ -236,7 +247,8 @@ def take_mimic(
         leader = mimic.get("joint", "")
         if leader in leaders and leader != name and multiplier:
             offset -= multiplier * reference
-            found = {"joint": leader, "multiplier": repr(multiplier), "offset": repr(offset)}
+            text = repr(told_multiplier(multiplier))
+            found = {"joint": leader, "multiplier": text, "offset": repr(offset)}
         else:
             warn(
                 f"joint '{name}' is written to follow joint '{leader}' (<mimic>): not enforced, "
@@ -245,19 +257,29 @@ def take_mimic(
     return found
 
 
-def refuse_macros(root: ElementTree.Element) -> None:
-    """Raise ModelError for a file with unexpanded xacro macros."""
-    macros = [f"<{child.tag}>" for child in root if child.tag in OLD_XACRO_ELEMENTS]
+def refuse_macros(root: ElementTree.Element, path: Path) -> None:
+    """Raise ModelError for a file with unexpanded xacro macros; remove properties and arguments.
+
+    Nothing is missing where a file only declares these. ``path``: the file, for the line.
+    """
+    for parent in list(root.iter()):
+        for child in [one for one in parent if one.tag in ("xacro:property", "xacro:arg")]:
+            parent.remove(child)
+    macros = [f"<{child.tag}" for child in root if child.tag in OLD_XACRO_ELEMENTS]
     for element in root.iter():
         if element.tag.startswith("xacro:"):
-            macros.append(f"<{element.tag}>")
+            macros.append(f"<{element.tag}")
         for value in [*element.attrib.values(), element.text or ""]:
             if "${" in value or "$(" in value:
-                macros.append(f"'{value.strip()[:60]}' in <{element.tag}>")
+                macros.append(value.strip().partition("\n")[0][:60])
     if macros:
+        lines = re.split("\n", _uncommented(_decoded(path.read_bytes())))
+        line = next((k for k, one in enumerate(lines, 1) if macros[0] in one), None)
+        what = f"{macros[0]}>" if macros[0].startswith("<") else f"'{macros[0]}'"
         raise ModelError(
-            f"it has unexpanded xacro macros, such as {macros[0]}: links and joints would be "
-            "missing; expand it first: xacro robot.urdf.xacro > robot.urdf (PyPI: xacro)"
+            f"it has unexpanded xacro macros, such as {what}{f' in line {line}' if line else ''}: "
+            "links and joints would be missing; expand it first: xacro robot.urdf.xacro > "
+            "robot.urdf (PyPI: xacro)"
         )
 
 

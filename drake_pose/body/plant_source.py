@@ -66,6 +66,15 @@ class Coupling(NamedTuple):
     offset: float  # Constant [rad or m].
 
 
+def told_multiplier(multiplier: float) -> float:
+    """Return the multiplier of a coupler that is added to a plant.
+
+    A plant's constraint tells the follower by its factor 1. A multiplier of -1 gives both joints
+    that factor; it is written as the next number.
+    """
+    return float(np.nextafter(-1.0, -2.0)) if multiplier == -1.0 else multiplier
+
+
 def read_couplings(plant: MultibodyPlant) -> list[Coupling]:
     """Return the coupler constraints of a finalized plant.
 
@@ -87,7 +96,8 @@ def read_couplings(plant: MultibodyPlant) -> list[Coupling]:
         if np.count_nonzero(row) == 2:
             # The follower has the factor 1; if both have it, the second is the follower.
             k = int(row[1] == 1.0)
-            found.append(Coupling(index[k], index[1 - k], -row[1 - k] / row[k], offset / row[k]))
+            multiplier = -1.0 if row[1 - k] == -told_multiplier(-1.0) else -row[1 - k] / row[k]
+            found.append(Coupling(index[k], index[1 - k], multiplier, offset / row[k]))
     return found
 
 
@@ -96,7 +106,7 @@ def add_coupler(
 ) -> None:
     """Add q_follower = multiplier * q_leader + offset [rad or m], if the plant supports it."""
     if plant.get_discrete_contact_solver() == DiscreteContactSolver.kSap:
-        plant.AddCouplerConstraint(follower, leader, multiplier, offset)
+        plant.AddCouplerConstraint(follower, leader, told_multiplier(multiplier), offset)
 
 
 class PlantSource:

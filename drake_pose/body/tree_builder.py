@@ -5,7 +5,7 @@ skipped, or kept as empty nodes where several branches meet. Joints that are tra
 plant's world are inverted. Branches whose joints all follow another branch's are attached to it.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -197,13 +197,12 @@ def _branches(graph: LinkGraph, start: int) -> list[Branch]:
                 step = replace(edge.joint_map, inverted=edge.outer == group)
                 walked = (*after.steps, step), (*after.positions, *edge.positions)
                 queue.append((Branch(edge.other(group), after.parent, after.depth, *walked), edge))
-    return _ordered(graph, found)
+    return _ordered(found, lambda one: (one.depth, graph.groups[one.group].body))
 
 
-def _ordered(graph: LinkGraph, found: list[Branch]) -> list[Branch]:
-    """Return the branches ``found`` sorted by depth, then by body, with updated parent indices."""
-    bodies = [graph.groups[branch.group].body for branch in found]
-    order = sorted(range(len(found)), key=lambda i: (found[i].depth, bodies[i]))
+def _ordered(found: list[Branch], key: Callable[[Branch], tuple[int, int]]) -> list[Branch]:
+    """Return the branches ``found`` sorted by a key, with updated parent indices."""
+    order = sorted(range(len(found)), key=lambda i: key(found[i]))
     return [
         replace(found[i], parent=order.index(found[i].parent) if found[i].parent >= 0 else -1)
         for i in order
@@ -221,10 +220,12 @@ def _attach_followers(
     ``held``: indices in q of positions that are not searched; they follow nothing. Returns all
     branches, sorted as by ``_branches``.
     """
-    couplings = _couplings_by_position(model)
+    couplings, followers = _couplings_by_position(model), {one.follower for one in model.couplings}
     skinned = {graph.group_of(link) for band in model.skin for link in (band.parent, band.child)}
     leaders: dict[int, tuple[int, int]] = {}
     found: list[Branch] = []
+    # A leader comes before its followers, wherever it stands in the model.
+    branches = _ordered(branches, lambda one: (one.depth, not followers.isdisjoint(one.positions)))
     for i, branch in enumerate(branches):
         known = [couplings.get(p) if p not in held else None for p in branch.positions]
         candidates = {
@@ -260,7 +261,7 @@ def _attach_followers(
             relation = _relative_coupling(couplings, coupling.follower, leaders[coupling.leader][1])
             follows.append(relation._replace(leader=leading.positions.index(relation.leader)))
         found.append(Branch(branch.group, leader, leading.depth + 1, steps, (), tuple(follows)))
-    return _ordered(graph, found)
+    return _ordered(found, lambda one: (one.depth, graph.groups[one.group].body))
 
 
 def _couplings_by_position(model: ParsedModel) -> dict[int, Coupling]:

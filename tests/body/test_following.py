@@ -24,9 +24,8 @@ from tests.fit.motions import assert_motions_are_derivatives
 LIMITS = 'lower="0" upper="0.8"'
 # A driven finger, a finger that follows it, its tip, which follows by half, and a nail on the tip;
 # last a follower that cannot be enforced, because other joints move it, too.
-HAND = urdf(
-    link("world", ""),
-    *map(link, ("palm", "one", "two", "tip", "nail", "far")),
+LINKS = (link("world", ""), *map(link, ("palm", "one", "two", "tip", "nail", "far")))
+JOINTS = (
     joint("wrist", "revolute", "world", "palm", axis="0 1 0"),
     joint("lead", "revolute", "palm", "one", axis="1 0 0", limits=LIMITS),
     joint("mirror", "revolute", "palm", "two", axis="1 1 0", limits='lower="-0.6" upper="0.1"',
@@ -36,6 +35,7 @@ HAND = urdf(
     joint("scratch", "revolute", "tip", "nail", axis="0 0 1"),
     joint("far", "prismatic", "nail", "far", axis="0 0 1", more='<mimic joint="lead"/>'),
 )  # fmt: skip
+HAND = urdf(*LINKS, *JOINTS)
 
 
 def tree_of(folder, text=HAND, **options):
@@ -49,8 +49,10 @@ def drawn(tree, generator):
 
 
 @pytest.mark.parametrize("root", [None, "tip", "one"])
-def test_node_poses_of_coupled_joints_match_the_plant(tmp_path, root):
-    tree = tree_of(tmp_path, root=root, root_position=None if root is None else [0.1, 0.2, 0.3])
+@pytest.mark.parametrize("step", [1, -1], ids=["leader first", "leader last"])
+def test_node_poses_of_coupled_joints_match_the_plant(tmp_path, root, step):
+    text, start = urdf(*LINKS, *JOINTS[::step]), None if root is None else [0.1, 0.2, 0.3]
+    tree = tree_of(tmp_path, text, root=root, root_position=start)
     model = tree.model
     kinematics = TreeKinematics(tree)
     if root is None:

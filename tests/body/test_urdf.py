@@ -90,11 +90,15 @@ def test_unexpanded_macros_are_refused(tmp_path, left, named, declared):
         text = text.replace("<robot ", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" ')
     message = refusal(tmp_path, text)
     assert named in message
+    line = next(k for k, one in enumerate(text.splitlines(), 1) if named in one)
+    assert f"in line {line}: links" in message
     assert "xacro robot.urdf.xacro > robot.urdf" in message
 
 
-def test_declared_xacro_prefix_without_macros_is_accepted(tmp_path):
-    text = arm(more='<gazebo><plugin><p>$(arg x)</p></plugin></gazebo><transmission name="t"/>')
+def test_xacro_prefix_and_properties_without_macros_are_accepted(tmp_path):
+    text = arm(more='<gazebo><plugin><p>$(arg x)</p></plugin></gazebo><transmission name="t"/>'
+               '<xacro:property name="w" value="${pi/2}"/><xacro:arg name="x" default="1"/>'
+               '<xacro:property name="o"><origin xyz="0 0 0"/></xacro:property>')  # fmt: skip
     text = text.replace("<robot ", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" ')
     model = read(tmp_path, text)
     assert model.position_names[-1] == "elbow"

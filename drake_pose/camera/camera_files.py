@@ -89,8 +89,8 @@ class CameraFile:
     # without pose is at the world's origin.
     cameras: dict[str, Camera]
     unplaced: tuple[str, ...]  # Names of the cameras without pose.
-    # Link of each camera that is mounted on one, by the camera's name; its X_WC holds X_LC, the
-    # pose in the link.
+    # Link of each camera that is mounted on one, by the camera's name, or END_EFFECTOR; its X_WC
+    # holds X_LC, the pose in the link.
     links: Mapping[str, str] = field(default_factory=dict)
     # Lens of each camera with distortion, for the images as taken.
     lenses: Mapping[str, Lens] = field(default_factory=dict)

@@ -23,6 +23,9 @@ from drake_pose.camera.models import check_pose, inverse_pose
 from drake_pose.errors import CameraError, listed
 from drake_pose.input_files import read_regular
 
+END_EFFECTOR = "end effector"
+"""Link of a camera on the robot's end effector whose file does not name the link."""
+
 
 class RecordedPose(NamedTuple):
     """Pose of a camera's optical frame (x right, y down, z forward)."""
@@ -70,12 +73,7 @@ def recorded_poses(
         more = content.get("parameters")
         words = content | (more if isinstance(more, dict) else {})
         on_hand = words.get("eye_on_hand") is True or words.get("calibration_type") == "eye_in_hand"
-        link = str(words.get("robot_effector_frame", "")) if on_hand else ""
-        if on_hand and not link:
-            raise CameraError(
-                f"{path}: is of a camera on the hand, but has no robot_effector_frame: add the "
-                "name of the link that carries it"
-            )
+        link = str(words.get("robot_effector_frame") or END_EFFECTOR) if on_hand else ""
         name = str(words.get("tracking_base_frame") or words.get("camera_name") or path.stem)
         return {name: _optical(name, alone._replace(link=link))}
     found = _poses_by_name(content, path)

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from drake_pose.camera.camera_files import intrinsics_of, load_camera_file, load_cameras
 from drake_pose.camera.exchange import ros_camera_info, ros_transforms
 from drake_pose.camera.models import PinholeCamera, inverse_pose
+from drake_pose.camera.pose_files import END_EFFECTOR
 from drake_pose.errors import CameraError
 
 X = np.eye(4)
@@ -127,11 +128,12 @@ def test_poses_without_intrinsics_are_read(tmp_path, scene, name, content):
 
 
 def test_a_camera_on_the_hand_has_its_link(tmp_path, scene):
-    for name, content in (
-        ("easy.yaml", easy(eye_on_hand=True)),
-        ("pose.launch", launch(QUATERNION, "cam_optical", parent="tool0")),
+    for name, content, link in (
+        ("easy.yaml", easy(eye_on_hand=True), "tool0"),
+        ("easy.yaml", easy(eye_on_hand=True, robot_effector_frame=""), END_EFFECTOR),
+        ("pose.launch", launch(QUATERNION, "cam_optical", parent="tool0"), "tool0"),
     ):
-        assert load(tmp_path / name, content, scene).links == {"left": "tool0"}
+        assert load(tmp_path / name, content, scene).links == {"left": link}
 
 
 def test_files_of_many_episodes_give_the_recordings_own(tmp_path):

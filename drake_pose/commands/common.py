@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from drake_pose.files.settings import within
+from drake_pose.files.settings import RUNNING, within
 
 if TYPE_CHECKING:
     from drake_pose.files.records import FrameRecord
@@ -33,24 +33,36 @@ Model = Annotated[
 Out = Annotated[
     Path, Parameter(["--out", "-o"], help="Folder for the result. It must be new or empty.")
 ]
+Cameras = Annotated[
+    Path | None, Parameter(help="Camera file to use instead of the scene's or episode's own.")
+]
+Joints = Annotated[
+    Path | None,
+    Parameter(
+        ["--joints", "-j"],
+        help="Joint positions in every frame [rad or m]: CSV file with the column frame (an "
+        "episode may have time instead) and one for each joint. Default: the scene's "
+        "joint_angles.csv or the episode's joint log.",
+    ),
+]
+Truth = Annotated[
+    Path | None,
+    Parameter(
+        help="Measured joint positions [rad or m] to compare with: CSV file with the column frame "
+        "and one for each joint. Default: SCENE/joint_angles.csv, if it exists."
+    ),
+]
 Pictures = Annotated[
     Path | None,
     Parameter(["--out", "-o"], help="Folder for pictures. Default: no pictures are written."),
 ]
-Resume = Annotated[bool, Parameter(help="Continue the interrupted result in --out.")]
-Replay = Annotated[bool, Parameter(negative="--no-replay", help="Write replay.html.")]
-Overlay = Annotated[
-    bool, Parameter(negative="--no-overlay", help="Write overlay/<camera>/<frame>.png.")
-]
-Json = Annotated[bool, Parameter(help="Print the result as JSON.")]
-Truth = Annotated[
-    Path | None,
-    Parameter(
-        help="Measured joint positions [rad or m] to compare with: a CSV file with the column "
-        "frame and one for each joint. Default: SCENE/joint_angles.csv, if it exists."
-    ),
-]
 Seed = Annotated[int, within(0), Parameter(help="Seed of the random numbers.")]
+Resume = Annotated[bool, RUNNING, Parameter(help="Continue the interrupted result in --out.")]
+Replay = Annotated[bool, RUNNING, Parameter(negative="--no-replay", help="Write replay.html.")]
+Overlay = Annotated[
+    bool, RUNNING, Parameter(negative="--no-overlay", help="Write overlay/<camera>/<frame>.png.")
+]
+Json = Annotated[bool, RUNNING, Parameter(help="Print the result as JSON.")]
 
 
 class UsageError(Exception):

@@ -15,6 +15,7 @@ from rich.table import Table
 
 from drake_pose.commands.common import (
     SPREAD,
+    Cameras,
     Json,
     Model,
     Out,
@@ -56,9 +57,9 @@ def estimate(
     *,
     model: Model,
     out: Out,
-    settings: Annotated[EstimateSettings | None, SPREAD] = None,
+    cameras: Cameras = None,
     truth: Truth = None,
-    cameras: Path | None = None,
+    settings: Annotated[EstimateSettings | None, SPREAD] = None,
     resume: Resume = False,
     overlay: Overlay = True,
     replay: Replay = True,
@@ -66,34 +67,25 @@ def estimate(
 ) -> None:
     r"""Estimate the joint angles in every frame of a scene.
 
-    A beam search places the body link by link, from the root outwards, and the body's contour is
-    then fitted to the silhouettes' edges to refine the best poses. All cameras are used together.
-    If scene.yaml has sequence: true, the pose is searched in the first frame and tracked in the
-    others. If the model is a person with landmarks.yaml and two or more cameras are calibrated, the
-    person is fitted to all silhouettes at once, link lengths and radius scales included, unless an
-    option of the search is given.
-
-    Files in the output folder: report.html (start here); poses.csv (for each frame every joint's
-    position [rad or m], E_total and seconds); joints.csv (95 % interval of each joint, and whether
-    the silhouettes determine it); modes.csv (other poses that fit equally well); summary.json;
-    overlay/; replay.html; for a sequence also a MOT file, and for a person or hand a TRC
-    file. E_total is the area where body and silhouettes differ, divided by the silhouettes' area.
-    Ctrl-C keeps the finished frames.
-
-    Example, a robot arm whose base is at the world's origin, and two cameras:
+    The body is placed link by link and fitted to the contours of the silhouettes, of all cameras
+    together. If scene.yaml has sequence: true, the pose is searched in the first frame and tracked
+    in the others. A person with landmarks.yaml before two or more cameras is fitted to all
+    silhouettes at once, link lengths and radius scales included.
 
         drake-pose estimate ../shared/data/arm_two_views --out results/arm \
           --model ../shared/data/arm_two_views/med7/med7.urdf
 
+    Files in the output folder: report.html (start here); poses.csv (joint positions [rad or m] and
+    E_total in each frame); joints.csv (95 % intervals, and whether the silhouettes determine a
+    joint); modes.csv (other poses that fit equally well); summary.json; overlay/; replay.html.
+    E_total is the area where body and silhouettes differ, divided by the silhouettes' area. Ctrl-C
+    keeps the finished frames.
+
     Args:
         scene: Folder with cameras.yaml and masks/<camera>/<frame>.png; or with masks/<frame>.png
-            alone, for one camera without calibration. A sequence may have
-            images/<camera>/<frame>.png or .jpg, or videos/<camera>.mp4, and a mask of the first
-            frame only. Or a robot's recorded episode: pictures or videos with a joint log, a
-            LeRobot data set, a raw folder of DROID or a ROS bag; the robot is tracked by colour,
-            starting at the first logged joint positions.
-        cameras: Camera file to use instead of the scene's or episode's own, such as one that
-            register has written.
+            alone, of one camera without calibration. A sequence may have images/ or videos/ and a
+            mask of the first frame only. Or a robot's recorded episode (pictures with a joint log,
+            LeRobot, DROID, ROS bag), tracked by colour from the first logged joint positions.
     """
     from drake_pose.jobs.estimate.compile_ahead import compiling_ahead
     from drake_pose.jobs.estimate.scene import estimate_scene
@@ -220,9 +212,9 @@ def capture(
     out: Out,
     model: Path | None = None,
     method: CaptureMethod = "person",
-    settings: Annotated[CaptureSettings | None, SPREAD] = None,
-    live: Annotated[LiveSettings | None, SPREAD] = None,
     truth: Truth = None,
+    live: Annotated[LiveSettings | None, SPREAD] = None,
+    settings: Annotated[CaptureSettings | None, SPREAD] = None,
     resume: Resume = False,
     overlay: Overlay = True,
     replay: Replay = True,
@@ -244,24 +236,19 @@ def capture(
             pictures and search for elbows and knees, as published by Date et al.
     """
     settings, live = settings or CaptureSettings(), live or LiveSettings()
-    of_masks = bool(truth or resume or set(changed(settings)) - {"packages"})
+    is_person, of_masks = method == "person", "--camera, --frame, --every, --truth, --no-track, "
     # Not SOURCES of camera.sources: importing that module would slow the start of every command.
     has_sources = (scene / "sources.yaml").is_file()
-    if method != "person" and (of_masks or not live.fit_shape):
-        raise UsageError(
-            "--camera, --frame, --every, --truth, --no-track, --resume and --no-fit-shape need "
-            "--method person"
-        )
-    if method == "person" and live.faces is not None:
+    if truth or resume or set(changed(settings)) - {"packages"}:
+        if not is_person:
+            raise UsageError(f"{of_masks}--resume need --method person")
+        if has_sources:
+            raise UsageError(f"{of_masks}--resume need masks, but {scene} has a sources.yaml")
+    if is_person and live.faces is not None:
         raise UsageError("--face-camera and --faces need --method paper")
-    if has_sources and of_masks:
-        raise UsageError(
-            "--camera, --frame, --every, --truth, --no-track and --resume need a folder "
-            f"of masks, but {scene} has a sources.yaml"
-        )
-    if method == "person" and not has_sources and live != LiveSettings():
+    if is_person and not has_sources and live != LiveSettings():
         raise UsageError(f"{scene} has no sources.yaml, which options of live capture need")
-    if method == "person" and not has_sources:
+    if is_person and not has_sources:
         from drake_pose.jobs.estimate.inputs import bundled_person
 
         given = {one.name: getattr(settings, one.name) for one in fields(settings)}
@@ -275,7 +262,7 @@ def capture(
 
     hush_opencv()
     studio = load_live_scene(scene)
-    if method != "person" and any(one.live for one in studio.specifications.values()):
+    if not is_person and any(one.live for one in studio.specifications.values()):
         say("drake-pose: stand upright in view of the cameras, both arms spread to the sides")
     with count_progress("frames", None) as advance:
         found, interrupted, unreported = capture_live(
@@ -331,7 +318,6 @@ def batch(
     out: Out,
     workers: Annotated[int | None, within(0)] = None,
     scheduler: Annotated[str | None, Parameter(metavar="ADDRESS")] = None,
-    chunk: Annotated[int | None, within(1), Parameter(metavar="FRAMES")] = None,
     resume: Resume = False,
     json: Json = False,
 ) -> None:
@@ -363,13 +349,12 @@ def batch(
             one for each core, or 0 if the extra cluster is not installed.
         scheduler: Address of a Dask scheduler whose workers are used instead, such as
             tcp://10.0.0.7:8786.
-        chunk: Number of frames in a chunk. Default: that of the job file.
     """
     from drake_pose.jobs.batch import run_batch
     from drake_pose.jobs.batch_tasks import read_job
     from drake_pose.jobs.cluster import has_dask, open_cluster, require_fit_workers
 
-    read = read_job(jobs, chunk)
+    read = read_job(jobs)
     if workers and scheduler is not None:
         raise UsageError("give --workers or --scheduler, not both")
     if workers is None and scheduler is None and not has_dask():

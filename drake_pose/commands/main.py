@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import NoReturn
 
-from cyclopts import App, CycloptsError, Parameter
+from cyclopts import App, CycloptsError, Group, Parameter
 from cyclopts.help import DefaultFormatter, HelpPanel
 from rich.console import Console, ConsoleOptions
 from rich.text import Text
@@ -63,6 +63,7 @@ def _program(name: str, help: str, *commands: Callable[..., None]) -> App:
         help_flags="--help",
         version=f"drake-pose {VERSION}",
         version_flags="--version",
+        group_parameters=Group("Options", sort_key=-1),
         default_parameter=Parameter(
             allow_repeating=True,
             negative=(),

@@ -13,6 +13,8 @@ from rich.table import Table
 
 from drake_pose.commands.common import (
     SPREAD,
+    Cameras,
+    Joints,
     Json,
     Model,
     Out,
@@ -47,54 +49,38 @@ def register(
     *,
     model: Model,
     out: Out,
-    joints: Annotated[Path | None, Parameter(alias="-j")] = None,
+    joints: Joints = None,
+    cameras: Cameras = None,
     settings: Annotated[RegistrationSettings | None, SPREAD] = None,
-    cameras: Path | None = None,
     overlay: Overlay = True,
     json: Json = False,
 ) -> None:
     r"""Find camera poses from a recorded episode or a robot's silhouettes, without a board.
 
-    The result is each camera's pose X_WC in the world [m], with the standard deviations of position
-    and rotation, other poses that fit equally well, and the frames that are outliers. The world is
-    the model's, in most files the robot's base. All rotations of a camera are searched, without an
-    initial guess, and the best poses are fitted to the robot's contour.
-
-    An episode needs no masks: pictures or videos with joint positions by time or frame, a LeRobot
-    data set, a raw folder of DROID, or a ROS bag. The robot must move in view of a static camera,
-    or carry the camera (--on) over a scene that stands still. Without a --target the time offset
-    between pictures and joints is estimated as well, and the focal length if it is unknown. A
-    static camera that was nudged meanwhile is refused; the message names the frames of each part.
-
-    From masks, focal length and principal point of each camera must be known, and the masks must be
-    free of distortion. Five poses that differ much are enough. Cameras that have an X_WC keep it; a
-    warning says if the robot is not seen there. Without joint positions the body's poses are
-    estimated from the cameras that have an X_WC (one for a robot with a fixed base, two for a
-    person), and refined together with the other cameras. --joints may also be the poses.csv of
-    drake-pose estimate, in which the base may move.
-
-    Files in the output folder: report.html (start here); cameras.yaml, which estimate reads;
-    registration.yaml (6 x 6 covariance, other poses); summary.json; overlay/; overlay_as_given/;
-    for an episode masks/ and joint_angles.csv, which make the folder a scene; with --export ros/,
-    mujoco.xml, drake.yaml or lerobot/.
-
-    Examples, a robot arm before one camera, and an episode of DROID:
-
-        drake-pose register ../shared/data/arm_one_view --out results/camera \
-          --model ../shared/data/arm_two_views/med7/med7.urdf \
-          --joints ../shared/data/arm_one_view/joint_angles.csv
+    The result is each camera's pose X_WC [m] in the model's world (in most files the robot's base),
+    with standard deviations of position and rotation, other poses that fit equally well, and the
+    frames that are outliers. No initial guess is needed.
 
         drake-pose register ../shared/data/droid_episodes/short --out results/episode --focal \
           --model ../shared/data/droid_episodes/robot/panda_robotiq.urdf
 
+    An episode needs no masks. The robot must move in view of a static camera, or carry the camera
+    (--on) over a scene that stands still. The time offset between pictures and joints is estimated
+    as well, and the focal length if it is unknown.
+
+    From masks, the cameras' intrinsics must be known, and five poses that differ much are enough.
+    Cameras that have an X_WC keep it. Without joint positions the body's poses are estimated from
+    these cameras (one for a robot with a fixed base, two for a person). --joints may also be the
+    poses.csv of drake-pose estimate, in which the base may move.
+
+    Files in the output folder: report.html (start here); cameras.yaml, which estimate reads;
+    registration.yaml (6 x 6 covariance, other poses); summary.json; overlay/; overlay_as_given/;
+    for an episode masks/ and joint_angles.csv; with --export ros/, mujoco.xml, drake.yaml or
+    lerobot/.
+
     Args:
         scene: Folder with masks/<camera>/<frame>.png and cameras.yaml, in which X_WC may be
             missing; or an episode, a folder or file.
-        joints: Joint positions in every frame [rad or m]: CSV file with the column frame (an
-            episode may have time instead) and one column for each joint. Default: the scene's
-            joint_angles.csv or the episode's joint log; a scene without either: estimated from the
-            cameras that have an X_WC.
-        cameras: Camera file to use instead of the scene's or episode's own.
     """
     from drake_pose.jobs.registration.register import register_scene
 
@@ -112,47 +98,39 @@ def audit(
     /,
     *,
     model: Model,
-    joints: Annotated[Path | None, Parameter(alias="-j")] = None,
-    out: Annotated[Path | None, Parameter(alias="-o")] = None,
+    out: Annotated[
+        Path | None,
+        Parameter(
+            alias="-o", help="Folder for the result, new or empty. Default: no files are written."
+        ),
+    ] = None,
+    joints: Joints = None,
+    cameras: Cameras = None,
     settings: Annotated[AuditSettings | None, SPREAD] = None,
-    cameras: Path | None = None,
     overlay: Overlay = True,
     json: Json = False,
 ) -> None:
     r"""Find errors in joint positions, cameras and frames of a scene.
 
-    Each frame is fitted by itself, with its joints and cameras free to move a little. A deviation
-    that all frames share is an error of a joint offset, a camera or the base; a frame that deviates
-    from the others is an outlier. An error is reported if it is significant, given the errors of
-    masks and surfaces, and moves the contours by a pixel or more. All causes that explain the masks
-    equally well are reported: with one camera, a moved base cannot be distinguished from a moved
-    camera.
-
-    Larger errors are searched: joint offsets and signs over the joints' whole range, focal lengths,
-    exchanged cameras, mirrored masks, conventions of X_WC, and cameras that moved during the
-    recording.
-
-    An episode, as for register, needs no masks: each camera is found in its pictures without the
-    given pose, which is then compared with the one found. Errors of the clocks are reported, too.
-
-    Files in the output folder: report.html (start here); summary.json; overlay/ of the frames that
-    are outliers; overlay_as_given/, the robot as given and as found.
-
-    Example, a scene whose joint positions do not belong to the pictures:
+    Each frame is fitted by itself, with its joints and cameras free to move. A deviation that all
+    frames share is an error of a joint offset, a camera or the base; a frame that deviates from the
+    others is an outlier. An error is reported if it is significant and moves the contours by a
+    pixel or more. All causes that explain the masks equally well are reported.
 
         drake-pose audit ../shared/data/franka_one_view \
           --model ../shared/data/franka_one_view/panda/panda.urdf \
           --cameras ../shared/data/franka_one_view/cameras_reference.yaml \
           --joints ../shared/data/franka_one_view/joint_angles.csv
 
+    An episode, as for register, needs no masks: each camera is found in its pictures without the
+    given pose, which is then compared with the one found.
+
+    Files in the output folder: report.html (start here); summary.json; overlay/ of the frames that
+    are outliers; overlay_as_given/, the robot as given and as found.
+
     Args:
         scene: Folder with cameras.yaml and masks/<camera>/<frame>.png; or an episode, a folder or
             file.
-        joints: Joint positions in every frame [rad or m]: CSV file with the column frame (an
-            episode may have time instead) and one column for each joint. Default: the scene's
-            joint_angles.csv or the episode's joint log.
-        out: Folder for the result. It must be new or empty. Default: no files are written.
-        cameras: Camera file to use instead of the scene's or episode's own.
     """
     from drake_pose.jobs.registration.audit import audit_scene
 
@@ -297,6 +275,7 @@ def check(file: Path, /, *, package: Packages | None = None, json: Json = False)
 
     Args:
         file: The model: URDF, SDFormat, MJCF or .dmd.yaml.
+        package: Folder of the package of package://NAME/... files; repeat for several.
     """
     from drake_pose.body import describe_model
 
@@ -332,7 +311,7 @@ def masks(
     *,
     out: Annotated[Path, Parameter(alias="-o", metavar="SCENE")],
     settings: Annotated[MaskSettings | None, SPREAD] = None,
-    overlay: Annotated[bool, Parameter(negative="--no-overlay")] = True,
+    overlay: Overlay = True,
     json: Json = False,
 ) -> None:
     """Make a scene of masks, from masks of other tools or from pictures.
@@ -352,7 +331,6 @@ def masks(
             pictures of a single camera; a picture; a video; a COCO file (.json); an episode of a
             LeRobot data set or DROID; or a ROS bag.
         out: Folder for the scene. It must be new or empty.
-        overlay: Write the pictures with the masks' contours, overlay/<camera>/<frame>.jpg.
     """
     from drake_pose.jobs.masks import make_masks
 

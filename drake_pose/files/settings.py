@@ -1,25 +1,24 @@
 """Settings of estimates, captures, registrations, audits, episodes and masks.
 
 Each field of a settings class is a command line option (cyclopts), a key of a batch's job file and
-an argument in Python. The docstring below a field is the option's help text. The parsers of option
-texts raise SettingsError for a text of another form.
+an argument in Python. Its entry in the class's docstring is the option's help text. The parsers of
+option texts raise SettingsError for a text of another form.
 """
 
-import ast
 import inspect
 import math
-import textwrap
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-from cyclopts import Parameter, Token
+from cyclopts import Group, Parameter, Token
 
 from drake_pose.errors import SettingsError, for_caller, require_at_least, require_positive
 
 _Settings = TypeVar("_Settings", bound=type)
+_Value = TypeVar("_Value")
 Axis = Literal["x", "y", "z"]
 RootTurns = Literal["fixed", "free"] | Mapping[Axis, tuple[float, float]]
 RootPosition = tuple[float, float, float] | tuple[Path, str] | Literal["unknown"]
@@ -41,6 +40,10 @@ GONE = {
     "reproduce --observed": "the lines of the paper are observed, or silhouettes with --pictures",
     "reproduce --noise": "the noise is the one that tutorials/figures.md reports",
     "reproduce --acceleration": "the filter is the one that tutorials/figures.md reports",
+    "--time-limit": "leave it out; every search ends by itself",
+    "--fit-shape": "leave it out; the shape is fitted if the model has joints for it",
+    "--no-fit-shape": "give a --model without joints for its shape",
+    "batch --chunk": "set chunk in the job file",
     "--export rerun": "log what drake_pose.load_cameras reads by rerun's own package",
     "capture --tolerance": "correct the time stamps; pictures half a period apart are of one time",
 }
@@ -116,32 +119,35 @@ def parse_number(text: str) -> float:
     return number
 
 
-def parse_assignments(texts: Iterable[str]) -> dict[str, float]:
-    """Return the numbers of ``NAME=NUMBER`` texts by name."""
-    values: dict[str, float] = {}
-    for text in texts:
-        name, equals, number = text.rpartition("=")
-        if not equals or not name:
-            raise SettingsError(f"'{text}' must have the form NAME=NUMBER")
+def parse_folder(text: str) -> Path:
+    """Return the absolute path of a folder that exists."""
+    if not Path(text).is_dir():
+        raise SettingsError(f"there is no folder {text}")
+    return Path(text).absolute()
+
+
+def _by_name(
+    pairs: Iterable[tuple[str, str, str]], form: str, parse: Callable[[str], _Value]
+) -> dict[str, _Value]:
+    """Return parsed values by name; ``pairs``: name, "=" and text; ``form``: for the message."""
+    values: dict[str, _Value] = {}
+    for name, equals, text in pairs:
+        if not (name and equals and text):
+            raise SettingsError(f"'{name}{equals}{text}' must have the form {form}")
         if name in values:
             raise SettingsError(f"'{name}' is given twice")
-        values[name] = parse_number(number)
+        values[name] = parse(text)
     return values
+
+
+def parse_assignments(texts: Iterable[str]) -> dict[str, float]:
+    """Return the numbers of ``NAME=NUMBER`` texts by name."""
+    return _by_name((text.rpartition("=") for text in texts), "NAME=NUMBER", parse_number)
 
 
 def parse_packages(texts: Iterable[str]) -> dict[str, Path]:
     """Return the absolute folders of ``NAME=FOLDER`` texts by package name."""
-    folders: dict[str, Path] = {}
-    for text in texts:
-        name, equals, folder = text.partition("=")
-        if not (name and equals and folder):
-            raise SettingsError(f"'{text}' must have the form NAME=FOLDER")
-        if name in folders:
-            raise SettingsError(f"'{name}' is given twice")
-        if not Path(folder).is_dir():
-            raise SettingsError(f"{name}: there is no folder {folder}")
-        folders[name] = Path(folder).absolute()
-    return folders
+    return _by_name((text.partition("=") for text in texts), "NAME=FOLDER", parse_folder)
 
 
 def parse_root_position(text: str) -> RootPosition:
@@ -188,137 +194,132 @@ def percent(fraction: float | None) -> str:
     return "-" if fraction is None else f"{100.0 * fraction:.2f} %"
 
 
-class _Documentation:
-    """Descriptor of a settings class's docstring: its own text and, as Args, its fields' texts.
+def documented(cls: _Settings) -> _Settings:
+    """Decorate a settings dataclass for ``help()`` and Sphinx.
 
-    ``own``: the docstring as written in the class. A field's text is its docstring or its help.
+    The Args of its docstring get the inherited fields, and its signature has plain types.
     """
-
-    def __init__(self, own: str) -> None:
-        self._own = own
-
-    def __get__(self, settings: object, owner: type) -> str:
-        texts = {
-            name: next((one.help for one in hint.__metadata__ if one.help), "")
-            for name, hint in get_type_hints(owner, include_extras=True).items()
-            if get_origin(hint) is Annotated
-        }
-        for one in reversed(owner.__mro__[:-1]):
-            (tree,) = ast.parse(textwrap.dedent(inspect.getsource(one))).body
-            assert isinstance(tree, ast.ClassDef)
-            for entry, below in pairwise(tree.body):
-                if isinstance(entry, ast.AnnAssign) and isinstance(below, ast.Expr):
-                    texts[ast.unparse(entry.target)] = ast.literal_eval(below.value)
-        lines = [f"    {one.name}: {' '.join(texts[one.name].split())}" for one in fields(owner)]
-        begin, _, raises = inspect.cleandoc(self._own).partition("\n\n")
-        wrapped = "\n".join(textwrap.fill(one, 100, subsequent_indent=8 * " ") for one in lines)
-        return f"{begin}\n\nArgs:\n{wrapped}\n" + (f"\n{raises}\n" if raises else "")
-
-
-def readable(cls: _Settings) -> _Settings:
-    """Decorate a settings dataclass so that ``help()`` shows plain types and the fields' texts."""
     made: Any = cls
-    hints, own = get_type_hints(cls), {one.name: one for one in fields(made)}
-    signature = inspect.signature(made.__init__)
-    parameters = []
-    for one in signature.parameters.values():
-        factory = own[one.name].default_factory if one.name in own else MISSING
-        default = one.default if factory is MISSING else factory()
-        parameters.append(one.replace(annotation=hints.get(one.name, one.empty), default=default))
-    made.__init__.__signature__ = signature.replace(parameters=parameters)
-    made.__signature__ = signature.replace(parameters=parameters[1:])
-    made.__doc__ = _Documentation(cls.__doc__ or "")
+    own, _, _ = inspect.cleandoc(cls.__doc__ or "").partition("\n\nArgs:\n")
+    entries: dict[str, str] = {}
+    for one in cls.__mro__:
+        args = inspect.cleandoc(one.__doc__ or "").partition("\nArgs:\n")[2]
+        for entry in re.split(r"\n(?=    \w)", args):
+            entries.setdefault(entry.partition(":")[0].strip(), entry)
+    listed = "\n".join(entries[one.name] for one in fields(made))
+    made.__doc__ = f"{own}\n\nArgs:\n{listed}\n"
+    made.__init__.__annotations__ = get_type_hints(cls)
     return cls
 
 
-def take_single_names(settings: Any) -> None:
-    """Replace a single name, such as "elbow", by a tuple in the fields of names of settings.
+def check_choices(settings: Any) -> None:
+    """Check names in settings; a single name, such as "elbow", becomes a tuple where it may.
 
     Raises:
-        SettingsError: such a field holds something else than names.
+        SettingsError: a field of names holds something else, or a name is not among its choices.
     """
-    hints = get_type_hints(type(settings))
-    for one in fields(settings):
-        value, (kind, *_) = getattr(settings, one.name), (*get_args(hints[one.name]), None)
-        if get_origin(hints[one.name]) is not tuple or get_args(hints[one.name])[1:] != (...,):
-            continue
-        if kind is not str and get_origin(kind) is not Literal:
-            continue
-        is_many = isinstance(value, Iterable) and not isinstance(value, Mapping | str)
-        names = tuple(value) if is_many else (value,)
-        if not all(isinstance(name, str) for name in names):
-            raise SettingsError(f"{one.name} must be names like ('a', 'b'), not {value!r}")
-        object.__setattr__(settings, one.name, names)
+    for name, hint in get_type_hints(type(settings)).items():
+        value, kind = getattr(settings, name), hint
+        if get_origin(hint) is tuple and get_args(hint)[1:] == (...,):
+            kind = get_args(hint)[0]
+            is_many = isinstance(value, Iterable) and not isinstance(value, Mapping | str)
+            value = tuple(value) if is_many else (value,)
+            if not all(isinstance(one, str) for one in value):
+                raise SettingsError(
+                    f"{name} must be names like ('a', 'b'), not {getattr(settings, name)!r}"
+                )
+            object.__setattr__(settings, name, value)
+        for one in value if isinstance(value, tuple) else (value,):
+            if get_origin(kind) is Literal and one not in get_args(kind):
+                known = ", ".join(get_args(kind))
+                raise SettingsError(f"there is no {name.rstrip('s')} '{one}'; there is: {known}")
 
+
+def in_group(title: str) -> Parameter:
+    """Return the cyclopts parameter of an option that the help shows in the group of this title."""
+    return Parameter(group=Group.create_ordered(title))
+
+
+SELECTION = in_group("Cameras and frames")
+BODY = in_group("Body")
+EPISODE = in_group("Recorded episodes")
+LIVE = in_group("Live capture")
+RUNNING = in_group("Running and output")
 
 Names = Annotated[tuple[str, ...], Parameter(metavar="NAME")]
+Links = Annotated[tuple[str, ...], Parameter(metavar="LINK")]
 Positions = Annotated[
     Mapping[str, float], from_text(parse_assignments, "NAME=VALUE", repeated=True)
 ]
 Packages = Annotated[
-    Mapping[str, Path],
-    from_text(parse_packages, "NAME=FOLDER", name="--package", repeated=True),
-    Parameter(
-        help="Folder of the package of package://NAME/... files; repeat for several. Others are "
-        "searched for in the folders above the model's file and in ROS_PACKAGE_PATH."
-    ),
+    Mapping[str, Path], from_text(parse_packages, "NAME=FOLDER", name="--package", repeated=True)
 ]
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneSettings:
-    """Cameras and frames of a scene to use, and the folders of the model's packages."""
+    """Cameras and frames of a scene to use, and the folders of the model's packages.
 
-    cameras: Annotated[Names, Parameter("--camera")] = ()
-    """Use this camera; repeat for several. Default: all, used together."""
-    frames: Annotated[Names, Parameter("--frame")] = ()
-    """Use this frame, or frames FIRST:LAST; repeat for several. Default: all."""
-    every: Annotated[int, Parameter(metavar="N")] = 1
-    """Use only every Nth frame, starting with the first."""
-    packages: Packages = field(default_factory=dict)
+    Args:
+        cameras: Use this camera; repeat for several. Default: all, used together.
+        frames: Use this frame, or frames FIRST:LAST; repeat for several. Default: all.
+        every: Use only every Nth frame, starting with the first.
+        packages: Folder of the package of package://NAME/... files; repeat for several. Others are
+            searched for above the model's file and in ROS_PACKAGE_PATH.
+    """
+
+    cameras: Annotated[Names, Parameter("--camera"), SELECTION] = ()
+    frames: Annotated[Names, Parameter("--frame"), SELECTION] = ()
+    every: Annotated[int, Parameter(metavar="N"), SELECTION] = 1
+    packages: Annotated[Packages, BODY] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        take_single_names(self)
+        check_choices(self)
 
     def as_json(self) -> dict[str, Any]:
-        """Return the settings as plain JSON values."""
-        return {one.name: plain(getattr(self, one.name)) for one in fields(self)}
+        """Return the settings that affect the result as plain JSON values."""
+        return {
+            one.name: plain(getattr(self, one.name))
+            for one in fields(self)
+            if one.name != "workers"
+        }
 
 
-@readable
+@documented
 @dataclass(frozen=True, kw_only=True)
 class CaptureSettings(SceneSettings):
-    """Settings that estimates and the capture of a person share."""
+    """Settings that estimates and the capture of a person share.
 
-    track: Annotated[bool, Parameter(negative="--no-track")] = True
-    """Track the body through a sequence, and search only in the first frame and after a loss;
-    --no-track: search in every frame."""
+    Args:
+        track: Track the body through a sequence, and search only in the first frame and after a
+            loss; --no-track: search in every frame.
+    """
+
+    track: Annotated[bool, Parameter(negative="--no-track"), SELECTION] = True
 
 
 CaptureMethod = Literal["person", "paper"]
 """person: a fit to all silhouettes at once; paper: the stages of Date et al. as published."""
 
 
-@readable
+@documented
 @dataclass(frozen=True, kw_only=True)
 class LiveSettings:
     """Settings of a live capture.
 
-    Raises:
-        SettingsError: a time is not positive, or an option lacks the other one that it needs.
+    Raises SettingsError: the time is not positive, or an option lacks the one that it needs.
+
+    Args:
+        seconds: Stop after this time [s]. Default: at the end of the recordings, or by Ctrl-C.
+        face_camera: With --method paper: the camera before the face, for the direction of the head;
+            needs --faces.
+        faces: With --method paper: folder with pictures of the person's face and directions.csv,
+            which has the columns picture, turn and nod [deg].
     """
 
-    seconds: Annotated[float | None, within(0.01)] = None
-    """Stop after this time [s]. Live capture (sources.yaml) only."""
-    fit_shape: Annotated[bool, Parameter(negative="--no-fit-shape")] = True
-    """--fit-shape: fit link lengths and radius scales to the first frames. --no-fit-shape: keep the
-    model's. Live capture only."""
-    face_camera: Annotated[str | None, Parameter(metavar="NAME")] = None
-    """With --method paper: the camera before the face, for the direction of the head; needs
-    --faces."""
-    faces: Annotated[Path | None, Parameter(metavar="FOLDER")] = None
-    """With --method paper: folder with pictures of the person's face and directions.csv, which has
-    the columns picture, turn and nod [deg]."""
+    seconds: Annotated[float | None, within(0.01), LIVE] = None
+    face_camera: Annotated[str | None, Parameter(metavar="NAME"), LIVE] = None
+    faces: Annotated[Path | None, Parameter(metavar="FOLDER"), LIVE] = None
 
     def __post_init__(self) -> None:
         require_positive(seconds=self.seconds)
@@ -328,82 +329,74 @@ class LiveSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeSettings(SceneSettings):
-    """Settings for reading a robot's recorded episode."""
+    """Settings for reading a robot's recorded episode.
 
-    episode: Annotated[int | None, Parameter(metavar="N")] = None
-    """Number of the episode in a LeRobot data set. Default: the only one."""
-    joint_map: Path | None = None
-    """YAML file that assigns columns of an episode's joint log to joints, with their units; or the
-    calibration file of a LeRobot robot (JSON)."""
-    intrinsics: Path | None = None
-    """Camera file with intrinsics, if the camera file has poses alone, as those of easy_handeye
-    and DROID. Default: the recording's own."""
-    units: Literal["rad", "deg", "normalised", "steps"] | None = None
-    """Unit of the angles in an episode's joint log; normalised: LeRobot's -100 to 100 of a motor's
-    range; steps: of its encoder. Default: inferred from the readings and the joints' limits."""
-    workers: Annotated[int | None, Parameter(metavar="N")] = None
-    """Number of threads; the result does not depend on it. Default: one for each core."""
+    Args:
+        episode: Number of the episode in a LeRobot data set. Default: the only one.
+        joint_map: YAML file that assigns columns of the joint log to joints, with their units; or
+            the calibration file of a LeRobot robot (JSON).
+        intrinsics: Camera file with intrinsics, if --cameras has poses alone, as those of
+            easy_handeye and DROID. Default: the recording's own.
+        units: Unit of the angles in the joint log: rad, deg, normalised (LeRobot's -100 to 100 of a
+            motor's range) or steps (of its encoder). Default: inferred from the readings and the
+            joints' limits.
+        workers: Number of threads; the result does not depend on it. Default: one for each core.
+    """
+
+    episode: Annotated[int | None, Parameter(metavar="N"), EPISODE] = None
+    joint_map: Annotated[Path | None, EPISODE] = None
+    intrinsics: Annotated[Path | None, EPISODE] = None
+    units: Annotated[Literal["rad", "deg", "normalised", "steps"] | None, EPISODE] = None
+    workers: Annotated[int | None, Parameter(metavar="N"), RUNNING] = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_at_least(1, workers=self.workers)
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the settings that affect the result as plain JSON values."""
-        values = super().as_json()
-        del values["workers"]
-        return values
 
-
-@readable
+@documented
 @dataclass(frozen=True, kw_only=True)
 class EstimateSettings(CaptureSettings, EpisodeSettings):
     """Settings of the estimate of a scene.
 
-    Raises:
-        SettingsError: the method does not exist or lacks an option, or a number is out of range.
+    Raises SettingsError: the method does not exist or lacks an option, or a number is out of range.
+
+    Args:
+        method: beam: beam search and continuous fit; paper: the search of Kameda, Minoh and Ikeda
+            as published; person: fit one person to all cameras' silhouettes at once; auto: person
+            if model, cameras and options allow it, else beam.
+        start: Joint positions in the first frame of a sequence [rad or m]: CSV file with the column
+            frame, or time [s], and one for each joint. Other rows are used after a loss.
+        hold: Hold this joint at a known position [deg or m]; repeat for several.
+        unseen: This link is missing in the pictures, such as the forearm of a hand cut off at the
+            wrist; repeat for several. Its joints are held. URDF models only.
+        root: Link at which the search starts; any link. Default: the model's root.
+        root_position: Position of the root's origin in the world: X,Y,Z [m]; or FILE.csv:JOINT, a
+            CSV file with the columns frame,joint,x,y,z and a row of that joint for each frame; or
+            unknown, to search it (the default if the scene has no cameras.yaml).
+        root_rotation: Rotation of the root: fixed, free, or limits [deg] about its axes in the
+            order of rotation, like y=-180:180,z=-10:10; zero is the rotation at the model's default
+            positions. Default: the model's own root moves as its joints allow, another is free.
     """
 
-    start: Path | None = None
-    """Joint positions in the first frame of a sequence [rad or m]: CSV file with the column frame,
-    or time [s], and one for each joint. Rows of other frames are used after a loss."""
-    hold: Positions = field(default_factory=dict)
-    """Hold this joint at a known position [deg or m]; repeat for several."""
-    unseen: Annotated[tuple[str, ...], Parameter(metavar="LINK")] = ()
-    """This link is missing in the pictures, such as the forearm of a hand cut off at the wrist;
-    repeat for several. Its joints are held. URDF models only."""
-    root: Annotated[str | None, Parameter(metavar="LINK")] = None
-    """Link at which the search starts; any link. Default: the model's root."""
-    root_position: Annotated[RootPosition | None, from_text(parse_root_position, "POINT")] = None
-    """Position of the root's origin in the world: X,Y,Z [m]; or FILE.csv:JOINT, a CSV file with the
-    columns frame,joint,x,y,z and a row of that joint for each frame; or unknown, to search it (the
-    default if the scene has no cameras.yaml)."""
-    root_rotation: Annotated[RootTurns | None, from_text(parse_root_rotation, "ROTATION")] = None
-    """Rotation of the root: fixed, free, or limits [deg] about its axes in the order of rotation,
-    like y=-180:180,z=-10:10; zero is the rotation at the model's default positions. Default: the
-    model's own root moves as its joints allow, any other link is free."""
-    time_limit: Annotated[float | None, Parameter(metavar="SECONDS")] = None
-    """Stop the search of a frame after this time [s] and take the best pose so far. Method beam
-    only."""
     method: Literal["auto", "beam", "paper", "person"] = "auto"
-    """beam: beam search and continuous fit; paper: the search of Kameda, Minoh and Ikeda as
-    published, with samples 10 degrees apart; person: fit one person to all cameras' silhouettes at
-    once; auto: person if model, cameras and options allow it, else beam."""
+    start: Path | None = None
+    hold: Annotated[Positions, BODY] = field(default_factory=dict)
+    unseen: Annotated[Links, BODY] = ()
+    root: Annotated[str | None, Parameter(metavar="LINK"), BODY] = None
+    root_position: Annotated[RootPosition | None, from_text(parse_root_position, "POINT"), BODY] = (
+        None
+    )
+    root_rotation: Annotated[RootTurns | None, from_text(parse_root_rotation, "ROTATION"), BODY] = (
+        None
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, hint in get_type_hints(type(self)).items():
-            value = getattr(self, name)
-            if get_origin(hint) is Literal and value not in get_args(hint):
-                choices = ", ".join(get_args(hint))
-                raise SettingsError(f"there is no {name} '{value}'; there is: {choices}")
-        require_at_least(0, time_limit=self.time_limit)
         if self.method == "person" and self.search_settings:
             raise SettingsError(
                 f"the method person does not search poses; leave {self.search_settings[0]} out"
             )
-        if self.method == "paper" and self.time_limit is not None:
-            raise SettingsError("the method paper has no time limit; leave it out")
 
     @property
     def search_settings(self) -> tuple[str, ...]:
@@ -419,31 +412,32 @@ class EstimateSettings(CaptureSettings, EpisodeSettings):
         return values
 
 
-@readable
+@documented
 @dataclass(frozen=True, kw_only=True)
 class MaskSettings:
     """Settings for making masks; without a background the source holds masks.
 
-    Raises:
-        SettingsError: classes of annotations are given with a background.
+    Raises SettingsError: classes of annotations are given with a background.
+
+    Args:
+        background: Picture of the empty room, or folder with <camera>.png or <camera>/<frame>.png;
+            median: each pixel's median over the pictures, in which the body must move. Default:
+            SOURCE/background, if it exists.
+        classes: Class of the object in a COCO file, by name or number; repeat for several; all:
+            every class. Default: the only class.
+        largest: Keep only the largest connected region of each mask.
+        cameras: Camera file for the scene. Default: SOURCE/cameras.yaml, if it exists.
+        episode: Number of the episode in a LeRobot data set. Default: the only one.
     """
 
-    cameras: Path | None = None
-    """Camera file for the scene. Default: SOURCE/cameras.yaml, if it exists."""
-    episode: Annotated[int | None, Parameter(metavar="N")] = None
-    """Number of the episode in a LeRobot data set. Default: the only one."""
-    classes: Annotated[tuple[str, ...], Parameter("--class", metavar="NAME")] = ()
-    """Class of the object in a COCO file, by name or number; repeat for several; all: every class.
-    Default: the only class."""
     background: str | Path | None = None
-    """Picture of the empty room, or folder with <camera>.png or <camera>/<frame>.png; median: each
-    pixel's median over the pictures, in which the body must move. Default: SOURCE/background, if it
-    exists."""
+    classes: Annotated[Names, Parameter("--class")] = ()
     largest: bool = False
-    """Keep only the largest connected region of each mask."""
+    cameras: Path | None = None
+    episode: Annotated[int | None, Parameter(metavar="N")] = None
 
     def __post_init__(self) -> None:
-        take_single_names(self)
+        check_choices(self)
         if self.classes and self.background is not None:
             raise SettingsError(for_caller("--class needs a COCO file and excludes --background"))
 
@@ -477,53 +471,53 @@ Export = Literal["ros", "mujoco", "drake", "lerobot"]
 """Programs for which cameras are exported; LeRobot gets the joints, too."""
 
 
-@readable
+@documented
 @dataclass(frozen=True, kw_only=True)
 class AuditSettings(EpisodeSettings):
-    """Settings of an audit."""
+    """Settings of an audit.
 
-    hold: Positions = field(default_factory=dict)
-    """Hold this joint at a known position [deg or m]; repeat for several."""
-    without: Annotated[tuple[str, ...], Parameter(metavar="LINK")] = ()
-    """Leave this link and all links that it carries out of drawings and comparisons, such as a
-    gripper that is not the model's; repeat for several."""
-    pictures: Annotated[bool, Parameter(negative="")] = False
-    """Use the scene's pictures and joint log, even if it has masks."""
+    Args:
+        hold: Hold this joint at a known position [deg or m]; repeat for several.
+        without: Leave this link and all links that it carries out of drawings and comparisons, such
+            as a gripper that is not the model's; repeat for several.
+        pictures: Use the scene's pictures and joint log, even if it has masks.
+    """
+
+    hold: Annotated[Positions, BODY] = field(default_factory=dict)
+    without: Annotated[Links, BODY] = ()
+    pictures: Annotated[bool, EPISODE] = False
 
 
-@readable
+@documented
 @dataclass(frozen=True, kw_only=True)
 class RegistrationSettings(AuditSettings):
-    """Settings of a registration."""
+    """Settings of a registration.
 
-    cameras: Annotated[Names, Parameter("--camera")] = ()
-    """Register this camera, and ignore its X_WC if it has one; repeat for several. Default: all
-    cameras of an episode; of a scene of masks those without X_WC."""
+    Args:
+        cameras: Register this camera, and ignore its X_WC if it has one; repeat for several.
+            Default: all cameras of an episode; of a scene of masks those without X_WC.
+        on: The cameras are mounted on this link (eye in hand). Their pose X_LC in the link's frame
+            is estimated from an episode's pictures of things that stand still, from masks of the
+            robot's static base, or from masks or pictures of a --target.
+        target: With --on: model file of a rigid calibration target anywhere in the world, which the
+            masks or pictures show; its pose is estimated, too.
+        zeros: Estimate the offset of this joint, too: a constant to be added to its positions in
+            all frames [deg or m]. "all": of every joint; repeat for several. For a URDF model, a
+            URDF with the significant offsets is written.
+        lengths: Estimate the scale of this link, too: a factor of the distances from its own joint
+            to the joints that it carries. "all": of every link; repeat for several. URDF models
+            only: a URDF with the significant scales is written.
+        focal: Estimate the cameras' focal lengths, too.
+        exports: Export the cameras for this program, too; repeat for several. ros: camera_info and
+            static transforms; mujoco: <camera> elements; drake: CameraConfigs; lerobot, for a
+            LeRobot data set: joint map, motors' calibration corrected by --zeros, and a copy of
+            meta with the cameras.
+    """
+
+    cameras: Annotated[Names, Parameter("--camera"), SELECTION] = ()
     on: Annotated[str | None, Parameter(metavar="LINK")] = None
-    """The cameras are mounted on this link (eye in hand). Their pose X_LC in the link's frame is
-    estimated from an episode's pictures of things that stand still, from masks of the robot's
-    static base, or from masks or pictures of a --target."""
     target: Path | None = None
-    """With --on: model file (URDF, SDFormat, MJCF) of a rigid calibration target anywhere in the
-    world, which the masks or pictures show; its pose is estimated, too."""
     zeros: Names = ()
-    """Estimate the offset of this joint, too: a constant to be added to its positions in all
-    frames. "all": of every joint; repeat for several. For a URDF model, a URDF with the significant
-    offsets is written."""
-    lengths: Annotated[tuple[str, ...], Parameter(metavar="LINK")] = ()
-    """Estimate the scale of this link, too: a factor of the distances from its own joint to the
-    joints that it carries. "all": of every link; repeat for several. URDF models only: a URDF with
-    the significant scales is written."""
+    lengths: Links = ()
     focal: bool = False
-    """Estimate the cameras' focal lengths, too."""
     exports: Annotated[tuple[Export, ...], Parameter("--export")] = ()
-    """Export the cameras for this program, too; repeat for several. ros: camera_info and static
-    transforms; mujoco: <camera> elements; drake: CameraConfigs; lerobot, for a LeRobot data set: a
-    joint map and the motors' calibration file, corrected by the offsets of --zeros, and a copy of
-    meta with the cameras."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in self.exports:
-            if name not in (known := get_args(Export)):
-                raise SettingsError(f"there is no export '{name}'; there is: {', '.join(known)}")

@@ -73,12 +73,12 @@ class SceneJob:
         return described
 
 
-def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
+def read_job(path: Path) -> tuple[SceneJob, ...]:
     """Return the scenes of a job file, in order. Its paths are relative to its folder.
 
     ``path``: YAML file with ``scenes`` (settings by name) and optionally ``defaults`` (settings of
     all scenes) and ``chunk``. A scene with ``episodes: "0:99"`` becomes one scene for each episode,
-    NAME_000000 and so on. ``chunk``: number of frames in a chunk; None: the file's, else 100.
+    NAME_000000 and so on.
 
     Raises SettingsError: the message names the file, scene and setting at fault.
     """
@@ -87,7 +87,7 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
     scenes = content.get("scenes")
     if not isinstance(scenes, dict) or not scenes:
         raise SettingsError(f"{path}: has no scenes; expected 'scenes:' with NAME: settings")
-    length = content.get("chunk", SceneJob.chunk) if chunk is None else chunk
+    length = content.get("chunk", SceneJob.chunk)
     if not isinstance(length, int) or isinstance(length, bool) or length < 1:
         raise SettingsError(f"{path}: chunk: must be a whole number, 1 or more, not {length!r:.60}")
     own = ("scene", "model", "truth", "overlay", "replay", "audit", "camera_file")

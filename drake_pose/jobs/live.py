@@ -284,7 +284,7 @@ def capture_live(
     tree, setup, shape = model.pose_tree(), None, None
     if method == "paper":
         setup = find_registered_pose(scene, model, settings, on_report)
-    elif settings.fit_shape:
+    else:
         shape = _fit_first_frames(scene, tree, on_report)
     tracker = tracker_of_person(tree, shape)
     with closing(scene.open_sensors()) as sensors:

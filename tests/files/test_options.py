@@ -87,10 +87,8 @@ def test_a_name_given_twice_is_refused(parse, texts):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"method": "paper", "time_limit": 3.0}, "the method paper has no time limit"),
         ({"method": "person", "root": "a"}, "does not search poses; leave root out"),
         ({"method": "guess"}, "there is no method 'guess'; there is: auto, beam, paper, person"),
-        ({"time_limit": -1.0}, "time_limit"),
         ({"workers": 0}, "workers"),
         ({"cameras": 3}, "cameras must be names like"),
         ({"cameras": {"a": 1}}, "cameras must be names like"),
@@ -106,7 +104,7 @@ def test_single_names_and_lists_become_tuples_and_json_is_plain():
     one = EstimateSettings(
         cameras="left", frames=["1", "2"], packages={"b": Path("/x")}, workers=3,
         start=Path("s.csv"),
-        root_rotation={"y": (-10.0, 20.0)}, time_limit=0.0,
+        root_rotation={"y": (-10.0, 20.0)},
     )  # fmt: skip
     assert (one.cameras, one.frames) == (("left",), ("1", "2"))
     told = one.as_json()
@@ -117,9 +115,9 @@ def test_single_names_and_lists_become_tuples_and_json_is_plain():
     assert plain((Path("a"), [Path("b")], 3)) == ["a", ["b"], 3]
     # Options that are not at their defaults, of the search alone or of all.
     assert {*changed(one)} == {
-        "cameras", "frames", "packages", "workers", "start", "root_rotation", "time_limit"
+        "cameras", "frames", "packages", "workers", "start", "root_rotation"
     }  # fmt: skip
-    assert {*one.search_settings} == {"start", "root_rotation", "time_limit"}
+    assert {*one.search_settings} == {"start", "root_rotation"}
     assert changed(EstimateSettings()) == ()
 
 

@@ -42,9 +42,11 @@ def scenes(tmp_path_factory):
     return base
 
 
-def write_job(folder: Path, scenes: dict[str, dict], name: str = "jobs.yaml") -> Path:
+def write_job(
+    folder: Path, scenes: dict[str, dict], name: str = "jobs.yaml", chunk: int = 2
+) -> Path:
     path = folder / name
-    content = {"chunk": 2, "defaults": {"model": "crane.urdf", **QUICK}, "scenes": scenes}
+    content = {"chunk": chunk, "defaults": {"model": "crane.urdf", **QUICK}, "scenes": scenes}
     path.write_text(yaml.safe_dump(content, sort_keys=False))
     return path
 
@@ -229,16 +231,15 @@ def test_job_file_gives_the_settings(tmp_path):
         "scene": "a", "model": "m.urdf", "cameras": ["left"], "frames": "0:9", "root": "base",
         "root_position": [1, 2, 3], "root_rotation": "y=-180:180",
         "hold": {"lift": 10}, "method": "beam", "truth": "t.csv", "replay": False,
-        "packages": {"arms": "robots"}, "start": "first.csv", "track": False, "time_limit": 2,
+        "packages": {"arms": "robots"}, "start": "first.csv", "track": False,
     }  # fmt: skip
     path = tmp_path / "jobs.yaml"
-    path.write_text(yaml.safe_dump({"scenes": {"a": entry}}))
-    (job,) = read_job(path, chunk=7)
+    path.write_text(yaml.safe_dump({"chunk": 7, "scenes": {"a": entry}}))
+    (job,) = read_job(path)
     settings = EstimateSettings(
         cameras=("left",), frames=("0:9",), root="base", root_position=(1.0, 2.0, 3.0),
         root_rotation={"y": (-180.0, 180.0)}, hold={"lift": 10.0}, method="beam",
         packages={"arms": tmp_path / "robots"}, start=tmp_path / "first.csv", track=False,
-        time_limit=2.0,
     )  # fmt: skip
     truth = tmp_path / "t.csv"
     assert job == SceneJob(
@@ -254,8 +255,9 @@ def test_job_file_gives_the_settings(tmp_path):
         ("scenes: {../a: {scene: a}}", "slashes"),
         ("scenes: {1: {scene: a}}", "quotes"),
         ("scenes: {a: {scene: a, methode: beam}}", "unknown field methode; there are: scene"),
-        ("scenes: {a: {scene: a, time_limit: wide}}", "time_limit: must be a number"),
-        ("scenes: {a: {scene: a, time_limit: true}}", "time_limit: must be a number"),
+        ("scenes: {a: {scene: a, every: wide}}", "every: must be a whole number"),
+        ("scenes: {a: {scene: a, every: true}}", "every: must be a whole number"),
+        ("scenes: {a: {scene: a, time_limit: 5}}", "--time-limit is gone"),
         ("scenes: {a: {scene: a, track: 1}}", "track: must be true or false"),
         ("scenes: {a: {scene: a, hold: {lift: low}}}", "hold: lift: must be a number"),
         ("scenes: {a: {scene: a, packages: [b]}}", "packages: expected NAME: VALUE"),
@@ -265,7 +267,7 @@ def test_job_file_gives_the_settings(tmp_path):
         ("scenes: {a: {scene: a}}\nchunk: 0", "chunk: must be a whole number"),
         ("scenes: {a: {scene: a}}\ndefaults: {model: 3}", "model: must be a text"),
         ("scene: {a: {scene: a}}", "unknown field scene"),
-        ("scenes: {a: {scene: a, audit: j.csv, time_limit: 5}}", "no setting time_limit"),
+        ("scenes: {a: {scene: a, audit: j.csv, root: a}}", "no setting root"),
         ("scenes: {a: {scene: a, audit: j.csv, truth: j.csv}}", "an audit has no setting truth"),
         ("scenes: {a: {scene: a, camera_file: c.yaml}}", "an estimate has no setting camera_file"),
         ("scenes: {a: {scene: a}, a: {scene: b}}", "given twice"),
@@ -340,7 +342,7 @@ def test_finished_tasks_are_not_repeated(scenes, out):
 @pytest.mark.parametrize("wrong", [{0}, {0, 1, 2}])
 def test_failed_chunks_do_not_stop_the_others_until_three_have_failed(scenes, out, wrong):
     entry = {"stills": {"scene": "stills"}, "motion": {"scene": "motion"}}
-    jobs = read_job(write_job(scenes, entry, "two.yaml"), chunk=1)
+    jobs = read_job(write_job(scenes, entry, "two.yaml", chunk=1))
     asked = []
 
     def work(task: Task) -> Outcome:

@@ -95,9 +95,9 @@ def test_ctrl_c_keeps_all_frames(studio, person, tmp_path):
         if count == 6:
             raise KeyboardInterrupt
 
-    scene, settings = load_live_scene(studio), LiveSettings(fit_shape=False)
+    scene = load_live_scene(studio)
     _, interrupted, _ = capture_live(
-        scene, tmp_path / "out", person.path, settings, replay=False, on_frame=interrupt
+        scene, tmp_path / "out", person.path, replay=False, on_frame=interrupt
     )
     assert interrupted
     assert len(read_rows(tmp_path / "out" / "poses.csv")) == 6
@@ -108,11 +108,11 @@ def test_ctrl_c_keeps_all_frames(studio, person, tmp_path):
 @pytest.mark.slow
 def test_command_captures_and_refuses(studio, captured, person, tmp_path):
     words = ["capture", str(studio), "--model", str(person.path), "--no-replay"]
-    new = ["--out", str(tmp_path / "a"), "--no-fit-shape"]
+    new = ["--out", str(tmp_path / "a")]
     done = run_command([*words, *new, "--seconds", "0.3", "--json"])
     assert done.exit_code == 0, done.output
     assert 3 <= json.loads(done.stdout)["frame_count"] <= 6
-    done = run_command([*words, "--out", str(tmp_path / "b"), "--no-fit-shape"])
+    done = run_command([*words, "--out", str(tmp_path / "b")])
     assert done.exit_code == 0, done.output
     assert "0004.png" in done.stderr
     assert "stopped at 0.27 s, returned at 0.67 s" in done.stdout

@@ -76,14 +76,14 @@ def make_search(
 
     Args:
         model: the body's model.
-        settings: method, root, root rotation, held positions and time limit.
+        settings: method, root, root rotation and held positions.
         position: (3,) position of the root in the world [m]; None: as the model has it.
         interval_deg: sampling interval of the published search [deg].
     """
     tree = make_tree(model, settings, position)
     if settings.method == "paper":
         return PaperSearch(tree, PaperSearchSettings(math.radians(interval_deg)))
-    return MultiStartSearch(tree, settings.time_limit)
+    return MultiStartSearch(tree)
 
 
 def make_placement_search(
@@ -101,7 +101,7 @@ def make_placement_search(
 
     Args:
         model: the body's model.
-        settings: method, root, root rotation, held positions and time limit.
+        settings: method, root, root rotation and held positions.
         position: (3,) start of the root position in the world [m]; None: the origin.
         scale_unknown: whether the scale of a parallel camera is searched as well.
         interval_deg: sampling interval of joint angles [deg].
@@ -122,7 +122,7 @@ def make_placement_search(
         tree = model.pose_tree(
             most_connected_node(tree), root_position=first, root_rotation=rotation, held=held
         )
-    sampling = BeamSearchSettings(math.radians(interval_deg), time_limit=settings.time_limit)
+    sampling = BeamSearchSettings(math.radians(interval_deg))
     return RootPlacementSearch(tree, sampling, scale_unknown)
 
 

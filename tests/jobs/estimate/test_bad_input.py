@@ -176,8 +176,6 @@ def test_unknown_names_are_refused(options, parts, own_scene):
         ("--method magic", "magic"),
         ("--speed 3", "--speed"),
         ("--every many", "--every"),
-        ("--method paper --time-limit 9", "time limit"),
-        ("--time-limit -1", "time_limit"),
     ],
 )
 def test_wrong_usage(options, part, tiny_scene):
